@@ -1,17 +1,22 @@
-"""Shared fixtures: real data where this machine has them, and one thread for the tests."""
+"""Shared fixtures: runs that are made once, real data where this machine has them, one thread."""
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from commands import NO_AGENT, run_command, tiny
 from matplotlib.figure import Figure
 from PIL import Image
 from streams import driven_once
+
+from lcc_rl.commands import training
 
 # Several test processes share a machine's cores; more threads each would only slow them down.
 torch.set_num_threads(1)
@@ -31,6 +36,46 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 50)
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """Return a folder that the first process of the session that asks for it fills.
+
+    Args:
+        factory: of temporary folders of this process.
+        name: of the folder.
+        make: fills the folder, which does not exist yet.
+    """
+    root = factory.getbasetemp()
+    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
+    folder = root / "made_once" / name
+    folder.parent.mkdir(exist_ok=True)
+    with folder.with_suffix(".lock").open("a+") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        file.seek(0)
+        if not file.read():
+            shutil.rmtree(folder, ignore_errors=True)
+            make(folder)
+            file.write("made")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny training of the variant alcc. Tests that change it copy it."""
+    cfg = tiny("train", "variant=alcc")
+    return made_once(tmp_path_factory, "alcc", lambda to: training.run(cfg, to, quiet=True))
+
+
+@pytest.fixture(scope="session")
+def evaluated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What lcc-rl train leaves of the rule idm, tiny. Tests that change it copy it."""
+
+    def make(to: Path) -> None:
+        words = ("variant=idm", *NO_AGENT, f"hydra.run.dir={to}")
+        run_command("lcc_rl.cli.train", *words, cwd=to.parent, check=True)
+
+    return made_once(tmp_path_factory, "idm", make)
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from functools import cache
@@ -22,6 +23,7 @@ from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.drivers.population import bootstrap, from_table
 from lcc_rl.envs import SingleAgent, build_env
+from lcc_rl.errors import LccError
 from lcc_rl.io.files import read_parquet
 
 PLATOON = ("cacc", "ddpg", "deadbeat", "hcfs")
@@ -174,3 +176,28 @@ def slow_but(quick: Iterable[Any], cases: Iterable[Any]) -> list[Any]:
         else pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.slow)
         for case in cases
     ]
+
+
+def check_refused(
+    call: Callable[..., object],
+    cases: Iterable[tuple[Any, ...]],
+    error: type[Exception] = LccError,
+) -> None:
+    """Check that a call ends in one line for every case, and name the cases for which it does not.
+
+    Args:
+        call: what is called with the items of a case but the last.
+        cases: the arguments and, last, the pattern of the error's words.
+        error: the class of the error.
+    """
+    wrong = []
+    for *given, words in cases:
+        try:
+            call(*given)
+        except error as caught:
+            said = str(caught)
+            if not re.search(words, said) or "\n" in said:
+                wrong.append(f"{given}: expected {words!r}, got {said!r}")
+        else:
+            wrong.append(f"{given} is not refused; expected {words!r}")
+    assert not wrong, "\n".join(wrong)

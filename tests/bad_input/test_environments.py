@@ -8,7 +8,7 @@ from collections import deque
 import pytest
 import torch
 from commands import DATA
-from helpers import compose, single_env, small_env, wavy_profiles
+from helpers import check_refused, compose, single_env, small_env, wavy_profiles
 from tensordict import TensorDict
 
 from lcc_rl.drivers.population import bootstrap
@@ -38,11 +38,9 @@ def envs():
     return {"group": small_env("alcc", 2), "single": single_env("alcc", 2)}
 
 
-@pytest.mark.parametrize(("given", "words"), BAD)
-def test_a_bad_reset_option_is_named(envs, given, words) -> None:
+def test_a_bad_reset_option_is_named(envs) -> None:
     for env in envs.values():
-        with pytest.raises(ConfigError, match=words):
-            env.reset(TensorDict(given, [2]))
+        check_refused(lambda given, env=env: env.reset(TensorDict(given, [2])), BAD)
 
 
 def test_every_way_to_reset_refuses_them(envs) -> None:
@@ -55,13 +53,13 @@ def test_every_way_to_reset_refuses_them(envs) -> None:
         env.reset(TensorDict({SEED: torch.zeros(3, 1).long()}, [3]))
 
 
-@pytest.mark.parametrize("kind", ["group", "single"])
-def test_a_whole_moment_may_be_given_and_replays_its_episode(envs, kind) -> None:
-    env, given = envs[kind], TensorDict({SEED: torch.tensor([[3], [4]])}, [2])
-    first = env.reset(given).clone()
-    assert (env.reset(given) == first).all()  # TorchRL has written the moment into it
-    reached = env.rollout(5, break_when_any_done=False, tensordict=first.clone())[:, -1]
-    assert torch.equal(env.reset(reached.exclude("next"))[SEED], first[SEED])
+def test_a_whole_moment_may_be_given_and_replays_its_episode(envs) -> None:
+    for env in envs.values():
+        given = TensorDict({SEED: torch.tensor([[3], [4]])}, [2])
+        first = env.reset(given).clone()
+        assert (env.reset(given) == first).all()  # TorchRL has written the moment into it
+        reached = env.rollout(5, break_when_any_done=False, tensordict=first.clone())[:, -1]
+        assert torch.equal(env.reset(reached.exclude("next"))[SEED], first[SEED])
 
 
 def test_what_torchrl_itself_resets_is_no_option(envs) -> None:
@@ -71,16 +69,16 @@ def test_what_torchrl_itself_resets_is_no_option(envs) -> None:
     assert collector.collect().shape == (2, 45)
 
 
-@pytest.mark.parametrize(
-    ("size", "seed", "words"),
-    [
-        (10**30, 0, r"batch_size=.* needs about \d+.* of memory"),
-        *(((), seed, "seed must be") for seed in (-1, 2**32, 1.0, True, "1")),
-    ],
-)
-def test_an_impossible_batch_or_seed(size, seed, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        make_env("alcc", size, DATA, seed=seed)
+def test_an_impossible_batch_seed_or_device() -> None:
+    devices = ["banana", *([] if torch.cuda.is_available() else ["cuda"])]
+    cases = [
+        ({"batch_size": 10**30}, r"batch_size=.* needs about \d+.* of memory"),
+        *(({"seed": seed}, "seed must be") for seed in (-1, 2**32, 1.0, True, "1")),
+        *(({"device": name}, f"device '{name}' is not available") for name in devices),
+    ]
+    check_refused(
+        lambda given: make_env("alcc", **{"batch_size": (), **given}, overrides=DATA), cases
+    )
 
 
 def test_seeds_that_would_play_the_same_episodes_are_refused(envs) -> None:
@@ -94,37 +92,26 @@ def test_seeds_that_would_play_the_same_episodes_are_refused(envs) -> None:
             env.set_seed(seed)
 
 
-@pytest.mark.parametrize(
-    "typed", ["wrong.option=1", "seed", "agent=dddpg", "scenario.horizon=0", "scenario.road=${a}"]
-)
-def test_a_wrong_setting_is_one_traceback(typed) -> None:
-    with pytest.raises(ConfigError) as caught:
-        make_env(overrides=[typed])
-    text = "".join(traceback.format_exception(caught.value))
-    assert text.count("Traceback") == 1
+def test_a_wrong_setting_is_one_traceback() -> None:
+    for typed in ("wrong.option=1", "seed", "agent=dddpg", "scenario.horizon=0"):
+        with pytest.raises(ConfigError) as caught:
+            make_env(overrides=[typed])
+        text = "".join(traceback.format_exception(caught.value))
+        assert text.count("Traceback") == 1, typed
 
 
-@pytest.mark.parametrize("device", ["banana", *([] if torch.cuda.is_available() else ["cuda"])])
-def test_a_device_that_there_is_not(device) -> None:
-    with pytest.raises(ConfigError, match=f"device '{device}' is not available"):
-        make_env("alcc", 2, DATA, device=device)
-
-
-@pytest.mark.parametrize(
-    ("kind", "action"),
-    [
-        ("single", torch.zeros(2)),
-        ("single", torch.zeros(2, 1, dtype=torch.float64)),
-        ("three", torch.zeros(2, 1, 1)),
-        ("three", torch.zeros(2, 3, 1, dtype=torch.int64)),
-    ],
-)
-def test_an_action_of_another_shape_or_type(envs, kind, action) -> None:
-    env = envs.get(kind) or small_env("ddpg", 2, ["scenario.string=automated*3"])
-    key = env.action_key
-    wanted = r"\[2, 1\]" if kind == "single" else r"\[2, 3, 1\]"
-    with pytest.raises(ConfigError, match=f"action must be {wanted} torch.float32, got"):
-        env.step(env.reset().set(key, action))
+def test_an_action_of_another_shape_or_type(envs) -> None:
+    three = small_env("ddpg", 2, ["scenario.string=automated*3"])
+    cases = [
+        (envs["single"], torch.zeros(2), r"\[2, 1\]"),
+        (envs["single"], torch.zeros(2, 1, dtype=torch.float64), r"\[2, 1\]"),
+        (three, torch.zeros(2, 1, 1), r"\[2, 3, 1\]"),
+        (three, torch.zeros(2, 3, 1, dtype=torch.int64), r"\[2, 3, 1\]"),
+    ]
+    check_refused(
+        lambda env, action: env.step(env.reset().set(env.action_key, action)),
+        [(*given, f"action must be {wanted} torch.float32, got") for *given, wanted in cases],
+    )
 
 
 # -- controllers that remember -----------------------------------------------------------------
@@ -171,12 +158,14 @@ def driven_by(group: str, name: str, node: dict) -> None:
     build_env(cfg, wavy_profiles(), bootstrap(), 2)
 
 
-@pytest.mark.parametrize("how", ["last", "seen", "total"])
-def test_a_controller_that_remembers_in_an_attribute_is_refused(how) -> None:
-    node = {"_target_": f"{__name__}.Remembering", "how": how}
-    words = f"Remembering remembers in its attribute '{how}'.* names in remembers"
-    with pytest.raises(ConfigError, match=words):
-        driven_by("controllers", "automated", node)
+def test_a_controller_that_remembers_in_an_attribute_is_refused() -> None:
+    words = "Remembering remembers in its attribute '{}'.* names in remembers"
+    check_refused(
+        lambda how: driven_by(
+            "controllers", "automated", {"_target_": f"{__name__}.Remembering", "how": how}
+        ),
+        [(how, words.format(how)) for how in ("last", "seen", "total")],
+    )
 
 
 def test_pieces_and_controllers_inside_others_are_held_to_it_too() -> None:
@@ -189,6 +178,6 @@ def test_pieces_and_controllers_inside_others_are_held_to_it_too() -> None:
         driven_by("controllers", "automated", node)
 
 
-@pytest.mark.parametrize("how", ["", "once"])
-def test_what_does_not_change_may_be_kept(how) -> None:
-    driven_by("controllers", "automated", {"_target_": f"{__name__}.Remembering", "how": how})
+def test_what_does_not_change_may_be_kept() -> None:
+    for how in ("", "once"):
+        driven_by("controllers", "automated", {"_target_": f"{__name__}.Remembering", "how": how})

@@ -69,7 +69,6 @@ ONLY_TRUCKS = ["energy=mixture", *(f"energy.shares.{name}=0" for name in CARS)]
     "words",
     [
         ["variant=idm", "energy=fuel", "energy.vehicle=Class8Tractor"],
-        ["variant=idm", *ONLY_TRUCKS],
         ["task=i24-follow5", "compare=[idm_acc]", "task.unit=kJ/km", *ONLY_TRUCKS],
     ],
 )

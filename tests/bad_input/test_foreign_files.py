@@ -14,28 +14,16 @@ import pytest
 import torch
 import yaml
 from commands import run_command, tiny
-from helpers import POPULATION, wavy_profiles
+from helpers import POPULATION, check_refused, wavy_profiles
 
 from lcc_rl.agents.factory import build_agent, make_trainer
 from lcc_rl.agents.loop import TrainingLoop
-from lcc_rl.commands import evaluation, training
+from lcc_rl.commands import evaluation
 from lcc_rl.data.sources import NgsimSource
-from lcc_rl.errors import DataError, LccError, ResultsError
+from lcc_rl.errors import DataError, ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.runs import load_config
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("trained") / "alcc"
-    training.run(tiny("train", "variant=alcc"), folder, quiet=True)
-    return folder
-
-
-@pytest.fixture
-def run(trained, tmp_path) -> Path:
-    return Path(shutil.copytree(trained, tmp_path / "run"))
 
 
 def changed(text: str, changes: dict[str, object]) -> str:
@@ -59,6 +47,11 @@ def change(folder: Path, changes: dict[str, object] | str) -> None:
     torch.save({**policy, "config": text}, folder / "policy.pt")
 
 
+@pytest.fixture
+def run(trained, tmp_path) -> Path:
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
 # -- settings --------------------------------------------------------------------------------------
 
 TARGET = "reward.terms.safety._target_"
@@ -67,24 +60,24 @@ FOREIGN: list[tuple[dict[str, object] | str, str]] = [
     ({TARGET: "os.system"}, rf"{TARGET} names 'os.system'"),
     ({TARGET: "mine.Comfort"}, "names 'mine.Comfort'.*trust="),
     ({TARGET: "lcc_rl.config.import_module"}, TARGET),
-    ({TARGET: "lcc_rl.data.episodes.write_episodes"}, TARGET),
     ({"seed": "${oc.env:SECRET}"}, "seed refers to"),
     ("seed: !!python/object:os.system {}", "damaged"),
     (": [", "damaged"),
     ("seed: " + 50_000 * "[", "damaged.*recursion"),
     ({"agent": "ddpg"}, "agent: expected a node"),
-    ({"scenario": None}, "scenario must be"),
 ]
 
 
-@pytest.mark.parametrize(("changes", "words"), FOREIGN, ids=[words for _, words in FOREIGN])
-def test_settings_that_a_run_or_policy_may_not_hold(run, monkeypatch, changes, words) -> None:
+def test_settings_that_a_run_or_policy_may_not_hold(run, monkeypatch) -> None:
     monkeypatch.setenv("SECRET", "revealed")
-    change(run, changes)
-    for read, name in ((load_config, r"config\.yaml"), (load_policy, r"policy\.pt")):
-        with pytest.raises(ResultsError, match=rf"{name}.*{words}") as caught:
-            read(run)
-        assert "revealed" not in str(caught.value)
+    before = (run / "config.yaml").read_text()
+    for changes, words in FOREIGN:
+        change(run, before)
+        change(run, changes)
+        for read, name in ((load_config, r"config\.yaml"), (load_policy, r"policy\.pt")):
+            with pytest.raises(ResultsError, match=rf"{name}.*{words}") as caught:
+                read(run)
+            assert "revealed" not in str(caught.value)
 
 
 def test_a_stored_configuration_writes_nowhere_but_into_its_folder(run, tmp_path, caplog) -> None:
@@ -163,12 +156,17 @@ DAMAGED: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.mark.parametrize("what", DAMAGED)
-def test_a_file_that_is_no_policy_runs_no_code(run, monkeypatch, what) -> None:
+def test_a_file_that_is_no_policy_runs_no_code(run, monkeypatch) -> None:
     monkeypatch.chdir(run)
-    DAMAGED[what](run / "policy.pt")
-    with pytest.raises(ResultsError, match=r"policy\.pt: "):
-        load_policy(run / "policy.pt")
+    path = run / "policy.pt"
+    before = path.read_bytes()
+
+    def damaged(what: str) -> None:
+        path.write_bytes(before)
+        DAMAGED[what](path)
+        load_policy(path)
+
+    check_refused(damaged, ((what, r"policy\.pt: ") for what in DAMAGED), ResultsError)
     assert not (run / "evil-was-here").exists()
 
 
@@ -183,15 +181,16 @@ FITS = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "variant", "words"), FITS)
-def test_a_policy_that_does_not_fit(trained, tmp_path, changes, variant, words) -> None:
-    path = Path(shutil.copy(trained / "policy.pt", tmp_path / "p.pt"))
-    policy_with(path, **changes)
-    given = {"idm": f"compare=[{path}]"}.get(variant, f"policy={path}")
-    variant = "idm" if variant == "none" else variant
-    cfg = tiny("evaluate", f"variant={variant}", given, agent=False)
-    with pytest.raises(LccError, match=words):
+def test_a_policy_that_does_not_fit(trained, tmp_path) -> None:
+    def evaluate(changes: dict[str, object], variant: str) -> None:
+        path = Path(shutil.copy(trained / "policy.pt", tmp_path / "p.pt"))
+        policy_with(path, **changes)
+        given = {"idm": f"compare=[{path}]"}.get(variant, f"policy={path}")
+        variant = "idm" if variant == "none" else variant
+        cfg = tiny("evaluate", f"variant={variant}", given, agent=False)
         evaluation.run(cfg, tmp_path / "out", quiet=True)
+
+    check_refused(evaluate, FITS)
 
 
 def test_a_compared_policy_drives_with_its_own_controller(trained, tmp_path) -> None:
@@ -202,15 +201,15 @@ def test_a_compared_policy_drives_with_its_own_controller(trained, tmp_path) -> 
     assert "alcc" in set(rows["strategy"])
 
 
-@pytest.mark.parametrize("place", ["pipe", "folder", "nothing"])
-def test_what_is_no_file_is_not_waited_for(tmp_path, place) -> None:
+def test_what_is_no_file_is_not_waited_for(tmp_path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(DataError, match=place):
-        NgsimSource(path=str(tmp_path / place)).load()
-    for read in (load_policy, read_parquet):
-        with pytest.raises(ResultsError, match=r"(not a file|no such file)$"):
-            read(tmp_path / place)
+    for place in ("pipe", "folder", "nothing"):
+        with pytest.raises(DataError, match=place):
+            NgsimSource(path=str(tmp_path / place)).load()
+        for read in (load_policy, read_parquet):
+            with pytest.raises(ResultsError, match=r"(not a file|no such file)$"):
+                read(tmp_path / place)
 
 
 # -- checkpoints -----------------------------------------------------------------------------------

@@ -150,6 +150,7 @@ fuzzed = settings(
 )
 
 
+@pytest.mark.slow
 def test_random_overrides_work_or_are_refused() -> None:
     ends = []
 
@@ -229,6 +230,7 @@ def tables(draw: Any) -> tuple[str, bytes]:
     return reader, coded(content[:cut])
 
 
+@pytest.mark.slow
 def test_random_tables_are_read_or_refused() -> None:
     ends = []
 

@@ -16,7 +16,7 @@ from table_text import BY_GAP, LENGTH, long_table
 from lcc_rl.data.leaders import DriveLeaders
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.data.tables import UNITS, named_unit
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import DataError
 
 
 def written(folder: Path, frame: pd.DataFrame, name: str = "my.csv", **options: object) -> str:
@@ -25,100 +25,91 @@ def written(folder: Path, frame: pd.DataFrame, name: str = "my.csv", **options: 
     return str(folder / name)
 
 
-@pytest.mark.parametrize(
-    ("name", "quantity", "unit"),
-    [
-        ("Target Speed, mph", "speed", "mph"),
-        ("v [km/h]", "speed", "km/h"),
-        ("speed_kmh", "speed", "km/h"),
-        ("SpeedKph", "speed", "km/h"),
-        ("speed_km_h_filtered", "speed", "km/h"),
-        ("wind knots", "speed", "kn"),
-        ("speed miles per hour", "speed", "mph"),
-        ("Speed [kilometres per hour]", "speed", "km/h"),
-        ("v_fps", "speed", "ft/s"),
-        ("gap (ft)", "length", "ft"),
-        ("SpaceFeet", "length", "ft"),
-        ("position_km", "length", "km"),
-        ("t_ms", "time", "ms"),
-        ("Time [us]", "time", "us"),
-        *((name, "speed", None) for name in ("speed_mps", "v [m/s]", "v_ms", "kmhspeed", "knee")),
-        *((name, "length", None) for name in ("gap_m", "left", "min_gap", "shift")),
-        *((name, "time", None) for name in ("time_s", "timestamps", "min_time", "status")),
-    ],
-)
-def test_the_name_of_a_column_may_say_its_unit(tmp_path, name, quantity, unit) -> None:
-    assert named_unit(name, quantity) == unit
-    if not unit:
-        return
-    key = {"speed": "speed", "length": "gap", "time": "time"}[quantity]
-    columns, size = {**BY_GAP, key: name}, UNITS[quantity][unit]
-    frame = long_table(rows=400).rename(columns={BY_GAP[key]: name})
-    frame[name] /= size
-    path = written(tmp_path, frame, "named.csv", quotechar='"')
-    words = re.escape(f"the name of column {name!r} says {unit}, and it is read in")
-    with pytest.raises(DataError, match=rf"{words} .*; set data\.units\.{key}={unit}, or give"):
-        TableSource(path=path, columns=columns).load()
-    assert len(TableSource(path=path, columns=columns, units={key: unit}).load().episodes) == 800
+NAMED = {
+    "Target Speed, mph": "mph",
+    "v [km/h]": "km/h",
+    "speed_kmh": "km/h",
+    "SpeedKph": "km/h",
+    "speed_km_h_filtered": "km/h",
+    "wind knots": "kn",
+    "speed miles per hour": "mph",
+    "Speed [kilometres per hour]": "km/h",
+    "v_fps": "ft/s",
+    "gap (ft)": "ft",
+    "SpaceFeet": "ft",
+    "position_km": "km",
+    "t_ms": "ms",
+    "Time [us]": "us",
+}
+UNNAMED = {
+    "speed": ("speed_mps", "v [m/s]", "v_ms", "kmhspeed", "knee"),
+    "length": ("gap_m", "left", "min_gap", "shift"),
+    "time": ("time_s", "timestamps", "min_time", "status"),
+}
 
 
-@pytest.mark.parametrize("end", ["", ","])
-@pytest.mark.parametrize("sign", [",", ";", "\t"])
-def test_an_empty_last_column_is_left_out_with_and_without_a_name(tmp_path, end, sign) -> None:
-    lines = written(tmp_path, long_table(), sep=sign)
-    head, *rows = Path(lines).read_text().splitlines()
-    text = "\n".join([head + sign * bool(end), *(row + sign for row in rows), ""])
-    Path(lines).write_text(text)
-    assert len(TableSource(path=lines, columns=BY_GAP).load().episodes) == 800
+def test_the_name_of_a_column_may_say_its_unit(tmp_path) -> None:
+    for quantity, names in UNNAMED.items():
+        assert [named_unit(name, quantity) for name in names] == [None] * len(names)
+    keys = {"speed": "speed", "length": "gap", "time": "time"}
+    for name, unit in NAMED.items():
+        quantity = next(x for x in ("speed", "length", "time") if unit in UNITS[x])
+        assert named_unit(name, quantity) == unit
+        key = keys[quantity]
+        columns = {**BY_GAP, key: name}
+        frame = long_table(rows=400).rename(columns={BY_GAP[key]: name})
+        frame[name] /= UNITS[quantity][unit]
+        path = written(tmp_path, frame, "named.csv", quotechar='"')
+        words = re.escape(f"the name of column {name!r} says {unit}, and it is read in")
+        with pytest.raises(DataError, match=rf"{words} .*; set data\.units\.{key}={unit}, or give"):
+            TableSource(path=path, columns=columns).load()
+        loaded = TableSource(path=path, columns=columns, units={key: unit}).load()
+        assert len(loaded.episodes) == 800, name
 
 
-@pytest.mark.parametrize("unit", ["frames/0", "frames/-1", "frames/x", "frames/nan", "frames"])
-def test_a_rate_of_frames_is_a_positive_number(unit: str) -> None:
-    with pytest.raises(ConfigError, match=r"unit in data\.units\.time: .*frames/<rate>, iso, min"):
-        TableSource(path="x.csv", columns=BY_GAP, units={"time": unit})
+def test_an_empty_last_column_is_left_out_with_and_without_a_name(tmp_path) -> None:
+    for sign, end in ((",", ""), (",", ","), (";", ";"), ("\t", "")):
+        path = Path(written(tmp_path, long_table(), sep=sign))
+        head, *rows = path.read_text().splitlines()
+        path.write_text("\n".join([head + end, *(row + sign for row in rows), ""]))
+        assert len(TableSource(path=str(path), columns=BY_GAP).load().episodes) == 800, (sign, end)
 
 
-@pytest.mark.parametrize("change", [lambda x: x.map("2026-01-02 10:{:%M:%S.%f}".format), None])
-@pytest.mark.parametrize("zone", ["", "Z", "+02:00"])
-def test_dates_and_times_are_read_as_they_are(tmp_path, zone, change) -> None:
+def test_dates_and_times_are_read_as_they_are(tmp_path) -> None:
     frame = long_table()
     stamp = pd.to_datetime("2026-01-02T10:00:00") + pd.to_timedelta(frame["t"].round(1), unit="s")
     expected = TableSource(path=written(tmp_path, frame), columns=BY_GAP).load().episodes
-    if change:
-        path = written(tmp_path, frame.assign(t=change(stamp) + zone), "times.csv")
-    else:  # as types of parquet
-        path = str(tmp_path / "times.parquet")
-        stamp = stamp.dt.tz_localize("UTC" if zone else None)
-        frame.assign(t=stamp).to_parquet(path)
-    found = TableSource(path=path, columns=BY_GAP).load().episodes
-    np.testing.assert_allclose(found["gap_m"], expected["gap_m"], atol=1e-4)
+    text = stamp.map("2026-01-02 10:{:%M:%S.%f}".format)
+    paths = [written(tmp_path, frame.assign(t=text + x), f"{x}.csv") for x in ("", "Z", "+02:00")]
+    for zone in ("UTC", None):  # as types of parquet
+        paths.append(str(tmp_path / f"{zone}.parquet"))
+        frame.assign(t=stamp.dt.tz_localize(zone)).to_parquet(paths[-1])
+    for path in paths:
+        found = TableSource(path=path, columns=BY_GAP).load().episodes
+        np.testing.assert_allclose(found["gap_m"], expected["gap_m"], atol=1e-4, err_msg=path)
 
 
-@pytest.mark.parametrize("leader", ["0.0", "0", "Int64"])
-def test_vehicles_may_be_numbered_from_0_with_blank_leaders(tmp_path, leader: str) -> None:
+def test_vehicles_may_be_numbered_from_0_with_blank_leaders(tmp_path) -> None:
     frame = long_table()
     frame["id"] -= 1
     frame["ahead"] = (frame["ahead"] - 1).where(frame["id"] > 0)  # 0.0, and blank for the first
-    if leader != "0.0":
-        frame["ahead"] = frame["ahead"].astype("Int64")
-    path = written(tmp_path, frame)
-    if leader == "Int64":
-        frame.to_parquet(path := str(tmp_path / "my.parquet"))
-    loaded = TableSource(path=path, columns=BY_GAP).load()
-    assert len(loaded.episodes) == 800
-    assert {*loaded.vehicles.values()} == {"0", "1", "2"}
+    whole = frame.astype({"ahead": "Int64"})
+    whole.to_parquet(tmp_path / "my.parquet")
+    paths = written(tmp_path, frame, "a.csv"), written(tmp_path, whole, "b.csv")
+    for path in (*paths, str(tmp_path / "my.parquet")):
+        loaded = TableSource(path=path, columns=BY_GAP).load()
+        assert len(loaded.episodes) == 800, path
+        assert {*loaded.vehicles.values()} == {"0", "1", "2"}, path
 
 
-@pytest.mark.parametrize("step", [0.1, 1.0])
-def test_positions_that_begin_anew_are_no_other_unit(tmp_path, step) -> None:
-    frame = long_table(rows=400, step=step)
-    frame["x"] %= 150.0  # a link, or a ring
-    source = TableSource(path=written(tmp_path, frame), columns={**BY_GAP, "position": "x"})
-    with pytest.raises(
-        DataError,
-        match=r"positions jump \d+ times, the first at .*data row \d+, vehicle 1: do they begin",
-    ):
-        source.load()
+def test_positions_that_begin_anew_are_no_other_unit(tmp_path) -> None:
+    words = r"positions jump \d+ times, the first at .*data row \d+, vehicle 1: do they begin"
+    for step in (0.1, 1.0):
+        frame = long_table(rows=400, step=step)
+        frame["x"] %= 150.0  # a link, or a ring
+        source = TableSource(path=written(tmp_path, frame), columns={**BY_GAP, "position": "x"})
+        with pytest.raises(DataError, match=words):
+            source.load()
 
 
 def test_irregular_samples_are_interpolated_and_counted(tmp_path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from helpers import wavy_profiles
+from helpers import check_refused, wavy_profiles
 from ngsim_text import cells, csv_text, pair
 from table_text import openacc_text, speed
 
@@ -107,24 +107,23 @@ def test_the_papers_own_protocol(tmp_path) -> None:
     assert first == pytest.approx(7.0 + 3.0 * np.sin(200 / 9.0), abs=1e-3)
 
 
-IMPOSSIBLE = {
-    "path is required": {"training": {"a": {}}},
-    "none of the package .*us06": {"training": {"a": {"path": "uds"}}},
-    "covers 0–600 s, not the stretch": {"cases": {"case_1": {"path": "us06", "start_s": 595.0}}},
-    r"case_1\.followers": {"cases": {"case_1": {"path": "us06", "followers": 0}}},
-    "scale must be greater": {"training": {"a": {"path": "us06", "scale": 0.0}}},
-    "is empty": {"training": {"a": {"path": "us06", "from_s": 600.0}}},
-    "drives up to .*max_speed": {"training": {"a": {"path": "us06", "scale": 9.0}}},
-    r"leader\.training names no record": {"training": {}},
-    "least_variation": {"least_variation": 1e6},
-}
-
-
-@pytest.mark.parametrize("words", IMPOSSIBLE)
-def test_impossible_leaders(words: str) -> None:
+def test_impossible_leaders() -> None:
+    cases = [
+        ({"training": {"a": {}}}, "path is required"),
+        ({"training": {"a": {"path": "uds"}}}, "none of the package .*us06"),
+        (
+            {"cases": {"case_1": {"path": "us06", "start_s": 595.0}}},
+            "covers 0–600 s, not the stretch",
+        ),
+        ({"cases": {"case_1": {"path": "us06", "followers": 0}}}, r"case_1\.followers"),
+        ({"training": {"a": {"path": "us06", "scale": 0.0}}}, "scale must be greater"),
+        ({"training": {"a": {"path": "us06", "from_s": 600.0}}}, "is empty"),
+        ({"training": {"a": {"path": "us06", "scale": 9.0}}}, "drives up to .*max_speed"),
+        ({"training": {}}, r"leader\.training names no record"),
+        ({"least_variation": 1e6}, "least_variation"),
+    ]
     usual = {"training": {"a": {"path": "us06"}}, "held_out": {"b": {"path": "hwfet"}}}
-    with pytest.raises((ConfigError, DataError), match=words):
-        RecordLeaders(**{**usual, **IMPOSSIBLE[words]}).load(0.1, 300, 3)
+    check_refused(lambda own: RecordLeaders(**{**usual, **own}).load(0.1, 300, 3), cases)
 
 
 # -- tables of drives ------------------------------------------------------------------------------
@@ -151,9 +150,8 @@ def test_fast_windows_are_left_out(table) -> None:
     assert list(slow.windows.names) == kept
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
+def test_impossible_drives() -> None:
+    cases = [
         ({"columns": {"sped": "v"}}, "'sped'.*Did you mean 'speed'"),
         ({"columns": {"time": None}}, r"leader\.columns\.time must name a column"),
         ({"columns": {"time": "t", "speed": "t"}}, "names the column 't' twice"),
@@ -163,11 +161,8 @@ def test_fast_windows_are_left_out(table) -> None:
         ({"evaluation_share": 1.0, "tuning": True}, "leaves nothing to tune on"),
         ({"columns": {"drive": None}, "together": "x"}, "the table holds one record"),
         ({"together": "("}, r"leader\.together=\("),
-    ],
-)
-def test_impossible_drives(settings, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        DriveLeaders(path="x.csv", **settings)
+    ]
+    check_refused(lambda own: DriveLeaders(path="x.csv", **own), cases, ConfigError)
 
 
 def test_the_first_car_of_native_openacc_files_leads(tmp_path) -> None:
@@ -256,17 +251,14 @@ def test_a_mixture_holds_every_source(table) -> None:
 
 def test_impossible_mixtures() -> None:
     source = RecordLeaders(training={}, held_out={})
-    for settings, words in (
+    nothing = {"cycles": source, "weights": {"cycles": 0}}
+    cases = [
         ({}, "names no source"),
         ({"more": 3}, r"leader\.more must be a source of leaders"),
         ({"cycles": source, "weights": {"cycle": 1}}, "'cycle'.*Did you mean 'cycles'"),
-        (
-            {"cycles": source, "weights": {"cycles": 0}},
-            r"weights\.cycles must be a positive.*got 0",
-        ),
-    ):
-        with pytest.raises(ConfigError, match=words):
-            Mixture(**settings)
+        (nothing, r"weights\.cycles must be a positive.*got 0"),
+    ]
+    check_refused(lambda settings: Mixture(**settings), cases, ConfigError)
 
 
 # -- real files ------------------------------------------------------------------------------------
@@ -288,22 +280,17 @@ def test_real_pairs_give_a_leader_each(shared_data) -> None:
     assert len(set(profiles.recordings)) == 3
 
 
-@pytest.mark.parametrize(
-    ("by", "said"),
-    [("recording", "held out: recordings rec1"), ("vehicle", "held out: vehicles rec1/3")],
-)
-def test_the_report_names_what_is_held_out(by, said) -> None:
-    training, held_out = Split(by=by, evaluation_share=0.25)(wavy_profiles())
-    assert apart(training, held_out) == [said]
-    assert apart(held_out, held_out) == []  # one profile for both
+def test_the_report_names_what_is_held_out() -> None:
+    held = {"recording": "held out: recordings rec1", "vehicle": "held out: vehicles rec1/3"}
+    for by, said in held.items():
+        training, held_out = Split(by=by, evaluation_share=0.25)(wavy_profiles())
+        assert apart(training, held_out) == [said]
+        assert apart(held_out, held_out) == []  # one profile for both
+    named = apart(training, held_out, {3: "red van"})  # by the names of their file
+    assert named == ["held out: vehicles rec1/red van"]
 
 
 def test_one_recording_cannot_be_divided_and_the_remedies_say_where_they_hold() -> None:
     words = r"use split.by=vehicle; evaluations also take split.evaluation_share=1$"
     with pytest.raises(DataError, match=words):
         Split()(wavy_profiles().select([0, 2]))
-
-
-def test_held_out_vehicles_have_the_names_of_their_file() -> None:
-    training, held_out = Split(by="vehicle", evaluation_share=0.25)(wavy_profiles())
-    assert apart(training, held_out, {3: "red van"}) == ["held out: vehicles rec1/red van"]

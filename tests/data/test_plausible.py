@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from helpers import check_refused
 from ngsim_text import csv_text, native_text, pair
 from table_text import pairs
 
@@ -148,17 +149,17 @@ MISTAKES = [
 ]
 
 
-@pytest.mark.parametrize("pairs", [1, 3])
-@pytest.mark.parametrize(("columns", "factor", "units", "words"), MISTAKES)
-def test_a_pair_in_another_unit_or_exchanged_is_named(columns, factor, units, words, pairs) -> None:
-    table = wavy()
-    wrong = table["episode"] >= 3 - pairs
-    table.loc[wrong, columns] *= factor
-    with pytest.raises(DataError, match=rf"f\.csv: row \d+, .*{words}") as caught:
-        judged(table, units)
-    count, first = f"; {pairs} of 3 pairs", 1200 if pairs == 1 else 600  # the one in the middle
-    assert count in str(caught.value)
-    assert f"row {first}, " in str(caught.value)
+def test_a_pair_in_another_unit_or_exchanged_is_named() -> None:
+    for wrong, first in ((1, 1200), (3, 600)):  # the one in the middle
+
+        def read(columns: list[str], factor: float, units: dict[str, str], wrong=wrong) -> None:
+            table = wavy()
+            table.loc[table["episode"] >= 3 - wrong, columns] *= factor
+            judged(table, units)
+
+        ends = rf"(?=.*; {wrong} of 3 pairs)"
+        cases = [(*given, rf"f\.csv: {ends}row {first}, .*{words}") for *given, words in MISTAKES]
+        check_refused(read, cases, DataError)
 
 
 def later(table: pd.DataFrame, signal: str, seconds: float) -> pd.DataFrame:
@@ -169,27 +170,21 @@ def later(table: pd.DataFrame, signal: str, seconds: float) -> pd.DataFrame:
 
 @pytest.mark.parametrize(
     ("signal", "words"),
-    [
-        ("leader_speed_mps", "leader"),
-        ("follower_speed_mps", "follower"),
-        ("gap_m", "gap"),
-    ],
+    [("leader_speed_mps", "leader"), ("follower_speed_mps", "follower"), ("gap_m", "gap")],
 )
-@pytest.mark.parametrize("seconds", [-2.0, -0.5, 0.2, 0.5, 1.0, 1.5])
-def test_a_signal_that_is_late_is_named_or_reported(signal: str, words: str, seconds) -> None:
-    table, good = irregular(), judged(irregular())
-    assert not any(isinstance(line, Concern) for line in good)
-    late = later(table, signal, seconds)
-    said = (
-        f"{signal}: {words} {abs(seconds)} s {'late' if seconds > 0 else 'early'}; are clocks apart"
-    )
-    if abs(seconds) > 1:
-        with pytest.raises(DataError, match=rf"f\.csv: row \d+, {said}.*3 of 3 pairs"):
-            judged(late)
-        judged(late, max_lag=3.0)
-        return
-    loud = [line for line in judged(late) if isinstance(line, Concern)]
-    assert [said in line for line in loud] == [True] * (abs(seconds) >= 0.3)
+def test_a_signal_that_is_late_is_named_or_reported(signal: str, words: str) -> None:
+    table = irregular()
+    assert not any(isinstance(line, Concern) for line in judged(table))
+    for seconds in (-2.0, -0.5, 0.2, 0.5, 1.0, 1.5):
+        late, side = later(table, signal, seconds), "late" if seconds > 0 else "early"
+        said = f"{signal}: {words} {abs(seconds)} s {side}; are clocks apart"
+        if abs(seconds) > 1:
+            with pytest.raises(DataError, match=rf"f\.csv: row \d+, {said}.*3 of 3 pairs"):
+                judged(late)
+            judged(late, max_lag=3.0)
+        else:
+            loud = [line for line in judged(late) if isinstance(line, Concern)]
+            assert [said in line for line in loud] == [True] * (abs(seconds) >= 0.3), seconds
 
 
 def test_a_gap_that_jumps_to_another_car_is_no_other_unit() -> None:
@@ -251,8 +246,7 @@ def test_forgotten_feet_are_refused_where_cars_brake_and_said_where_they_stand(s
     assert "feet" not in judged(queue.assign(gap_m=6.0 / 0.3048), {"gap": "ft"})[-1]
 
 
-@pytest.mark.parametrize("spell", [csv_text, native_text])
-@pytest.mark.parametrize("lengths", [True, False])
+@pytest.mark.parametrize(("spell", "lengths"), [(csv_text, True), (native_text, False)])
 def test_a_file_in_metres_is_refused_and_read_when_said(tmp_path, spell, lengths: bool) -> None:
     near = pair(range(200), Space_Headway=25)
     metres = [row.copy() for row in near]
@@ -304,27 +298,22 @@ def test_a_bad_sample_costs_itself_and_divides_its_record(tmp_path: Path) -> Non
 BLANK = {0: 200, 3: 399, 1: 600, 2: 600}  # samples of the parts
 
 
-@pytest.mark.parametrize(
-    ("column", "cell", "sizes"),
-    [
+def test_a_blank_cell_or_a_row_twice_costs_the_row(tmp_path: Path) -> None:
+    for column, cell, sizes in (
         ("gap_m", "", BLANK),
         ("follower_speed_mps", "n/a", BLANK),
         ("leader_speed_mps", "NaN", BLANK),
         ("time_s", "", BLANK),
         ("time_s", 19.9, BLANK),  # the time of the row before
         ("gap_m", None, {0: 600, 1: 600, 2: 600}),  # None: the row is there twice
-    ],
-)
-def test_a_blank_cell_or_a_row_twice_costs_the_row(tmp_path: Path, column, cell, sizes) -> None:
-    frame = wavy().astype({column: object})
-    if cell is None:
-        frame = pd.concat([frame, frame.iloc[[200]]])
-    else:
-        frame.loc[200, column] = cell
-    path = tmp_path / "pairs.csv"
-    frame.to_csv(path, index=False)
-    loaded = EpisodesSource(path=str(path)).load()
-    assert loaded.episodes.groupby("episode").size().to_dict() == sizes
-    said = [line for line in loaded.report if re.search("(left out|dropped) 1 rows", line)]
-    assert len(said) == 1
-    assert f"data row {1801 if cell is None else 201}, column" in said[0]
+    ):
+        frame = wavy().astype({column: object})
+        if cell is None:
+            frame = pd.concat([frame, frame.iloc[[200]]])
+        else:
+            frame.loc[200, column] = cell
+        frame.to_csv(tmp_path / "pairs.csv", index=False)
+        loaded = EpisodesSource(path=str(tmp_path / "pairs.csv")).load()
+        assert loaded.episodes.groupby("episode").size().to_dict() == sizes, (column, cell)
+        (said,) = (x for x in loaded.report if re.search("(left out|dropped) 1 rows", x))
+        assert f"data row {1801 if cell is None else 201}, column" in said

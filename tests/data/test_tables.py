@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import gzip
+from functools import partial
 from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from helpers import check_refused
 from table_text import GAP, LENGTH, long_table, openacc_text, pairs, speed
 
 from lcc_rl.data import text
@@ -56,8 +58,7 @@ def truth(loaded: LoadedEpisodes, cars: int = 3) -> pd.DataFrame:
 # -- data=table ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["my.csv.gz", "my.parquet"])
-@pytest.mark.parametrize("columns", [BY_GAP, BY_LANE])
+@pytest.mark.parametrize(("name", "columns"), [("my.csv.gz", BY_GAP), ("my.parquet", BY_LANE)])
 def test_the_leader_is_named_or_the_next_on_the_lane(tmp_path, name, columns) -> None:
     path = written(tmp_path, long_table(), name)
     loaded = TableSource(path=path, columns=columns).load()
@@ -79,16 +80,14 @@ def test_units(tmp_path) -> None:
     truth(TableSource(path=written(tmp_path, frame), columns=columns, units=units).load())
 
 
-@pytest.mark.parametrize(
-    ("separator", "decimal"), [(";", ","), (";", "."), ("\t", "."), (" ", ".")]
-)
-def test_separators_and_decimal_commas(tmp_path, separator, decimal) -> None:
+def test_separators_and_decimal_commas(tmp_path) -> None:
     frame = long_table().assign(gap=lambda table: table["gap"].fillna(99.0))
-    path = written(tmp_path, frame, sep=separator, decimal=decimal)
-    loaded = TableSource(path=path, columns=BY_GAP).load()
-    truth(loaded)
-    assert any("columns are separated by" in line for line in loaded.report)
-    assert any("decimal comma" in line for line in loaded.report) == (decimal == ",")
+    for separator, decimal in ((";", ","), (";", "."), ("\t", "."), (" ", ".")):
+        path = written(tmp_path, frame, sep=separator, decimal=decimal)
+        loaded = TableSource(path=path, columns=BY_GAP).load()
+        truth(loaded)
+        assert any("columns are separated by" in line for line in loaded.report)
+        assert any("decimal comma" in line for line in loaded.report) == (decimal == ",")
 
 
 NAMES = {0: "0", 1: "Audi, A8", 2: "BMW", 3: "Ford"}
@@ -124,27 +123,26 @@ def test_a_file_larger_than_a_block_is_the_same_table(tmp_path, monkeypatch, cod
         TableSource(path=written(tmp_path, frame), **settings).load()
 
 
-@pytest.mark.parametrize(
-    ("units", "change", "words"),
-    [
-        ({"gap": "ft"}, {"v": 80.0}, "row 801, vehicle BMW, column 'v' holds 80 m/s"),
-        (
-            {"gap": "ft"},
-            {},
-            r"speed: m/s, gap: ft} for 't', 'v', 'gap': .* in km/h \(data.units.speed=km/h",
-        ),
-        ({"speed": "km/h"}, {}, "speed: km/h, gap: m} for 't', 'v', 'gap': .*changes by 3"),
-        ({"time": "ms"}, {}, "{time: ms, speed: m/s, gap: m} for .* is the time in s"),
-        ({}, {"t": 0.0}, "data row 2, vehicle Audi, A8, column 't' repeats .* as do 100 %"),
-        ({}, {"t": 1e3}, "{time: s, speed: m/s, gap: m} for .* are 100 s apart"),
-    ],
-)
-def test_errors_name_columns_units_and_vehicles(tmp_path, units, change, words) -> None:
-    frame = named()
-    for name, value in change.items():
-        frame[name] = value if name == "v" else value * frame[name]
-    with pytest.raises(DataError, match=rf"my\.csv.*{words}"):
+FEET = {"gap": "ft"}
+MISREAD = [
+    (FEET, {"v": 80.0}, "row 801, vehicle BMW, column 'v' holds 80 m/s"),
+    (FEET, {}, r"speed: m/s, gap: ft} for 't', 'v', 'gap': .* in km/h \(data.units.speed=km/h"),
+    ({"speed": "km/h"}, {}, "speed: km/h, gap: m} for 't', 'v', 'gap': .*changes by 3"),
+    ({"time": "ms"}, {}, "{time: ms, speed: m/s, gap: m} for .* is the time in s"),
+    ({}, {"t": 0.0}, "data row 2, vehicle Audi, A8, column 't' repeats .* as do 100 %"),
+    ({}, {"t": 1e3}, "{time: s, speed: m/s, gap: m} for .* are 100 s apart"),
+]
+
+
+def test_errors_name_columns_units_and_vehicles(tmp_path) -> None:
+    def read(units: dict[str, str], change: dict[str, float]) -> None:
+        frame = named()
+        for name, value in change.items():
+            frame[name] = value if name == "v" else value * frame[name]
         TableSource(path=written(tmp_path, frame), columns=BY_GAP, units=units).load()
+
+    cases = [(*given, rf"my\.csv.*{words}") for *given, words in MISREAD]
+    check_refused(read, cases, DataError)
 
 
 def test_samples_left_out_are_described_by_their_rows(tmp_path) -> None:
@@ -161,8 +159,7 @@ def test_samples_left_out_are_described_by_their_rows(tmp_path) -> None:
     assert f"1 samples with a leader but a blank gap follow nobody, {blank}" in report
 
 
-@pytest.mark.parametrize("step", [0.04, 1.0])
-@pytest.mark.parametrize("columns", [BY_GAP, BY_LANE])
+@pytest.mark.parametrize(("step", "columns"), [(0.04, BY_GAP), (1.0, BY_LANE)])
 def test_other_steps_are_interpolated(tmp_path, step, columns) -> None:
     path = written(tmp_path, long_table(rows=round(40 / step), step=step))
     loaded = TableSource(path=path, columns=columns).load()
@@ -217,56 +214,47 @@ def test_the_first_sample_left_out_is_named_by_file_row_and_column(tmp_path) -> 
     ]
 
 
-@pytest.mark.parametrize(
-    ("units", "first"),
-    [
-        ({"gap": "ft"}, r"gap in m \(data.units.gap=m\)\? or are both speeds in ft/s .*=ft/s\)\?;"),
-        ({"speed": "km/h"}, r"are both speeds in m/s \(data.units.speed=m/s\)\?;"),
-        ({"speed": "kn"}, r"are both speeds in m/s \(data.units.speed=m/s\)\?;"),
-    ],
-)
-def test_a_unit_declared_for_si_is_named(tmp_path, units, first) -> None:
+def test_a_unit_declared_for_si_is_named(tmp_path) -> None:
     frame = named()
     frame["v"] *= 3.0 / 3.6  # m/s, fast enough to tell
     frame["gap"] *= 3.0 * FOOT
     path = written(tmp_path, frame)
-    with pytest.raises(DataError, match=rf"where the leader drives 1 m, .*{first} 2 of 2 pairs"):
-        TableSource(path=path, columns=BY_GAP, units=units).load()
-    with pytest.raises(
-        DataError, match=r"0\.0001 s apart; .* is the time in s \(data\.units\.time="
-    ):
-        TableSource(path=path, columns=BY_GAP, units={"time": "ms"}).load()
+    feet = r"gap in m \(data.units.gap=m\)\? or are both speeds in ft/s .*=ft/s\)\?;"
+    metres = r"are both speeds in m/s \(data.units.speed=m/s\)\?;"
+    both = r"where the leader drives 1 m, .*{} 2 of 2 pairs"
+    cases = [
+        ({"gap": "ft"}, both.format(feet)),
+        ({"speed": "km/h"}, both.format(metres)),
+        ({"speed": "kn"}, both.format(metres)),
+        ({"time": "ms"}, r"0\.0001 s apart; .* is the time in s \(data\.units\.time="),
+    ]
+    read = partial(TableSource, path=path, columns=BY_GAP)
+    check_refused(lambda units: read(units=units).load(), cases, DataError)
 
 
-@pytest.mark.parametrize(
-    ("columns", "factors", "car", "words"),
-    [
-        (
-            BY_GAP,
-            {"v": 3.6},
-            2,
-            r"row 601, vehicle 2, .*is the leader's speed in km/h\?; 2 of 7 pairs",
-        ),
-        (BY_GAP, {"v": 3.6}, 1, "row 1, vehicle 1, .*is the leader's speed in km/h"),
-        (BY_GAP, {"gap": 1 / FOOT}, 3, "row 1201, vehicle 3, .*'gap': .* by 3.28 .*gap=ft.*1 of 7"),
-        (
-            BY_LANE,
-            {"v": 3.6},
-            7,
-            "by its positions the vehicle from .*data row 3601, vehicle 7, on drives 726 m, by its",
-        ),
-        (BY_LANE, {"x": 1 / FOOT}, 7, "data row 3601, vehicle 7, on drives 2382 m, by its sp"),
-    ],
-)
-def test_one_vehicle_in_another_unit_is_named(tmp_path, columns, factors, car, words) -> None:
-    frame = long_table(cars=8, rows=600)
-    for name, factor in factors.items():
+# Columns, what is in another unit, by which factor, of which car, and what is said.
+OTHER_UNIT = [
+    (BY_GAP, "v", 3.6, 2, r"row 601, vehicle 2, .*is the leader's speed in km/h\?; 2 of 7 pairs"),
+    (BY_GAP, "v", 3.6, 1, "row 1, vehicle 1, .*is the leader's speed in km/h"),
+    (BY_GAP, "gap", 1 / FOOT, 3, "row 1201, vehicle 3, .*'gap': .* by 3.28 .*gap=ft.*1 of 7"),
+    (
+        BY_LANE,
+        *("v", 3.6, 7),
+        "by its positions the vehicle from .*data row 3601, vehicle 7, on drives 726 m, by its",
+    ),
+    (BY_LANE, "x", 1 / FOOT, 7, "data row 3601, vehicle 7, on drives 2382 m, by its sp"),
+]
+
+
+def test_one_vehicle_in_another_unit_is_named(tmp_path) -> None:
+    def read(columns: dict[str, str], name: str, factor: float, car: int) -> None:
+        frame = long_table(cars=8, rows=600)
         frame.loc[frame["id"] == car, name] *= factor
-    source = TableSource(
-        path=written(tmp_path, frame), columns=columns, plausible=Plausible(max_acceleration=30.0)
-    )
-    with pytest.raises(DataError, match=rf"my\.csv, with .*{words}"):
-        source.load()
+        limits = Plausible(max_acceleration=30.0)
+        TableSource(path=written(tmp_path, frame), columns=columns, plausible=limits).load()
+
+    cases = [(*given, rf"my\.csv, with .*{words}") for *given, words in OTHER_UNIT]
+    check_refused(read, cases, DataError)
 
 
 def test_one_pair_in_another_unit_is_named_as_the_file_calls_it(tmp_path) -> None:
@@ -293,9 +281,8 @@ def test_the_report_of_an_extraction_without_episode_is_divided_by_semicolons(tm
         TableSource(path=path, columns=BY_GAP).load()
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
+def test_impossible_tables() -> None:
+    cases = [
         ({"units": {"speed": "kmh"}}, r"unit in data\.units\.speed: 'kmh'.*Did you mean 'km/h'"),
         ({"columns": {**BY_GAP, "sped": "w"}}, "'sped'.*Did you mean 'speed'"),
         ({"columns": {**BY_GAP, "time": None}}, r"data\.columns\.time must name a column"),
@@ -304,11 +291,13 @@ def test_the_report_of_an_extraction_without_episode_is_divided_by_semicolons(tm
         ({"columns": {**BY_GAP, "gap": "t"}}, "names the column 't' twice"),
         ({"vehicle_length": -1.0}, "vehicle_length must be greater"),
         ({"smoothing": SavitzkyGolay()}, "smooths positions"),
-    ],
-)
-def test_impossible_tables(settings, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        TableSource(**{"path": "x.csv", "columns": BY_GAP, **settings})
+        *(
+            ({"units": {"time": unit}}, r"unit in data\.units\.time: .*frames/<rate>, iso, min")
+            for unit in ("frames/0", "frames/-1", "frames/x", "frames/nan", "frames")
+        ),
+    ]
+    usual = {"path": "x.csv", "columns": BY_GAP}
+    check_refused(lambda settings: TableSource(**{**usual, **settings}), cases, ConfigError)
 
 
 # -- data=episodes ---------------------------------------------------------------------------------
@@ -415,13 +404,13 @@ def test_columns_of_missing_cars_are_absent_and_followers_are_chosen(tmp_path) -
     assert f"{path}: 300 samples of followers driven by human, 500 of others" in found.report
 
 
-@pytest.mark.parametrize("name", ["casale", "zalazone_dynamic_part26"])
-def test_native_files_of_other_campaigns(shared_data, name: str) -> None:
-    path = shared_data / f"new_openacc_native_{name}.csv.gz"
-    criteria = Criteria(max_gap_m=200.0, passenger_cars_only=False)
-    loaded = OpenAccSource(path=str(path), criteria=criteria).load()
-    validate_episodes(loaded.episodes, name)
-    assert len(loaded.episodes) > 1900
+def test_native_files_of_other_campaigns(shared_data) -> None:
+    for name in ("casale", "zalazone_dynamic_part26"):
+        path = shared_data / f"new_openacc_native_{name}.csv.gz"
+        criteria = Criteria(max_gap_m=200.0, passenger_cars_only=False)
+        loaded = OpenAccSource(path=str(path), criteria=criteria).load()
+        validate_episodes(loaded.episodes, name)
+        assert len(loaded.episodes) > 1900
 
 
 def test_a_real_openacc_file(shared_data) -> None:
