@@ -41,44 +41,43 @@ def options(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
+def test_every_variant_and_controller_drives(subtests) -> None:
+    for words in [
         *([f"variant={name}"] for name in options("variant")),
         *([f"task={name}", "+faults=all"] for name in options("task")),
         *(
             [f"variant={SCENARIO_OF.get(name, 'alcc')}", f"controller@{AUTO}={name}"]
             for name in options("controller")
         ),
-    ],
-    ids=" ".join,
-)
-def test_every_variant_and_controller_drives(words) -> None:
-    cfg = load("train", [*words, "scenario.horizon=20"])
-    policy = shared_policy(build_agent(cfg, POPULATION).policy) if learns(cfg) else None
-    env = build_env(cfg, followed_profiles(), POPULATION, 2)
-    rows = env.rollout(3, policy, break_when_any_done=False)["next"]
-    assert rows["vehicles", "acceleration"].isfinite().all()
+    ]:
+        with subtests.test(words=words):
+            cfg = load("train", [*words, "scenario.horizon=20"])
+            policy = shared_policy(build_agent(cfg, POPULATION).policy) if learns(cfg) else None
+            env = build_env(cfg, followed_profiles(), POPULATION, 2)
+            rows = env.rollout(3, policy, break_when_any_done=False)["next"]
+            assert rows["vehicles", "acceleration"].isfinite().all()
 
 
 def test_the_tests_know_every_variant() -> None:
     assert sorted(VARIANTS) == options("variant")
 
 
-@pytest.mark.parametrize("entry", ["train", "evaluate", "pipeline"])
-def test_every_experiment_composes_for_every_command(entry) -> None:
-    for experiment in options("experiment"):
-        variant = ["variant=ddpg"] if "hcfs" in experiment else []
-        cfg = load(entry, [f"experiment={experiment}", *variant])
-        assert cfg.training.episodes % cfg.training.environments == 0
+def test_every_experiment_composes_for_every_command(subtests) -> None:
+    for entry in ["train", "evaluate", "pipeline"]:
+        with subtests.test(entry=entry):
+            for experiment in options("experiment"):
+                variant = ["variant=ddpg"] if "hcfs" in experiment else []
+                cfg = load(entry, [f"experiment={experiment}", *variant])
+                assert cfg.training.episodes % cfg.training.environments == 0
 
 
-@pytest.mark.parametrize("group", ["data", "drivers", "energy", "leader", "logger", "split"])
-def test_every_choice_of_a_group_builds(group) -> None:
-    for option in options(group):
-        if option not in OF_FILES:
-            node = getattr(load("train", [f"{group}={option}"]), group)
-            assert node is None or build(node, group) is not None
+def test_every_choice_of_a_group_builds(subtests) -> None:
+    for group in ["data", "drivers", "energy", "leader", "logger", "split"]:
+        with subtests.test(group=group):
+            for option in options(group):
+                if option not in OF_FILES:
+                    node = getattr(load("train", [f"{group}={option}"]), group)
+                    assert node is None or build(node, group) is not None
 
 
 @pytest.mark.parametrize(

@@ -55,11 +55,14 @@ def test_help_names_the_version_and_every_command(tmp_path) -> None:
     assert all(callable(import_module(module).main) for module, _ in COMMANDS.values())
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_fits_80_columns(name, tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    shown = run_command("lcc_rl.cli.console", name, "--help", cwd=tmp_path, check=True).stdout
-    assert [line for line in shown.splitlines() if len(line) > 80] == []
+def test_help_fits_80_columns(tmp_path, monkeypatch, subtests) -> None:
+    for name in COMMANDS:
+        with subtests.test(name=name):
+            monkeypatch.setenv("COLUMNS", "80")
+            shown = run_command(
+                "lcc_rl.cli.console", name, "--help", cwd=tmp_path, check=True
+            ).stdout
+            assert [line for line in shown.splitlines() if len(line) > 80] == []
 
 
 @pytest.mark.parametrize(

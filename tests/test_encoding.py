@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 
-import pytest
 from page_blocks import ROOT
 
 FOLDERS = ("lcc_rl", "tools")
@@ -37,9 +36,8 @@ def by_code_page(tree: ast.AST) -> Iterator[int]:
             yield call.lineno
 
 
-@pytest.mark.parametrize(
-    ("code", "found"),
-    [
+def test_calls_that_depend_on_the_code_page_are_found(subtests) -> None:
+    for code, found in [
         ("path.read_text()", True),
         ("path.read_text('utf-8')", False),
         ("path.read_text(encoding='utf-8')", False),
@@ -53,10 +51,9 @@ def by_code_page(tree: ast.AST) -> Iterator[int]:
         ("gzip.open(path, 'wt')", True),
         ("gzip.open(path, 'wt', encoding='utf-8')", False),
         ("Image.open(path)", False),
-    ],
-)
-def test_calls_that_depend_on_the_code_page_are_found(code, found) -> None:
-    assert bool(list(by_code_page(ast.parse(code)))) == found
+    ]:
+        with subtests.test(code=code):
+            assert bool(list(by_code_page(ast.parse(code)))) == found
 
 
 def test_every_text_is_utf_8() -> None:

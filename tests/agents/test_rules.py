@@ -27,16 +27,17 @@ def policy(kind: str, **settings):
     return make_policy(kind, Observation(scales=SCALES).bind(), (8, 8), 0, **given).module
 
 
-@pytest.mark.parametrize("state", [(8.0, 15.0, 0.5), (0.0, 2.5, 1.0), (12.0, 18.0, -2.0)])
-def test_the_rules_are_those_of_the_equations(state) -> None:
-    speed, gap, relative = (torch.tensor(x) for x in state)
-    idm = idm_acceleration(speed, gap, -relative, 20.0, 1.1, IDMConstants(1.2, 1.7, 1.5))
-    constants = {"desired_speed": 20.0, "time_gap": 1.1, "acceleration": 1.2}
-    constants |= {"deceleration": 1.7, "min_gap": 1.5}
-    action = policy("idm", constants=constants, max_acceleration=4.0)(seen(*state))
-    assert action.item() == pytest.approx(float(idm) / 4.0, rel=1e-4)
-    acc = linear_acc(speed, gap, relative, 25.0, 1.5, 2.0, 0.1, 0.5)
-    assert policy("acc")(seen(*state)).item() == pytest.approx(float(acc) / 3.0, rel=1e-4)
+def test_the_rules_are_those_of_the_equations(subtests) -> None:
+    for state in [(8.0, 15.0, 0.5), (0.0, 2.5, 1.0), (12.0, 18.0, -2.0)]:
+        with subtests.test(state=state):
+            speed, gap, relative = (torch.tensor(x) for x in state)
+            idm = idm_acceleration(speed, gap, -relative, 20.0, 1.1, IDMConstants(1.2, 1.7, 1.5))
+            constants = {"desired_speed": 20.0, "time_gap": 1.1, "acceleration": 1.2}
+            constants |= {"deceleration": 1.7, "min_gap": 1.5}
+            action = policy("idm", constants=constants, max_acceleration=4.0)(seen(*state))
+            assert action.item() == pytest.approx(float(idm) / 4.0, rel=1e-4)
+            acc = linear_acc(speed, gap, relative, 25.0, 1.5, 2.0, 0.1, 0.5)
+            assert policy("acc")(seen(*state)).item() == pytest.approx(float(acc) / 3.0, rel=1e-4)
 
 
 class Scaled(Controller):
@@ -56,15 +57,16 @@ def test_a_rule_whose_actions_have_an_unknown_scale_is_refused() -> None:
         make_agent(cfg)
 
 
-@pytest.mark.parametrize("kind", ["idm", "acc"])
-def test_a_residual_begins_at_the_rule_and_leaves_it_alone(kind) -> None:
-    rule, residual = policy(kind), policy(f"residual_{kind}")
-    state = seen(8.0, 15.0, 0.5)
-    assert torch.equal(residual(state), rule(state))
-    residual(state).sum().backward()
-    graded = {name for name, entry in residual.named_parameters() if entry.grad is not None}
-    assert graded
-    assert all(name.startswith("network.") for name in graded)
+def test_a_residual_begins_at_the_rule_and_leaves_it_alone(subtests) -> None:
+    for kind in ["idm", "acc"]:
+        with subtests.test(kind=kind):
+            rule, residual = policy(kind), policy(f"residual_{kind}")
+            state = seen(8.0, 15.0, 0.5)
+            assert torch.equal(residual(state), rule(state))
+            residual(state).sum().backward()
+            graded = {name for name, entry in residual.named_parameters() if entry.grad is not None}
+            assert graded
+            assert all(name.startswith("network.") for name in graded)
 
 
 def test_the_agent_learns_the_constants_alone() -> None:

@@ -1,11 +1,10 @@
-"""Random overrides and tables end in a result or in an error of the package, within bounds.
+"""Random overrides end in a result or in an error of the package, within bounds.
 
 A long run: ``FUZZ=5000 pytest tests/bad_input/test_fuzz.py``.
 """
 
 from __future__ import annotations
 
-import gzip
 import os
 import resource
 import signal
@@ -18,20 +17,15 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from unittest.mock import patch
 
-import numpy as np
 import pytest
-import torch
 from commands import DATA, process_state
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from ngsim_text import csv_text, pair, portal_text
-from table_text import READERS, long_table, openacc_text, pairs
 
 import lcc_rl.conf
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
 from lcc_rl.config.schemas import as_plain
-from lcc_rl.data.sources import LoadedEpisodes
 from lcc_rl.errors import LccError
 from lcc_rl.io import memory
 
@@ -168,101 +162,3 @@ def test_random_overrides_work_or_are_refused() -> None:
 
     attempt()
     assert {*ends} == {"works", "refused"}
-
-
-LONG = long_table(rows=60, step=0.5)  # small, for a failure prints it
-RECORDS = long_table(rows=60).rename(columns={"id": "drive", "t": "time_s", "v": "speed_mps"})
-TABLES = {
-    "ngsim": csv_text(pair(range(60))),
-    "source": csv_text(pair(range(200))),
-    "i-80": portal_text(pair(range(60))),
-    "table": LONG.to_csv(index=False),
-    "episodes": pairs(5).to_csv(index=False),
-    "openacc": openacc_text(2, 200),
-    "drives": RECORDS.to_csv(index=False),
-    "record": RECORDS.iloc[:60].to_csv(index=False),
-}
-CELLS = (
-    *("", " ", "nan", "inf", "-inf", "1e400", "1e20", "-1", "0", "1", "0.05", "99999999999"),
-    *("abc", "größe", '"', "'", "1;2", "=1+1", "0x10", "1e", "--", "\t", "\r", "\0", "TRUE"),
-)
-SIGNS = ((",", ";"), (",", "\t"), (",", " "), ("\n", "\r\n"), ("\n", "\r"), (".", ","), ("0", ""))
-
-
-@st.composite
-def tables(draw: Any) -> tuple[str, bytes]:
-    """Draw a reader and a table of its own with up to three faults."""
-    reader = draw(st.sampled_from(list(TABLES)))
-    text = TABLES[reader]
-    for _ in range(draw(st.integers(0, 3))):
-        lines = text.split("\n")
-        first, last = sorted(draw(st.integers(0, len(lines) - 1)) for _ in range(2))
-        column, cell = draw(st.integers(0, 17)), draw(st.sampled_from(CELLS))
-        end = draw(st.sampled_from((first + 1, last + 1, len(lines))))
-
-        def replaced(line: str, column: int = column, cell: str = cell) -> str:
-            cells = line.split(",")
-            return ",".join([*cells[:column], cell, *cells[column + 1 :]])
-
-        def without(line: str, column: int = column) -> str:
-            cells = line.split(",")
-            return ",".join(cells[:column] + cells[column + 1 :])
-
-        here = lines[first:end]
-        change: list[str] = draw(
-            st.sampled_from(
-                (
-                    *([replaced(line) for line in here],) * 3,
-                    [without(line) for line in here],
-                    [line + "," + line for line in here],
-                    here[::-1],
-                    here * 2,
-                    [],
-                )
-            )
-        )
-        text = "\n".join(lines[:first] + change + lines[end:])
-        if draw(st.integers(0, 9)) == 0:
-            text = text.replace(*draw(st.sampled_from(SIGNS)))
-    content = text.encode()
-    cut = draw(st.sampled_from((len(content),) * 9 + (len(content) // 2, 100, 1)))
-    coded = draw(st.sampled_from((bytes,) * 9 + (gzip.compress,)))
-    return reader, coded(content[:cut])
-
-
-@pytest.mark.slow
-def test_random_tables_are_read_or_refused() -> None:
-    ends = []
-
-    @fuzzed
-    @given(tables())
-    def attempt(table: tuple[str, bytes]) -> None:
-        reader, content = table
-        refused, read = "", None
-        with limited(), TemporaryDirectory() as folder:
-            path = Path(folder) / "table.csv"
-            path.write_bytes(content)
-            try:
-                read = READERS[reader](str(path))
-            except LccError as error:
-                refused = str(error)
-        if read is None:
-            assert "table.csv" in refused
-            assert all(line.isprintable() for line in refused.split("\n")), refused
-            ends.append("refused")
-        else:
-            if isinstance(read, LoadedEpisodes):
-                numbers = read.episodes.select_dtypes("number")
-                assert len(numbers)
-                assert np.isfinite(numbers.to_numpy()).all()
-            ends.append("works")
-
-    attempt()
-    assert {*ends} == {"works", "refused"}
-
-
-def test_hangs_and_too_much_memory_are_failures() -> None:
-    with pytest.raises(TimeoutError), limited(seconds=0.1):
-        signal.pause()
-    with pytest.raises(RuntimeError, match="can't allocate memory"), limited():
-        torch.ones(3 << 30)

@@ -37,67 +37,72 @@ def environment(view: str, batch: int = 8):
     return small_env("alcc", batch, [*CRASHING, *([string(MIXED)] if view == "two" else [])])
 
 
-@pytest.mark.parametrize("view", ["single", "one", "two"])
-def test_transitions_are_those_of_torchrls_collector(view) -> None:
-    acting, frames = policy(view == "single"), 8 * 40
-    theirs = Collector(
-        environment(view),
-        acting,
-        frames_per_batch=frames,
-        total_frames=3 * frames,
-        auto_register_policy_transforms=False,
-    )
-    ours = StringCollector(
-        environment(view), acting, frames_per_batch=frames, total_frames=3 * frames
-    )
-    assert isinstance(ours, BaseCollector)
-    seen = 0
-    for wanted, batch in zip(theirs, ours, strict=True):
-        assert batch.shape == (8, 40)
-        # All entries but those of the collector itself.
-        assert set(wanted.exclude("collector").keys(True, True)) == set(batch.keys(True, True))
-        for key in batch.keys(True, True):
-            assert torch.equal(batch[key], wanted[key]), key
-        seen += batch.numel()
-        over = wanted["next", "terminated"].any()
-    assert over
-    assert seen == 3 * frames
-    theirs.shutdown()
-    ours.shutdown()
+def test_transitions_are_those_of_torchrls_collector(subtests) -> None:
+    for view in ["single", "one", "two"]:
+        with subtests.test(view=view):
+            acting, frames = policy(view == "single"), 8 * 40
+            theirs = Collector(
+                environment(view),
+                acting,
+                frames_per_batch=frames,
+                total_frames=3 * frames,
+                auto_register_policy_transforms=False,
+            )
+            ours = StringCollector(
+                environment(view), acting, frames_per_batch=frames, total_frames=3 * frames
+            )
+            assert isinstance(ours, BaseCollector)
+            seen = 0
+            for wanted, batch in zip(theirs, ours, strict=True):
+                assert batch.shape == (8, 40)
+                # All entries but those of the collector itself.
+                assert set(wanted.exclude("collector").keys(True, True)) == set(
+                    batch.keys(True, True)
+                )
+                for key in batch.keys(True, True):
+                    assert torch.equal(batch[key], wanted[key]), key
+                seen += batch.numel()
+                over = wanted["next", "terminated"].any()
+            assert over
+            assert seen == 3 * frames
+            theirs.shutdown()
+            ours.shutdown()
 
 
-@pytest.mark.parametrize("batch", [(), (2, 3)])
-def test_any_batch_of_episodes(batch) -> None:
-    def played(make):
-        env = small_env("alcc", batch, ["scenario.horizon=10"])
-        return next(iter(make(env, policy(), frames_per_batch=env.batch_size.numel() * 25)))
+def test_any_batch_of_episodes(subtests) -> None:
+    for batch in [(), (2, 3)]:
+        with subtests.test(batch=batch):
 
-    theirs = played(partial(Collector, total_frames=-1, auto_register_policy_transforms=False))
-    ours = played(StringCollector)
-    assert ours.shape == (*batch, 25)
-    assert ours["next", "done"].sum() == 2 * ours[..., 0].numel()
-    for key in ours.keys(True, True):
-        assert torch.equal(ours[key], theirs[key]), key
+            def played(make, batch=batch):
+                env = small_env("alcc", batch, ["scenario.horizon=10"])
+                return next(iter(make(env, policy(), frames_per_batch=env.batch_size.numel() * 25)))
+
+            theirs = played(
+                partial(Collector, total_frames=-1, auto_register_policy_transforms=False)
+            )
+            ours = played(StringCollector)
+            assert ours.shape == (*batch, 25)
+            assert ours["next", "done"].sum() == 2 * ours[..., 0].numel()
+            for key in ours.keys(True, True):
+                assert torch.equal(ours[key], theirs[key]), key
 
 
-@pytest.mark.parametrize(
-    ("variant", "overrides"),
-    [
+def test_an_episode_begins_as_the_environment_would_begin_it(subtests) -> None:
+    for variant, overrides in [
         *((variant, []) for variant in VARIANTS),
         ("alcc", ["+knowledge=[memory,preview]", "+filter=cbf"]),
         ("alcc", ["scenario.string={size: 9, penetration: 0.4}"]),
         ("alcc", ["scenario.pieces.leader.perturbation=1.0"]),
         ("idm", ["scenario=ring"]),
-    ],
-)
-def test_an_episode_begins_as_the_environment_would_begin_it(variant, overrides) -> None:
-    env = small_env(variant, 7, overrides)
-    begun = env.reset()
-    rows = torch.tensor([5, 2])
-    ours = Step(pieces_of(env), env.base_env.horizon).begin(begun[SEED][rows])
-    assert set(ours) == {as_key(key) for key in begun.keys(True, True)}
-    for key, value in ours.items():
-        assert torch.equal(value, begun[key][rows]), key
+    ]:
+        with subtests.test(variant=variant):
+            env = small_env(variant, 7, overrides)
+            begun = env.reset()
+            rows = torch.tensor([5, 2])
+            ours = Step(pieces_of(env), env.base_env.horizon).begin(begun[SEED][rows])
+            assert set(ours) == {as_key(key) for key in begun.keys(True, True)}
+            for key, value in ours.items():
+                assert torch.equal(value, begun[key][rows]), key
 
 
 def test_an_environment_may_be_made_by_a_function_and_its_state_restored() -> None:

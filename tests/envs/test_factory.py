@@ -36,10 +36,11 @@ def play(env, actions):
     return [td, *play_from(env, td, actions)]
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("batch_size", [(), 3])
-def test_specs(variant, batch_size) -> None:
-    check_env_specs(small_env(variant, batch_size), break_when_any_done="both")
+def test_specs(subtests) -> None:
+    for batch_size in [(), 3]:
+        for variant in VARIANTS:
+            with subtests.test(batch_size=batch_size, variant=variant):
+                check_env_specs(small_env(variant, batch_size), break_when_any_done="both")
 
 
 def test_rollout_follows_the_equations() -> None:
@@ -214,14 +215,12 @@ def own_drivers() -> DriverPopulation:
     return fixed(desired_speed=20.0, time_gap=1.0)
 
 
-@pytest.mark.parametrize(
-    ("words", "origin"),
-    [
+def test_the_report_says_whose_drivers_drive(subtests) -> None:
+    for words, origin in [
         ("drivers=i80", "fitted to NGSIM I-80, shipped, drivers.mode=local"),
         ("drivers=fixed", "fixed"),
         (f"drivers._target_={__name__}.own_drivers", "own_drivers"),
-    ],
-)
-def test_the_report_says_whose_drivers_drive(words, origin) -> None:
-    line = next(x for x in load_inputs(tiny("train", words)).report if "human drivers" in x)
-    assert f"human drivers ({origin})" in line
+    ]:
+        with subtests.test(words=words):
+            line = next(x for x in load_inputs(tiny("train", words)).report if "human drivers" in x)
+            assert f"human drivers ({origin})" in line

@@ -66,35 +66,41 @@ def test_an_evaluation_measures_what_follows() -> None:
         assert steps[name].tolist() == played[name].tolist()[200:], name
 
 
-@pytest.mark.parametrize("nominal", [False, True])
-def test_rings_differ_in_training_and_not_in_an_evaluation(nominal) -> None:
-    cfg = compose("alcc", "task=ring-22", *(f"{key}={value}" for key, value in RANGES.items()))
-    inputs = load_inputs(cfg)
-    start = build_env(cfg, inputs.training, inputs.population, 64, 0, nominal=nominal).reset()
-    time_gaps = start["human", "desired_time_gap"]
-    factors = {
-        "[0.8, 1.25]": (start["vehicles", "gap"].sum(-2) + 22 * 5.0) / 260.0,
-        "[0.8, 1.2]": time_gaps[:, 0] / 1.0,
-    }
-    assert time_gaps.std(-2).max() < 1e-6  # the drivers of an episode share the factor
-    for name, drawn in factors.items():
-        low, high = (1.0, 1.0) if nominal else json.loads(name)
-        assert drawn.min().item() == pytest.approx(low, abs=0.05)
-        assert drawn.max().item() == pytest.approx(high, abs=0.05)
-        assert bool(((drawn > low - 1e-5) & (drawn < high + 1e-5)).all())
+def test_rings_differ_in_training_and_not_in_an_evaluation(subtests) -> None:
+    for nominal in [False, True]:
+        with subtests.test(nominal=nominal):
+            cfg = compose(
+                "alcc", "task=ring-22", *(f"{key}={value}" for key, value in RANGES.items())
+            )
+            inputs = load_inputs(cfg)
+            start = build_env(
+                cfg, inputs.training, inputs.population, 64, 0, nominal=nominal
+            ).reset()
+            time_gaps = start["human", "desired_time_gap"]
+            factors = {
+                "[0.8, 1.25]": (start["vehicles", "gap"].sum(-2) + 22 * 5.0) / 260.0,
+                "[0.8, 1.2]": time_gaps[:, 0] / 1.0,
+            }
+            assert time_gaps.std(-2).max() < 1e-6  # the drivers of an episode share the factor
+            for name, drawn in factors.items():
+                low, high = (1.0, 1.0) if nominal else json.loads(name)
+                assert drawn.min().item() == pytest.approx(low, abs=0.05)
+                assert drawn.max().item() == pytest.approx(high, abs=0.05)
+                assert bool(((drawn > low - 1e-5) & (drawn < high + 1e-5)).all())
 
 
-@pytest.mark.parametrize("nominal", [False, True])
-def test_noise_differs_in_training(nominal) -> None:
+def test_noise_differs_in_training(subtests) -> None:
     """The first step of equal drivers differs by the noise alone; its size by the episode."""
-    words = [f"{key}={value}" for key, value in RANGES.items() if "wiener" in key]
-    cfg = compose("alcc", "task=ring-22", *words, "scenario.controllers.human.wiener=1")
-    inputs = load_inputs(cfg)
-    env = build_env(cfg, inputs.training, inputs.population, 256, 0, nominal=nominal)
-    moved = env.step(env.rand_action(env.reset()))["next", "command", "human"]
-    size = moved.std(-2).flatten() * 0.1**0.5
-    ends = size.quantile(torch.tensor([0.05, 0.95])).tolist()
-    assert ends == pytest.approx([0.74, 1.26] if nominal else [0.5, 2.0], rel=0.15)
+    for nominal in [False, True]:
+        with subtests.test(nominal=nominal):
+            words = [f"{key}={value}" for key, value in RANGES.items() if "wiener" in key]
+            cfg = compose("alcc", "task=ring-22", *words, "scenario.controllers.human.wiener=1")
+            inputs = load_inputs(cfg)
+            env = build_env(cfg, inputs.training, inputs.population, 256, 0, nominal=nominal)
+            moved = env.step(env.rand_action(env.reset()))["next", "command", "human"]
+            size = moved.std(-2).flatten() * 0.1**0.5
+            ends = size.quantile(torch.tensor([0.05, 0.95])).tolist()
+            assert ends == pytest.approx([0.74, 1.26] if nominal else [0.5, 2.0], rel=0.15)
 
 
 def test_an_open_road_is_refused() -> None:

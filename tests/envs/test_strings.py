@@ -13,6 +13,7 @@ from helpers import (
     POPULATION,
     REWARD,
     VARIANTS,
+    check_refused,
     composed,
     single_env,
     slow_but,
@@ -65,23 +66,27 @@ def mixture(name: str, batch_size=()):
     return build_env(cfg, wavy_profiles(), POPULATION, batch_size)
 
 
-@pytest.mark.parametrize("batch_size", [(), 3])
-@pytest.mark.parametrize("name", list(MIXTURES))
-def test_specs_of_mixed_strings(name, batch_size) -> None:
-    check_env_specs(mixture(name, batch_size), break_when_any_done="both")
+def test_specs_of_mixed_strings(subtests) -> None:
+    for name in list(MIXTURES):
+        for batch_size in [(), 3]:
+            with subtests.test(name=name, batch_size=batch_size):
+                check_env_specs(mixture(name, batch_size), break_when_any_done="both")
 
 
-@pytest.mark.parametrize("variant", [v for v in VARIANTS if v != "direct"])
-@pytest.mark.parametrize("batch_size", [(), 3])
-def test_specs_of_the_single_agent_view(variant, batch_size) -> None:
-    env = single_env(variant, batch_size, [string("automated")] if variant in PLATOON else [])
-    check_env_specs(env, break_when_any_done="both")
-    shape = env.batch_size
-    assert env.full_reward_spec["reward"].shape == (*shape, 1)
-    data = env.rollout(3)
-    assert data["observation"].shape[:-1] == (*shape, 3)
-    assert data["next", "reward"].shape == (*shape, 3, 1)
-    assert OBSERVATION not in data.keys(True)
+def test_specs_of_the_single_agent_view(subtests) -> None:
+    for batch_size in [(), 3]:
+        for variant in [v for v in VARIANTS if v != "direct"]:
+            with subtests.test(batch_size=batch_size, variant=variant):
+                env = single_env(
+                    variant, batch_size, [string("automated")] if variant in PLATOON else []
+                )
+                check_env_specs(env, break_when_any_done="both")
+                shape = env.batch_size
+                assert env.full_reward_spec["reward"].shape == (*shape, 1)
+                data = env.rollout(3)
+                assert data["observation"].shape[:-1] == (*shape, 3)
+                assert data["next", "reward"].shape == (*shape, 3, 1)
+                assert OBSERVATION not in data.keys(True)
 
 
 def test_who_may_ask_for_the_single_agent_view(monkeypatch) -> None:
@@ -174,51 +179,78 @@ class Broken(Feature):
         return gap + torch.zeros(3, 1)
 
 
-@pytest.mark.parametrize(
-    ("piece", "words"),
-    [
-        (Wide().bind(), r"Wide writes vehicles\.wide as \[4, 4, 1\] .* expected \[4, 1\]"),
-        (Broken().bind(), "Broken does not fit the string of vehicles"),
-        (
-            MOTION.bind(WORLD),
-            r"vehicles\.speed is written by more than one piece: \['StringMotion', 'StringMot",
-        ),
-        (
-            TimeToCollision().bind(World(parse_string("automated*3"))),
-            r"TimeToCollision writes vehicles\.ttc as \[4, 1\] .* expected \[3, 1\]",
-        ),
-        (
-            Action().bind(WORLD, "other"),
-            r"Action reads other\.action, but only automated vehicles have an action",
-        ),
-    ],
-)
-def test_a_piece_that_does_not_fit_is_refused(piece, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        check(piece)
+def test_a_piece_that_does_not_fit_is_refused() -> None:
+    check_refused(
+        lambda piece: check(piece),
+        [
+            (Wide().bind(), r"Wide writes vehicles\.wide as \[4, 4, 1\] .* expected \[4, 1\]"),
+            (Broken().bind(), "Broken does not fit the string of vehicles"),
+            (
+                MOTION.bind(WORLD),
+                r"vehicles\.speed is written by more than one piece: \['StringMotion', 'StringMot",
+            ),
+            (
+                TimeToCollision().bind(World(parse_string("automated*3"))),
+                r"TimeToCollision writes vehicles\.ttc as \[4, 1\] .* expected \[3, 1\]",
+            ),
+            (
+                Action().bind(WORLD, "other"),
+                r"Action reads other\.action, but only automated vehicles have an action",
+            ),
+        ],
+        ConfigError,
+    )
 
 
-@pytest.mark.parametrize(
-    ("variant", "overrides", "words"),
-    [
-        ("alcc", ["scenario.pieces.time_gap=null"], r"reads vehicles\.time_gap, which no piece"),
-        ("alcc", ["scenario.pieces.estimator=null"], r"reads human\.predicted_acceleration, which"),
-        ("ddpg", ["scenario.pieces.communication=null"], r"reads vehicles\.gap_error, which no"),
-        ("alcc", [string("automated truck")], "has the role 'truck', but scenario.controllers nam"),
-        ("alcc", [string("automated human"), "scenario.road=ring"], "a ring road has no leader"),
-        ("alcc", ["scenario.circumference=100"], "circumference=100 has no effect: it belongs to"),
-        ("alcc", ["scenario.filters={auto: null}"], r"unknown role \(scenario\.filters\) 'auto'"),
-        ("alcc", ["scenario.start.human=null"], r"scenario\.start lacks human"),
-        ("alcc", [string("automated (human")], "this bracket is never closed at character 11"),
-        ("alcc", ["reward.terms=null"], "terms"),
-    ],
-)
-def test_a_configuration_that_does_not_fit_is_refused(variant, overrides, words) -> None:
-    with pytest.raises(ConfigError, match=words):
-        small_env(variant, 2, overrides)
+def test_a_configuration_that_does_not_fit_is_refused() -> None:
+    check_refused(
+        lambda variant, overrides: small_env(variant, 2, overrides),
+        [
+            (
+                "alcc",
+                ["scenario.pieces.time_gap=null"],
+                r"reads vehicles\.time_gap, which no piece",
+            ),
+            (
+                "alcc",
+                ["scenario.pieces.estimator=null"],
+                r"reads human\.predicted_acceleration, which",
+            ),
+            (
+                "ddpg",
+                ["scenario.pieces.communication=null"],
+                r"reads vehicles\.gap_error, which no",
+            ),
+            (
+                "alcc",
+                [string("automated truck")],
+                "has the role 'truck', but scenario.controllers nam",
+            ),
+            (
+                "alcc",
+                [string("automated human"), "scenario.road=ring"],
+                "a ring road has no leader",
+            ),
+            (
+                "alcc",
+                ["scenario.circumference=100"],
+                "circumference=100 has no effect: it belongs to",
+            ),
+            (
+                "alcc",
+                ["scenario.filters={auto: null}"],
+                r"unknown role \(scenario\.filters\) 'auto'",
+            ),
+            ("alcc", ["scenario.start.human=null"], r"scenario\.start lacks human"),
+            ("alcc", [string("automated (human")], "this bracket is never closed at character 11"),
+            ("alcc", ["reward.terms=null"], "terms"),
+        ],
+        ConfigError,
+    )
 
 
-@pytest.mark.parametrize("choice", ["+filter=cbf", "+faults=all"])
-def test_a_role_without_vehicles_has_no_pieces(choice) -> None:
-    plain, further = (small_env("direct", 2, words) for words in ([], [choice]))
-    assert list(map(type, pieces_of(further))) == list(map(type, pieces_of(plain)))
+def test_a_role_without_vehicles_has_no_pieces(subtests) -> None:
+    for choice in ["+filter=cbf", "+faults=all"]:
+        with subtests.test(choice=choice):
+            plain, further = (small_env("direct", 2, words) for words in ([], [choice]))
+            assert list(map(type, pieces_of(further))) == list(map(type, pieces_of(plain)))

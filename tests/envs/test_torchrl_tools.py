@@ -1,7 +1,7 @@
 """TorchRL's own transforms, collectors and wrappers take the environment as any single-agent one.
 
-Everything that TorchRL 0.14 exports is in a table: what fits an environment with one continuous
-action is tried, and what does not has its reason.
+Every transform and collector of TorchRL 0.14 that fits an environment with one continuous action is
+tried.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from helpers import single_env, small_env
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl import collectors, envs
 from torchrl.collectors import (
     AsyncBatchedCollector,
     AsyncCollector,
@@ -114,56 +113,6 @@ FITS = {
 }
 ONE = {"NoopResetEnv"}  # takes one episode, no batch
 
-BASE, STORED = "a base class or a helper", "of replay buffers, refused by every environment"
-PIXELS, DISCRETE, ROBOT = "images", "discrete actions", "robots: actions are structures of theirs"
-TESTED = "of several vehicles, tested below"
-ELSEWHERE = {
-    **dict.fromkeys(
-        ("Transform", "ObservationTransform", "TransformedEnv", "RunningMeanStd"), BASE
-    ),
-    **dict.fromkeys(
-        (
-            *("ActionChunkTransform", "BurnInTransform", "MultiStepTransform", "PolicyAgeFilter"),
-            *("NextStateReconstructor", "RandomCropTensorDict", "Reward2GoTransform"),
-        ),
-        STORED,
-    ),
-    **dict.fromkeys(
-        (
-            *("CenterCrop", "Crop", "DecodeVideoTransform", "GrayScale", "R3MTransform", "Resize"),
-            *("ToTensorImage", "VC1Transform", "VIPRewardTransform", "VIPTransform"),
-            "EndOfLifeTransform",
-        ),
-        PIXELS,
-    ),
-    **dict.fromkeys(("ActionMask", "DiscreteActionProjection"), DISCRETE),
-    **dict.fromkeys(
-        (
-            *("CartesianSolver", "HumanoidMacroAction", "MacroAction", "MacroPrimitive"),
-            *("MacroPrimitiveTransform", "RobotMacroAction", "RobotMacroActionMode"),
-            *("SatelliteAttitudeTransform", "SatelliteMacroAction", "TargetMacroAction"),
-            *("URScriptPrimitive", "URScriptPrimitiveTransform"),
-        ),
-        ROBOT,
-    ),
-    **dict.fromkeys(
-        ("AutoResetEnv", "AutoResetTransform"), "of environments that reset themselves"
-    ),
-    "FlattenAction": TESTED,
-    "MeanActionSelector": "of model-based belief states",
-    "NextObservationDelta": "drops the next observation: no environment passes check_env_specs",
-    "PinMemoryTransform": "needs an accelerator",
-    "RayTransform": "needs Ray",
-    "SelectTransform": "drops the state, which is in the TensorDict; refused, tested below",
-    "Tokenizer": "texts",
-    "VecGymEnvTransform": "of Gymnasium's vectors",
-}
-
-
-def test_every_transform_of_torchrl_is_in_a_table() -> None:
-    assert {*FITS, *ELSEWHERE} == set(room.__all__)
-    assert not FITS.keys() & ELSEWHERE
-
 
 class Constant(nn.Module):
     """An action in the middle of any specification."""
@@ -178,39 +127,45 @@ class Constant(nn.Module):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", FITS)
-def test_a_transform(name) -> None:
-    env = single_env("alcc", () if name in ONE else 2)
-    if name == "FlattenObservation":
-        env.append_transform(room.UnsqueezeTransform(-1, in_keys=OBS))
-    env.append_transform(FITS[name]())
-    check_env_specs(env)
-    key = env.action_keys[0]
-    seen = "observation"
-    policy = TensorDictModule(Constant(env), [seen], [key])
-    for driver in (None, policy):
-        driven = env.rollout(4, driver, break_when_any_done=name != "BatchSizeTransform")
-        assert driven[seen].isfinite().all()
-        assert driven["next", env.reward_keys[0]].isfinite().all()
-        if name == "RandomTruncationTransform":
-            continue  # ends at random
-        assert driven.shape[-1] == 4
-        moved = driven["next", *STEP].flatten().max()
-        assert moved >= (1 if name == "ConditionalSkip" else 4)
-    assert env.rand_step()["next", seen].isfinite().all()
+def test_a_transform(subtests) -> None:
+    for name in FITS:
+        with subtests.test(name=name):
+            env = single_env("alcc", () if name in ONE else 2)
+            if name == "FlattenObservation":
+                env.append_transform(room.UnsqueezeTransform(-1, in_keys=OBS))
+            env.append_transform(FITS[name]())
+            check_env_specs(env)
+            key = env.action_keys[0]
+            seen = "observation"
+            policy = TensorDictModule(Constant(env), [seen], [key])
+            for driver in (None, policy):
+                driven = env.rollout(4, driver, break_when_any_done=name != "BatchSizeTransform")
+                assert driven[seen].isfinite().all()
+                assert driven["next", env.reward_keys[0]].isfinite().all()
+                if name == "RandomTruncationTransform":
+                    continue  # ends at random
+                assert driven.shape[-1] == 4
+                moved = driven["next", *STEP].flatten().max()
+                assert moved >= (1 if name == "ConditionalSkip" else 4)
+            assert env.rand_step()["next", seen].isfinite().all()
 
 
-@pytest.mark.parametrize("batch", [(), 2])
-def test_the_environment_alone(batch) -> None:
-    for env in (single_env("alcc", batch), TransformedEnv(single_env("alcc", batch))):
-        assert (env.reward_key, env.action_key) == ("reward", "action")
-        assert list(env.full_reward_spec.keys(True, True)) == ["reward"]
-        assert env.rand_action()["action"].shape == env.action_spec.shape
-        for policy in (None, RandomPolicy(env.full_action_spec), AnyAction(env.action_spec)):
-            assert env.rollout(4, policy)["next", "reward"].isfinite().all()
-    assert single_env("alcc", batch).rand_step()["next", *STEP].unique() == 1
-    group = small_env("alcc", batch, ["scenario.string='automated human automated'"])
-    assert group.reward_key == ("automated", "reward")
+def test_the_environment_alone(subtests) -> None:
+    for batch in [(), 2]:
+        with subtests.test(batch=batch):
+            for env in (single_env("alcc", batch), TransformedEnv(single_env("alcc", batch))):
+                assert (env.reward_key, env.action_key) == ("reward", "action")
+                assert list(env.full_reward_spec.keys(True, True)) == ["reward"]
+                assert env.rand_action()["action"].shape == env.action_spec.shape
+                for policy in (
+                    None,
+                    RandomPolicy(env.full_action_spec),
+                    AnyAction(env.action_spec),
+                ):
+                    assert env.rollout(4, policy)["next", "reward"].isfinite().all()
+            assert single_env("alcc", batch).rand_step()["next", *STEP].unique() == 1
+            group = small_env("alcc", batch, ["scenario.string='automated human automated'"])
+            assert group.reward_key == ("automated", "reward")
 
 
 def test_what_torchrl_calls_is_its_own() -> None:
@@ -273,14 +228,15 @@ def test_an_episode_that_skips_stands_still() -> None:
     assert not torch.equal(after["observation"][1], start[1])
 
 
-@pytest.mark.parametrize("nested", [False, True])
-def test_statistics_of_observations(nested) -> None:
-    norm = room.ObservationNorm(in_keys=OBS, standard_normal=True)
-    env = single_env("alcc", ())
-    env = TransformedEnv(env, Compose(norm)) if nested else env.append_transform(norm)
-    norm.init_stats(40, reduce_dim=0, cat_dim=0)
-    assert norm.loc.shape == (WIDTH,)
-    assert env.rollout(20)["observation"].abs().median() < 3.0
+def test_statistics_of_observations(subtests) -> None:
+    for nested in [False, True]:
+        with subtests.test(nested=nested):
+            norm = room.ObservationNorm(in_keys=OBS, standard_normal=True)
+            env = single_env("alcc", ())
+            env = TransformedEnv(env, Compose(norm)) if nested else env.append_transform(norm)
+            norm.init_stats(40, reduce_dim=0, cat_dim=0)
+            assert norm.loc.shape == (WIDTH,)
+            assert env.rollout(20)["observation"].abs().median() < 3.0
 
 
 def test_actions_of_a_group_flattened() -> None:
@@ -320,19 +276,6 @@ def test_a_step_without_its_state_is_refused_in_one_line() -> None:
 
 # -- collectors and wrappers -----------------------------------------------------------------------
 
-NOT_HERE = {
-    "BaseCollector": BASE,
-    "Evaluator": "takes an environment and a policy as Collector does, in processes",
-    "MultiCollector": "the base of MultiSync and MultiAsync",
-    **dict.fromkeys(("ProfileConfig", "RandomPolicy"), BASE),
-    **dict.fromkeys(
-        (
-            *("MultiProcessedWeightUpdater", "RayWeightUpdater", "RemoteModuleWeightUpdater"),
-            *("VanillaWeightUpdater", "WeightUpdaterBase"),
-        ),
-        "weights of policies",
-    ),
-}
 make = partial(lcc_rl.make_env, "alcc", (), ["data.platoons=2", "data.recordings=2"])
 SIZE = {"frames_per_batch": 20, "total_frames": 40}
 
@@ -382,45 +325,37 @@ COLLECTORS = {
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", COLLECTORS)
-def test_a_collector(name) -> None:
-    collector = COLLECTORS[name]()
-    batches = list(collector)
-    collector.shutdown()
-    masks = [batch.get(("collector", "mask"), None) for batch in batches]
-    counted = zip(batches, masks, strict=True)
-    frames = sum(batch.numel() if mask is None else mask.sum() for batch, mask in counted)
-    assert frames == SIZE["total_frames"]
-    assert all(batch["next", "reward"].isfinite().all() for batch in batches)
-
-
-def test_every_collector_of_torchrl_is_in_a_table() -> None:
-    tried = {"Collector", "AsyncBatchedCollector", "MultiSyncCollector", "MultiAsyncCollector"}
-    exported = {name for name in dir(collectors) if name[0].isupper()}
-    assert exported == {*tried, "AsyncCollector", *NOT_HERE}
+def test_a_collector(subtests) -> None:
+    for name in COLLECTORS:
+        with subtests.test(name=name):
+            collector = COLLECTORS[name]()
+            batches = list(collector)
+            collector.shutdown()
+            masks = [batch.get(("collector", "mask"), None) for batch in batches]
+            counted = zip(batches, masks, strict=True)
+            frames = sum(batch.numel() if mask is None else mask.sum() for batch, mask in counted)
+            assert frames == SIZE["total_frames"]
+            assert all(batch["next", "reward"].isfinite().all() for batch in batches)
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(
-    "wrap",
-    [
+def test_environments_side_by_side(subtests) -> None:
+    for wrap in [
         lambda: SerialEnv(2, make),
         lambda: SerialEnv(2, lambda: single_env("alcc", 3)),
         lambda: TransformedEnv(SerialEnv(2, make), Compose(room.RewardSum(), room.StepCounter())),
         lambda: AsyncEnvPool([make, make], backend="threading"),
         lambda: ParallelEnv(2, make, mp_start_method="fork"),
-    ],
-    ids=["serial", "serial batches", "transformed", "threads", "processes"],
-)
-def test_environments_side_by_side(wrap) -> None:
-    env = wrap()
-    if not isinstance(env, AsyncEnvPool):
-        check_env_specs(env)
-    for policy in (None, pushing()):
-        played = env.rollout(4, policy)
-        assert played.shape[0] == 2
-        assert played["next", "reward"].isfinite().all()
-    env.close(raise_if_closed=False)
+    ]:
+        with subtests.test(wrap=wrap):
+            env = wrap()
+            if not isinstance(env, AsyncEnvPool):
+                check_env_specs(env)
+            for policy in (None, pushing()):
+                played = env.rollout(4, policy)
+                assert played.shape[0] == 2
+                assert played["next", "reward"].isfinite().all()
+            env.close(raise_if_closed=False)
 
 
 def first_seeds(env) -> torch.Tensor:
@@ -443,12 +378,13 @@ def test_workers_play_different_episodes() -> None:
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.usefixtures("fork")
-@pytest.mark.parametrize("kind", ["MultiSyncCollector", "MultiAsyncCollector", "AsyncCollector"])
-def test_collectors_in_processes(kind) -> None:
-    batches = forked()[kind]
-    assert sum(batch.numel() for batch in batches) == SIZE["total_frames"]
-    seeds = torch.cat([batch[SEED].flatten() for batch in batches])
-    assert len(seeds.unique()) >= (1 if kind == "AsyncCollector" else 2)
+def test_collectors_in_processes(subtests) -> None:
+    for kind in ["MultiSyncCollector", "MultiAsyncCollector", "AsyncCollector"]:
+        with subtests.test(kind=kind):
+            batches = forked()[kind]
+            assert sum(batch.numel() for batch in batches) == SIZE["total_frames"]
+            seeds = torch.cat([batch[SEED].flatten() for batch in batches])
+            assert len(seeds.unique()) >= (1 if kind == "AsyncCollector" else 2)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -459,18 +395,6 @@ def test_a_seed_of_a_collector_differs_by_worker() -> None:
     (batch,) = [batch[SEED].clone() for batch in collector]
     collector.shutdown()
     assert len(batch.unique()) == 2
-
-
-WRAPPERS = {
-    "MultiThreadedEnv": "of envpool's environments",
-    "MultiThreadedEnvWrapper": "of envpool's environments",
-    "EnvCreator": "makes environments for workers, as a function does",
-    "ProcessorAsyncEnvPool": "AsyncEnvPool(backend='multiprocessing'): processes by spawn",
-}
-
-
-def test_wrappers_not_tried_exist() -> None:
-    assert all(hasattr(envs, name) for name in WRAPPERS)
 
 
 def test_an_environment_is_built_and_played_in_inference_mode() -> None:

@@ -21,7 +21,6 @@ from lcc_rl.evaluation.blocks import BLOCKS, Store
 from lcc_rl.evaluation.episodes import Episodes, Plan, evaluate
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.results.report import summary, windows_for
 
 PROFILES = wavy_profiles().windows(100)
 INPUTS = Inputs(PROFILES, PROFILES, POPULATION)
@@ -49,21 +48,22 @@ def same(one: Path, two: Path) -> None:
 # -- the plan -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("batch", "repeats"), [(1, 1), (7, 3), (1000, 2)])
-def test_blocks_hold_every_episode_once_and_shards_every_block_once(batch, repeats) -> None:
-    plan = Plan(4, 249, 5, batch, repeats)
-    seen = [
-        tuple(int(part[place]) for part in plan.episodes(block))
-        for block in plan.own
-        for place in range(plan.count(block))
-    ]
-    assert len(seen) == len(set(seen)) == len(plan) == 20 * repeats
-    assert plan.size <= batch
-    assert all(0 < plan.count(block) <= plan.size for block in plan.own)
-    shards = min(3, plan.blocks)
-    parts = [Plan(4, 249, 5, batch, repeats, shards, shard).own for shard in range(shards)]
-    assert [block for part in parts for block in part] == list(plan.own)
-    assert all(parts)
+def test_blocks_hold_every_episode_once_and_shards_every_block_once(subtests) -> None:
+    for batch, repeats in [(1, 1), (7, 3), (1000, 2)]:
+        with subtests.test(batch=batch):
+            plan = Plan(4, 249, 5, batch, repeats)
+            seen = [
+                tuple(int(part[place]) for part in plan.episodes(block))
+                for block in plan.own
+                for place in range(plan.count(block))
+            ]
+            assert len(seen) == len(set(seen)) == len(plan) == 20 * repeats
+            assert plan.size <= batch
+            assert all(0 < plan.count(block) <= plan.size for block in plan.own)
+            shards = min(3, plan.blocks)
+            parts = [Plan(4, 249, 5, batch, repeats, shards, shard).own for shard in range(shards)]
+            assert [block for part in parts for block in part] == list(plan.own)
+            assert all(parts)
 
 
 # -- repeats --------------------------------------------------------------------------------------
@@ -189,22 +189,6 @@ def test_a_dataset_is_the_same_table(whole, tmp_path) -> None:
     assert all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in zip(*energies, strict=True))
     field = type(data.schema.field("run").type).__name__
     assert field == "DictionaryType"
-
-
-def test_a_saving_per_km_is_of_the_sums_over_windows() -> None:
-    rows = pd.DataFrame(
-        {
-            "strategy": ["idm"] * 2 + ["alcc"] * 2,
-            "training_seed": pd.array([None] * 2 + [0] * 2, dtype="Int64"),
-            "profile_id": [0, 1] * 2,
-            "driver_id": 0,
-            "total_path_energy_kj": [1.0, 10.0, 2.0, 8.0],
-            "cav_distance_m": [1.0, 10.0] * 2,
-            "collided": False,
-        }
-    )
-    row = summary(windows_for(rows)).set_index("strategy").loc["alcc"]
-    assert row["saving"] == pytest.approx(1.0 / 11.0)
 
 
 # -- compiled -------------------------------------------------------------------------------------

@@ -7,8 +7,8 @@ from functools import partial
 
 import pytest
 import torch
-from commands import NO_AGENT, UNTRAINED, run_command, tiny
-from helpers import POPULATION, compose, wavy_profiles
+from commands import NO_AGENT, UNTRAINED, run_command
+from helpers import POPULATION, check_refused, compose, wavy_profiles
 
 import lcc_rl
 from lcc_rl.commands import evaluation
@@ -62,9 +62,8 @@ def test_a_class_a_function_an_object_a_node_and_a_file_drive_alike(tmp_path, mo
     assert found["slow"] != found["class"]
 
 
-@pytest.mark.parametrize(
-    ("who", "label"),
-    [
+def test_an_own_controller_never_has_the_name_of_a_shipped_one() -> None:
+    for who, label in (
         ("mine/my_idm_1.1.yaml", "my_idm_1.1"),
         ("idm_acc.yaml", "idm_acc.yaml"),  # not the tuned IDM, which idm_acc means
         ("alcc.onnx", "alcc.onnx"),
@@ -74,10 +73,8 @@ def test_a_class_a_function_an_object_a_node_and_a_file_drive_alike(tmp_path, mo
         ({TARGET: PATH, "gain": 0.3}, "Steady"),
         ({TARGET: "lcc_rl.pieces.Law", "law": f"{__name__}.steady"}, "steady"),
         ("idm_acc", "idm_acc"),
-    ],
-)
-def test_an_own_controller_never_has_the_name_of_a_shipped_one(who, label: str) -> None:
-    assert label_of(who) == label
+    ):
+        assert label_of(who) == label
 
 
 def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None:
@@ -95,18 +92,25 @@ def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None
         lcc_rl.compare(both, overrides=SMALL, folder=tmp_path / "b")
 
 
-@pytest.mark.parametrize(("longest", "own"), [("2.45", True), ("null", False)])
-def test_constants_tuned_behind_a_filter_need_its_longest_gap(longest: str, own: bool) -> None:
-    words = ["variant=alcc", "+filter=cbf", f"scenario.filters.automated.time_gap={longest}"]
-    plain, behind = (
-        baseline(load("evaluate", words), name).cfg.scenario.controllers["automated"]
-        for name in ("idm_acc", "idm_acc_filtered")
-    )
-    assert (behind["desired_speed"] < plain["desired_speed"]) == own
-    asked = baseline(load("evaluate", words), "idm_acc_filtered", "idm_acc_filtered")  # compare=
-    assert asked.cfg.scenario.controllers["automated"] == behind
-    alone = baseline(load("evaluate", words), "constant_filtered").cfg.scenario
-    assert alone.controllers["automated"]["acceleration"] == 3.0  # full throttle
+def test_constants_tuned_behind_a_filter_need_its_longest_gap(subtests) -> None:
+    for longest, own in [("2.45", True), ("null", False)]:
+        with subtests.test(longest=longest):
+            words = [
+                "variant=alcc",
+                "+filter=cbf",
+                f"scenario.filters.automated.time_gap={longest}",
+            ]
+            plain, behind = (
+                baseline(load("evaluate", words), name).cfg.scenario.controllers["automated"]
+                for name in ("idm_acc", "idm_acc_filtered")
+            )
+            assert (behind["desired_speed"] < plain["desired_speed"]) == own
+            asked = baseline(
+                load("evaluate", words), "idm_acc_filtered", "idm_acc_filtered"
+            )  # compare=
+            assert asked.cfg.scenario.controllers["automated"] == behind
+            alone = baseline(load("evaluate", words), "constant_filtered").cfg.scenario
+            assert alone.controllers["automated"]["acceleration"] == 3.0  # full throttle
 
 
 @pytest.mark.parametrize(
@@ -148,9 +152,8 @@ scenario: {{controllers: {{automated: {node}}}}}
         (tmp_path / "run" / "config.yaml").unlink()
 
 
-@pytest.mark.parametrize(
-    ("who", "words"),
-    [
+def test_who_cannot_drive_is_told_how() -> None:
+    cases = [
         ("nowhere.X", "export PYTHONPATH"),
         (f"{__name__}.Nobody", "Nobody"),
         ("idm_ac", "'idm_ac'.*'idm_acc'.*--config-dir"),
@@ -160,11 +163,8 @@ scenario: {{controllers: {{automated: {node}}}}}
         ({"gain": 3}, "expected _target_"),
         ({TARGET: PATH, "gian": 3}, "'gian'.*'gain'"),
         ({TARGET: "lcc_rl.pieces.TimeGap"}, "expected Controller"),
-    ],
-)
-def test_who_cannot_drive_is_told_how(who, words) -> None:
-    with pytest.raises(LccError, match=words):
-        controller_of(who)
+    ]
+    check_refused(controller_of, cases)
 
 
 class Winding(Steady):
@@ -193,14 +193,14 @@ def test_a_file_that_the_package_hides_is_refused(tmp_path) -> None:
 
 
 def test_what_cannot_be_named_or_told_apart_is_refused(tmp_path) -> None:
-    for who in (lambda gap: gap, partial(steady, gain=0.1)):
-        with pytest.raises(LccError, match="at the top of a module"):
-            lcc_rl.compare([who], overrides=SMALL, folder=tmp_path)
-    for name in ("rule", "alcc", "idm_acc", "acc_filtered"):
-        with pytest.raises(LccError, match=f"names Steady {name}, which stands for '.+': choose"):
-            lcc_rl.compare({name: PATH}, overrides=SMALL, folder=tmp_path)
-    with pytest.raises(LccError, match="two Steady: give each a name"):
-        evaluation.run(tiny("evaluate", f"compare=[{PATH},{PATH}]", agent=False), tmp_path)
+    names = ("rule", "alcc", "idm_acc", "acc_filtered")
+    cases = [
+        ([lambda gap: gap], "at the top of a module"),
+        ([partial(steady, gain=0.1)], "at the top of a module"),
+        *(({x: PATH}, f"names Steady {x}, which stands for '.+': choose") for x in names),
+        ([PATH, PATH], "two Steady: give each a name"),
+    ]
+    check_refused(lambda who: lcc_rl.compare(who, overrides=SMALL, folder=tmp_path), cases)
 
 
 def unknown(gap, velocity):
@@ -232,24 +232,18 @@ class Unwritten(Steady):
     reads = ("self.gap", "self.speed", "my.last")
 
 
-@pytest.mark.parametrize(
-    ("who", "words"),
-    [
+def test_a_controller_that_does_not_fit_is_named_and_leaves_no_folder(tmp_path) -> None:
+    cases = [
         (unknown, r"\.unknown reads vehicles.velocity, .* only .*vehicles.gap, .*vehicles.speed"),
-        (
-            plain_number,
-            r"\.plain_number .* float .* must return command.automated as tensors \[",
-        ),
+        (plain_number, r"\.plain_number .* float .* must return command.automated as tensors \["),
         (Wide, r"Wide writes command.automated as \[1, 2\]"),
         (Forgetful, r"returned 1 instead of 2 .* command.automated and automated.integral as"),
         (Talkative, r"returned 2 instead of 1 .* must return command.automated as tensors"),
         (Unwritten, r"Unwritten reads my.last, which no piece of the scenario writes;"),
-    ],
-)
-def test_a_controller_that_does_not_fit_is_named_and_leaves_no_folder(who, words, tmp_path) -> None:
-    with pytest.raises(LccError, match=words):
-        lcc_rl.compare([who], overrides=SMALL, folder=tmp_path / "a")
-    typed = [*SMALL, f"compare=[{__name__}.{who.__name__}]", "hydra.run.dir=b"]
+    ]
+    out = {"overrides": SMALL, "folder": tmp_path / "a"}
+    check_refused(lambda who: lcc_rl.compare([who], **out), cases)
+    typed = [*SMALL, f"compare=[{__name__}.Wide]", "hydra.run.dir=b"]
     assert run_command("lcc_rl.cli.evaluate", *typed, cwd=tmp_path).returncode == 2
     assert not list(tmp_path.iterdir())
 
@@ -303,29 +297,16 @@ class Harder(Hard):
     max_acceleration: Positive = 4.0  # [m/s²]
 
 
-@pytest.mark.parametrize(
-    ("node", "least"),
-    [
-        ({TARGET: f"{__name__}.Hard"}, -3.0),
-        ({TARGET: f"{__name__}.Harder"}, -4.0),
-        (
-            {
-                TARGET: "lcc_rl.pieces.Handover",
-                "before": {TARGET: f"{__name__}.Harder"},
-                "after": {TARGET: f"{__name__}.Hard"},
-                "from_s": 0.2,
-            },
-            (-4.0, -4.0, -3.0),
-        ),
-    ],
-)
-def test_commands_to_automated_vehicles_alone_are_bounded(node, least) -> None:
-    cfg = compose("idm", "scenario.start.human=${scenario.start.automated}")
-    cfg.scenario.controllers |= {AUTOMATED: node, "human": {TARGET: f"{__name__}.Hard"}}
-    command = build_env(cfg, wavy_profiles(), POPULATION, 2).rollout(3)["next", "command"]
-    expected = torch.tensor(least).expand(2, 3)
-    assert torch.equal(command[AUTOMATED][..., 0, 0], expected)
-    assert (command["human"] == -5.0).all()
+def test_commands_to_automated_vehicles_alone_are_bounded() -> None:
+    hard, harder = ({TARGET: f"{__name__}.{name}"} for name in ("Hard", "Harder"))
+    handover = {TARGET: "lcc_rl.pieces.Handover", "before": harder, "after": hard, "from_s": 0.2}
+    for node, least in ((hard, -3.0), (harder, -4.0), (handover, (-4.0, -4.0, -3.0))):
+        cfg = compose("idm", "scenario.start.human=${scenario.start.automated}")
+        cfg.scenario.controllers |= {AUTOMATED: node, "human": hard}
+        command = build_env(cfg, wavy_profiles(), POPULATION, 2).rollout(3)["next", "command"]
+        expected = torch.tensor(least).expand(2, 3)
+        assert torch.equal(command[AUTOMATED][..., 0, 0], expected), node
+        assert (command["human"] == -5.0).all()
 
 
 def test_a_law_reads_what_its_parameters_name() -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import compose
+from helpers import check_refused, compose
 from tensordict.nn import TensorDictModule
 
 from lcc_rl.agents.rules import ACCRule, IDMRule
@@ -24,33 +24,35 @@ from lcc_rl.functional.rules import idm_acc, linear_acc
 from lcc_rl.pieces import IDMACC, LinearACC
 
 
-@pytest.mark.parametrize("name", TUNED)
-def test_a_tuned_rule_behind_the_filter_is_called_so_and_has_constants_for_it(name) -> None:
-    cfg = compose("alcc", "+filter=cbf")
-    free, filtered = (baseline(cfg, one).cfg.scenario for one in (name, f"{name}_filtered"))
-    assert free.filters.get(AUTOMATED) is None
-    assert filtered.filters[AUTOMATED]["time_gap"] == 2.45
-    one, two = (scenario.controllers[AUTOMATED] for scenario in (free, filtered))
-    assert one["time_gap"] != two["time_gap"]
-    named = baseline(cfg, "behind the filter", f"{name}_filtered").cfg.scenario
-    assert named.filters[AUTOMATED]
-    assert named.controllers[AUTOMATED] == two
-    # A human driver has no filter.
-    human = baseline(compose("alcc", "+filter=cbf"), "idm").cfg.scenario
-    assert human.filters.get(AUTOMATED) is None
+def test_a_tuned_rule_behind_the_filter_is_called_so_and_has_constants_for_it(subtests) -> None:
+    for name in TUNED:
+        with subtests.test(name=name):
+            cfg = compose("alcc", "+filter=cbf")
+            free, filtered = (baseline(cfg, one).cfg.scenario for one in (name, f"{name}_filtered"))
+            assert free.filters.get(AUTOMATED) is None
+            assert filtered.filters[AUTOMATED]["time_gap"] == 2.45
+            one, two = (scenario.controllers[AUTOMATED] for scenario in (free, filtered))
+            assert one["time_gap"] != two["time_gap"]
+            named = baseline(cfg, "behind the filter", f"{name}_filtered").cfg.scenario
+            assert named.filters[AUTOMATED]
+            assert named.controllers[AUTOMATED] == two
+            # A human driver has no filter.
+            human = baseline(compose("alcc", "+filter=cbf"), "idm").cfg.scenario
+            assert human.filters.get(AUTOMATED) is None
 
 
-@pytest.mark.parametrize(
-    ("piece", "rule", "law"), [(IDMACC, IDMRule, idm_acc), (LinearACC, ACCRule, linear_acc)]
-)
-def test_a_controller_commands_what_the_rule_of_an_agent_does(piece, rule, law) -> None:
-    generator = torch.Generator().manual_seed(0)
-    speed, gap = (20.0 * torch.rand(64, 1, 1, generator=generator) for _ in range(2))
-    relative_speed = torch.randn(64, 1, 1, generator=generator)
-    command = piece(**rule.START).bind().limited(speed, gap, relative_speed)
-    constants = rule.START.values()
-    assert torch.equal(command, law(speed, gap, relative_speed, *constants).clamp(-3.0, 3.0))
-    assert command.min() == -3.0
+def test_a_controller_commands_what_the_rule_of_an_agent_does(subtests) -> None:
+    for piece, rule, law in [(IDMACC, IDMRule, idm_acc), (LinearACC, ACCRule, linear_acc)]:
+        with subtests.test(piece=piece):
+            generator = torch.Generator().manual_seed(0)
+            speed, gap = (20.0 * torch.rand(64, 1, 1, generator=generator) for _ in range(2))
+            relative_speed = torch.randn(64, 1, 1, generator=generator)
+            command = piece(**rule.START).bind().limited(speed, gap, relative_speed)
+            constants = rule.START.values()
+            assert torch.equal(
+                command, law(speed, gap, relative_speed, *constants).clamp(-3.0, 3.0)
+            )
+            assert command.min() == -3.0
 
 
 def test_policies_of_one_variant_are_named_by_what_they_learned_with() -> None:
@@ -102,23 +104,19 @@ def test_policies_of_one_training_are_named_by_their_files_and_one_file_is_refus
         check_distinct(twice)
 
 
-@pytest.mark.parametrize(
-    ("variant", "words", "expected"),
-    [
-        ("reference", (), "was trained as variant reference"),
-        ("alcc", ("observation.scales.self.gap=0.2",), "scales.self.gap=0.2, got 0.1"),
-        ("alcc", ("+knowledge=memory",), r"with memory\.entries in its .* 'compare=\[p\.pt\]'"),
-        ("alcc", ("~observation.scales.ahead",), r"trained without ahead\.speed in its"),
-        ("alcc", ("+knowledge=memory", "~observation.scales.memory"), "scenario.pieces.memory"),
-        ("alcc", ("scenario.time_step=0.2",), "scenario.time_step=0.2, got 0.1"),
-    ],
-)
-def test_a_policy_of_other_settings_is_refused(variant, words, expected) -> None:
+def test_a_policy_of_other_settings_is_refused() -> None:
     cfg = compose("alcc")
     cfg.policy = "p.pt"
     check_policy(cfg, compose("alcc"))
-    with pytest.raises(ConfigError, match=expected):
-        check_policy(cfg, compose(variant, *words))
+    cases = [
+        ("reference", "was trained as variant reference"),
+        ("alcc", "observation.scales.self.gap=0.2", "scales.self.gap=0.2, got 0.1"),
+        ("alcc", "+knowledge=memory", r"with memory\.entries in its .* 'compare=\[p\.pt\]'"),
+        ("alcc", "~observation.scales.ahead", r"trained without ahead\.speed in its"),
+        ("alcc", "+knowledge=memory", "~observation.scales.memory", "scenario.pieces.memory"),
+        ("alcc", "scenario.time_step=0.2", "scenario.time_step=0.2, got 0.1"),
+    ]
+    check_refused(lambda *words: check_policy(cfg, compose(*words)), cases, ConfigError)
 
 
 def test_a_policy_of_a_task_is_refused_without_a_task_and_in_another_scenario() -> None:

@@ -163,12 +163,13 @@ TABLE_IV = {  # strategy: Σ|e_v|, Σ|jerk|, Σ reward
 }
 
 
-@pytest.mark.parametrize("strategy", TABLE_IV)
-def test_weights_reproduce_table_iv(strategy) -> None:
-    speed_error, jerk, printed = TABLE_IV[strategy]
-    # The reward is additive in both absolute values, so sums go in as they are.
-    got = PlatoonReward()(torch.tensor(speed_error), torch.tensor(jerk))
-    assert abs(float(got) - printed) < 0.1
+def test_weights_reproduce_table_iv(subtests) -> None:
+    for strategy in TABLE_IV:
+        with subtests.test(strategy=strategy):
+            speed_error, jerk, printed = TABLE_IV[strategy]
+            # The reward is additive in both absolute values, so sums go in as they are.
+            got = PlatoonReward()(torch.tensor(speed_error), torch.tensor(jerk))
+            assert abs(float(got) - printed) < 0.1
 
 
 def test_one_step_reward() -> None:

@@ -73,38 +73,48 @@ def test_gipps_with_a_step_of_the_reaction_time_reaches_gipps_speed() -> None:
 
 
 @EACH
-def test_nobody_accelerates_at_the_equilibrium_gap(model) -> None:
-    law, speed = LAWS[model], torch.linspace(0.0, 22.0, 12, dtype=torch.float64)
-    own = law.constants()
-    gap = law.equilibrium_gap(speed, t(25.0), t(1.2), own, 1e3)
-    got = law.acceleration(speed, gap, torch.zeros_like(speed), t(25.0), t(1.2), own)
-    torch.testing.assert_close(got, torch.zeros_like(got), rtol=0, atol=1e-9)
-    assert (gap.diff() > 0).all()
-    assert gap[0].item() == pytest.approx(own.min_gap)
-    nearer = law.acceleration(speed, gap - 0.5, torch.zeros_like(speed), t(25.0), t(1.2), own)
-    assert (nearer < 0).all()
+def test_nobody_accelerates_at_the_equilibrium_gap(model, subtests) -> None:
+    with subtests.test():
+        law, speed = LAWS[model], torch.linspace(0.0, 22.0, 12, dtype=torch.float64)
+        own = law.constants()
+        gap = law.equilibrium_gap(speed, t(25.0), t(1.2), own, 1e3)
+        got = law.acceleration(speed, gap, torch.zeros_like(speed), t(25.0), t(1.2), own)
+        torch.testing.assert_close(got, torch.zeros_like(got), rtol=0, atol=1e-9)
+        assert (gap.diff() > 0).all()
+        assert gap[0].item() == pytest.approx(own.min_gap)
+        nearer = law.acceleration(speed, gap - 0.5, torch.zeros_like(speed), t(25.0), t(1.2), own)
+        assert (nearer < 0).all()
 
 
-@pytest.mark.parametrize("model", ["idm", "fvdm", "gipps"])
-@pytest.mark.parametrize("time_gap", [0.9, 1.2, 2.0])
-def test_stops_behind_a_standing_leader(model, time_gap) -> None:
-    law = LAWS[model]
-    leader = torch.zeros(1801, 3, dtype=torch.float64)
-    start = t(8.0, 15.0, 20.0)
-    speed, gap, _ = simulate_follower(
-        leader, start, t(60.0, 90.0, 150.0), t(25.0), t(time_gap), law.constants(), 0.1, law=law
-    )
-    assert gap.min().item() > 0.5
-    assert speed[-1].max().item() < 0.05
+def test_stops_behind_a_standing_leader(subtests) -> None:
+    for time_gap in [0.9, 1.2, 2.0]:
+        for model in ["idm", "fvdm", "gipps"]:
+            with subtests.test(time_gap=time_gap, model=model):
+                law = LAWS[model]
+                leader = torch.zeros(1801, 3, dtype=torch.float64)
+                start = t(8.0, 15.0, 20.0)
+                speed, gap, _ = simulate_follower(
+                    leader,
+                    start,
+                    t(60.0, 90.0, 150.0),
+                    t(25.0),
+                    t(time_gap),
+                    law.constants(),
+                    0.1,
+                    law=law,
+                )
+                assert gap.min().item() > 0.5
+                assert speed[-1].max().item() < 0.05
 
 
 @EACH
-def test_gradients_are_finite_everywhere(model) -> None:
-    law = LAWS[model]
-    speed = t(0.0, 0.0, 10.0, 30.0, 5.0).requires_grad_()
-    gap = t(2.0, -1.0, 0.0, 500.0, 8.0).requires_grad_()
-    law.acceleration(speed, gap, speed - 5.0, t(25.0), t(1.2), law.constants()).sum().backward()
-    assert speed.grad is not None
-    assert speed.grad.isfinite().all()
-    assert gap.grad is not None
-    assert gap.grad.isfinite().all()
+def test_gradients_are_finite_everywhere(model, subtests) -> None:
+    with subtests.test():
+        law = LAWS[model]
+        speed = t(0.0, 0.0, 10.0, 30.0, 5.0).requires_grad_()
+        gap = t(2.0, -1.0, 0.0, 500.0, 8.0).requires_grad_()
+        law.acceleration(speed, gap, speed - 5.0, t(25.0), t(1.2), law.constants()).sum().backward()
+        assert speed.grad is not None
+        assert speed.grad.isfinite().all()
+        assert gap.grad is not None
+        assert gap.grad.isfinite().all()

@@ -1,6 +1,5 @@
 """The estimator of A15 on simulated followers with noise, and the population mean."""
 
-import pytest
 import torch
 
 from lcc_rl.drivers.population import bootstrap
@@ -78,12 +77,15 @@ def test_recovers_the_driver_without_noise() -> None:
     assert error.median() < 0.02
 
 
-@pytest.mark.parametrize(("v", "s", "rate"), [(4.0, 12.0, 0.5), (2.0, 4.0, -3.0), (0.0, 3.0, 0.0)])
-def test_population_mean_is_the_mean_over_drivers(v: float, s: float, rate: float) -> None:
-    population = bootstrap()
-    mean = PopulationMean(population.desired_speed, population.time_gap, population.constants)
-    state = [torch.tensor([x]) for x in (v, s, rate)]
-    each = idm_acceleration(
-        *state, population.desired_speed, population.time_gap, population.constants
-    )
-    torch.testing.assert_close(mean(*state), each.mean().unsqueeze(0), rtol=1e-4, atol=1e-4)
+def test_population_mean_is_the_mean_over_drivers(subtests) -> None:
+    for v, s, rate in [(4.0, 12.0, 0.5), (2.0, 4.0, -3.0), (0.0, 3.0, 0.0)]:
+        with subtests.test(v=v):
+            population = bootstrap()
+            mean = PopulationMean(
+                population.desired_speed, population.time_gap, population.constants
+            )
+            state = [torch.tensor([x]) for x in (v, s, rate)]
+            each = idm_acceleration(
+                *state, population.desired_speed, population.time_gap, population.constants
+            )
+            torch.testing.assert_close(mean(*state), each.mean().unsqueeze(0), rtol=1e-4, atol=1e-4)

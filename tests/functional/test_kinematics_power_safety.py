@@ -1,6 +1,5 @@
 """Equations against values worked out by hand."""
 
-import pytest
 import torch
 
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
@@ -56,13 +55,17 @@ def test_kinetic_energy() -> None:
     torch.testing.assert_close(kinetic_energy(t(10.0)), t(51255.0))
 
 
-@pytest.mark.parametrize(
-    ("gap", "rate", "expected"),
-    [(8.0, 2.0, 4.0), (8.0, 0.0, 1e3), (8.0, -1.0, 1e3), (0.001, 5.0, 0.01), (-0.5, -1.0, 0.01)],
-)
-def test_time_to_collision(gap: float, rate: float, expected: float) -> None:
-    # closing: 8/2 = 4; opening or steady: the ceiling; contact: the floor, whatever the rate.
-    torch.testing.assert_close(time_to_collision(t(gap), t(rate)), t(expected))
+def test_time_to_collision(subtests) -> None:
+    for gap, rate, expected in [
+        (8.0, 2.0, 4.0),
+        (8.0, 0.0, 1e3),
+        (8.0, -1.0, 1e3),
+        (0.001, 5.0, 0.01),
+        (-0.5, -1.0, 0.01),
+    ]:
+        with subtests.test(gap=gap):
+            # closing: 8/2 = 4; opening or steady: the ceiling; contact: the floor.
+            torch.testing.assert_close(time_to_collision(t(gap), t(rate)), t(expected))
 
 
 def test_time_gap_floor() -> None:

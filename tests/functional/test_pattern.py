@@ -14,9 +14,8 @@ from lcc_rl.functional.pattern import parse_string
 A, H = "automated", "human"
 
 
-@pytest.mark.parametrize(
-    ("pattern", "roles"),
-    [
+def test_what_a_pattern_means(subtests) -> None:
+    for pattern, roles in [
         ("automated", [A]),
         ("automated human*5", [A, *[H] * 5]),
         ("  human * 2(automated) ", [H, H, A]),
@@ -26,19 +25,17 @@ A, H = "automated", "human"
         ("automated*10000", [A] * 10_000),
         ("automated*0000025", [A] * 25),
         ("automated*00000100", [A] * 100),
-    ],
-)
-def test_what_a_pattern_means(pattern, roles) -> None:
-    string = parse_string(pattern)
-    assert string.roles == tuple(roles)
-    assert not string.drawn
-    assert not string.ring
-    assert len(string) == len(roles)
+    ]:
+        with subtests.test(pattern=pattern):
+            string = parse_string(pattern)
+            assert string.roles == tuple(roles)
+            assert not string.drawn
+            assert not string.ring
+            assert len(string) == len(roles)
 
 
-@pytest.mark.parametrize(
-    ("pattern", "words", "place"),
-    [
+def test_an_error_points_at_the_place(subtests) -> None:
+    for pattern, words, place in [
         ("", "expected a role", 1),
         ("automated )", "expected a role, '(' or the end", 11),
         ("(automated", "this bracket is never closed", 1),
@@ -52,15 +49,14 @@ def test_what_a_pattern_means(pattern, roles) -> None:
         ("automated*5000 human*5001", "more than 10000 vehicles", 16),
         ("human*2*3", "expected a role before '*'", 8),
         ("(" * 30 + "human" + ")" * 30, "too many brackets", 22),
-    ],
-)
-def test_an_error_points_at_the_place(pattern, words, place) -> None:
-    with pytest.raises(ConfigError) as error:
-        parse_string(pattern)
-    text = str(error.value)
-    assert f"{words} at character {place}: " in text
-    # The pattern itself, marked where it goes wrong.
-    assert text.endswith(f"{pattern[: place - 1]}»{pattern[place - 1 :]}")
+    ]:
+        with subtests.test(pattern=pattern):
+            with pytest.raises(ConfigError) as error:
+                parse_string(pattern)
+            text = str(error.value)
+            assert f"{words} at character {place}: " in text
+            # The pattern itself, marked where it goes wrong.
+            assert text.endswith(f"{pattern[: place - 1]}»{pattern[place - 1 :]}")
 
 
 def test_a_share_is_a_number() -> None:
@@ -68,9 +64,8 @@ def test_a_share_is_a_number() -> None:
         parse_string({"size": 10, "penetration": True})
 
 
-@pytest.mark.parametrize(
-    ("size", "penetration", "count"),
-    [
+def test_penetration_is_rounded_to_whole_vehicles(subtests) -> None:
+    for size, penetration, count in [
         (100, 0.1, 10),
         (10, 0.04, 1),  # at least one above 0
         (10, 1e-9, 1),
@@ -79,14 +74,13 @@ def test_a_share_is_a_number() -> None:
         (6, 0.34, 2),
         (10, 1, 10),
         (1, 0.5, 1),
-    ],
-)
-def test_penetration_is_rounded_to_whole_vehicles(size, penetration, count) -> None:
-    string = parse_string({"size": size, "penetration": penetration})
-    assert string.count(A) == count
-    assert string.count(H) == size - count
-    # Where only one role is left there is nothing to draw.
-    assert string.drawn == (0 < count < size)
+    ]:
+        with subtests.test(size=size):
+            string = parse_string({"size": size, "penetration": penetration})
+            assert string.count(A) == count
+            assert string.count(H) == size - count
+            # Where only one role is left there is nothing to draw.
+            assert string.drawn == (0 < count < size)
 
 
 # A pattern as a tree: a role, or a sequence of trees; each with how often.

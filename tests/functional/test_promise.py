@@ -125,9 +125,10 @@ def test_the_promise_holds_with_faults(fault, episodes, steps) -> None:
     assert least < 4.1  # full throttle reaches the limit
 
 
-@pytest.mark.parametrize("fault", ["errors", "sensors 0.2 s late"])
-def test_a_filter_that_does_not_reckon_with_a_fault_breaks_it(fault) -> None:
-    assert driven(Road(fault, 500, 0, robust=False))[1] > 100
+def test_a_filter_that_does_not_reckon_with_a_fault_breaks_it(subtests) -> None:
+    for fault in ["errors", "sensors 0.2 s late"]:
+        with subtests.test(fault=fault):
+            assert driven(Road(fault, 500, 0, robust=False))[1] > 100
 
 
 def farthest_behind(piece: CBFFilter) -> tuple[float, float]:
@@ -155,9 +156,10 @@ def farthest_behind(piece: CBFFilter) -> tuple[float, float]:
     return farthest, least
 
 
-@pytest.mark.parametrize(("longest", "kept"), [(115.0, True), (None, False)])
-def test_the_longest_gap_is_kept_and_nearness_wins(longest, kept) -> None:
-    piece = CBFFilter(time_gap=None, longest_gap=longest, shortest_time_gap=1.05).bind()
-    farthest, least = farthest_behind(piece)
-    assert (farthest < 116.0) == kept
-    assert least >= LIMIT
+def test_the_longest_gap_is_kept_and_nearness_wins(subtests) -> None:
+    for longest, kept in [(115.0, True), (None, False)]:
+        with subtests.test(longest=longest):
+            piece = CBFFilter(time_gap=None, longest_gap=longest, shortest_time_gap=1.05).bind()
+            farthest, least = farthest_behind(piece)
+            assert (farthest < 116.0) == kept
+            assert least >= LIMIT

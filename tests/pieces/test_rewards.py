@@ -2,7 +2,6 @@
 
 import math
 
-import pytest
 import torch
 
 from lcc_rl.pieces import (
@@ -65,13 +64,15 @@ POWER = torch.tensor([1.0, 10.0, 100.0, 2.0, 20.0, 200.0]).view(1, 6, 1) * 1000.
 GAPS = torch.full((1, 6, 1), 5.0)
 
 
-@pytest.mark.parametrize(
-    ("of", "earned"),
-    [("self", (1.0, 2.0)), ("behind", (110.0, 220.0)), ("string", (333.0, 333.0))],
-)
-def test_whose_energy_counts(of, earned) -> None:
-    term = EnergyReward(of=of, scale=1000.0).bind(World(STRING))
-    torch.testing.assert_close(term.compute(POWER), -0.1 * t(*earned).unsqueeze(0))
+def test_whose_energy_counts(subtests) -> None:
+    for of, earned in [
+        ("self", (1.0, 2.0)),
+        ("behind", (110.0, 220.0)),
+        ("string", (333.0, 333.0)),
+    ]:
+        with subtests.test(of=of):
+            term = EnergyReward(of=of, scale=1000.0).bind(World(STRING))
+            torch.testing.assert_close(term.compute(POWER), -0.1 * t(*earned).unsqueeze(0))
 
 
 def test_estimated_energy_of_the_human_drivers_behind() -> None:
@@ -95,9 +96,8 @@ def test_what_is_ahead_of_the_first_is_behind_the_last_on_a_ring() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("hit", "behind", "pays"),
-    [
+def test_who_pays_for_a_collision(subtests) -> None:
+    for hit, behind, pays in [
         ((0,), True, (1.0, 0.0)),
         ((3,), True, (0.0, 1.0)),  # of one automated vehicle into a human: the one that hit
         ((3,), False, (0.0, 1.0)),
@@ -107,12 +107,11 @@ def test_what_is_ahead_of_the_first_is_behind_the_last_on_a_ring() -> None:
         ((5,), True, (0.0, 1.0)),
         ((0, 4), True, (1.0, 1.0)),
         ((), True, (0.0, 0.0)),
-    ],
-)
-def test_who_pays_for_a_collision(hit, behind, pays) -> None:
-    gaps = GAPS.clone()
-    gaps[:, list(hit)] = -0.1
-    term = CollisionPenalty(weight=100.0, behind=behind).bind(World(STRING))
-    entries = {("vehicles", "gap"): gaps}
-    got = term.compute(*(entries[key] for key in term.in_keys))
-    torch.testing.assert_close(got, -100.0 * t(*pays).unsqueeze(0))
+    ]:
+        with subtests.test(hit=hit):
+            gaps = GAPS.clone()
+            gaps[:, list(hit)] = -0.1
+            term = CollisionPenalty(weight=100.0, behind=behind).bind(World(STRING))
+            entries = {("vehicles", "gap"): gaps}
+            got = term.compute(*(entries[key] for key in term.in_keys))
+            torch.testing.assert_close(got, -100.0 * t(*pays).unsqueeze(0))

@@ -215,9 +215,8 @@ def test_contact_of_any_two_vehicles_ends_the_episode() -> None:
 # -- rules -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("speed", "gap", "ahead", "wanted"),
-    [
+def test_follower_stopper_by_region(subtests) -> None:
+    for speed, gap, ahead, wanted in [
         (5.0, 4.0, 5.0, 0.0),  # nearer than 4.5 m
         (5.0, 4.875, 5.0, 2.5),  # half way from 4.5 to 5.25 m: half of the speed ahead
         (5.0, 5.25, 5.0, 5.0),
@@ -231,13 +230,12 @@ def test_contact_of_any_two_vehicles_ends_the_episode() -> None:
         (8.0, 0.5 * (7.5 + 9.75), 5.0, 2.5),
         (8.0, 0.5 * (9.75 + 15.0), 5.0, 6.5),
         (8.0, 15.1, 5.0, 8.0),
-    ],
-)
-def test_follower_stopper_by_region(speed, gap, ahead, wanted) -> None:
-    gaps, zeros, decelerations = (4.5, 5.25, 6.0), (0.0, 0.0, 0.0), (1.5, 1.0, 0.5)
-    values = (torch.tensor([x], dtype=torch.float64) for x in (speed, gap, ahead, 8.0))
-    got = follower_stopper_speed(*values, gaps, zeros, decelerations)
-    assert float(got) == pytest.approx(wanted)
+    ]:
+        with subtests.test(speed=speed):
+            gaps, zeros, decelerations = (4.5, 5.25, 6.0), (0.0, 0.0, 0.0), (1.5, 1.0, 0.5)
+            values = (torch.tensor([x], dtype=torch.float64) for x in (speed, gap, ahead, 8.0))
+            got = follower_stopper_speed(*values, gaps, zeros, decelerations)
+            assert float(got) == pytest.approx(wanted)
 
 
 def test_follower_stopper_keeps_time_gaps_and_its_limits() -> None:

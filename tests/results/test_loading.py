@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from helpers import check_refused
 
 from lcc_rl import results
 from lcc_rl.cli.status import main as status
@@ -40,32 +40,27 @@ def made(folder: Path, seed: int = 0, **settings: object) -> Path:
 # -- settings --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("names", "columns"),
-    [
+def test_rows_are_those_of_the_files_beside_the_settings_that_are_named(tmp_path) -> None:
+    made(tmp_path / "b" / "2", 5, agent={"gamma": 0.9, "tau": 0.1})
+    made(tmp_path / "b" / "1", 7)
+    own = pd.concat([episodes(7), episodes(5)], ignore_index=True)
+    for names, columns in (
         (None, ["run", "seed", "variant", "agent.tau"]),
         ([], ["run"]),
         (["seed"], ["run", "seed"]),
         (["agent.*"], ["run", "agent.gamma", "agent.tau"]),
         (["*"], ["run", "seed", "variant", "agent.gamma", "trust", "agent.tau"]),
-    ],
-)
-def test_rows_are_those_of_the_files_beside_the_settings_that_are_named(
-    tmp_path, names, columns
-) -> None:
-    made(tmp_path / "b" / "2", 5, agent={"gamma": 0.9, "tau": 0.1})
-    made(tmp_path / "b" / "1", 7)
-    frame = results.load(tmp_path, settings=names)
-    assert list(frame.columns[3:]) == columns
-    assert frame["run"].tolist() == ["b/1"] * 6 + ["b/2"] * 6
-    own = pd.concat([episodes(7), episodes(5)], ignore_index=True)
-    assert frame["training_seed"].dtype == own["training_seed"].dtype
-    pd.testing.assert_frame_equal(frame[own.columns].astype({"strategy": str}), own)
-    found = results.load(tmp_path, settings=names, lazy=True).to_table().to_pandas()
-    found = found.astype({"training_seed": "Int64"})
-    pd.testing.assert_frame_equal(found.astype(object), frame.astype(object), check_exact=True)
-    if "agent.tau" in columns:
-        assert frame.groupby("run")["agent.tau"].first().tolist()[1] == 0.1
+    ):
+        frame = results.load(tmp_path, settings=names)
+        assert list(frame.columns[3:]) == columns
+        assert frame["run"].tolist() == ["b/1"] * 6 + ["b/2"] * 6
+        assert frame["training_seed"].dtype == own["training_seed"].dtype
+        pd.testing.assert_frame_equal(frame[own.columns].astype({"strategy": str}), own)
+        found = results.load(tmp_path, settings=names, lazy=True).to_table().to_pandas()
+        found = found.astype({"training_seed": "Int64"})
+        pd.testing.assert_frame_equal(found.astype(object), frame.astype(object), check_exact=True)
+        if "agent.tau" in columns:
+            assert frame.groupby("run")["agent.tau"].first().tolist()[1] == 0.1
 
 
 def test_a_job_counts_each_episode_once(tmp_path) -> None:
@@ -134,12 +129,16 @@ def test_damaged_runs_are_named_in_a_line_each_and_the_rest_is_read(tmp_path, ca
             results.load(tmp_path / name)
 
 
-@pytest.mark.parametrize("broken", [b"{broken", b"[]", json.dumps({"columns": 5}).encode()])
-def test_broken_metadata_of_pandas_is_one_line(tmp_path, broken) -> None:
-    rewritten(made(tmp_path / "a"), b"pandas", broken)
-    with pytest.raises(ResultsError, match=r"a/episodes\.parquet: damaged") as caught:
-        read_parquet(tmp_path / "a" / TABLE)
-    assert "\n" not in str(caught.value)
+def test_broken_metadata_of_pandas_is_one_line(tmp_path) -> None:
+    folder = made(tmp_path / "a")
+
+    def read(broken: bytes) -> None:
+        rewritten(folder, b"pandas", broken)
+        read_parquet(folder / TABLE)
+
+    words = r"a/episodes\.parquet: damaged"
+    cases = [(broken, words) for broken in (b"{broken", b"[]", b'{"columns": 5}')]
+    check_refused(read, cases, ResultsError)
 
 
 @pytest.fixture
@@ -157,11 +156,10 @@ def open_folder() -> Iterator[Path]:
         os.seteuid(user)
 
 
-@pytest.mark.parametrize("mode", [0o600, 0o000])
-def test_a_folder_that_cannot_be_entered_is_named(open_folder, capsys, mode) -> None:
+def test_a_folder_that_cannot_be_entered_is_named(open_folder, capsys) -> None:
     made(open_folder / "good")
     closed = made(open_folder / "closed")
-    closed.chmod(mode)
+    closed.chmod(0o000)
     try:
         frame = results.load(open_folder)
         assert set(frame["run"]) == {"good"}
@@ -185,21 +183,19 @@ MOVED = {
 MOVED |= {"time_s": [0.1, 0.2], "cav_speed": [9.0, 9.0], "cav_gap": [20.0, 20.0]}
 
 
-@pytest.mark.parametrize(
-    ("steps", "settings", "message"),
-    [
-        ({"strategy": ["idm"] * 2}, {}, r"a: not what a run writes: KeyError: 'training_seed'"),
-        ({"a": [1]}, {}, r"a: not what a run writes: KeyError: 'strategy'"),
-        (MOVED, {}, r"a: not what a run writes: KeyError: 'scenario'"),
+def test_an_animation_of_foreign_files_is_refused_in_a_line(tmp_path) -> None:
+    lacks = r"\d: not what a run writes: KeyError: "
+    cases = [
+        ({"strategy": ["idm"] * 2}, {}, lacks + "'training_seed'"),
+        ({"a": [1]}, {}, lacks + "'strategy'"),
+        (MOVED, {}, lacks + "'scenario'"),
         (MOVED, {"scenario": "x"}, r"config\.yaml: damaged: scenario must be a mapping .*'x'"),
-        (MOVED, {"scenario": {"road": 3}}, r"a: not what a run writes: KeyError: 'string'"),
-    ],
-)
-def test_an_animation_of_foreign_files_is_refused_in_a_line(
-    tmp_path, steps, settings, message
-) -> None:
-    folder = made(tmp_path / "a", **settings)
-    write_parquet(pd.DataFrame(steps), folder / "steps.parquet")
-    with pytest.raises(ResultsError, match=message) as caught:
+        (MOVED, {"scenario": {"road": 3}}, lacks + "'string'"),
+    ]
+
+    def animated(steps: dict[str, object], settings: dict[str, object]) -> None:
+        folder = made(tmp_path / str(len([*tmp_path.iterdir()])), **settings)
+        write_parquet(pd.DataFrame(steps), folder / "steps.parquet")
         animate.run(folder)
-    assert "\n" not in str(caught.value)
+
+    check_refused(animated, cases, ResultsError)

@@ -94,19 +94,20 @@ def data_of(text: str) -> dict:
     return json.loads(found[1])
 
 
-@pytest.mark.parametrize("ring", [False, True])
-def test_a_page_holds_the_motion_of_all_vehicles_and_needs_nothing_else(ring) -> None:
-    shown = drifting(3, ring)
-    text = page(shown, "a </script> title")
-    found = data_of(text)
-    assert found["title"] == "a </script> title"
-    assert found["roles"] == ["automated", "human", "human"]
-    for name in ("speed", "gap"):
-        assert pytest.approx(getattr(shown, name), abs=0.005) == np.array(found[name]).T
-    assert (found["leader"] is None) == (found["circumference"] is not None) == ring
-    assert not re.search(r"(src|href)=|https?:|@import", text)
-    long = data_of(page(drifting(100, seconds=600.0), "a fleet"))
-    assert len(long["time"]) * 100 <= LARGEST
+def test_a_page_holds_the_motion_of_all_vehicles_and_needs_nothing_else(subtests) -> None:
+    for ring in [False, True]:
+        with subtests.test(ring=ring):
+            shown = drifting(3, ring)
+            text = page(shown, "a </script> title")
+            found = data_of(text)
+            assert found["title"] == "a </script> title"
+            assert found["roles"] == ["automated", "human", "human"]
+            for name in ("speed", "gap"):
+                assert pytest.approx(getattr(shown, name), abs=0.005) == np.array(found[name]).T
+            assert (found["leader"] is None) == (found["circumference"] is not None) == ring
+            assert not re.search(r"(src|href)=|https?:|@import", text)
+            long = data_of(page(drifting(100, seconds=600.0), "a fleet"))
+            assert len(long["time"]) * 100 <= LARGEST
 
 
 @pytest.mark.parametrize("ring", [False, True])
@@ -124,12 +125,12 @@ def test_the_frames_of_a_gif_differ_and_show_each_role(ring, tmp_path) -> None:
         assert near.sum() > 30, role
 
 
-@pytest.mark.parametrize("ring", [False, True])
-def test_every_colour_and_axis_of_a_film_is_named(ring) -> None:
-    *_, figure = frames(drifting(9, ring), "title")
-    _, speeds, gaps = figure.axes
-    names = [text.get_text() for text in speeds.get_legend().get_texts()]
-    assert names == ["leader", "controlled car", "human driver"][ring:]
+def test_every_colour_and_axis_of_a_film_is_named() -> None:
+    for ring in (True, False):
+        *_, figure = frames(drifting(9, ring), "title")
+        _, speeds, gaps = figure.axes
+        names = [text.get_text() for text in speeds.get_legend().get_texts()]
+        assert names == ["leader", "controlled car", "human driver"][ring:]
     assert [axis.get_ylabel() for axis in (speeds, gaps)] == ["speed [m/s]", "gap ahead [m]"]
     assert gaps.get_xlabel() == "time [s]"
     assert all(line.get_alpha() == 1.0 for line in speeds.get_legend().get_lines())
@@ -169,16 +170,7 @@ def test_the_command_animates_what_is_named(run_folder, capsys) -> None:
     assert name == str(run_folder / "figures" / "animation_alcc_0.html")
     assert "network, for all: profile p, driver 0" in Path(name).read_text()
     out = run_folder.parent / "there.html"
-    words = [
-        "--strategy",
-        "one driver (IDM)",
-        "--episode",
-        "1",
-        "--start",
-        "1",
-        "--duration",
-        "0.5",
-    ]
+    words = ["--strategy=one driver (IDM)", "--episode=1", "--start=1", "--duration=0.5"]
     assert command.main([str(run_folder), *words, "--out", str(out)]) == 0
     found = data_of(out.read_text())
     assert (found["title"], found["time"]) == ("one driver (IDM): profile p, driver 1", [1.0, 1.5])

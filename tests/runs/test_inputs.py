@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from commands import NO_AGENT, run_command
+from helpers import slow_but
 
 from lcc_rl.commands.evaluation import made_by
 from lcc_rl.config import identity, load
@@ -53,7 +54,7 @@ def place(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("typed", READ)
+@pytest.mark.parametrize("typed", slow_but([*READ][::4], READ))
 def test_a_configuration_has_another_identity_once_a_file_holds_something_else(
     place, typed
 ) -> None:
@@ -83,7 +84,9 @@ def drivers(place: Path, factor: float) -> None:
     write_parquet(table.assign(time_gap_s=factor * table["time_gap_s"]), place / "d.parquet")
 
 
-@pytest.mark.parametrize(("entry", "anew"), [("train", False), ("evaluate", True)])
+@pytest.mark.parametrize(
+    ("entry", "anew"), slow_but([("train", False)], [("train", False), ("evaluate", True)])
+)
 def test_a_changed_file_is_said_on_resume_and_seen_by_a_sweep(place, entry, anew) -> None:
     drivers(place, 1.0)
     words = [*NO_AGENT, "variant=idm", "drivers=calibrated", "drivers.path=d.parquet"]

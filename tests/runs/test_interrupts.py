@@ -21,6 +21,7 @@ from commands import (
     tiny,
     wait_for,
 )
+from helpers import slow_but
 
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.commands import training
@@ -68,7 +69,7 @@ def ctrl_c():
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.parametrize("kind", SENT)
+@pytest.mark.parametrize("kind", slow_but(SENT[-1:], SENT))
 def test_a_command_that_imports_yet_ends_with_one_line(kind) -> None:
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", IMPORTS], text=True, **pipes) as child:
@@ -78,6 +79,7 @@ def test_a_command_that_imports_yet_ends_with_one_line(kind) -> None:
     assert (child.returncode, errors) == (130, "lcc_rl: interrupted\n")
 
 
+@pytest.mark.slow
 def test_a_program_that_imports_the_package_keeps_its_handlers(tmp_path) -> None:
     (tmp_path / "mine").mkdir()
     for name, text in (("__init__", MINE), ("__main__", PROGRAM)):
@@ -85,17 +87,18 @@ def test_a_program_that_imports_the_package_keeps_its_handlers(tmp_path) -> None
     subprocess.run([sys.executable, "-m", "mine"], cwd=tmp_path, check=True, timeout=60)
 
 
-@pytest.mark.parametrize("kind", SENT)
-def test_the_first_signal_asks_and_one_that_comes_later_acts(monkeypatch, kind) -> None:
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL  # importing changes no handler
-    with interruptible(), stop_signal() as stop:
-        os.kill(os.getpid(), kind)
-        assert stop.is_set()
-        os.kill(os.getpid(), kind)  # as a scheduler does, to this process and by its parent
-        monkeypatch.setattr("lcc_rl.runs.interrupts.time.monotonic", lambda: math.inf)
-        with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGINT)
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+def test_the_first_signal_asks_and_one_that_comes_later_acts(monkeypatch) -> None:
+    for kind in SENT:
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL  # importing changes no handler
+        with interruptible(), stop_signal() as stop:
+            os.kill(os.getpid(), kind)
+            assert stop.is_set()
+            os.kill(os.getpid(), kind)  # as a scheduler does, to this process and by its parent
+            with monkeypatch.context() as later:
+                later.setattr("lcc_rl.runs.interrupts.time.monotonic", lambda: math.inf)
+                with pytest.raises(KeyboardInterrupt):
+                    os.kill(os.getpid(), signal.SIGINT)
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 def test_an_error_that_follows_from_an_interrupt_is_one(capsys) -> None:

@@ -159,17 +159,17 @@ def test_random_kills_lose_nothing() -> None:
     assert "nothing lost, all readable, rows identical" in done.stdout
 
 
-@pytest.mark.parametrize("srun", [None, "/usr/bin/srun"])
 def test_a_sweep_on_slurm_without_slurm_is_refused_in_one_line(
-    tmp_path, monkeypatch, capsys, srun
+    tmp_path, monkeypatch, capsys
 ) -> None:
-    monkeypatch.setattr(sweeps, "which", lambda name: srun)
     monkeypatch.setattr(sweeps, "make_plan", lambda config: sweeps.Plan(sweeps.MOST_RUNS + 1))
     launcher = {"_target_": "hydra_plugins.submitit.SlurmLauncher"}
     parts = {"launcher": launcher, "sweep": {"dir": str(tmp_path / "sweep")}}
-    with pytest.raises(SystemExit):
-        sweeps.SweepCallback().on_multirun_start(OmegaConf.create({"hydra": parts}))
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert ("use hydra/launcher=lcc_submitit_local" in said) == (srun is None)
+    for srun in (None, "/usr/bin/srun"):
+        monkeypatch.setattr(sweeps, "which", lambda name, srun=srun: srun)
+        with pytest.raises(SystemExit):
+            sweeps.SweepCallback().on_multirun_start(OmegaConf.create({"hydra": parts}))
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert ("use hydra/launcher=lcc_submitit_local" in said) == (srun is None)
     assert not list(tmp_path.iterdir())

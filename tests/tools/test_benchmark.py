@@ -9,7 +9,7 @@ import torch
 from benchmarks import command
 from lcc_rl.io.files import read_parquet
 
-SHORT = ("env", "collect", "analytic")  # the others take most of the time
+SHORT = ("env",)  # the others take most of the time
 
 
 def check_rows(rows: pd.DataFrame, name: str) -> None:

@@ -75,10 +75,3 @@ def test_what_was_measured_by_a_model_is_that_model(tmp_path, capsys) -> None:
     assert capsys.readouterr().out == said
     pixels = imread(tmp_path / "drawn.png")[..., :3].reshape(-1, 3)
     assert len(np.unique((255 * pixels).astype(int), axis=0)) > 100
-
-
-def test_both_files_are_needed(tmp_path, capsys) -> None:
-    with pytest.raises(SystemExit) as stop:
-        tool.main(["--bench", "x.parquet"])
-    assert stop.value.code == 2
-    assert "give --bench and --electric, or --draw" in capsys.readouterr().err
