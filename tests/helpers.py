@@ -18,7 +18,7 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent
 from lcc_rl.agents.loop import TrainingLoop
-from lcc_rl.config import load
+from lcc_rl.config import identity, load
 from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.drivers.population import bootstrap, from_table
@@ -125,6 +125,14 @@ def single_env(
 def make_agent(cfg: TrainConfig) -> Agent:
     """Build the agent of a configuration for the shipped drivers."""
     return build_agent(cfg, POPULATION)
+
+
+def small_loop(folder: Path, *overrides: str, variant: str = "alcc") -> TrainingLoop[Any]:
+    """Build the loop of an agent that trains on the wavy profiles in a folder."""
+    cfg = compose(variant, *overrides)
+    env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
+    agent = make_agent(cfg)
+    return agent.loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
 
 
 def weights(loop: TrainingLoop[Any]) -> torch.Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -64,10 +63,3 @@ def words_of(line: str) -> list[str]:
     words = shlex.split(line, comments=True)
     pairs = zip(["", *words], words, strict=False)
     return [word for before, word in pairs if word != "…" or before.startswith("--")]
-
-
-def inline(page: Path) -> Iterator[str]:
-    """Yield every code span of a page's text."""
-    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
-    for span in re.findall(r"`([^`]+)`", text):
-        yield " ".join(span.split())

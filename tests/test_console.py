@@ -14,6 +14,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from commands import run_command
+from helpers import slow_but
 
 import lcc_rl
 from lcc_rl.cli.console import COMMANDS
@@ -65,18 +66,20 @@ def test_help_fits_80_columns(tmp_path, monkeypatch, subtests) -> None:
             assert [line for line in shown.splitlines() if len(line) > 80] == []
 
 
+QUICK_TO_START = [  # what is done, what is not loaded for it, and what is printed
+    (
+        ["lcc_rl.cli.train", "--help-all"],
+        HEAVY | TABLES,
+        "calibration: both, energy, global, local",
+    ),
+    (["lcc_rl.cli.train", "-h", "agent=td3"], HEAVY | TABLES, "td3             analytic, ddpg"),
+    (["lcc_rl.cli.status", "."], HEAVY | TABLES, "1 finished"),
+    (["from lcc_rl import results; print(results.load('.')['seed'].tolist())"], HEAVY, "[3]"),
+]
+
+
 @pytest.mark.parametrize(
-    ("words", "unused", "printed"),
-    [
-        (
-            ["lcc_rl.cli.train", "--help-all"],
-            HEAVY | TABLES,
-            "calibration: both, energy, global, local",
-        ),
-        (["lcc_rl.cli.train", "-h", "agent=td3"], HEAVY | TABLES, "td3             analytic, ddpg"),
-        (["lcc_rl.cli.status", "."], HEAVY | TABLES, "1 finished"),
-        (["from lcc_rl import results; print(results.load('.')['seed'].tolist())"], HEAVY, "[3]"),
-    ],
+    ("words", "unused", "printed"), slow_but(QUICK_TO_START[:1], QUICK_TO_START)
 )
 def test_what_need_not_wait_for_torch_does_not_load_it(tmp_path, words, unused, printed) -> None:
     write_parquet(pd.DataFrame({"strategy": ["idm"]}), tmp_path / "run" / "episodes.parquet")
@@ -140,6 +143,7 @@ sys.path.insert(0, "")
 """
 
 
+@pytest.mark.slow
 def test_commands_run_on_a_newer_python_in_a_clone_that_is_installed_elsewhere() -> None:
     refused = f"{NEWER}\nfrom hydra._internal.utils import get_args_parser\nget_args_parser()"
     done = subprocess.run([sys.executable, "-c", refused], capture_output=True, text=True)

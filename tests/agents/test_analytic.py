@@ -9,22 +9,19 @@ import pandas as pd
 import pytest
 import torch
 from helpers import (
-    POPULATION,
     REWARD,
     TERMS,
     compose,
     make_agent,
     slow_but,
+    small_loop,
     string,
-    wavy_profiles,
     weights,
 )
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.agent import derived_seed
-from lcc_rl.agents.gradient import GradientLoop
-from lcc_rl.config import identity
-from lcc_rl.envs import build_env
+from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.errors import Diverged, Interrupted
 from lcc_rl.io.files import read_parquet
 
@@ -40,11 +37,8 @@ SMALL = (
 WHOLE = ("training.segment=${scenario.horizon}", "agent.bootstrap=false", "agent.gamma=1")
 
 
-def make(folder, *overrides: str, variant: str = "alcc") -> GradientLoop:
-    cfg = compose(variant, *SMALL, *overrides)
-    env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
-    agent = make_agent(cfg)
-    return GradientLoop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
+def make(folder, *overrides: str, variant: str = "alcc") -> TrainingLoop:
+    return small_loop(folder, *SMALL, *overrides, variant=variant)
 
 
 PAIR, PLATOON = "automated human", "(automated human*5)*2"
@@ -62,7 +56,7 @@ def test_same_seed_same_rows_and_weights(tmp_path, variant, vehicles) -> None:
     assert not torch.equal(weights(one), weights(other))
 
 
-@pytest.mark.parametrize("overrides", [(), WHOLE])
+@pytest.mark.parametrize("overrides", [(), pytest.param(WHOLE, marks=pytest.mark.slow)])
 def test_resuming_equals_never_having_stopped(tmp_path, overrides) -> None:
     whole = make(tmp_path / "whole", *overrides)
     expected = whole.run()

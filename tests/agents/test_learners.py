@@ -5,25 +5,17 @@ from __future__ import annotations
 import sys
 from types import ModuleType
 
-import pandas as pd
 import pytest
-import torch
 from helpers import (
-    POPULATION,
     check_resuming,
-    compose,
-    make_agent,
     small_env,
-    wavy_profiles,
-    weights,
+    small_loop,
 )
 from page_blocks import ROOT, blocks
 from tensordict import TensorDict
 
 from lcc_rl.agents import PPO, TrainingLoop
 from lcc_rl.agents.agent import Scene
-from lcc_rl.config import identity
-from lcc_rl.envs import build_env
 
 SMALL = (
     *("training.episodes=16", "training.environments=4", "training.checkpoint_every=2"),
@@ -47,22 +39,7 @@ def my_learner(monkeypatch) -> None:
 
 
 def make(folder, agent: str, *overrides: str) -> TrainingLoop:
-    cfg = compose("alcc", *AGENTS[agent], *SMALL, *overrides)
-    env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
-    made = make_agent(cfg)
-    return made.loop(made, env, cfg.training, cfg.seed, folder, identity(cfg))
-
-
-@EACH
-def test_same_seed_same_rows_and_weights(tmp_path, agent) -> None:
-    one, two = (make(tmp_path / name, agent) for name in "ab")
-    first = weights(one)
-    pd.testing.assert_frame_equal(one.run(), two.run(), check_exact=True)
-    assert torch.equal(weights(one), weights(two))
-    assert not torch.equal(weights(one), first)
-    other = make(tmp_path / "c", agent, "seed=1")
-    other.run()
-    assert not torch.equal(weights(one), weights(other))
+    return small_loop(folder, *AGENTS[agent], *SMALL, *overrides)
 
 
 @EACH

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import signal
-
 import pandas as pd
 import pytest
 import torch
 from helpers import (
     ACTION,
-    POPULATION,
     check_resuming,
-    compose,
-    make_agent,
     small_env,
+    small_loop,
     string,
-    wavy_profiles,
     weights,
 )
 
 from lcc_rl.agents.collecting import transitions
-from lcc_rl.agents.loop import episode_statistics
-from lcc_rl.agents.replay import ReplayLoop
-from lcc_rl.config import identity
-from lcc_rl.envs import build_env
-from lcc_rl.errors import Interrupted, ResultsError
+from lcc_rl.agents.loop import TrainingLoop, episode_statistics
+from lcc_rl.errors import ResultsError
 
 SMALL = (
     "training.episodes=20",
@@ -37,11 +29,8 @@ SMALL = (
 )
 
 
-def make(folder, *overrides: str) -> ReplayLoop:
-    cfg = compose("alcc", *SMALL, *overrides)
-    env = build_env(cfg, wavy_profiles(), POPULATION, cfg.training.environments)
-    agent = make_agent(cfg)
-    return ReplayLoop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
+def make(folder, *overrides: str) -> TrainingLoop:
+    return small_loop(folder, *SMALL, *overrides)
 
 
 def test_same_seed_same_rows_and_weights(tmp_path) -> None:
@@ -102,27 +91,6 @@ def test_the_best_policy_is_that_of_its_iteration(tmp_path) -> None:
     assert trainer.best["score"] == pytest.approx(scores.max())
     best = seen[trainer.best["iteration"]]
     assert all(torch.equal(value, best[key]) for key, value in trainer.best["weights"].items())
-
-
-def test_sigint_saves_and_says_how_to_go_on(tmp_path) -> None:
-    expected = make(tmp_path / "whole").run()
-    before = signal.getsignal(signal.SIGINT)
-    stopped = make(tmp_path / "stopped")
-    iterate = stopped._iterate
-
-    def interrupted(collector):
-        if stopped.iteration == 2:
-            signal.raise_signal(signal.SIGINT)  # in the middle of the third iteration
-        return iterate(collector)
-
-    stopped._iterate = interrupted
-    with pytest.raises(Interrupted, match=r"after iteration 3 of 5; .*resume="):
-        stopped.run()
-    assert signal.getsignal(signal.SIGINT) is before
-    again = make(tmp_path / "stopped")
-    again.load()
-    assert again.iteration == 3
-    pd.testing.assert_frame_equal(again.run(), expected, check_exact=True)
 
 
 def test_a_checkpoint_of_another_configuration_is_refused(tmp_path) -> None:

@@ -79,9 +79,8 @@ def followed(delay: float, noise: float, drivers: int = 40) -> tuple[pd.DataFram
     return table, known
 
 
-@pytest.mark.parametrize(
-    ("delay", "noise"), [pytest.param(0.0, 0.0, marks=pytest.mark.slow), (0.6, 0.25)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("delay", "noise"), [(0.0, 0.0), (0.6, 0.25)])
 def test_the_reaction_of_drivers_is_found(delay, noise) -> None:
     episodes, known = followed(delay, noise)
     observed = observe(episodes)

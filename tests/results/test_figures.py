@@ -273,7 +273,7 @@ def test_a_ring_closes_and_no_line_crosses_it() -> None:
 @pytest.mark.usefixtures("blank_figures")
 def test_networks_and_own_controllers_have_figures_and_those_of_the_package_none(tmp_path) -> None:
     own = "lcc_rl.pieces.LinearACC"  # as a user's class, under a name of its own
-    rivals = f"compare={{mine: {own}, acc_filtered: acc_filtered, mpc: mpc}}"
+    rivals = f"compare={{mine: {own}, acc_filtered: acc_filtered}}"
     words = ("variant=alcc", "policy=pretrained", "+filter=cbf", rivals, "evaluation.drivers=3")
     evaluation.run(tiny("evaluate", *words, agent=False), tmp_path)
     drawn = {path.stem for path in (tmp_path / "figures").iterdir()} - {"overview", "space_time"}

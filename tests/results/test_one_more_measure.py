@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 
 import pytest
+from helpers import slow_but
 
 from lcc_rl.cli import table
 from lcc_rl.commands import evaluation, score
@@ -31,11 +32,11 @@ def mine(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("mine", "blank_figures")
-@pytest.mark.parametrize("words", [["variant=idm"], ["task=i80-follow", "compare=[idm_acc]"]])
+@pytest.mark.parametrize("words", slow_but(["task"], ["task", "variant=idm"]))
 def test_it_stands_in_every_table(words, tmp_path, capsys) -> None:
-    task = words[0].startswith("task")
-    limit = [f"+task.limits.{MINE.key}=1e-3"] * task
-    rows = evaluation.run(load("evaluate", [*words, *limit, *SMALL]), tmp_path)
+    task = ["task=i80-follow", "compare=[idm_acc]", f"+task.limits.{MINE.key}=1e-3"]
+    typed = task if words == "task" else [words]
+    rows = evaluation.run(load("evaluate", [*typed, *SMALL]), tmp_path)
     assert rows[MINE.key].max() > 0.01
     assert "jerk" in capsys.readouterr().out  # of a task by its limit
     found = {}
@@ -48,10 +49,11 @@ def test_it_stands_in_every_table(words, tmp_path, capsys) -> None:
     assert MINE.key in found["csv"].splitlines()[0].split(",")
     table.main([str(tmp_path), "--format", "markdown"])
     assert "max jerk [m/s³]" in capsys.readouterr().out.splitlines()[0]
-    if task:
+    if words == "task":
         assert "limit: jerk ≤ 0.001 [m/s³]" in found["text"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("mine")
 def test_a_score_has_it(tmp_path) -> None:
     words = ["idm_acc", "--task", "i80-follow", "--on", "everyday", "--out", str(tmp_path / "out")]

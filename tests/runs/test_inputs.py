@@ -113,6 +113,7 @@ def test_what_a_run_reads_is_no_setting() -> None:
         load("train", ["inputs={}"])
 
 
+@pytest.mark.slow
 def test_a_file_of_config_dir_is_an_input(place) -> None:
     own = place / "own" / "controller" / "slow.yaml"
     own.parent.mkdir(parents=True)
