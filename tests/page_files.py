@@ -34,19 +34,14 @@ def recordings() -> list[list[list[str]]]:
 
 def official(path: Path) -> None:
     """Both recordings as the official CSV."""
-    text = csv_text([row for part in recordings() for row in part])
-    path.write_bytes(gzip.compress(text.encode()) if path.suffix == ".gz" else text.encode())
+    text = csv_text([row for part in recordings() for row in part]).encode()
+    path.write_bytes(gzip.compress(text) if path.suffix == ".gz" else text)
 
 
 def native(path: Path) -> None:
     """One native file for each recording."""
     for number, rows in enumerate(recordings()):
         path.with_name(path.name.replace("*", str(number))).write_text(native_text(rows))
-
-
-def portal(path: Path) -> None:
-    """Both recordings as the portal exports them."""
-    path.write_text(portal_text([row for part in recordings() for row in part]))
 
 
 def pairs(path: Path) -> None:
@@ -102,14 +97,18 @@ def highd(path: Path) -> None:
     meta.to_csv(path.with_name("01_tracksMeta.csv"), index=False)
 
 
+def record(path: Path, unit: float = 3.6) -> None:
+    """One record, in km/h."""
+    time = np.arange(0.0, 300.0, 0.1)
+    frame = pd.DataFrame({"t": time, "v": unit * (12.0 + 4.0 * np.sin(time / 5.0))})
+    frame.to_csv(path, index=False)
+
+
 def trips(path: Path) -> None:
     """A folder of twelve drives, each in a file."""
     path.mkdir()
-    record(path / "long.csv")
-    frame = pd.read_csv(path / "long.csv")
     for number in range(12):
-        frame.assign(v=frame["v"] / 3.6).to_csv(path / f"trip{number}.csv", index=False)
-    (path / "long.csv").unlink()
+        record(path / f"trip{number}.csv", 1.0)
 
 
 def openacc(path: Path) -> None:
@@ -122,36 +121,20 @@ def openacc(path: Path) -> None:
 def drives(path: Path) -> None:
     """Twelve wavy drives of twelve days."""
     time = np.arange(0.0, 150.0, 0.1)
-    parts = [
-        pd.DataFrame(
-            {
-                "drive": f"2021-03-{day:02}-22-35-14_{day}",
-                "time_s": time,
-                "speed_mps": 18.0 + 5.0 * np.sin(time / (4.0 + day)),
-            }
-        )
-        for day in range(1, 13)
-    ]
+    parts = []
+    for day in range(1, 13):
+        drive = {"drive": f"2021-03-{day:02}-22-35-14_{day}", "time_s": time}
+        parts.append(pd.DataFrame({**drive, "speed_mps": 18.0 + 5.0 * np.sin(time / (4.0 + day))}))
     pd.concat(parts, ignore_index=True).to_parquet(path)
 
 
-def record(path: Path) -> None:
-    """One record in km/h."""
-    time = np.arange(0.0, 300.0, 0.1)
-    frame = pd.DataFrame({"t": time, "v": 3.6 * (12.0 + 4.0 * np.sin(time / 5.0))})
-    frame.to_csv(path, index=False)
-
-
-def drivers(path: Path) -> None:
-    """Six of the shipped drivers."""
-    write_parquet(load_drivers().head(6), path)
-
-
 # By the name that the pages use; a star stands for several files.
-FILES: dict[str, Callable[[Path], None]] = {
+FILES: dict[str, Callable[[Path], object]] = {
     "trajectories.csv.gz": official,
     "raw/trajectories-*.txt": native,
-    "portal.csv": portal,
+    "portal.csv": lambda path: path.write_text(
+        portal_text([row for part in recordings() for row in part])
+    ),
     "other.csv": official,
     "my.csv": table,
     "mine.csv": wide,
@@ -166,7 +149,7 @@ FILES: dict[str, Callable[[Path], None]] = {
     "fcd.csv": fcd,
     "01_tracks.csv": highd,
     "my_trips": trips,
-    "drivers.parquet": drivers,
+    "drivers.parquet": lambda path: write_parquet(load_drivers().head(6), path),
 }
 # What stands where a page leaves a path out, by the setting or the group that it belongs to.
 LEFT_OUT = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -34,6 +35,16 @@ READERS: dict[str, Callable[[str], object]] = {
         0.1, 9
     ),
 }
+
+
+def written(folder: Path, frame: pd.DataFrame, name: str = "my.csv", **options: object) -> str:
+    """Write a table as parquet, or as text with the options of pandas; return its path."""
+    path = folder / name
+    if path.suffix == ".parquet":
+        frame.to_parquet(path)
+    else:
+        frame.to_csv(path, index=False, **options)
+    return str(path)
 
 
 def speed(time: np.ndarray, car: int) -> np.ndarray:

@@ -59,9 +59,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ),
     ("ngsim", GOOD.encode() + b"7,\xe9,1" + b",1" * 15 + b"\n", "row 41, column 'Frame_ID' holds"),
     ("ngsim", gzip.compress(GOOD.encode())[:-20], "damaged or cut off"),
-    ("table", gzip.compress(csv(TABLE).encode())[:2000], "damaged or cut off"),
     ("table", b"id,t,v,ahead,gap,x\n1,0,\xff,0,1,1\n", "column 'v' holds 'ÿ'"),
-    ("table", b"id,t,v,ahead,gap,x\n1,0,\xff,\0,1,1\n", "is not UTF-8 text; expected a table"),
     (
         "table",
         b"PK\x03\x04" + bytes(40),
@@ -93,7 +91,6 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("episodes", csv(pairs().drop(columns="gap_m")), "lacks the column gap_m.*data.columns="),
     ("openacc", openacc_text().replace("IVS", "gap"), "lacks IVS1, IVS2"),
     ("openacc", csv(TABLE), "expected a native OpenACC file"),
-    ("record", "time,speed\n0,1\n1,1\n", "lacks the column time_s, speed_mps; .*leader.columns"),
     ("record", RECORD, "holds 0 samples"),
     # Cells that are blank, words, not finite or out of range.
     ("ngsim", ngsim(v_Vel="abc"), "data row 3, column 'v_Vel' holds 'abc'; expected a number"),
@@ -102,24 +99,20 @@ BAD: list[tuple[str, str | bytes, str]] = [
         ngsim(Local_Y="NaN"),
         "row 3, column 'Local_Y' holds nothing; expected a number",
     ),
-    ("ngsim", ngsim(v_Acc="inf"), "data row 3, column 'v_Acc' holds 'inf'"),
-    ("ngsim", ngsim(Space_Headway="9" * 40), "data row 3, column 'Space_Headway' holds '9999"),
     (
         "ngsim",
         ngsim(Vehicle_ID=""),
         "row 3, column 'Vehicle_ID' holds nothing; expected a whole",
     ),
+    ("ngsim", ngsim(v_Acc="inf"), "data row 3, column 'v_Acc' holds 'inf'"),
     ("ngsim", ngsim(Vehicle_ID="7.5"), "column 'Vehicle_ID' holds '7.5'; expected a whole number"),
-    ("ngsim", ngsim(Vehicle_ID='"1,15"'), "data row 3, column 'Vehicle_ID' holds '1,15'"),
     ("ngsim", ngsim(Lane_ID="70000"), "data row 3, column 'Lane_ID' holds '70000'"),
     ("table", table(v="fast"), "data row 501, column 'v' holds 'fast'; expected a number"),
+    ("table", table(v=1e20), r"data row 501, column 'v' holds '1e\+20'"),
     ("table", COMMAS.replace(";11,", ";1l,", 1), "column 'v' holds '1l,"),
     ("table", csv(TABLE.assign(v="")), "data row 1, column 'v' is blank"),
-    ("table", table(v=1e20), r"data row 501, column 'v' holds '1e\+20'"),
     ("table", table(id=""), "data row 501, column 'id' is blank"),
     ("table", table(id="x" * 1001), "data row 501, column 'id' holds a text of 1,001 signs"),
-    ("episodes", episodes(1, episode=""), "row 2, column 'episode' is blank"),
-    ("drives", DRIVES + ",0.1,1\n", "data row 2, column 'drive' is blank"),
     ("record", RECORD + "0,1\n1,fast\n", "data row 2, column 'speed_mps' holds 'fast'"),
     # Rows that contradict each other, and times.
     ("table", csv(LATE), r"data row 1191, vehicle 3 is 1e\+11 s after the first"),
@@ -127,28 +120,19 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("episodes", episodes(3, leader_id=8), "row 4, column 'leader_id' changes within an episode"),
     (
         "episodes",
-        csv(pairs(2, 5).iloc[[0, 5]]),
-        "no episode has two samples: .*column 'episode'",
-    ),
-    (
-        "episodes",
         TWICE,
         "row 601, column 'time_s' repeats a moment of its episode with other values, as do 50 %",
     ),
     ("table", csv(TABLE.assign(t=0.0)), "data row 2, vehicle 1, column 't' repeats a moment of"),
-    ("drives", DRIVES + "b,0,1\n", "no drive has two samples: .*data row 1, column 'drive'"),
-    ("record", RECORD + "0,1\n0,2\n", "data row 2, column 'time_s' repeats .* as do 50 %"),
     ("leaders", RECORD + "0,1\n1,2\n2,1\n", r"covers 0–2 s, not the stretch 0–9 s"),
     # Values that are implausible, and units.
     ("ngsim", csv_text(pair(v_Length=4.5, Preceding=0)[:20]), "is 4.5 feet; .*data.units=metres"),
     ("source", csv_text(pair(range(200), v_Vel=400)), "holds 121.92 m/s .*max_speed=70"),
     ("table", csv(TABLE.assign(t=1e3 * TABLE["t"])), "are 100 s apart; .*is the time in ms"),
-    ("episodes", csv(pairs().eval("time_s = 1000 * time_s")), "are 100 s apart; .*data.units"),
     ("table", csv(TABLE.assign(v=3.6 * TABLE["v"])), "by their positions the vehicles drive"),
     ("table", csv(TABLE.assign(x=-TABLE["x"])), "must grow in the direction of travel"),
     ("drives", DRIVES + "a,0.1,1\na,0.2,9\n", "recording a, data row 3, .* changes by 80 m/s²"),
     ("record", RECORD + "0,540\n1,540\n", r"data row 1, .* holds 540 m/s .*plausible\.max_speed"),
-    ("record", RECORD + "0,5\n500,5\n", "are 500 s apart; .*leader.units.time=ms"),
 ]
 
 

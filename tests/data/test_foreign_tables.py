@@ -11,19 +11,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from page_files import highd
-from table_text import BY_GAP, LENGTH, long_table
+from table_text import BY_GAP, LENGTH, long_table, written
 
 from lcc_rl.data.leaders import DriveLeaders
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.data.tables import UNITS, named_unit
 from lcc_rl.errors import DataError
-
-
-def written(folder: Path, frame: pd.DataFrame, name: str = "my.csv", **options: object) -> str:
-    """Write a table as text and return its path."""
-    frame.to_csv(folder / name, index=False, **options)
-    return str(folder / name)
-
 
 NAMED = {
     "Target Speed, mph": "mph",

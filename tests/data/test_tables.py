@@ -5,13 +5,12 @@ from __future__ import annotations
 import gzip
 from functools import partial
 from io import StringIO
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from helpers import check_refused
-from table_text import GAP, LENGTH, long_table, openacc_text, pairs, speed
+from table_text import GAP, LENGTH, long_table, openacc_text, pairs, speed, written
 
 from lcc_rl.data import text
 from lcc_rl.data.car_following import Criteria
@@ -27,15 +26,6 @@ from lcc_rl.errors import ConfigError, DataError
 BASE = {"vehicle": "id", "time": "t", "speed": "v"}
 BY_GAP = {**BASE, "leader": "ahead", "gap": "gap"}
 BY_LANE = {**BASE, "lane": "lane", "position": "x", "length": "length"}
-
-
-def written(folder: Path, frame: pd.DataFrame, name: str = "my.csv", **options: object) -> str:
-    path = folder / name
-    if path.suffix == ".parquet":
-        frame.to_parquet(path)
-    else:
-        frame.to_csv(path, index=False, **options)
-    return str(path)
 
 
 def truth(loaded: LoadedEpisodes, cars: int = 3) -> pd.DataFrame:
