@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import gzip
 from pathlib import Path
 from time import perf_counter
 from types import SimpleNamespace
 
 import pytest
 from commands import NO_AGENT, tiny
-from table_text import long_table
 
 from lcc_rl.agents.controller import ControllerPolicy
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.config import load
-from lcc_rl.data import text
 from lcc_rl.data.leaders import Mixture
-from lcc_rl.data.table_source import TableSource
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.ovm import OVMConstants
 from lcc_rl.io import memory
@@ -155,16 +151,3 @@ def test_an_evaluation_that_does_not_fit_is_refused_once_the_data_are_read(
     monkeypatch.setattr(memory, "available", lambda device: 12 * 2**20)
     with pytest.raises(ConfigError, match="an evaluation of 3984 episodes of 40 steps side by"):
         evaluation.run(cfg, tmp_path)
-
-
-@pytest.mark.parametrize("more", [b"", gzip.compress(b"")], ids=["one", "two members"])
-def test_a_table_larger_than_memory(tmp_path, monkeypatch, more) -> None:
-    path = tmp_path / "big.csv.gz"
-    path.write_bytes(gzip.compress(long_table(rows=200).to_csv(index=False).encode()) + more)
-    columns = {"vehicle": "id", "time": "t", "speed": "v", "leader": "ahead", "gap": "gap"}
-    source = TableSource(path=str(path), columns=columns)
-    source.load()
-    for module in (memory, text):
-        monkeypatch.setattr(module, "available", lambda device="cpu": 29_000)
-    with pytest.raises(ConfigError, match=r"reading .*big\.csv\.gz needs about"):
-        source.load()
