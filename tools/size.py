@@ -1,4 +1,4 @@
-"""Print how large the project is, or check it: python tools/size.py [--check], make size, make lint.
+"""Print or check how large the project is: python tools/size.py [--check]; make size, make lint.
 
 Only files that git tracks count. Code is what is left of the lines without docstrings, comments and
 blank lines. Guards are the lines of `raise`, of calls of check_… and require_…, and of functions
@@ -198,7 +198,7 @@ def structure(names: Iterable[str]) -> dict[str, int]:
 
 
 def main(words: Sequence[str]) -> int:
-    """Print the table and the structure; or check them, and return 1 if one is above its ceiling."""
+    """Print table and structure; or check them, and return 1 if one is above its ceiling."""
     names, check = tracked(), "--check" in words
     found, shape = table(names, {} if check else cases()), structure(names)
     lines = above(found, shape)
