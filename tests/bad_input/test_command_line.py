@@ -183,18 +183,13 @@ def test_the_second_process_in_a_folder_touches_nothing(tmp_path, monkeypatch) -
 FULL = "lcc_rl: error: .*No space left on device: 'standard output'\n"
 OUTPUTS = [
     ("status run | true", 0, ""),
-    ("-h | true", 0, ""),
     ("--version >&-", 0, ""),
-    ("status run >&- 2>&- <&-", 0, ""),
-    ("--version >/dev/full", 2, FULL),
-    ("status run >/dev/full", 2, FULL),
     ("table run >/dev/full", 2, FULL),
-    ("table run --all --format csv >/dev/full", 2, FULL),
     ("trian 2>/dev/full", 2, ""),
 ]
 
 
-@pytest.mark.parametrize(("words", "code", "said"), slow_but(OUTPUTS[-3:-2], OUTPUTS))
+@pytest.mark.parametrize(("words", "code", "said"), slow_but(OUTPUTS[2:3], OUTPUTS))
 def test_output_that_cannot_be_written_ends_nothing(run, tmp_path, words, code, said) -> None:
     command = f"{sys.executable} -m lcc_rl {words}; exit ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import os
 import resource
-import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from commands import TINY, assert_same_tables, run_command, tiny
+from commands import assert_same_tables, tiny
 
 from lcc_rl.commands import training
 from lcc_rl.config import load
@@ -28,8 +27,6 @@ from lcc_rl.io.tensors import read_torch, write_torch
 from lcc_rl.results.runs import save_config
 from lcc_rl.runs.states import inspect_run
 
-TRAIN = ("variant=alcc", *TINY)
-
 
 @contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
@@ -40,21 +37,6 @@ def files_of_at_most(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-@contextmanager
-def small_disk(folder: Path, size: str) -> Iterator[None]:
-    """Mount a file system in memory; skip the test where that is not allowed."""
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
-    try:
-        subprocess.run(command, check=True, capture_output=True)
-    except (OSError, subprocess.CalledProcessError):
-        pytest.skip("mounting is not allowed here")
-    try:
-        yield
-    finally:
-        subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
 NOISE = np.random.default_rng(0).normal(size=20_000)
@@ -151,18 +133,3 @@ def test_a_folder_that_is_removed_during_the_run_is_one_clear_error(tmp_path) ->
     with pytest.raises(ResultsError, match="the folder was removed during the run"):
         training.run(tiny("train", "variant=alcc", *words), tmp_path / "run", quiet=True)
     assert read_torch(tmp_path / "elsewhere" / "checkpoint.pt")["iteration"] == 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("size", ["4k", "200k"])
-def test_a_command_on_a_disk_without_space_ends_in_one_line(tmp_path, size) -> None:
-    disk = tmp_path / "disk"
-    with small_disk(disk, size):
-        target = f"hydra.run.dir={disk / 'run'}"
-        done = run_command("lcc_rl.cli.train", *TRAIN, target, cwd=tmp_path)
-        assert not list(disk.rglob("*.tmp"))
-    lines = [line for line in done.stderr.splitlines() if "error" in line]
-    assert done.returncode == 2
-    assert len(lines) == 1, done.stderr
-    assert lines[0].startswith(f"lcc_rl: error: {disk / 'run'}")
-    assert lines[0].endswith("No space left on device")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import warnings
 
 import numpy as np
@@ -61,13 +59,6 @@ def test_gymnasium_accepts_it() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped)
-
-
-@pytest.mark.slow
-def test_a_name_with_its_module_needs_no_import() -> None:
-    code = f"import gymnasium; print(gymnasium.make({NAME!r}, overrides={SHORT}).reset()[0].shape)"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert found.stdout.strip() == "(7,)", found.stderr
 
 
 @pytest.mark.parametrize(
