@@ -59,23 +59,9 @@ def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, ca
     np.testing.assert_allclose(every["score"], run.headline["score"])
     limits = task_of(cfg).limits
     assert {*limits, *(f"limit_{x}" for x in limits), "total_path_energy_kj"} <= set(every)
-    halves = [rows.assign(source=source) for source in ("a", "b")]
-    pooled = Run(tmp_path, pd.concat(halves, ignore_index=True), cfg)
-    assert pooled.table["of"].tolist() == ["a"] * len(every) + ["b"] * len(every)
-    table_again([str(tmp_path), "--format", "latex"])
-    latex = capsys.readouterr().out
-    against = task_of(cfg).against
-    score = run.headline.set_index("strategy").loc[against, "score"]
-    assert any(f"{in_words(against)} & {score:{form}}" in latex for form in (".2f", ".1f", ",.0f"))
-    assert r"saved [\%]" in latex
-    assert latex.splitlines()[-1].startswith("% ")  # the note, as a comment
-    table_again([str(tmp_path), "--format", "markdown"])
-    assert not capsys.readouterr().out.splitlines()[-1].startswith("|")
     table_again([str(tmp_path), "--format", "latex", "--columns", "who,saved_pct"])
     heads = capsys.readouterr().out.splitlines()[2]
     assert heads.split(" & ") == ["driven by", r"saved [\%] \\"]
-    table_again([str(tmp_path), "--all"])
-    assert len(capsys.readouterr().out) > len(str(run))
     with pytest.raises(ConfigError, match="Did you mean 'saved_pct'"):
         table_again([str(tmp_path), "--columns", "saved"])
 
