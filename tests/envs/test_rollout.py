@@ -31,30 +31,27 @@ WANTED = [("vehicles", name) for name in ("gap", "power", "relative_speed")]
 OBSERVED = [REWARD, (*TERMS, "hdv_energy"), (*TERMS, "safety")]
 
 
-def test_entries_equal_those_of_a_rollout(subtests) -> None:
-    for variant in ["alcc", "reference"]:
-        for more in [
-            followers(1),
-            followers(3),
-            string("human (automated human)*2"),
-            "+filter=cbf",
-        ]:
-            with subtests.test(variant=variant, more=more):
-                # From such gaps nobody collides, after which a rollout would begin anew.
-                overrides = [more, "training.gap_range=[0.8,1.5]"]
-                observed = OBSERVED if variant == "alcc" else [REWARD, (*TERMS, "safety")]
-                policy = make_agent(compose(variant, *overrides)).policy
-                with torch.no_grad():
-                    env = small_env(variant, 5, overrides, seed=3)
-                    expected = env.rollout(20, shared_policy(policy), break_when_any_done=False)
-                    unrolled = DifferentiableRollout(
-                        small_env(variant, 5, overrides, seed=3), WANTED, observed
-                    )
-                    _, record = unrolled.play(unrolled.start(), policy.module, 20)
-                    got = unrolled.assemble(record)
-                for key in [*WANTED, *observed, ("done",), ("terminated",), OBSERVATION]:
-                    assert torch.equal(got.get(("next", *key)), expected.get(("next", *key))), key
-                assert torch.equal(got[ACTION], expected[ACTION])
+FILTER, SEVERAL = "+filter=cbf", string("human (automated human)*2")
+
+
+@pytest.mark.parametrize(
+    ("variant", "more"),
+    [*(("alcc", x) for x in (followers(1), followers(3), SEVERAL, FILTER)), ("reference", FILTER)],
+)
+def test_entries_equal_those_of_a_rollout(variant, more) -> None:
+    # From such gaps nobody collides, after which a rollout would begin anew.
+    overrides = [more, "training.gap_range=[0.8,1.5]"]
+    observed = OBSERVED if variant == "alcc" else [REWARD, (*TERMS, "safety")]
+    policy = make_agent(compose(variant, *overrides)).policy
+    with torch.no_grad():
+        env = small_env(variant, 5, overrides, seed=3)
+        expected = env.rollout(20, shared_policy(policy), break_when_any_done=False)
+        unrolled = DifferentiableRollout(small_env(variant, 5, overrides, seed=3), WANTED, observed)
+        _, record = unrolled.play(unrolled.start(), policy.module, 20)
+        got = unrolled.assemble(record)
+    for key in [*WANTED, *observed, ("done",), ("terminated",), OBSERVATION]:
+        assert torch.equal(got.get(("next", *key)), expected.get(("next", *key))), key
+    assert torch.equal(got[ACTION], expected[ACTION])
 
 
 def total_power(env: TransformedEnv, network, seed: int = 0) -> torch.Tensor:

@@ -270,6 +270,7 @@ def test_a_ring_closes_and_no_line_crosses_it() -> None:
         assert np.abs(np.diff(segments, axis=1)).max() < 30.0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_networks_and_own_controllers_have_figures_and_those_of_the_package_none(tmp_path) -> None:
     own = "lcc_rl.pieces.LinearACC"  # as a user's class, under a name of its own

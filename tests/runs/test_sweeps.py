@@ -14,6 +14,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from commands import AGENT, NO_AGENT, TINY, run_command
+from helpers import slow_but
 from omegaconf import OmegaConf
 
 from lcc_rl import results
@@ -26,6 +27,7 @@ from lcc_rl.runs.sweeps import run_name
 ROOT = Path(__file__).resolve().parents[2]
 GAP = "scenario.controllers.automated.time_gap"
 SWEEP = ("-m", *NO_AGENT, "variant=idm")
+INTERRUPTED = ("agents.loop.ProgressReporter.update", "commands.training.build_agent")
 
 
 def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path) -> None:
@@ -55,9 +57,7 @@ def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path
     assert not table.exists()
 
 
-@pytest.mark.parametrize(
-    "where", ["agents.loop.ProgressReporter.update", "commands.training.build_agent"]
-)
+@pytest.mark.parametrize("where", slow_but(INTERRUPTED[:1], INTERRUPTED))
 def test_a_sweep_that_is_interrupted_names_the_way_to_resume(tmp_path, monkeypatch, where) -> None:
     """Within an iteration, and where a library answers an interrupt with an error of its own."""
 
