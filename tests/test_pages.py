@@ -15,6 +15,7 @@ from types import ModuleType
 import matplotlib as mpl
 import pytest
 from commands import DATA, QUICK, jobs_in_threads, process_state, run_command
+from helpers import slow_but
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from page_blocks import PAGES, ROOT, Block, blocks, commands
 from page_files import LEFT_OUT, write_named
@@ -265,10 +266,9 @@ def folder(tmp_path, monkeypatch) -> Path:
         sys.modules.pop(path.stem, None)
 
 
-def test_every_command_of_the_pages_composes(folder, subtests) -> None:
-    for page in PAGES:
-        with subtests.test(page=page.name):
-            Reader(folder).read(page)
+@pytest.mark.parametrize("page", slow_but(PAGES[:1], PAGES), ids=lambda page: page.name)
+def test_every_command_of_a_page_composes(page, folder) -> None:
+    Reader(folder).read(page)
 
 
 @pytest.fixture(scope="module")
