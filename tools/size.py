@@ -28,10 +28,10 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # Above these make lint fails; what is built next may take the difference to what there is.
 CEILINGS = {
     "lcc_rl + tools": {"lines": 38_600, "code": 25_000},
-    "tests": {"lines": 20_200},
+    "tests": {"lines": 19_700},
     "conf": {"yaml": 135},
 }
-CASES = 2_200  # that a run of all quick tests collects, see tests/tools/test_size.py
+CASES = 1_100  # that a run of all quick tests collects, see tests/tools/test_size.py
 STRUCTURE = {"names in several modules": 175, "floors": 12, "circles": 0}
 
 
