@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lcc_rl.drivers.parameters import COLUMNS, IDM, MODEL, PLAUSIBLE, REACTION, users
+from lcc_rl.drivers.parameters import IDM, MODEL, REACTION, parameters_of, users
 from lcc_rl.errors import DataError, ResultsError
 from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.laws import LAWS
@@ -75,7 +75,7 @@ def models_of(frame: pd.DataFrame, name: str) -> pd.Series:
 
 
 def check_drivers(frame: pd.DataFrame, name: str) -> None:
-    """Check that a table holds drivers: their parameters, each within :data:`PLAUSIBLE`, once.
+    """Check that a table holds drivers: their parameters, each within its plausible range, once.
 
     Raises:
         DataError: naming the table, row and column of the first fault.
@@ -83,19 +83,15 @@ def check_drivers(frame: pd.DataFrame, name: str) -> None:
     if frame.empty:
         raise DataError(f"{name}: the table holds no drivers")
     models = models_of(frame, name)
-    found = {column: models.isin(users(parameter)) for parameter, column in COLUMNS.items()}
-    needed = {column: rows for column, rows in found.items() if rows.any()}
-    missing = [column for column in needed if column not in frame.columns]
+    needed = parameters_of(models.unique())
+    missing = [one.column for one in needed.values() if one.column not in frame.columns]
     if missing:
         raise DataError(f"{name}: missing column(s) {', '.join(missing)}")
-    for parameter, column in COLUMNS.items():
-        if column not in needed:
-            continue
+    for parameter, (column, _, _, (low, high)) in needed.items():
         if not pd.api.types.is_numeric_dtype(frame[column]):
             raise DataError(f"{name}: column {column!r} is not numeric")
         values = frame[column].to_numpy(np.float64, na_value=np.nan)
-        low, high = PLAUSIBLE[parameter]
-        bad = needed[column].to_numpy() & ~((values >= low) & (values <= high))
+        bad = models.isin(users(parameter)).to_numpy() & ~((values >= low) & (values <= high))
         if bad.any():
             row = int(bad.argmax())
             raise DataError(

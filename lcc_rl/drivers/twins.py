@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -22,11 +21,9 @@ from torch import Tensor
 
 from lcc_rl.drivers.genetic import Progress
 from lcc_rl.drivers.observed import Observed
-from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.energy import PaperMotor
 from lcc_rl.errors import Concern
-from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, NoiseStep, Reaction
-from lcc_rl.functional.kinematics import advance_gap, advance_speed
+from lcc_rl.functional.driver_models import DriverConstants, NoiseStep, Reaction, follow
 from lcc_rl.functional.laws import LAWS
 
 # Moving averages of the speeds before their energy is computed; the first one counts for the choice
@@ -42,14 +39,13 @@ DELAYS = tuple(round(0.1 * number, 1) for number in range(10))  # among which is
 NOISES = tuple(round(0.05 * number, 2) for number in range(13))  # likewise [m/s²]
 TOLERANCES = {"lost": 0.05, "spectrum": 0.2, "growth": 0.05}  # relative; see choose
 CARS = 5  # drivers in a row, along whom energy must not grow
-CAP = 3.0  # bounds the gaps that they start at, see lcc_rl.functional.idm.equilibrium_gap [s]
 HELD = "the recorded drivers hold their speeds"
 LEAST_LOST = 1e-6  # share of the energy that drivers in traffic lose at least to accelerating
 DENSITY, HERTZ = "density_", "hz"  # around the frequency in the name of a column
 RECORDED, TWINS, REACTING = "recorded", "as calibrated", "with reaction"
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
-People = tuple[DriverLaw, tuple[Tensor, Tensor], DriverConstants]  # model, (v0, T), the rest
+People = tuple[DriverConstants, tuple[Tensor, Tensor]]  # model and (v0, T) of drivers
 
 
 def measure(speed: Array, gap: Array, samples: NDArray[np.int64], time_step: float) -> pd.DataFrame:
@@ -182,7 +178,7 @@ def growth(
     own equilibrium. What is returned is the logarithm of the ratio of both energies per distance,
     for every reaction; infinity if anybody collides.
     """
-    law, own, constants = _people(observed, drivers)
+    law, own = _people(observed, drivers)
     leader = observed.leader_speed.double().cpu()
     generator, chance = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
     shape, step = (len(reactions), 1, observed.count), observed.time_step
@@ -190,9 +186,9 @@ def growth(
     inside = _inside(len(leader), observed.samples)
     for car in range(CARS):
         order = torch.from_numpy(chance.permutation(observed.count))
-        shared = {name: getattr(constants, name)[order] for name in law.shared}
-        who = (law, (own[0][order], own[1][order]), constants.with_(**shared))
-        gap = law.equilibrium_gap(leader[0], *who[1], who[2], CAP)
+        shared = {name: getattr(law, name)[order] for name in law.shared()}
+        who = (law.with_(**shared), (own[0][order], own[1][order]))
+        gap = who[0].equilibrium_gap(leader[0], *who[1])
         motion = _follow(who, leader, (leader[0], gap), reactions, shape, generator, step)
         collided |= [bool(((gaps <= 0.0) & inside).any()) for _, gaps in motion]
         if car in (0, CARS - 1):
@@ -216,25 +212,25 @@ def _follow(
 
     The leader's speed is ``[time, …]``, broadcast to ``shape``: reactions, draws, drivers.
     """
-    law, own, constants = who
+    law, own = who
     level = torch.tensor([one.noise for one in reactions]).double().view(-1, 1, 1)
     noise_step = NoiseStep.of(step)
 
     def draw() -> Tensor:
         return torch.randn(shape[1:], generator=generator, dtype=torch.float64)
 
-    speed, gap = (x.expand(shape) for x in start)
     noise, last = noise_step.start(draw(), draw())
-    seen = [(speed, gap, leader[0])] * (round(reactions[0].delay / step) + 1)
-    motion = [(speed, gap)]
-    for before, after in pairwise(leader):
-        seen = [*seen[1:], (speed, gap, before)]
-        old_speed, old_gap, ahead = seen[0]
-        command = law.acceleration(old_speed, old_gap, old_speed - ahead, *own, constants)
-        reached, _ = advance_speed(speed, command + level * noise, step)
-        gap = advance_gap(gap, before, speed, after, reached, step)
-        speed, noise, last = reached, noise_step.next(noise, last, draw()), noise
-        motion.append((speed, gap))
+
+    def strayed(_: int, command: Tensor) -> Tensor:
+        nonlocal noise, last
+        command = command + level * noise
+        noise, last = noise_step.next(noise, last, draw()), noise
+        return command
+
+    speed, gap = (x.expand(shape) for x in start)
+    late = round(reactions[0].delay / step)
+    driven = follow(law, leader, speed, gap, own, step, late, strayed)
+    motion = [(speed, gap), *((speed, gap) for speed, gap, _ in driven)]
     speeds, gaps = (torch.stack(x, 1).numpy() for x in zip(*motion, strict=True))
     return list(zip(speeds, gaps, strict=True))
 
@@ -245,11 +241,11 @@ def one_step_error(observed: Observed, drivers: pd.DataFrame, delay: float) -> f
     The model acts on the recorded state, as old as the delay; the logarithm of this number is, but
     for a constant, the negative likelihood of a sample.
     """
-    law, own, constants = _people(observed, drivers)
+    law, own = _people(observed, drivers)
     series = (observed.leader_speed, observed.follower_speed, observed.gaps)
     leader, speed, gap = (x.double().cpu() for x in series)
     late = round(delay / observed.time_step)
-    wish = law.acceleration(speed, gap, speed - leader, *own, constants)
+    wish = law(speed, gap, speed - leader, *own)
     left = speed.diff(dim=0)[late:] / observed.time_step - wish[: len(wish) - 1 - late]
     last = torch.tensor(observed.samples) - 1 - late
     inside = torch.arange(len(left)).unsqueeze(-1) < last
@@ -257,12 +253,12 @@ def one_step_error(observed: Observed, drivers: pd.DataFrame, delay: float) -> f
 
 
 def _people(observed: Observed, drivers: pd.DataFrame) -> People:
-    """Return model, (v0, T) and constants of the drivers in the order of the records."""
+    """Return the model and (v0, T) of the drivers in the order of the records."""
     table = drivers.set_index("episode").loc[observed.identity["episode"]]
     law = LAWS[str(table["model"].iloc[0])]
-    own = {x: torch.tensor(table[COLUMNS[x]].to_numpy(np.float64)) for x in law.parameters}
-    constants = law.constants().with_(**{name: own[name] for name in law.shared})
-    return law, (own["desired_speed"], own["time_gap"]), constants
+    columns = {name: one.column for name, one in law.table().items()}
+    own = {name: torch.tensor(table[x].to_numpy(np.float64)) for name, x in columns.items()}
+    return law().with_(**{x: own[x] for x in law.shared()}), (own["desired_speed"], own["time_gap"])
 
 
 def ratios(

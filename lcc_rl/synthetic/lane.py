@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lcc_rl.data.trajectories import FRAME
-from lcc_rl.drivers.parameters import COLUMNS, fitted
+from lcc_rl.drivers.parameters import fitted
 from lcc_rl.drivers.population import DriverPopulation
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.idm import equilibrium_gap, simulate_follower
+from lcc_rl.functional.driver_models import PARAMETERS, simulate_follower
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
 Array = NDArray[np.float64]
@@ -146,7 +146,7 @@ def follow(ahead: Tensor, ranks: list[DriverPopulation], xi: Tensor) -> tuple[Ar
     speeds, gaps = [ahead], []
     for rank, drivers in enumerate(ranks):
         own, leading = (drivers.desired_speed.double(), drivers.time_gap.double()), speeds[-1]
-        start = equilibrium_gap(leading[0], *own, drivers.constants)
+        start = drivers.constants.equilibrium_gap(leading[0], *own)
         noise = xi[:, rank].__getitem__
         speed, gap, _ = simulate_follower(
             leading, leading[0], start, *own, drivers.constants, FRAME, noise
@@ -162,7 +162,9 @@ def _truth(ranks: list[DriverPopulation]) -> pd.DataFrame:
     parameters = [drivers.parameters() for drivers in ranks]
     columns = {"vehicle": vehicle, "preceding": vehicle - 1}
     for name in fitted("global"):
-        columns[COLUMNS[name]] = torch.stack([own[name] for own in parameters]).T.flatten().numpy()
+        columns[PARAMETERS[name].column] = (
+            torch.stack([own[name] for own in parameters]).T.flatten().numpy()
+        )
     return pd.DataFrame(columns)
 
 

@@ -86,7 +86,7 @@ def test_drivers_of_several_models_are_a_population(table, written):
     assert population.models == tuple(table["model"])
     assert population.constants == IDMConstants()
     own = population.parameters()
-    assert set(own) == {*LAWS["idm"].parameters, *LAWS["gipps"].parameters}
+    assert set(own) == {*LAWS["idm"].table(), *LAWS["gipps"].table()}
     expected = table["leader_deceleration_mps2"].to_numpy()
     np.testing.assert_allclose(own["leader_deceleration"], expected, rtol=1e-6)
     with pytest.raises(DataError, match="row 1, column 'leader_deceleration_mps2'"):

@@ -15,7 +15,6 @@ from lcc_rl.commands.pipeline import _pass_on
 from lcc_rl.drivers import twins
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.observed import observe
-from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.twins import (
     REACTING,
     RECORDED,
@@ -31,6 +30,7 @@ from lcc_rl.drivers.twins import (
     tried,
 )
 from lcc_rl.errors import DataError
+from lcc_rl.functional.driver_models import PARAMETERS
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.power import acceleration_loss
 
@@ -73,8 +73,11 @@ def followed(delay: float, noise: float, drivers: int = 40) -> tuple[pd.DataFram
     table = table.assign(**{name: values.T.ravel() for name, values in series.items()})
     own = IDMConstants()
     known = pd.DataFrame({"episode": range(drivers), "model": "idm"}).assign(
-        **{COLUMNS["desired_speed"]: v0, COLUMNS["time_gap"]: headway},
-        **{COLUMNS[x]: getattr(own, x) for x in ("acceleration", "deceleration", "min_gap")},
+        **{PARAMETERS["desired_speed"].column: v0, PARAMETERS["time_gap"].column: headway},
+        **{
+            PARAMETERS[x].column: getattr(own, x)
+            for x in ("acceleration", "deceleration", "min_gap")
+        },
     )
     return table, known
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import astuple
 from typing import Any, NamedTuple
 
 import numba
@@ -37,10 +36,17 @@ def motor_power(v: float, a: float) -> float:
     return constant + a * (p01 + v * (p11 + v * p21) + a * (p02 + v * p12))
 
 
+# The order in which the loops read the parameters of IDMConstants.
+KNOWN = (
+    *("acceleration", "deceleration", "min_gap", "exponent", "gap_floor"),
+    *("braking_limit", "acceleration_limit"),
+)
+
+
 class Constants(NamedTuple):
     """What all drivers share, and how their accelerations are measured."""
 
-    known: tuple[float, ...]  # the values of IDMConstants, in order
+    known: tuple[float, ...]  # the values of KNOWN
     root: float
     dt: float
     noise: float
@@ -145,7 +151,7 @@ class NumbaString:
 
     def __init__(self, plain: PlainLoop, start: TensorDictBase) -> None:
         human, estimator, state = plain.human, plain.estimator, plain.start(start)
-        known = astuple(human.drivers)
+        known = tuple(getattr(human.drivers, name) for name in KNOWN)
         root = 2.0 * (known[0] * known[1]) ** 0.5
         average, error = estimator.mean, estimator.measurement_error**2
         self.constants = Constants(

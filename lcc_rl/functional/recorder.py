@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import reduce
 from typing import Any
 
@@ -106,6 +106,23 @@ class Recorder(TorchDispatchMode):
                 raise Untranslatable(f"it takes more than {MOST_STATEMENTS} statements")
         return self.known[statement]
 
+    def needed(self, results: Iterable[int]) -> list[int]:
+        """Return the variables that some are computed from, these included, in order."""
+        found, left = set[int](), list(results)
+        while left:
+            if (variable := left.pop()) not in found:
+                found.add(variable)
+                left += self.statements[variable][1]
+        return sorted(found)
+
+    def dependents(self, inputs: Iterable[int]) -> set[int]:
+        """Return the variables that some decide, these included."""
+        found = set(inputs)
+        for variable, (_, reads) in enumerate(self.statements):
+            if not found.isdisjoint(reads):
+                found.add(variable)
+        return found
+
     def __torch_dispatch__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
     ) -> Any:
@@ -129,6 +146,8 @@ class Recorder(TorchDispatchMode):
 
     def _each(self, name: str, dtype: torch.dtype, *values: Any) -> Tensor:
         """Record an operation on single entries."""
+        if name == "pow" and isinstance(values[1], float) and values[1] == 0.5:  # so does torch
+            name, values = "sqrt", values[:1]
         if name in COMPARISONS:
             dtype = torch.result_type(*values)
         formula = COMPARISONS.get(name) or ARITHMETIC[name]
