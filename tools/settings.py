@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
-from lcc_rl.settings import Settings
+from lcc_rl.settings import Settings, defaults
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "settings.md"
@@ -50,6 +50,8 @@ def settings(kind: type[Settings]) -> Iterator[tuple[str, str, str, str]]:
     for node in body.body:
         if isinstance(node, ast.AnnAssign) and "ClassVar" not in ast.unparse(node.annotation):
             value = "required" if node.value is None else default(ast.unparse(node.value))
+            if isinstance(node.value, (ast.Name, ast.Attribute)):  # a constant from elsewhere
+                value = repr(defaults(kind)[ast.unparse(node.target)])
             yield ast.unparse(node.target), ast.unparse(node.annotation), value, said(lines, node)
 
 

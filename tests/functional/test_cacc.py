@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.braking import Braking, safe_acceleration
 from lcc_rl.functional.cacc import (
     Errors,
     Gains,
@@ -22,7 +23,6 @@ from lcc_rl.functional.hcfs import (
     PlatoonReward,
     hybrid_decision,
     jerk_interval,
-    safe_acceleration,
 )
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.string import entries_ahead
@@ -226,7 +226,7 @@ def test_the_cap_is_safe_and_tight() -> None:
     ahead = 30.0 * torch.rand(shape, generator=generator, dtype=torch.float64)
     speed = 30.0 * torch.rand(shape, generator=generator, dtype=torch.float64)
     gap = 60.0 * torch.rand(shape, generator=generator, dtype=torch.float64) + 0.5
-    cap = safe_acceleration(gap, speed, ahead, T, 3.0, 0.5)
+    cap = safe_acceleration(speed, gap - 0.5, ahead, Braking(3.0, 3.0, 0.0), T)
     feasible = cap >= -3.0
     binding = feasible & (cap <= 3.0) & (speed + cap * T > 1.0)
     assert binding.sum() > 50
