@@ -91,8 +91,8 @@ class Residual(nn.Module):
         return (self.rule(observation) + correction).clamp(-1.0, 1.0)
 
 
-RULES: dict[str, type[Cruise]] = {"idm": IDMACC, "acc": LinearACC}
-NETWORK = "network"
+RULE_KINDS: dict[str, type[Cruise]] = {"idm": IDMACC, "acc": LinearACC}
+NETWORK_ALONE = "network"
 RESIDUAL = "residual_"
 
 
@@ -124,20 +124,20 @@ def make_policy(
             does not know what its actions do.
     """
     size = observation.event_shape[-1]
-    if kind == NETWORK:
+    if kind == NETWORK_ALONE:
         if constants:
             raise ConfigError("agent.constants belong to a rule: use agent.policy=idm or acc")
         return make_actor(size, 1, hidden, seed)
     name = kind.removeprefix(RESIDUAL)
-    if name not in RULES:
-        known = (NETWORK, *RULES, *(RESIDUAL + rule for rule in RULES))
+    if name not in RULE_KINDS:
+        known = (NETWORK_ALONE, *RULE_KINDS, *(RESIDUAL + rule for rule in RULE_KINDS))
         raise unknown_name("agent.policy", kind, known)
     if max_acceleration is None:
         raise ConfigError(
             f"agent.policy={kind} needs to know the acceleration of action 1: the controller of "
             "automated vehicles has no setting max_acceleration [m/s²]"
         )
-    module: nn.Module = Rule(RULES[name], observation, constants, max_acceleration)
+    module: nn.Module = Rule(RULE_KINDS[name], observation, constants, max_acceleration)
     if kind != name:
         module = Residual(module, size, hidden, seed)  # type: ignore[arg-type]
     return TensorDictModule(module, in_keys=["observation"], out_keys=["action"])

@@ -19,7 +19,7 @@ from rich.table import Table
 from lcc_rl.config import config_hash
 from lcc_rl.config.nodes import CALLED, build
 from lcc_rl.config.schemas import CalibrateConfig
-from lcc_rl.drivers.calibrator import OUT, Calibration, counted
+from lcc_rl.drivers.calibrator import OUT, Calibration, count_records
 from lcc_rl.drivers.parameters import MODEL, parameters_of
 from lcc_rl.drivers.population import from_table
 from lcc_rl.envs.inputs import load_episodes
@@ -122,7 +122,7 @@ def _summary(drivers: pd.DataFrame) -> Table:
     modes = list(drivers["mode"].unique())
     table = Table("", *modes, title="calibrated drivers, mean ± standard deviation", **PLAIN)
     parts = {mode: drivers[drivers["mode"] == mode] for mode in modes}
-    table.add_row("fitted", *map(counted, parts.values()))
+    table.add_row("fitted", *map(count_records, parts.values()))
     errors = [(column, column, label) for column, label in ERRORS]
     errors += [(column + OUT, column, f"{label}, held out") for column, label in ERRORS]
     for column, kind, label in errors:

@@ -12,24 +12,23 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.drivers.fit_error import GAP, GAP_SHARE, SPEED, FitError, Objective
-from lcc_rl.drivers.genetic import Evolution, GeneticSettings, Progress, minimise
-from lcc_rl.drivers.genetic import Objective as Minimised
+from lcc_rl.drivers.fit_error import GAP_NRMSE, GAP_RMSE, SPEED_RMSPE, FitError, FitMeasure
+from lcc_rl.drivers.genetic import Evolution, Fitness, GeneticSettings, Progress, minimise
 from lcc_rl.drivers.observed import Observed, Selection, observe
 from lcc_rl.drivers.parameters import (
     DEFAULT_BOUNDS,
-    IDM,
+    DEFAULT_MODEL,
     MODEL,
     REACTION,
-    Limits,
+    BoundPair,
     Mode,
     at_bound,
     find_law,
     fitted,
 )
-from lcc_rl.drivers.twins import HELD, accelerate, compare
+from lcc_rl.drivers.twins import HELD, accelerate, compare_twins
 from lcc_rl.errors import Concern, ConfigError, DataError, unknown_name
-from lcc_rl.functional.driver_models import OWN, PARAMETERS, DriverConstants, Parameter
+from lcc_rl.functional.driver_models import INDIVIDUAL, PARAMETERS, DriverConstants, Parameter
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.settings import Positive, Settings, given_as
 
@@ -38,7 +37,7 @@ OUTER = GeneticSettings(population=12, generations=12, founders=2, patience=4)
 INNER = GeneticSettings(population=16, generations=8)
 
 # Columns of the errors; those of the part held out end in ``_out``.
-ERRORS = {SPEED: "rmspe", GAP: "gap_rmse_m", GAP_SHARE: "gap_nrmse"}
+ERROR_COLUMNS = {SPEED_RMSPE: "rmspe", GAP_RMSE: "gap_rmse_m", GAP_NRMSE: "gap_nrmse"}
 OUT = "_out"
 IMPLAUSIBLE = 1.0  # relative error of the median driver's gap from which on the report says so
 CONGESTED = "; followers that never drive freely do not tell it"
@@ -51,7 +50,7 @@ class Calibration:
     Args:
         drivers: one row per driver, in the order of the episodes in the input.
         report: what was dropped, chosen and found, in plain lines.
-        twins: what :func:`lcc_rl.drivers.twins.compare` measured of the recorded and of the
+        twins: what :func:`lcc_rl.drivers.twins.compare_twins` measured of the recorded and of the
             calibrated drivers, with the column mode.
     """
 
@@ -61,7 +60,7 @@ class Calibration:
 
 
 # The parameters that the local mode does not fit; None: the default of the driver model.
-DEFAULT_CONSTANTS = dict.fromkeys(list(PARAMETERS)[len(OWN) :])
+DEFAULT_CONSTANTS = dict.fromkeys(list(PARAMETERS)[len(INDIVIDUAL) :])
 
 
 def _wide() -> GeneticSettings:
@@ -75,12 +74,12 @@ class Calibrator(Settings):
     """
 
     modes: Annotated[Sequence[Mode], Field(min_length=1)] = ("local",)
-    model: str = IDM  # idm, ovm, fvdm, gipps or the dotted path of a class of your own
-    objective: Objective = "speed_rmspe"  # see lcc_rl.drivers.fit_error.FitError
+    model: str = DEFAULT_MODEL  # idm, ovm, fvdm, gipps or the dotted path of a class of your own
+    objective: FitMeasure = "speed_rmspe"  # see lcc_rl.drivers.fit_error.FitError
     # Share of each episode, its end, that is predicted instead of fitted.
     holdout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
     # Lower and upper bound by parameter, see lcc_rl.functional.driver_models.PARAMETERS.
-    bounds: Mapping[str, Limits] = field(default_factory=lambda: dict(DEFAULT_BOUNDS))
+    bounds: Mapping[str, BoundPair] = field(default_factory=lambda: dict(DEFAULT_BOUNDS))
     # Parameters that the local mode does not fit; None: the default of the driver model.
     constants: Mapping[str, Positive | None] = field(
         default_factory=lambda: dict(DEFAULT_CONSTANTS)
@@ -147,7 +146,7 @@ class Calibrator(Settings):
         parts, twins, report = [], [], list(observed.report)
         for mode in dict.fromkeys(self.modes):
             drivers, lines = _Fit(self, mode, observed, seed, device, progress).drivers()
-            reaction, measured, more = compare(observed, drivers, self.reaction, progress)
+            reaction, measured, more = compare_twins(observed, drivers, self.reaction, progress)
             twins.append(measured.assign(mode=mode))
             if self.reaction:
                 own = {REACTION[name][0]: value for name, value in vars(reaction).items()}
@@ -200,7 +199,7 @@ class _Fit:
 
     def search(
         self,
-        error: Minimised,
+        error: Fitness,
         names: Sequence[str],
         problems: int,
         genetic: GeneticSettings,
@@ -251,14 +250,18 @@ class _Fit:
         for end, part in self.parts.items():
             exact = FitError(part.to("cpu", torch.float64), constants, self.names)
             measures = exact.measures(best.unsqueeze(1))
-            for name, column in ERRORS.items():
+            for name, column in ERROR_COLUMNS.items():
                 columns[column + end] = measures[name].squeeze(1).numpy()
             columns[f"samples{end}"] = part.samples
         for name in self.table_of:
             columns[f"{name}_at_bound"] = name in own and at_bound(own[name], self.limits[name])
         drivers = pd.DataFrame({**columns, "mode": self.mode, MODEL: self.model})
         objective = self.settings.objective
-        needed = [ERRORS[objective]] if objective in ERRORS else [ERRORS[SPEED], ERRORS[GAP_SHARE]]
+        needed = (
+            [ERROR_COLUMNS[objective]]
+            if objective in ERROR_COLUMNS
+            else [ERROR_COLUMNS[SPEED_RMSPE], ERROR_COLUMNS[GAP_NRMSE]]
+        )
         lost = ~np.isfinite(drivers[needed].to_numpy()).all(axis=1)
         if lost.any():
             raise DataError(
@@ -271,7 +274,7 @@ class _Fit:
         return drivers.sort_values("episode", kind="stable", ignore_index=True)
 
 
-def counted(drivers: pd.DataFrame) -> str:
+def count_records(drivers: pd.DataFrame) -> str:
     """Return how many records a calibration in one mode fitted, and of how many drivers."""
     people = len(drivers[["recording", "follower_id"]].drop_duplicates())
     whose = f"{people} driver{'s' * (people > 1)}"
@@ -287,7 +290,7 @@ def _findings(
     """Lines on the quality of the fit and on what it could not identify."""
     error = 100.0 * drivers["rmspe"]
     lines = [
-        f"RMSPE of {counted(drivers)}: mean {error.mean():.2f} %, "
+        f"RMSPE of {count_records(drivers)}: mean {error.mean():.2f} %, "
         f"median {error.median():.2f} %, worst {error.max():.1f} %"
     ]
     for end, part in (("", "fitted"), (OUT, "held out")):

@@ -16,9 +16,9 @@ from lcc_rl.functional.recorder import Untranslatable
 
 log = logging.getLogger("lcc_rl")
 
-SPEED, GAP, GAP_SHARE = "speed_rmspe", "gap_rmse", "gap_nrmse"
+SPEED_RMSPE, GAP_RMSE, GAP_NRMSE = "speed_rmspe", "gap_rmse", "gap_nrmse"
 # What a calibration may minimise; ``both`` is the sum of the two relative errors.
-Objective = Literal["speed_rmspe", "gap_rmse", "gap_nrmse", "both"]
+FitMeasure = Literal["speed_rmspe", "gap_rmse", "gap_nrmse", "both"]
 
 
 class FitError:
@@ -43,7 +43,7 @@ class FitError:
         observed: Observed,
         law: DriverConstants,
         names: Sequence[str],
-        objective: Objective = "speed_rmspe",
+        objective: FitMeasure = "speed_rmspe",
     ) -> None:
         self.observed, self.law, self.objective = observed, law, objective
         self.names = tuple(names)
@@ -61,10 +61,10 @@ class FitError:
 
         The law's parameters may be tensors that broadcast to ``[drivers, candidates]``.
         """
-        measures = self.measures(candidates, self.objective != SPEED)
+        measures = self.measures(candidates, self.objective != SPEED_RMSPE)
         if self.objective in measures:
             return measures[self.objective]
-        return measures[SPEED] + measures[GAP_SHARE]
+        return measures[SPEED_RMSPE] + measures[GAP_NRMSE]
 
     def measures(self, candidates: Tensor, apart: bool = True) -> dict[str, Tensor]:
         """Return every error by name, each as :meth:`__call__` does.
@@ -77,9 +77,9 @@ class FitError:
             simulate = self._by_kernel if self.compiled else self._by_tensors
             speed, gap = simulate(self._parameters(candidates), apart)
             return {
-                SPEED: (speed / self._norms[0]).sqrt(),
-                GAP: (gap / self._samples).sqrt(),
-                GAP_SHARE: (gap / self._norms[1]).sqrt(),
+                SPEED_RMSPE: (speed / self._norms[0]).sqrt(),
+                GAP_RMSE: (gap / self._samples).sqrt(),
+                GAP_NRMSE: (gap / self._norms[1]).sqrt(),
             }
 
     def _parameters(self, candidates: Tensor) -> dict[str, Tensor]:

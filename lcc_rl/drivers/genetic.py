@@ -15,7 +15,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.io.memory import require_memory
 from lcc_rl.settings import NonNegative, Positive, Settings
 
-Objective = Callable[[Tensor], Tensor]
+Fitness = Callable[[Tensor], Tensor]
 Progress = Callable[[int, int, str], None]
 
 SIMULATED = 12  # numbers that the simulation of an individual holds besides its genes
@@ -59,7 +59,7 @@ class Evolution:
 
 
 def minimise(
-    objective: Objective,
+    objective: Fitness,
     lower: Tensor,
     upper: Tensor,
     problems: int,
@@ -98,7 +98,7 @@ def minimise(
 
 
 def _evolve(
-    evaluate: Objective,
+    evaluate: Fitness,
     problems: int,
     random: _Random,
     settings: GeneticSettings,
@@ -148,7 +148,7 @@ def _latin_hypercube(random: _Random, count: int) -> Tensor:
     return (strata + random.uniform(count, dims)) / count
 
 
-def _in_units(objective: Objective, lower: Tensor, upper: Tensor) -> Objective:
+def _in_units(objective: Fitness, lower: Tensor, upper: Tensor) -> Fitness:
     """Wrap the objective: genes of the unit box in, finite fitness out."""
     span = upper - lower
 

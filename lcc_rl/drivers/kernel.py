@@ -11,12 +11,12 @@ from torch import Tensor
 
 from lcc_rl.functional.driver_models import DriverConstants, follow
 from lcc_rl.functional.machine_code import kept
-from lcc_rl.functional.recorder import TYPES, Recorder
+from lcc_rl.functional.recorder import NUMBER_TYPES, Recorder
 
 # The inner loop runs over the candidates of one driver, in which it becomes vector instructions.
 # numba drops the branch for an argument that is None. Gaps follow the trapezoidal rule (A18d), the
 # leader's part of which is the same for all candidates.
-SOURCE = """
+TEMPLATE = """
 def kernel(apart, leader, follower, gaps, samples, parameters, total):
     speed, gap = np.empty_like(total[0, 0]), np.empty_like(total[0, 0])
 {memory}
@@ -39,7 +39,7 @@ def kernel(apart, leader, follower, gaps, samples, parameters, total):
                 if apart is not None:
                     distance[i] += (gap[i] - seen) * (gap[i] - seen)
 """
-MOTION = ("speed[i]", "gap[i]", "ahead", "ahead_reached")  # what a step changes
+STEP_INPUTS = ("speed[i]", "gap[i]", "ahead", "ahead_reached")  # what a step changes
 
 
 def squared_errors(
@@ -83,14 +83,14 @@ def _source(
         recorder.add(tensor, torch.tensor([recorder.variable(expression, ())]))
         return tensor
 
-    motion = [number(expression) for expression in MOTION]
+    motion = [number(expression) for expression in STEP_INPUTS]
     own = {name: number(f"p{place}[i]") for place, name in enumerate(names)}
     with torch.no_grad(), recorder:
         speed, gap, *leader = motion
         law = kind(**dict(constants)).with_(**{name: own[name] for name in kind.shared()})
         pair = own["desired_speed"], own["time_gap"]
         reached, *_ = next(follow(law, torch.stack(leader), speed, gap, pair, time_step))
-    return _written(recorder, int(recorder.numbers(reached, dtype)), time_step, TYPES[dtype])
+    return _written(recorder, int(recorder.numbers(reached, dtype)), time_step, NUMBER_TYPES[dtype])
 
 
 def _written(recorder: Recorder, reached: int, time_step: float, number: str) -> str:
@@ -98,7 +98,7 @@ def _written(recorder: Recorder, reached: int, time_step: float, number: str) ->
 
     So is the reciprocal of such a divisor: a step multiplies by it.
     """
-    statements, inputs = recorder.statements, range(len(MOTION))
+    statements, inputs = recorder.statements, range(len(STEP_INPUTS))
     changing = recorder.dependents(inputs)
     for variable in sorted(changing):
         formula, reads = statements[variable]
@@ -124,7 +124,7 @@ def _written(recorder: Recorder, reached: int, time_step: float, number: str) ->
         else:
             texts[i] = f"({expression})"
     places = [int(texts[i][1:-3]) for i in parameters]
-    return SOURCE.format(
+    return TEMPLATE.format(
         memory=_indented(4, [f"{x.split('[')[0]} = np.empty_like(total[0, 0])" for x in before]),
         own=_indented(8, [f"p{place} = parameters[{place}][driver]" for place in places]),
         before=_indented(12, before or ["pass"]),

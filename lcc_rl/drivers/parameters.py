@@ -21,14 +21,14 @@ REACTION = {
     "delay": ("reaction_delay_s", 0.0, 3.0),
     "noise": ("acceleration_noise_mps2", 0.0, 3.0),
 }
-IDM = "idm"
+DEFAULT_MODEL = "idm"
 MODEL = "model"  # the column that names a driver's model; a table without it is of the IDM
 # A parameter this close to a bound, as a share of the range, counts as being on it.
 BOUND_TOLERANCE = 0.005
 
 Mode = Literal["local", "global"]
-Limits = Annotated[tuple[Number, Number], Field(strict=False)]  # lower and upper
-DEFAULT_BOUNDS: dict[str, Limits] = {name: one.bounds for name, one in PARAMETERS.items()}
+BoundPair = Annotated[tuple[Number, Number], Field(strict=False)]  # lower and upper
+DEFAULT_BOUNDS: dict[str, BoundPair] = {name: one.bounds for name, one in PARAMETERS.items()}
 
 
 def find_law(name: str) -> type[DriverConstants]:
@@ -57,7 +57,7 @@ def parameters_of(models: Iterable[str]) -> dict[str, Parameter]:
     return {name: found[name] for name in (*PARAMETERS, *found) if name in found}
 
 
-def fitted(mode: str, model: str = IDM) -> tuple[str, ...]:
+def fitted(mode: str, model: str = DEFAULT_MODEL) -> tuple[str, ...]:
     """Return the parameters that a mode fits: (v0, T), or all of the model."""
     parameters = tuple(LAWS[model].table())
     return parameters[:2] if mode == "local" else parameters

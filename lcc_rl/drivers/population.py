@@ -13,16 +13,16 @@ from torch import Tensor
 
 from lcc_rl.drivers.parameters import (
     DEFAULT_BOUNDS,
-    IDM,
+    DEFAULT_MODEL,
     REACTION,
     at_bound,
     find_law,
     parameters_of,
     users,
 )
-from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers, models_of, reaction_of
+from lcc_rl.drivers.tables import PAIR_IDENTITY, check_drivers, load_drivers, models_of, reaction_of
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.driver_models import OWN, PARAMETERS, Reaction
+from lcc_rl.functional.driver_models import INDIVIDUAL, PARAMETERS, Reaction
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.settings import NonNegative, Positive, checked
@@ -63,7 +63,7 @@ class DriverPopulation:
     def __post_init__(self) -> None:
         if not self.ids:
             raise ConfigError("driver population: holds no drivers")
-        table = parameters_of(self.models or (IDM,))
+        table = parameters_of(self.models or (DEFAULT_MODEL,))
         for name, values in self.parameters().items():
             low, high = table[name].plausible
             unused = values.isnan() if self.models else torch.zeros(()).bool()
@@ -83,10 +83,6 @@ class DriverPopulation:
     def __len__(self) -> int:
         """Number of drivers."""
         return len(self.ids)
-
-    def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw drivers with replacement: indices ``[count]`` on the CPU."""
-        return torch.randint(len(self), (count,), generator=generator)
 
     def select(self, index: Tensor) -> DriverPopulation:
         """Return the drivers at ``index`` ``[chosen]``, in that order, repetitions included."""
@@ -126,7 +122,7 @@ class DriverPopulation:
         Of IDM drivers these are five; of a mixture of models NaN stands for what a driver lacks.
         """
         own = {"desired_speed": self.desired_speed, "time_gap": self.time_gap}
-        shared = {name: getattr(self.constants, name) for name in LAWS[IDM].shared()}
+        shared = {name: getattr(self.constants, name) for name in LAWS[DEFAULT_MODEL].shared()}
         own |= shared if self.models is None else self.own
         device = self.desired_speed.device
         return {
@@ -181,7 +177,7 @@ def from_table(table: pd.DataFrame) -> DriverPopulation:
     """
     check_drivers(table, "driver table")
     models = models_of(table, "driver table")
-    shared = LAWS[IDM].shared() if (models == IDM).all() else ()
+    shared = LAWS[DEFAULT_MODEL].shared() if (models == DEFAULT_MODEL).all() else ()
     own = {name: table[PARAMETERS[name].column].to_numpy(np.float64) for name in shared}
     constants = IDMConstants(
         **{name: float(values[0]) for name, values in own.items() if np.ptp(values) == 0.0}
@@ -200,7 +196,7 @@ def from_table(table: pd.DataFrame) -> DriverPopulation:
     more = {
         name: _tensor(table[one.column].where(models.isin(users(name))))
         for name, one in parameters_of(models.unique()).items()
-        if name not in OWN
+        if name not in INDIVIDUAL
     }
     return replace(found, models=tuple(models), own=more)
 
@@ -216,9 +212,11 @@ def _tensor(values: np.ndarray | pd.Series) -> Tensor:
 
 def _identities(table: pd.DataFrame) -> tuple[str, ...]:
     """``recording/follower/leader`` where known, else the row's number."""
-    if not set(IDENTITY) <= set(table.columns):
+    if not set(PAIR_IDENTITY) <= set(table.columns):
         return tuple(str(number) for number in range(len(table)))
-    return tuple("/".join(map(str, row)) for row in table[list(IDENTITY)].itertuples(index=False))
+    return tuple(
+        "/".join(map(str, row)) for row in table[list(PAIR_IDENTITY)].itertuples(index=False)
+    )
 
 
 def _flags(table: pd.DataFrame) -> Tensor:

@@ -9,8 +9,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lcc_rl.drivers.parameters import IDM, MODEL, parameters_of
-from lcc_rl.drivers.twins import REACTING, RECORDED, TWINS, densities, ratios
+from lcc_rl.drivers.parameters import DEFAULT_MODEL, MODEL, parameters_of
+from lcc_rl.drivers.twins import REACTING, RECORDED_DRIVERS, TWINS, densities, ratios
 from lcc_rl.errors import DataError
 from lcc_rl.figures.drawing import (
     COLUMN,
@@ -27,7 +27,7 @@ from lcc_rl.figures.drawing import (
 from lcc_rl.results.render import signed
 
 COLOURS = {"local": "#0072b2", "global": "#d55e00"}
-DRIVERS = {RECORDED: INK, TWINS: "#d55e00", REACTING: "#0072b2"}
+DRIVERS = {RECORDED_DRIVERS: INK, TWINS: "#d55e00", REACTING: "#0072b2"}
 RATIOS = {"energy": "energy\nper km", "lost": "lost to\naccelerating", "distance": "distance"}
 
 
@@ -131,11 +131,11 @@ def twins_figure(twins: pd.DataFrame) -> Figure:
             spectra.semilogy(density.index, density, **look)
             ordered = np.sort(one["gap_m"])
             gaps.plot(ordered, np.linspace(0.0, 1.0, len(ordered)), **look)
-            if who != RECORDED:
-                near = ratios(one, found[RECORDED])
+            if who != RECORDED_DRIVERS:
+                near = ratios(one, found[RECORDED_DRIVERS])
                 places = [100.0 * (near[name] - 1.0) for name in RATIOS]
                 share.plot(places, range(len(RATIOS)), "o", color=DRIVERS[who], label=who)
-        share.axvline(0.0, color=DRIVERS[RECORDED], linewidth=1.0)
+        share.axvline(0.0, color=DRIVERS[RECORDED_DRIVERS], linewidth=1.0)
         share.set_yticks(range(len(RATIOS)), list(RATIOS.values()))
         share.set_ylim(len(RATIOS) - 0.5, -0.5)
         style(spectra, "frequency [Hz]", "acceleration [m²/s⁴/Hz]")
@@ -152,7 +152,7 @@ def twins_figure(twins: pd.DataFrame) -> Figure:
 
 
 def _models(drivers: pd.DataFrame) -> list[str]:
-    return list(drivers[MODEL].unique()) if MODEL in drivers else [IDM]
+    return list(drivers[MODEL].unique()) if MODEL in drivers else [DEFAULT_MODEL]
 
 
 def _modes(drivers: pd.DataFrame) -> dict[str, pd.DataFrame]:

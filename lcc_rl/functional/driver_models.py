@@ -60,7 +60,7 @@ PARAMETERS: dict[str, Parameter] = {
         _ACCELERATION,
     ),
 }
-OWN = ("desired_speed", "time_gap")  # what every driver has of its own, whatever the model
+INDIVIDUAL = ("desired_speed", "time_gap")  # what every driver has of its own, whatever the model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,12 +156,13 @@ class DriverConstants(ABC):
     def table(cls) -> dict[str, Parameter]:
         """Return the parameters that a calibration may fit, v0 and T first."""
         known = {**PARAMETERS, **cls.own}
-        return {x: known[x] for x in (*OWN, *(field.name for field in fields(cls))) if x in known}
+        names = [*INDIVIDUAL, *(field.name for field in fields(cls))]
+        return {name: known[name] for name in names if name in known}
 
     @classmethod
     def shared(cls) -> tuple[str, ...]:
         """Return the names of the parameters besides v0 and T."""
-        return tuple(cls.table())[len(OWN) :]
+        return tuple(cls.table())[len(INDIVIDUAL) :]
 
     def with_(self, **changes: Tensor | float) -> Self:
         """Return a copy in which some constants vary by driver (tensors, for calibration)."""

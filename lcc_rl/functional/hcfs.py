@@ -19,7 +19,7 @@ from lcc_rl.functional.kinematics import advance_gap, advance_speed
 Choice = Literal["better", "between", "first"]
 
 
-class Place(NamedTuple):
+class PlatoonPlace(NamedTuple):
     """Place of a vehicle in its platoon, each ``[*batch, N, 1]``.
 
     leader_gap: e_x(i,0), positive where too far behind [m]; leader_speed: v_0 [m/s].
@@ -69,7 +69,7 @@ class PlatoonReward:
         acceleration: Tensor,
         leader_next: Tensor,
         time_step: float,
-        place: Place | None = None,
+        place: PlatoonPlace | None = None,
     ) -> Tensor:
         """Return the reward that an acceleration will earn, ``[*batch, N, 1]`` (H12).
 
@@ -131,7 +131,7 @@ def hybrid_decision(
     reward: PlatoonReward,
     time_step: float,
     max_acceleration: float,
-    place: Place | None = None,
+    place: PlatoonPlace | None = None,
     choice: Choice = "better",
 ) -> Decision:
     """Decide between two candidate accelerations, per follower (H12–H14).

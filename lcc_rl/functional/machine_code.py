@@ -32,7 +32,7 @@ def read(table: Any, place: Any) -> Any:
     return table[place]
 
 
-NAMES = {
+SCOPE = {
     "pick": pick,
     "read": read,
     "ndtri": ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(
@@ -55,7 +55,7 @@ def compiled(source: str) -> Callable[..., None]:
 
 
 def _made(source: str, file: str, name: str) -> Callable[..., None]:
-    scope: dict[str, Any] = {**NAMES, "__name__": __name__}
+    scope: dict[str, Any] = {**SCOPE, "__name__": __name__}
     exec(compile(source.replace("def kernel(", f"def {name}("), file, "exec"), scope)
     return scope[name]
 

@@ -12,7 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 MOST_STATEMENTS = 4000  # numba takes 2 to 4 s for each thousand
 
-TYPES = {torch.float32: "f32", torch.float64: "f64", torch.int64: "i64", torch.bool: "flag"}
+NUMBER_TYPES = {torch.float32: "f32", torch.float64: "f64", torch.int64: "i64", torch.bool: "flag"}
 # Formulas of operations by their names in torch; numbers are {0}, {1}, …
 ARITHMETIC = {
     "add": "{0} + {1}",
@@ -53,8 +53,8 @@ COMPARISONS = {
     "eq": "{0} == {1}",
     "ne": "{0} != {1}",
 }
-OTHERS = ("bitwise_not", "clamp", "index", "searchsorted", "where")  # methods of Recorder
-FOLDS = {"sum": "add", "any": "logical_or", "all": "logical_and"}
+METHODS = ("bitwise_not", "clamp", "index", "searchsorted", "where")  # methods of Recorder
+REDUCTIONS = {"sum": "add", "any": "logical_or", "all": "logical_and"}
 # They move entries, whatever these are, and are applied to the numbers of the variables.
 MOVES = {
     "_unsafe_view", "alias", "cat", "clone", "detach", "expand", "flip", "permute", "repeat",
@@ -134,9 +134,9 @@ class Recorder(TorchDispatchMode):
             return result
         if name in MOVES:
             self._move(func, args, kwargs, result)
-        elif name in OTHERS:
+        elif name in METHODS:
             self.add(result, getattr(self, f"_{name}")(result, *args, **kwargs))
-        elif name in FOLDS:
+        elif name in REDUCTIONS:
             self.add(result, self._fold(name, result, *args, **kwargs))
         elif name == "_to_copy" or (name in {*ARITHMETIC, *COMPARISONS} and not kwargs):
             self.add(result, self._each(name, result.dtype, *given))
@@ -164,7 +164,7 @@ class Recorder(TorchDispatchMode):
 
     def numbers(self, value: Any, dtype: torch.dtype) -> Tensor:
         """Return the variables of a value as numbers of a type."""
-        if (kind := TYPES.get(dtype)) is None:
+        if (kind := NUMBER_TYPES.get(dtype)) is None:
             raise Untranslatable(f"numbers of {dtype}")
         variables = self.of(value)
         if variables is not None:
@@ -196,7 +196,7 @@ class Recorder(TorchDispatchMode):
         dims = [dims] if isinstance(dims, int) else dims or list(range(value.ndim))
         variables = self.numbers(value, result.dtype).movedim(dims, [*range(len(dims))])
         parts = variables.flatten(0, len(dims) - 1).unbind(0)
-        formula = ARITHMETIC[FOLDS[name]]
+        formula = ARITHMETIC[REDUCTIONS[name]]
         return reduce(lambda *two: self._stated(formula, two), parts).reshape(result.shape)
 
     def _bitwise_not(self, result: Tensor, value: Tensor) -> Tensor:

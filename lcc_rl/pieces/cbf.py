@@ -10,7 +10,7 @@ import torch
 from pydantic import InstanceOf
 from torch import Tensor
 
-from lcc_rl.functional.actuation import Motion, predicted
+from lcc_rl.functional.actuation import PairState, predicted
 from lcc_rl.functional.braking import (
     Braking,
     least_room,
@@ -139,8 +139,8 @@ class CBFFilter(StepTransform):
         return [next(given) if needed else nothing for needed in self.remembers.values()]
 
     def _when_it_acts(
-        self, motion: Motion, acceleration: Tensor | float, actuation: Tensor, sensors: Tensor
-    ) -> Motion:
+        self, motion: PairState, acceleration: Tensor | float, actuation: Tensor, sensors: Tensor
+    ) -> PairState:
         """Return the motion when the command begins to act, from one as old as the measurement."""
         past = frames_of(sensors, ACCELERATION)[..., : self.sensing.oldest]
         now = brought_up(motion, sensors[..., :1], past, acceleration, self.time_step)
@@ -165,7 +165,7 @@ class CBFFilter(StepTransform):
         # Any of them that is no number, or infinite, shows in the sum.
         known = (wanted + speed + gap + ahead + ahead_acceleration).isfinite()
         kept = self.kept(memories, wanted)
-        measured = Motion(speed, gap, ahead, kept[0][..., :1])
+        measured = PairState(speed, gap, ahead, kept[0][..., :1])
         worst = self._when_it_acts(self.sensing.worst(measured), -self.braking_ahead, *kept)
         safe = self._safe(replace(worst, gap=worst.gap - self.margin))
         now = self._when_it_acts(measured, ahead_acceleration, *kept)
@@ -173,7 +173,7 @@ class CBFFilter(StepTransform):
         command = command.clamp(-self.max_acceleration, self.max_acceleration)
         return torch.where(known, command, -self.max_acceleration)
 
-    def _safe(self, worst: Motion) -> Tensor:
+    def _safe(self, worst: PairState) -> Tensor:
         """Return the largest command that leaves the vehicle where braking suffices."""
         if self.late:
             return safe_command(worst, self.response, self.limits)
@@ -181,7 +181,7 @@ class CBFFilter(StepTransform):
         return safe_acceleration(*state, self.limits, self.time_step)
 
     def _comfortable(
-        self, wanted: Tensor, now: Motion, ahead_acceleration: Tensor, safe: Tensor
+        self, wanted: Tensor, now: PairState, ahead_acceleration: Tensor, safe: Tensor
     ) -> Tensor:
         """Return the command nearest to what is wanted within all bounds, not clamped."""
         speed, gap, closing = now.speed, now.gap, now.speed - now.ahead
@@ -265,7 +265,7 @@ class Promised(StepTransform):
         safety = self.safety
         speed, gap, ahead, acceleration, *memories, step = self.views(*entries)
         actuation, sensors = safety.kept(memories, speed)
-        now = Motion(speed, gap - safety.margin, ahead, actuation[..., :1])
+        now = PairState(speed, gap - safety.margin, ahead, actuation[..., :1])
         if safety.late:
             room = least_room_to_come(now, actuation[..., 1:], safety.response, safety.limits)
         else:

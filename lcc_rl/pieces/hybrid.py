@@ -20,7 +20,7 @@ from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.hcfs import (
     Choice,
     Decision,
-    Place,
+    PlatoonPlace,
     PlatoonReward,
     hybrid_decision,
     jerk_interval,
@@ -140,7 +140,7 @@ class HCFS(Controller):
             self.reward,
             self.time_step,
             self.max_acceleration,
-            Place(leader_gap, leader[0]),
+            PlatoonPlace(leader_gap, leader[0]),
             self.choice,
         )
 

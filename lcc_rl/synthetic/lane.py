@@ -70,7 +70,7 @@ def drive_platoons(
     drawn = _drawn(leader, drivers, vehicles, noise, recordings)
     ahead, chosen, xi, _ = (np.concatenate(parts, -1) for parts in zip(*drawn, strict=True))
     ranks = [drivers.select(row) for row in torch.from_numpy(chosen)]
-    speed, gap = follow(torch.from_numpy(ahead), ranks, torch.from_numpy(xi))
+    speed, gap = drive_ranks(torch.from_numpy(ahead), ranks, torch.from_numpy(xi))
     made, first, warm_up = [], 0, round(WARM_UP_S / FRAME)
     for (seen, _), (_, chosen, _, length) in zip(recordings, drawn, strict=True):
         own = slice(first, first := first + len(seen))
@@ -131,7 +131,7 @@ def draw_drivers(
     return order[torch.from_numpy(place.astype(np.int64))]
 
 
-def follow(ahead: Tensor, ranks: list[DriverPopulation], xi: Tensor) -> tuple[Array, Array]:
+def drive_ranks(ahead: Tensor, ranks: list[DriverPopulation], xi: Tensor) -> tuple[Array, Array]:
     """Drive platoons behind their leaders, from the equilibrium at the first speed.
 
     Args:

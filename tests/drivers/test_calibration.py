@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from helpers import slow_but
+from helpers import compose, slow_but, wavy_profiles
 
 from lcc_rl.drivers import kernel
 from lcc_rl.drivers.calibrator import Calibration, Calibrator
@@ -18,9 +19,16 @@ from lcc_rl.drivers.fit_error import FitError
 from lcc_rl.drivers.genetic import GeneticSettings
 from lcc_rl.drivers.observed import Selection, observe
 from lcc_rl.drivers.parameters import DEFAULT_BOUNDS, fitted
+from lcc_rl.drivers.population import from_table
+from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional import machine_code
-from lcc_rl.functional.driver_models import PARAMETERS, simulate_follower
+from lcc_rl.functional.driver_models import (
+    PARAMETERS,
+    DriverConstants,
+    Parameter,
+    simulate_follower,
+)
 from lcc_rl.functional.laws import LAWS
 
 QUICK = GeneticSettings(population=8, generations=2, founders=1)
@@ -236,6 +244,60 @@ def test_episodes_are_cut_where_the_holdout_begins(uneven_lengths):
             assert torch.equal(tail[: samples - cut], whole[cut:samples, column])
             assert not head[cut + 1 :].any()
             assert not tail[samples - cut :].any()
+
+
+@dataclass(frozen=True)
+class Helly(DriverConstants):
+    """Helly's linear model: a law of one's own, with a parameter that no other has."""
+
+    gap_gain: float = 0.1
+    speed_gain: float = 0.5
+
+    own: ClassVar = {
+        "gap_gain": Parameter("gap_gain_hz2", "gap gain [1/s²]", (0.01, 1.0), (0.001, 10.0))
+    }
+
+    def wish(self, speed, gap, approach_rate, desired_speed, time_gap):
+        following = self.gap_gain * (gap - self.min_gap - time_gap * speed)
+        following = following - self.speed_gain * approach_rate
+        return torch.minimum(following, self.speed_gain * (desired_speed - speed))
+
+    def steady_gap(self, speed, desired_speed, time_gap):
+        return self.min_gap + time_gap * speed
+
+
+class Sorted(Helly):
+    """The same law by an operation that has no counterpart in machine code."""
+
+    def wish(self, *motion):
+        return super().wish(*motion).unsqueeze(-1).sort(-1).values.squeeze(-1)
+
+
+def test_a_model_of_ones_own_is_calibrated_and_drives(make_episodes):
+    known, name = Helly(gap_gain=0.2, speed_gain=0.8), f"{__name__}.Helly"
+    episodes = make_episodes([15.0, 25.0], [1.0, 1.5], known, [30.0] * 2)
+    settings = {"model": name, "constants": {"gap_gain": 0.2, "speed_gain": 0.8}}
+    drivers = fit(episodes, objective="gap_rmse", **settings).drivers
+    assert drivers["desired_speed_mps"].tolist() == pytest.approx([15.0, 25.0], rel=0.01)
+    assert drivers["time_gap_s"].tolist() == pytest.approx([1.0, 1.5], rel=0.01)
+    assert (drivers["gap_gain_hz2"] == 0.2).all()
+    cfg = compose("alcc", "controller@scenario.controllers.human=calibrated")
+    cfg.scenario.controllers["human"]["noise"] = 0.0
+    data = build_env(cfg, wavy_profiles(), from_table(drivers), 4).rollout(20)
+    speed, gap, rate = (data["vehicles", x][..., 1:, :] for x in ("speed", "gap", "relative_speed"))
+    own = (data["human", "desired_speed"], data["human", "desired_time_gap"])
+    wanted = known(speed, gap, -rate, *own)
+    torch.testing.assert_close(data["next", "command", "human"], wanted)
+
+
+def test_a_law_without_machine_code_is_simulated_by_tensors(uneven_lengths):
+    observed, candidates = observe(uneven_lengths), torch.tensor([[20.0, 1.0]]).double()
+    found = []
+    for law in (Helly(), Sorted()):
+        error = FitError(observed, law, ("desired_speed", "time_gap"))
+        found.append(error(candidates.expand(3, 5, 2)))
+    assert not error.compiled
+    torch.testing.assert_close(*found)
 
 
 def test_the_part_held_out_is_predicted_and_has_no_say_in_the_fit(make_episodes):

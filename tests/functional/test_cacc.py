@@ -19,7 +19,7 @@ from lcc_rl.functional.cacc import (
     platoon_errors,
 )
 from lcc_rl.functional.hcfs import (
-    Place,
+    PlatoonPlace,
     PlatoonReward,
     hybrid_decision,
     jerk_interval,
@@ -184,7 +184,7 @@ def test_one_step_reward_with_spacing(seconds, error) -> None:
     # As above, 0.9 m behind its place and a leader at 10.0 m/s: after the step it is
     # 0.9 + 0.1 (0 + 0.3) = 0.93 m behind, and falls back by 0.3 m/s.
     given = (column(10.0), column(0.5), column(1.0), column(10.5)[0], T)
-    place = Place(column(0.9), column(10.0))
+    place = PlatoonPlace(column(0.9), column(10.0))
     reward = PlatoonReward(10.0, 20.0, 0.03, 30.0, 0.02, 0.5, seconds)
     got = reward.one_step(*given, place)
     wanted = -0.5 * 0.3 - 0.001 * 2.5 - 0.02 * (error / 0.5) ** 2
