@@ -100,7 +100,7 @@ class Calibrator(Settings):
         default_factory=_wide
     )
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         given = {name: x for name, x in values(self.constants).items() if x is not None}
         for name in given:
             if name not in LAWS[self.model].shared:

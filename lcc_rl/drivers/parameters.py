@@ -65,7 +65,7 @@ class Bounds(Settings):
     speed_gain: Limits = (0.05, 3.0)  # λ of fvdm [1/s]
     leader_deceleration: Limits = (0.3, 5.0)  # b̂ of gipps [m/s²]
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         for name, (lower, upper) in values(self).items():
             low, high = PLAUSIBLE[name]
             if not low <= lower < upper <= high:

@@ -49,7 +49,7 @@ class ProgramInput(Settings):
     unit: Short
     meaning: str = ""
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.name not in MEASURED:
             raise ValueError(
                 f"{self.name!r} is not measured: expected self, ahead or behind and an entry of "
@@ -176,9 +176,8 @@ class OnnxPolicy(Controller):
     path: str  # the program's file
     max_acceleration: Positive = 3.0  # in both directions [m/s²]
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         """Read the program, so that a wrong one is refused before anything starts."""
-        super().settled()
         self.program = Program(self.path)
 
     def setup(self, world: World) -> None:

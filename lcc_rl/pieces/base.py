@@ -78,8 +78,8 @@ class Piece(Part, TensorDictModuleBase, Transform):
         """What messages call it."""
         return type(self).__name__
 
-    def settled(self) -> None:
-        """Make it a transform, which reads and writes nothing before :meth:`wire`."""
+    def __post_init__(self) -> None:
+        # A transform, which reads and writes nothing before it is put into a world.
         Transform.__init__(self, in_keys=[], out_keys=[])
 
     def __getattr__(self, name: str) -> Any:

@@ -95,7 +95,7 @@ class CBFFilter(StepTransform):
 
     name = AUTOMATED
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.time_gap is not None and (self.shortest_time_gap or 0.0) >= self.time_gap:
             shortest = f"shortest_time_gap={self.shortest_time_gap}"
             raise ValueError(f"{shortest} must be below time_gap={self.time_gap}")

@@ -235,7 +235,7 @@ class DriverModel(Drivers):
     # Those besides v0 and T, the law's constants; None: of the population.
     parameters: Annotated[InstanceOf[DriverConstants] | None, BeforeValidator(_made)] = None
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if (self.desired_speed is None) != (self.time_gap is None):
             raise ValueError("desired_speed and time_gap belong together: give both or none")
 

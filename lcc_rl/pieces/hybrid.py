@@ -80,7 +80,7 @@ class HCFS(Controller):
 
     reads = (f"{AUTOMATED}.action",)
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.braking > self.max_acceleration:  # more than vehicles can brake is no safe cap
             raise ValueError(
                 f"braking must be at most max_acceleration={self.max_acceleration}, "

@@ -50,7 +50,7 @@ class MPCSettings(Settings):
     tolerance: Annotated[float, Field(ge=1e-10, le=0.1)] = 1e-4
     iterations: Annotated[int, Field(ge=1, le=1_000_000)] = 4000  # after which it gives up
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.longest_time_gap <= self.least_time_gap:
             least = f"least_time_gap={self.least_time_gap}"
             raise ValueError(f"longest_time_gap must be above {least}, got {self.longest_time_gap}")

@@ -44,7 +44,7 @@ class Observation(Feature):
 
     constants: ClassVar[Tensor]
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         zeros = [".".join(key) for key, scale in self._flat().items() if not scale]
         if zeros or not self._flat():
             which = f"{zeros[0]} has scale 0" if zeros else "there is none"

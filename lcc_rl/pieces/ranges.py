@@ -20,7 +20,7 @@ class RangeReward(RewardTerm):
     least: Positive | None = None  # in the entry's unit; None for no bound
     largest: Positive | None = None
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.least is None and self.largest is None:
             raise ValueError("needs least, largest or both")
         if self.least is not None and self.largest is not None and self.least >= self.largest:

@@ -83,7 +83,7 @@ class SafetyReward(RewardTerm):
 
     reads = ("self.gap", "self.relative_speed")
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.floor >= self.threshold:
             raise ValueError(f"floor={self.floor} must be below threshold={self.threshold}")
 

@@ -86,7 +86,7 @@ class FollowerStopper(Averaging):
 
     reads = ("self.speed", "self.gap", "ahead.speed")
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if list(self.gaps) != sorted(self.gaps):
             raise ValueError(f"gaps must increase, got {list(self.gaps)}")
 
@@ -124,7 +124,7 @@ class PISaturation(Averaging):
     closing_time: Positive = 2.0  # how long closing in may take [s]
     transition: Positive = 2.0  # range of gaps over which it changes from one to the other [m]
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.gaps[0] >= self.gaps[1]:
             raise ValueError(f"gaps must be two increasing numbers, got {list(self.gaps)}")
 

@@ -50,7 +50,7 @@ class Sensors(StepTransform):
     name = AUTOMATED
     index: ClassVar[Tensor]
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if (self.dropouts > 0.0) != (self.longest_dropout > 0.0):
             raise ValueError("dropouts and longest_dropout belong together: give both or none")
 

@@ -86,7 +86,7 @@ class HeadwayStart(Part):
     gap_spread: NonNegative = 2.0  # largest deviation of a gap from it; evaluation takes 0 [m]
     speed_spread: NonNegative = 1.0  # … and of a speed from the leader's [m/s]
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.gap_spread >= self.headway:
             raise ValueError(f"gap_spread={self.gap_spread} must be below headway={self.headway}")
 

@@ -102,9 +102,8 @@ class Part(Settings):
             world: what the pieces of the environment share.
             name: the role that it drives, or its key in the configuration.
         """
-        bound = type(self).__new__(type(self))
-        bound.__dict__.update(values(self), name=name or self.name)
-        bound.settled()
+        bound = type(self)(**values(self))
+        bound.name = name or self.name  # type: ignore[misc]
         bound.setup(world or World())
         return bound
 
