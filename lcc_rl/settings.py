@@ -106,6 +106,8 @@ def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
     try:
         return kind(**{key: value for key, value in given.items() if value != "???"})
     except RefusedSetting as error:
+        if error.__cause__ is None:  # its place is named already
+            raise
         raise refused(error.__cause__, kind, where) from None
 
 

@@ -13,14 +13,12 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
 from lcc_rl.io.memory import require_memory
-from lcc_rl.pieces.base import SEED, STEP
+from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP
 
 # Bytes that a weight costs a training: it, its gradient, two moments of Adam, its target.
 WEIGHT = 5 * 4
-OBSERVATION, ACTION = (AUTOMATED, "observation"), (AUTOMATED, "action")
 
 
 def seeded_mlp(inputs: int, outputs: int, hidden: Sequence[int], seed: int) -> MLP:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 
-from lcc_rl.agents.actor import ACTION
 from lcc_rl.errors import ConfigError, require_positive
-from lcc_rl.pieces.base import NEXT, root_key
+from lcc_rl.pieces.base import ACTION, NEXT, root_key
 from lcc_rl.pieces.controllers import Controller
 
 

@@ -146,7 +146,7 @@ def _attempt(piece: Piece, action: object) -> None:
 
 def _compare(piece: Piece, found: Mapping[Key, Tensor], when: str) -> None:
     """Compare what a piece wrote with what its spec promises."""
-    specs = piece.written_specs(torch.Size([BATCH]), None)
+    specs = piece.specs(torch.Size([BATCH]), None)
     for key, value in found.items():
         spec = specs.get(key)
         if spec is None or key in (DONE, TERMINATED):

@@ -11,13 +11,20 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.compiled import Compiled
-from lcc_rl.envs.finite import ACTION
 from lcc_rl.envs.step import DONE, TERMINATED, Step, closure, pieces_of, written
-from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces.base import NEXT, SEED, STEP, Piece, State, StepTransform, as_key
+from lcc_rl.pieces.base import (
+    ACTION,
+    OBSERVATION,
+    SEED,
+    STEP,
+    Piece,
+    State,
+    StepTransform,
+    as_key,
+)
+from lcc_rl.pieces.views import NEXT
 
 Network = Callable[[Tensor], Tensor]
-OBSERVATION = (AUTOMATED, "observation")
 
 
 class DifferentiableRollout:

@@ -7,7 +7,7 @@ from torchrl.data import Composite
 from torchrl.envs.transforms import Transform
 
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces.base import Key
+from lcc_rl.pieces.base import Entry, Key
 
 # Entries of the group that the view shows at the root, without the dimension of one.
 SHOWN = ("observation", "reward", "reward_terms")
@@ -20,6 +20,13 @@ class SingleAgent(Transform):
     n]``; likewise ``"action"``, ``"reward"`` and ``("reward_terms", name)``. The last transform
     of an environment.
     """
+
+    shows = (
+        Entry("observation", "–", "observation in the single-agent view"),
+        Entry("action", "–", "action in the single-agent view"),
+        Entry("reward_terms.name", "–", "terms of the reward in the single-agent view"),
+        Entry("reward", "–", "reward in the single-agent view"),
+    )
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         group = next_tensordict.get(AUTOMATED, None)

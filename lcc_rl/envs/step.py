@@ -16,17 +16,29 @@ from torch import Tensor, compiler, device, ones_like, zeros_like
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, FrameSkipTransform, Transform
 
-from lcc_rl.envs.finite import ACTION, check_numbers
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.finite import any_lost
-from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key, root_key
-from lcc_rl.pieces.rewards import REWARD, RewardPiece, RewardTerm, TotalReward
+from lcc_rl.functional.finite import any_lost, require_finite
+from lcc_rl.pieces.base import (
+    ACTION,
+    OBSERVATION,
+    REWARD,
+    SEED,
+    STEP,
+    Key,
+    Piece,
+    RewardPiece,
+    State,
+    StepTransform,
+    as_key,
+    root_key,
+)
+from lcc_rl.pieces.rewards import RewardTerm, TotalReward
 from lcc_rl.pieces.world import World
 
 DONE, TERMINATED, TRUNCATED = ("done",), ("terminated",), ("truncated",)
 PARTIAL = "_step"  # TorchRL's name of the mask of those that take the step
 # If these entries are finite after a step, all others that matter are.
-TELLING = (("vehicles", "gap"), (ACTION[0], "observation"), REWARD)
+FINITE_CHECKED = (("vehicles", "gap"), OBSERVATION, REWARD)
 
 
 def tick(seed: Tensor, step: Tensor, horizon: int) -> State:
@@ -184,7 +196,7 @@ class Pieces(Compose):
         Raises:
             Diverged: naming the first entry that is not, its step and its episode.
         """
-        telling = [td.get(ACTION, None), *(next_td.get(key, None) for key in TELLING)]
+        telling = [td.get(ACTION, None), *(next_td.get(key, None) for key in FINITE_CHECKED)]
         if not any_lost(value for value in telling if value is not None):
             return
         pieces = [piece for piece in self.transforms if isinstance(piece, Piece)]
@@ -194,7 +206,7 @@ class Pieces(Compose):
         running = ones_like(next_td.get(DONE)) if done is None else ~done
         batch = running.numel()
         reached = {k: x.reshape(1, batch, -1) for k, x in named.items() if x is not None}
-        check_numbers(reached, running.reshape(1, batch, 1), int(next_td.get(STEP).max()))
+        require_finite(reached, running.reshape(1, batch, 1), int(next_td.get(STEP).max()))
 
     def inv(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the inverse of what is not a piece, last first."""

@@ -10,11 +10,11 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.compiled import Compiled
-from lcc_rl.envs.finite import ACTION, check_numbers
 from lcc_rl.envs.step import TERMINATED, Step, closure, entries, pieces_of, written
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.finite import require_finite
 from lcc_rl.functional.random import MASK, STREAM, hash_bits
-from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, as_key
+from lcc_rl.pieces.base import ACTION, SEED, STEP, Key, Piece, State, as_key
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.string import COMMAND, WANTED
 
@@ -115,7 +115,7 @@ class Player:
                     record[key][0] = before[key]
                 record[key][step + first] = value
         after = {key: record[key][-self.horizon :] for key in self.checked}
-        if check_numbers(after, torch.stack(alive), who=self.who, named=named):
+        if require_finite(after, torch.stack(alive), who=self.who, named=named):
             for value in after.values():
                 value.nan_to_num_(0.0, 0.0, 0.0)
         return {key: record[key] for key in self.kept}, torch.stack(alive)

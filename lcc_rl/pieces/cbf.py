@@ -19,12 +19,11 @@ from lcc_rl.functional.braking import (
     safe_command,
 )
 from lcc_rl.functional.layout import join
-from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.sensing import brought_up
 from lcc_rl.pieces.actuation import ACTUATION, Actuation
-from lcc_rl.pieces.base import StepTransform
+from lcc_rl.pieces.base import Entry, RoleTransform
 from lcc_rl.pieces.sensors import ACCELERATION, AHEAD_ACCELERATION, SENSORS, Sensors, frames_of
-from lcc_rl.pieces.string import COMMAND, WANTED
+from lcc_rl.pieces.string import COMMANDED, WANTED
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
 
@@ -33,7 +32,7 @@ STATE = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
 SLOWEST = 1.0  # slower speeds count as this, as in the time gap: the limit has a slope [m/s]
 
 
-class CBFFilter(StepTransform):
+class CBFFilter(RoleTransform):
     """Changes a command as little as needed for the vehicle to stay between its limits.
 
     Two functions of the state are to stay positive: ``gap − margin − τ·(v − v_ahead)``, which
@@ -93,7 +92,8 @@ class CBFFilter(StepTransform):
     least_gap: NonNegative = 2.0  # gap that the limit of the time gap always allows [m]
     from_s: NonNegative = 0.0  # moment of the episode from which on it acts, see Handover [s]
 
-    name = AUTOMATED
+    measures = True
+    writes = (COMMANDED,)
 
     def validate(self) -> None:
         if self.time_gap is not None and (self.shortest_time_gap or 0.0) >= self.time_gap:
@@ -102,7 +102,7 @@ class CBFFilter(StepTransform):
 
     def setup(self, world: World) -> None:
         """Read the commands of the role and what bounds them."""
-        self.role, self.string, self.time_step = self.name, world.string, world.time_step
+        self.time_step = world.time_step
         actuation = world.actuators.get(self.role, Actuation())
         sensors = world.sensors.get(self.role, Sensors())
         self.answers = self.robust or self.role not in {*world.actuators, *world.sensors}
@@ -114,24 +114,21 @@ class CBFFilter(StepTransform):
         self.late = self.response.late > 0 or self.response.share < 1.0
         self.remembers = {ACTUATION: self.late, SENSORS: self.sensing.oldest > 0}
         self.memories = [f"{self.role}.{name}" for name, needed in self.remembers.items() if needed]
-        seen = world.sensed(self.role, STATE)
-        seen = [f"next.{WANTED}.{self.role}", *seen, *self.memories]
         self.from_step = world.steps(self.from_s, "from_s")
-        seen += ["episode.step"] * (self.from_step > 0)
-        self.see(world, seen, [(COMMAND, self.role)], self.role)
+        seen = [f"next.{WANTED}.{self.role}", *STATE, *self.memories]
+        self.declare(world, [*seen, *["episode.step"] * (self.from_step > 0)])
         self.limits = Braking(self.response.braking, self.braking_ahead, self.time_to_collision)
 
     def watch(self) -> Promised:
         """Return the piece that records the steps for which the filter promises its limit."""
         return Promised(safety=self).bind(World(self.string), self.role)
 
-    def compute(self, *entries: Tensor) -> Tensor:
+    def compute(self, wanted: Tensor, *more: Tensor) -> Tensor:
         """Return the commands that the vehicles obey."""
-        wanted, *more = self.views(*entries)
         if not self.from_step:
             return self.filtered(wanted, *more)
-        *more, step = more
-        return torch.where(step < self.from_step, wanted, self.filtered(wanted, *more))
+        *state, step = more
+        return torch.where(step < self.from_step, wanted, self.filtered(wanted, *state))
 
     def kept(self, memories: Sequence[Tensor], nothing: Tensor) -> list[Tensor]:
         """Return the memories of actuation and sensors; ``nothing``, one column, for none."""
@@ -215,7 +212,7 @@ class CBFFilter(StepTransform):
         return (time_gap * share * moving).clamp(min=self.least_gap), slope
 
 
-class Corrected(StepTransform):
+class Corrected(RoleTransform):
     """Writes by how much the command differs from a policy's action, ``(role, "correction")``.
 
     ``[*batch, n, 1]`` [m/s²]: zero where the filter lets the policy drive.
@@ -223,21 +220,20 @@ class Corrected(StepTransform):
 
     max_acceleration: Positive = 3.0  # acceleration of action 1 [m/s²]
 
-    name = AUTOMATED
+    writes = (
+        Entry("role.correction", "m/s²", "what the safety filter added to a policy's command"),
+    )
 
     def setup(self, world: World) -> None:
         """Read the actions and commands of the role."""
-        role = self.name
-        seen = (f"{role}.action", f"next.command.{role}")
-        self.see(world, seen, [(role, "correction")], role)
+        self.declare(world, (f"{self.role}.action", f"next.command.{self.role}"))
 
-    def compute(self, *entries: Tensor) -> Tensor:
+    def compute(self, action: Tensor, command: Tensor) -> Tensor:
         """Return what the filter added."""
-        action, command = self.views(*entries)
         return command - self.max_acceleration * action
 
 
-class Promised(StepTransform):
+class Promised(RoleTransform):
     """Writes for which steps a filter answers, ``(role, "promised")``, ``[*batch, n, 1]``.
 
     1 where the vehicle was safe when the step began and the vehicle ahead braked no harder than
@@ -252,18 +248,23 @@ class Promised(StepTransform):
 
     safety: InstanceOf[CBFFilter]  # the filter, bound
 
-    name = AUTOMATED
+    writes = (
+        Entry(
+            "role.promised", "–", "1 where the safety filter answers for the step: see CBFFilter"
+        ),
+        Entry("role.safe", "–", "1 where full braking keeps the limit when the step begins"),
+    )
 
     def setup(self, world: World) -> None:
         """Read the true state, and what bounds the commands of the role."""
         seen = ["self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration"]
-        seen += [*self.safety.memories, "episode.step"]
-        self.see(world, seen, [(self.name, name) for name in ("promised", "safe")], self.name)
+        self.declare(world, [*seen, *self.safety.memories, "episode.step"])
 
-    def compute(self, *entries: Tensor) -> tuple[Tensor, Tensor]:
+    def compute(
+        self, speed: Tensor, gap: Tensor, ahead: Tensor, acceleration: Tensor, *more: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return 1 for the steps that are covered, and for those that begin safe."""
-        safety = self.safety
-        speed, gap, ahead, acceleration, *memories, step = self.views(*entries)
+        safety, (*memories, step) = self.safety, more
         actuation, sensors = safety.kept(memories, speed)
         now = Motion(speed, gap - safety.margin, ahead, actuation[..., :1])
         if safety.late:

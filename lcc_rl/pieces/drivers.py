@@ -9,7 +9,6 @@ import torch
 from pydantic import BeforeValidator, Field, InstanceOf
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, NoiseStep, Reaction
@@ -19,13 +18,14 @@ from lcc_rl.functional.layout import join
 from lcc_rl.functional.ovm import FVDM_LAW, OVM_LAW
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.functional.random import between, choose, normal, stream_id, uniform
-from lcc_rl.pieces.base import SEED, Key, as_key, require_option
+from lcc_rl.pieces.base import SEED, Entry, require_option
 from lcc_rl.pieces.controllers import Controller, stream_name
+from lcc_rl.pieces.string import LEADER_SPEED
+from lcc_rl.pieces.views import MOTION
 from lcc_rl.pieces.world import MOST_LATE, World
 from lcc_rl.settings import Factors, NonNegative, Positive, Share
 
-LEADER_SPEED = ("leader", "speed")
-MOTION = ("self.speed", "self.gap", "self.relative_speed")
+INT = torch.int64
 # Draws that all drivers of an episode share.
 SPREAD, TIME_GAP = stream_id("drivers.wiener"), stream_id("drivers.time_gap")
 LONGEST = 1000.0  # time gap up to which an equilibrium gap is written [s]
@@ -58,6 +58,18 @@ class Drivers(Controller):
     acceleration_noise: NonNegative | None = None
 
     name = HUMAN
+    known = (
+        Entry("role.driver", "–", "id of each vehicle's driver in the population", 1, INT, True),
+        Entry("role.desired_speed", "m/s", "desired speed v0 of the driver"),
+        Entry("role.desired_time_gap", "s", "desired time gap T of the driver"),
+        Entry(
+            "role.equilibrium_gap", "m", "gap at which the driver follows the leader's first speed"
+        ),
+    )
+    history = Entry(
+        "role.motion_history", "m/s, m, m/s", "past (speed, gap, relative speed), latest first"
+    )
+    stray = Entry("role.acceleration_noise", "m/s²", "noise of the acceleration, latest first", 2)
     law: ClassVar[DriverLaw] = IDM_LAW
     takes_population: ClassVar[bool] = True
     tells_gap: ClassVar[bool] = False  # whether the equilibrium gap is written
@@ -70,7 +82,6 @@ class Drivers(Controller):
         """Take the drivers, and choose what is read and written by the settings."""
         role = self.name
         speeds, time_gaps, self.drivers = self.described(world, f"scenario.controllers.{role}")
-        kept = ["driver", "desired_speed", "desired_time_gap"]
         reaction = self.reaction(world)
         late, strays = self.delay, self.acceleration_noise
         what = "the reaction delay of drivers"
@@ -78,14 +89,11 @@ class Drivers(Controller):
         self.strays = reaction.noise if strays is None else strays
         self.noise_step = NoiseStep.of(world.time_step)
         self.starts = self.tells_gap and not world.string.ring
-        constants = [(role, name) for name in [*kept, *["equilibrium_gap"] * self.starts]]
-        history = [(role, "motion_history")] * (self.late > 0)
-        history += [(role, "acceleration_noise")] * (self.strays > 0)
-        names = [*MOTION, *(".".join(key) for key in constants[1:3]), "episode.seed"]
+        memory = [self.history.wide(3 * self.late)] * (self.late > 0)
+        memory += [self.stray] * (self.strays > 0)
+        names = [*MOTION, f"{role}.desired_speed", f"{role}.desired_time_gap", "episode.seed"]
         names += ["episode.step", *(f"{role}.{name}" for name in self.further)]
-        names += [".".join(key) for key in history]
-        options = constants[:1]
-        self.drive(world, names, history, constants=constants, reset_options=options)
+        self.declare(world, names, keeps=self.known[: 3 + self.starts], remembers=memory)
         self.limits = None  # drives as a person, in automated vehicles, too
         walk = self.wiener / world.time_step**0.5
         self.spreads = tuple(walk * factor for factor in world.deviations(self.wiener_range))
@@ -98,7 +106,7 @@ class Drivers(Controller):
         self.driver_stream = stream_id(f"{stream_name(role)}.driver")
         self.register_buffer("desired_speeds", speeds)
         self.register_buffer("time_gaps", time_gaps)
-        self.register_buffer("index", torch.arange(self.event_shape[0]).unsqueeze(-1))
+        self.register_buffer("index", torch.arange(*self.rows).unsqueeze(-1))
 
     def described(self, world: World, where: str) -> tuple[Tensor, Tensor, DriverConstants]:
         """Return v0 [m/s] and T [s] of the drivers, ``[drivers]``, and what they share.
@@ -106,9 +114,7 @@ class Drivers(Controller):
         Raises:
             ConfigError: if there are none, or they are of other models.
         """
-        if world.population is None:
-            raise ConfigError(f"{where} needs drivers: bind it to a World(population=…)")
-        population = world.population
+        population = world.given("population", where)
         return population.desired_speed, population.time_gap, population.constants
 
     def reaction(self, world: World) -> Reaction:
@@ -180,19 +186,6 @@ class Drivers(Controller):
         """Return the gap at which drivers follow steadily [m], all ``[*batch, n, 1]``."""
         return self.law.equilibrium_gap(speed, desired_speed, time_gap, self.drivers, LONGEST)
 
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        specs = super().written_specs(batch, device)
-        for key in self.targets[1:]:
-            width = 3 * self.late if key[-1] == "motion_history" else 2
-            specs[key] = Unbounded(shape=(*batch, self.event_shape[0], width), device=device)
-        return specs
-
-    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        specs = super().constant_specs(batch, device)
-        shape = (*batch, *self.event_shape)
-        specs[self.constants[0]] = Unbounded(shape=shape, dtype=torch.int64, device=device)
-        return specs
-
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         super().begin(given, start)
         driver = given.get(self.reset_options[0], None)
@@ -208,7 +201,7 @@ class Drivers(Controller):
             speed = start.get(LEADER_SPEED).unsqueeze(-2).expand_as(values[1])
             values.append(self.equilibrium_gap(speed, values[1], values[2], driver))
         for key, value in zip(self.constants, values, strict=True):
-            start.set(as_key(key), value)
+            start.set(key, value)
 
 
 def _made(value: Any) -> Any:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lcc_rl.errors import ConfigError, how_to_install
 from lcc_rl.functional.power import POWER_COEFFICIENTS
+from lcc_rl.pieces.base import Entry
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
@@ -72,11 +73,14 @@ class MPC(MPCSettings, Controller):
     """
 
     reads = ("self.speed", "self.gap", "self.acceleration", "ahead.speed", "ahead.acceleration")
+    writes = (
+        Entry("role.unsolved", "–", "1 where the plan of MPC had no solution, and it brakes"),
+    )
 
     def setup(self, world: World) -> None:
         """Set up the solver."""
         self.check_installed()
-        self.drive(world, self.reads, [(self.name, "unsolved")])
+        self.declare(world)
         own = {field.name: getattr(self, field.name) for field in fields(MPCSettings)}
         self.solver = Solver(MPCSettings(**own))
 

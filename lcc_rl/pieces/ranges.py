@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -26,9 +24,9 @@ class RangeReward(RewardTerm):
         if self.least is not None and self.largest is not None and self.least >= self.largest:
             raise ValueError(f"least={self.least} must be below largest={self.largest}")
 
-    def setup(self, world: World, reads: Sequence[str] | None = None) -> None:
+    def setup(self, world: World) -> None:
         """Read the entry."""
-        super().setup(world, [f"self.{self.entry}"])
+        self.declare(world, [f"self.{self.entry}"])
 
     def reward(self, entry: Tensor) -> Tensor:
         """Return the unweighted term."""

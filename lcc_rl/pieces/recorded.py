@@ -51,7 +51,7 @@ class RecordedDriver(Controller):
         found = _followers(world, f"scenario.controllers.{self.name}")
         self.register_buffer("records", found)
         self.register_buffer("offsets", world.profiles.offsets)
-        self.drive(world, self.reads)
+        self.declare(world)
         self.limits = None
 
     def command(

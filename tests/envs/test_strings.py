@@ -157,8 +157,9 @@ def check(*more) -> None:
 class Wide(Feature):
     """Writes a row per pair of vehicles where its spec says a row per vehicle."""
 
-    def setup(self, world: World) -> None:
-        self.wire([("vehicles", "gap")], [("vehicles", "wide")], (4, 1))
+    role = "vehicles"
+    reads = ("vehicles.gap",)
+    writes = ("vehicles.wide",)
 
     def compute(self, gap: Tensor) -> Tensor:
         return gap.unsqueeze(-2).expand(*gap.shape[:-1], 4, 1)
@@ -167,8 +168,9 @@ class Wide(Feature):
 class Broken(Feature):
     """Cannot compute on such a string."""
 
-    def setup(self, world: World) -> None:
-        self.wire([("vehicles", "gap")], [("vehicles", "broken")], (4, 1))
+    role = "vehicles"
+    reads = ("vehicles.gap",)
+    writes = ("vehicles.broken",)
 
     def compute(self, gap: Tensor) -> Tensor:
         return gap + torch.zeros(3, 1)

@@ -47,7 +47,7 @@ def test_a_controller_commands_what_the_rule_of_an_agent_does(piece, rule, law) 
     generator = torch.Generator().manual_seed(0)
     speed, gap = (20.0 * torch.rand(64, 1, 1, generator=generator) for _ in range(2))
     relative_speed = torch.randn(64, 1, 1, generator=generator)
-    command = piece(**rule.START).bind().limited(speed, gap, relative_speed)
+    command = piece(**rule.START).bind().compute(speed, gap, relative_speed)
     constants = rule.START.values()
     assert torch.equal(command, law(speed, gap, relative_speed, *constants).clamp(-3.0, 3.0))
     assert command.min() == -3.0

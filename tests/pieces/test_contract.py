@@ -33,7 +33,7 @@ from torchrl.envs import Compose, TransformedEnv, check_env_specs
 import lcc_rl.pieces as room
 from lcc_rl.agents.actor import GaussianExploration, make_actor, shared_policy
 from lcc_rl.agents.controller import ControllerPolicy
-from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet
+from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet, as_fleet
 from lcc_rl.envs.clock import Clock, Traffic
 from lcc_rl.envs.step import Pieces, pieces_of
 from lcc_rl.pieces import (
@@ -275,7 +275,7 @@ def makers(road: str) -> dict[str, Callable[[], Piece]]:
 
 
 def world_of(road: str, label: str) -> World:
-    world = World(STRINGS[road], T, HORIZON, followed_profiles(), POPULATION)
+    world = World(STRINGS[road], T, HORIZON, followed_profiles(), POPULATION, as_fleet(None))
     faults = {"actuators": {"slow": LATE}, "sensors": {"slow": BLURRED}}
     world = replace(world, filtered=["automated"], **faults)
     if label == "CalibratedDrivers":
@@ -462,9 +462,7 @@ def test_in_a_replay_buffer_of_transitions(road, name) -> None:
 @each_piece
 def test_written_specs_match_what_is_written(road, name) -> None:
     piece, reached = made(road)[name], played(road)[:, 3]["next"]
-    specs = piece.written_specs(reached.batch_size, None)
-    if isinstance(piece, StepTransform):
-        specs |= piece.constant_specs(reached.batch_size, None)
+    specs = piece.specs(reached.batch_size, None, list(piece.entries))
     assert set(specs) >= set(piece.targets)
     for key, spec in specs.items():
         if key not in (("done",), ("terminated",)):

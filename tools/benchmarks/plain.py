@@ -18,14 +18,13 @@ from benchmarks.harness import agree, stream
 from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.envs import Inputs, build_env, load_inputs
-from lcc_rl.envs.rollout import ACTION
 from lcc_rl.functional.estimation import Belief, predict_and_update
 from lcc_rl.functional.idm import equilibrium_gap, idm_acceleration
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.power import motor_power
 from lcc_rl.functional.random import choose, uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
-from lcc_rl.pieces.base import SEED, STEP
+from lcc_rl.pieces.base import ACTION, SEED, STEP
 from lcc_rl.pieces.rewards import TOUCH
 
 State = dict[str, Tensor]
