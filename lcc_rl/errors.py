@@ -82,6 +82,12 @@ def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:
     return ConfigError(f"unknown {what} {name!r}; valid: {', '.join(options) or 'none'}.{hint}")
 
 
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an allocation failed, as NumPy, pyarrow and torch say it."""
+    text = str(error)
+    return isinstance(error, MemoryError) or "t allocate memory" in text or "out of memory" in text
+
+
 def of_hydra(error: BaseException) -> bool:
     """Whether an error is one of Hydra's or OmegaConf's; neither need be loaded."""
     kinds = type(error).__mro__

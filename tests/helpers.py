@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -19,6 +20,7 @@ from lcc_rl.agents.factory import Agent, build_agent
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.config import load
 from lcc_rl.config.schemas import TrainConfig
+from lcc_rl.data.episodes import SCHEMA
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.drivers.population import bootstrap, from_table
 from lcc_rl.envs import SingleAgent, build_env
@@ -174,3 +176,21 @@ def slow_but(quick: Iterable[Any], cases: Iterable[Any]) -> list[Any]:
         else pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.slow)
         for case in cases
     ]
+
+
+def check_episodes(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the columns of an episode table in its types, after checking that it is whole.
+
+    The rows of an episode lie together, 0.1 s apart, are of one pair and hold numbers that are
+    finite; speeds and gaps are not negative.
+    """
+    table = table[[*SCHEMA]].reset_index(drop=True).astype({**SCHEMA, "recording": str})
+    begins = (table["episode"].diff() != 0).to_numpy()
+    assert table.loc[begins, "episode"].is_unique
+    groups = table.groupby("episode")
+    assert (groups.size() >= 2).all()
+    assert (groups[["recording", "follower_id", "leader_id"]].nunique() == 1).all(axis=None)
+    assert np.allclose(table["time_s"].diff()[~begins], 0.1, atol=1e-3)
+    assert np.isfinite(table.select_dtypes("number")).all(axis=None)
+    assert (table.filter(regex="speed_mps|gap_m") >= 0).all(axis=None)
+    return table

@@ -14,7 +14,6 @@ from ngsim_text import csv_text, native_text, portal_text
 from table_text import long_table, openacc_text
 
 from benchmarks.read import write_ngsim
-from lcc_rl.data.episodes import write_episodes
 from lcc_rl.data.sources import NgsimSource
 from lcc_rl.drivers.tables import load_drivers
 from lcc_rl.io.files import write_parquet
@@ -52,7 +51,7 @@ def portal(path: Path) -> None:
 def pairs(path: Path) -> None:
     """The pairs of both recordings."""
     official(path.with_suffix(".csv"))
-    write_episodes(NgsimSource(path=str(path.with_suffix(".csv"))).load().episodes, path)
+    write_parquet(NgsimSource(path=str(path.with_suffix(".csv"))).load().episodes, path)
 
 
 def wide(path: Path) -> None:

@@ -33,9 +33,8 @@ from lcc_rl.cli import calibrate, console, evaluate, pipeline, train
 from lcc_rl.commands.pipeline import COMMAND
 from lcc_rl.config import load
 from lcc_rl.config.nodes import build
-from lcc_rl.data.episodes import write_episodes
 from lcc_rl.errors import ResultsError
-from lcc_rl.io.files import read_parquet
+from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.io.settings import read_json
 from lcc_rl.io.tensors import read_torch
 from lcc_rl.results.runs import read_settings
@@ -218,7 +217,7 @@ def compare(whole: Path, killed: Path) -> None:
 def jobs(folder: Path) -> dict[str, Job]:
     """Return the commands that are killed, each run once to its end."""
     source = build(load("train", ["data.platoons=4", "data.recordings=2"]).data, "data")
-    write_episodes(source.load().episodes, folder / "pairs.parquet")
+    write_parquet(source.load().episodes, folder / "pairs.parquet")
     small = ["experiment=smoke", "scenario.horizon=40", "data=episodes"]
     small += [f"data.path={folder / 'pairs.parquet'}"]
     agent = ["agent.batch_size=64", "agent.hidden=[16,16]", "training.episodes=48"]

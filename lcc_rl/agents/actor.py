@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 
 import torch
 from tensordict import TensorDictBase
@@ -14,11 +13,7 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from lcc_rl.functional.random import normal, stream_id
-from lcc_rl.io.memory import require_memory
 from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP
-
-# Bytes that a weight costs a training: it, its gradient, two moments of Adam, its target.
-WEIGHT = 5 * 4
 
 
 def seeded_mlp(inputs: int, outputs: int, hidden: Sequence[int], seed: int) -> MLP:
@@ -29,12 +24,7 @@ def seeded_mlp(inputs: int, outputs: int, hidden: Sequence[int], seed: int) -> M
         outputs: entries written.
         hidden: sizes of the layers between; none for a linear map.
         seed: seed of the weights.
-
-    Raises:
-        ConfigError: if the weights do not fit into memory.
     """
-    weights = sum(a * b for a, b in pairwise([inputs, *hidden, outputs]))
-    require_memory({f"agent.hidden={list(hidden)}": WEIGHT * weights})
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return MLP(

@@ -8,7 +8,7 @@ from contextlib import suppress
 from functools import wraps
 from typing import Any, NoReturn
 
-from lcc_rl.errors import Interrupted, input_error, of_hydra, one_line
+from lcc_rl.errors import Interrupted, input_error, of_hydra, one_line, out_of_memory
 from lcc_rl.runs.interrupts import BAD_INPUT, INTERRUPTED, interruptible
 from lcc_rl.runs.output import unbroken_output
 
@@ -37,7 +37,10 @@ def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
             cause = input_error(error)
             if isinstance(cause, Interrupted):
                 stop(str(cause), INTERRUPTED)
-            if cause is None and not (isinstance(error, (OSError, MemoryError)) or of_hydra(error)):
+            if cause is None and out_of_memory(error):
+                first = str(error).strip().partition("\n")[0]
+                stop(f"error: too little memory: {first}", BAD_INPUT)
+            if cause is None and not (isinstance(error, OSError) or of_hydra(error)):
                 raise
             stop(f"error: {cause or str(error) or type(error).__name__}", BAD_INPUT)
 

@@ -29,7 +29,7 @@ from lcc_rl.config.schemas import (
     PipelineConfig,
     TrainConfig,
 )
-from lcc_rl.data.episodes import write_episodes
+from lcc_rl.data.episodes import SCHEMA
 from lcc_rl.drivers.calibrator import counted
 from lcc_rl.envs.inputs import build_energy, build_source, load_inputs
 from lcc_rl.errors import Concern, ConfigError, Interrupted
@@ -39,7 +39,7 @@ from lcc_rl.figures.main_page import held_to, write_page
 from lcc_rl.figures.training import training_figure
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.io.files import Rows
+from lcc_rl.io.files import Rows, write_parquet
 from lcc_rl.io.settings import read_text
 from lcc_rl.results.render import show, terminal
 from lcc_rl.results.report import RULE, report, sample_of, windows_for
@@ -194,7 +194,8 @@ def read_once(cfg: PipelineConfig, folder: Path) -> None:
     counts = [line for line in loaded.report if line.startswith(("kept ", "read "))]
     tell(f"data: {(counts or loaded.report)[-1]}")
     load_inputs(cfg, loaded.episodes).to_learn_from()
-    write_episodes(loaded.episodes, folder / TRAJECTORIES)
+    episodes = loaded.episodes[list(SCHEMA)].astype({**SCHEMA, "recording": str})
+    write_parquet(episodes, folder / TRAJECTORIES)
 
 
 def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:

@@ -1,23 +1,19 @@
-"""Table of car-following episodes: schema, reading, writing and validation."""
+"""Table of car-following episodes: schema and reading."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from lcc_rl.data.grid import Places, continuous, on_grid, places, stretches
-from lcc_rl.data.tables import LARGEST_ID, Column, TableFile, checked, lacking, whole_numbers
+from lcc_rl.data.tables import LARGEST_ID, Column, TableFile, lacking, whole_numbers
 from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
-from lcc_rl.io.files import write_parquet
 
 SCHEMA: dict[str, str] = {
     "episode": "int32",
@@ -49,24 +45,9 @@ FIELDS = (
 MEASURED = [column.key for column in FIELDS if column.blank]  # a blank cell costs the row
 COLUMNS = tuple(SCHEMA)
 OWN = dict(zip((column.key for column in FIELDS), COLUMNS, strict=True))  # names by default
-# What a finished table has: every column, episodes are numbers, no speed or gap is negative.
-STRICT = (
-    Column("episode", least=-(2**31), most=2**31 - 1, whole=True),
-    *(
-        replace(
-            x,
-            key=OWN[x.key],
-            required=True,
-            blank=False,
-            least=0.0 if x.quantity == "speed" or x.key == "gap" else x.least,
-        )
-        for x in FIELDS[1:]
-    ),
-)
 ALIASES = {"event": "episode", "period": "recording"}
 DERIVED = "no positions given: those of leaders are the integral of their speeds"
 MOTION = [name for name in COLUMNS if name.endswith(("_position_m", "_speed_mps", "gap_m"))]
-ONE_ROW = "is of one row; expected at least two"
 
 
 def load_episodes(
@@ -207,84 +188,3 @@ def derive_positions(episodes: pd.DataFrame) -> None:
     behind = episodes["gap_m"].to_numpy() + episodes["leader_length_m"].to_numpy()
     episodes["leader_position_m"] = position.astype(np.float32)
     episodes["follower_position_m"] = (position - behind).astype(np.float32)
-
-
-def write_episodes(frame: pd.DataFrame, path: str | Path) -> None:
-    """Validate an episode table and write it atomically as parquet.
-
-    Raises:
-        DataError: if the table is not valid.
-        ResultsError: if the file cannot be written.
-    """
-    write_parquet(validate_episodes(frame, str(path)), path)
-
-
-def validate_episodes(frame: pd.DataFrame, source: str) -> pd.DataFrame:
-    """Check an episode table and give it the types of ``SCHEMA``.
-
-    Args:
-        frame: the table; rows of one episode must be consecutive and in order of time.
-        source: where it comes from, for messages.
-
-    Returns:
-        The columns of ``SCHEMA`` in their order and types, with a fresh index.
-
-    Raises:
-        DataError: naming the source, the row (from 1) and the column, if a column is missing or
-            holds NaN, text or an impossible value, or if an episode is not contiguous, has a
-            single row or several pairs, or its time does not advance by one constant step.
-    """
-    present = [str(name) for name in frame.columns]
-    missing = [name for name in COLUMNS if name not in present]
-    if missing:
-        raise lacking(source, missing, present, "")
-    values = {}
-    for column in STRICT:
-        if present.count(column.key) > 1:
-            raise DataError(f"{source}: has column {column.key!r} twice; expected it once")
-        try:
-            cells = pa.array(frame[column.key], from_pandas=True)
-        except pa.ArrowException as error:
-            raise DataError(f"{source}: column {column.key!r}: {error}") from error
-
-        def fault(row: int, words: str, name: str = column.key) -> DataError:
-            return _at(source, row, name, words)
-
-        values[column.key] = checked(cells, column, fault)
-    return _typed(values, source)
-
-
-def _at(source: str, row: int, name: str, words: str) -> DataError:
-    return DataError(f"{source}: data row {row + 1}, column {name!r} {words}")
-
-
-def _typed(values: dict[str, NDArray], source: str) -> pd.DataFrame:
-    """Episodes that are unbroken, of one pair, longer than a row and regular in time."""
-    if not len(values["episode"]):
-        raise DataError(f"{source}: has no episodes; expected at least one row")
-    starts, lengths = stretches(values["episode"])
-    again = pd.Series(values["episode"][starts]).duplicated().to_numpy()
-    if again.any():
-        row = int(starts[int(np.argmax(again))])
-        raise _at(source, row, "episode", "begins again; expected the rows of an episode together")
-    if (lengths < 2).any():
-        row = int(starts[int(np.argmax(lengths < 2))])
-        raise _at(source, row, "episode", ONE_ROW)
-    for name in ("recording", "follower_id", "leader_id"):
-        wrong = values[name] != values[name][np.repeat(starts, lengths)]
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            raise _at(source, row, name, "changes within an episode; expected one pair")
-    steps = np.diff(values["time_s"])
-    inner = np.ones(len(steps), dtype=bool)
-    inner[starts[1:] - 1] = False
-    step = float(np.median(steps[inner]))
-    # Times that were kept in float32 are off by some tens of microseconds.
-    wrong = np.append(False, inner & ((steps <= 0) | (np.abs(steps - step) > 0.01 * abs(step))))
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        words = f"is {steps[row - 1]:+g} s after the row before; expected a constant step"
-        remedy = f"({step:g} s here): begin another episode there, with a number of its own"
-        raise _at(source, row, "time_s", f"{words} {remedy}")
-    frame = pd.DataFrame({name: values[name] for name in COLUMNS})
-    return frame.astype({**SCHEMA, "recording": str})

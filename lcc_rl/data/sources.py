@@ -19,10 +19,8 @@ from lcc_rl.data.grid import Places, places
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.tables import SI, Column, Names, check_map
-from lcc_rl.data.text import TEXT_TAKES, file_size
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import DataError
-from lcc_rl.io.memory import require_memory
 from lcc_rl.settings import Settings
 
 ASSETS = Path(lcc_rl.assets.__file__).parent
@@ -71,8 +69,6 @@ class NgsimSource(Settings):
                 are implausible than ``plausible`` allows.
         """
         files = find_files(self.path)
-        if self.location is None:  # of one location of several, nobody knows how much there is
-            require_memory({f"reading {name}": TEXT_TAKES * file_size(name) for name in files})
         trajectories = read_ngsim(files, self.location, self.units)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)

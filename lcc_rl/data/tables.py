@@ -24,9 +24,7 @@ from numpy.typing import NDArray
 
 from lcc_rl.data.text import (
     SEPARATORS,
-    TEXT_TAKES,
     cells_of,
-    file_size,
     line_chunks,
     parse_text,
     preamble,
@@ -36,10 +34,8 @@ from lcc_rl.data.text import (
 )
 from lcc_rl.data.trajectories import FOOT
 from lcc_rl.errors import ConfigError, DataError, unknown_name
-from lcc_rl.io.memory import require_memory
 
 PARQUET = (".parquet", ".pq")
-PARQUET_TAKES = 8  # bytes of memory that reading a byte of a file takes
 LARGEST = 1e12  # in SI: beyond any time or place, and within every type
 LONGEST_TEXT = 1000  # of a name, signs
 LARGEST_ID = 2**53  # beyond this, whole numbers no longer fit a float
@@ -213,8 +209,6 @@ class TableFile:
         missing = [name for name in self.names.values() if name not in self.header]
         if missing:
             raise lacking(str(self.path), missing, self.header, option)
-        takes = PARQUET_TAKES if self.parquet else TEXT_TAKES
-        require_memory({f"reading {self.path}": takes * file_size(self.path)})
         wanted = {
             column: self._scale(column, units or {}, option)
             for column in columns

@@ -9,7 +9,7 @@ import zlib
 from codecs import EncodedFile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from io import BufferedReader, RawIOBase
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,11 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 
 from lcc_rl.errors import Concern, DataError
-from lcc_rl.io.memory import available, require_memory
 
 BLANK = ["", "NA", "N/A", "n/a", "nan", "NaN", "NAN", "NULL", "null", "None", "-"]
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 PREAMBLE = 20  # lines within which the header of a native OpenACC file begins
 BLOCK_BYTES, LONGEST_LINE = 1 << 22, 1 << 24  # read at once
-TEXT_TAKES = 3  # bytes of memory that reading a byte of text takes
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 # What files are that are no table in UTF-8, by their first bytes, and the remedy.
 OTHERS = {
@@ -49,37 +47,11 @@ def reading(name: str | Path) -> Iterator[BufferedReader]:
         with open(name, "rb") as file:
             packed = file.read(2) == b"\x1f\x8b"
             file.seek(0)
-            yield BufferedReader(_Unpacked(file, name)) if packed else file
+            yield BufferedReader(gzip.GzipFile(fileobj=file)) if packed else file
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise DataError(f"{name}: the compressed file is damaged or cut off: {error}") from error
     except OSError as error:
         raise DataError(f"{name}: cannot be read: {error.strerror or error}") from error
-
-
-class _Unpacked(RawIOBase):
-    """The content of a gzipped file, which says nowhere how long it is.
-
-    Raises:
-        ConfigError: once more was unpacked than could be parsed in the memory that was free.
-    """
-
-    def __init__(self, file: BufferedReader, name: str | Path) -> None:
-        self.file, self.name = gzip.GzipFile(fileobj=file), name
-        self.size, self.free = 0, available()
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        self.size += (count := self.file.readinto(buffer))
-        require_memory({f"reading {self.name}": TEXT_TAKES * self.size}, free=self.free)
-        return count
-
-
-def file_size(name: str | Path) -> int:
-    """Return the bytes of a file; 0 for none."""
-    # A pipe would be waited for; who reads it raises the error.
-    return Path(name).stat().st_size if Path(name).is_file() else 0
 
 
 def is_text(content: bytes) -> bool:

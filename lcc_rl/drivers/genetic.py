@@ -12,13 +12,11 @@ from pydantic import Field
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.io.memory import require_memory
 from lcc_rl.settings import NonNegative, Positive, Settings
 
 Objective = Callable[[Tensor], Tensor]
 Progress = Callable[[int, int, str], None]
 
-SIMULATED = 12  # numbers that the simulation of an individual holds besides its genes
 Individuals = Annotated[int, Field(ge=1, le=100_000)]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 
@@ -83,15 +81,11 @@ def minimise(
         progress: called as ``progress(generation, total, text)`` after each generation.
 
     Raises:
-        ConfigError: if the bounds are empty or crossed, or memory is short.
+        ConfigError: if the bounds are empty or crossed.
     """
     settings = settings or GeneticSettings()
     if lower.ndim != 1 or lower.shape != upper.shape or not bool((lower < upper).all()):
         raise ConfigError("bounds must be two vectors of one length with lower < upper")
-    first = settings.founders * settings.population
-    what = f"a genetic search of {problems} × {first} (founders × population) individuals"
-    needs = problems * first * (4 * lower.numel() + SIMULATED) * 4
-    require_memory({what: needs}, lower.device)
     evaluate = _in_units(objective, lower, upper)
     found = _evolve(evaluate, problems, _Random(generator, lower), settings, progress)
     return replace(found, best=lower + found.best * (upper - lower))

@@ -18,7 +18,6 @@ from pyarrow import fs
 
 from lcc_rl.errors import ResultsError, one_line
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.io.memory import require_memory
 from lcc_rl.version import __version__
 
 SCHEMA_VERSION = "1"
@@ -93,10 +92,7 @@ def read_parquet(path: str | Path) -> pd.DataFrame:
 
     Raises:
         ResultsError: if the file is missing, damaged or of a newer schema.
-        ConfigError: if it does not fit into memory.
     """
-    # As a table, as a data frame, and once more while it is checked.
-    require_memory({f"reading {path}": 3 * unpacked_size(path)})
     schema_of(path)
     table = read_table(path)
     try:
@@ -203,12 +199,6 @@ def _constants(columns: Mapping[str, Any]) -> ds.Expression:
         same = ds.field(name).is_null() if value is None else ds.field(name) == value
         found = found & same
     return found
-
-
-def unpacked_size(path: str | Path) -> int:
-    """Return the bytes that a table's columns take in memory, about."""
-    found = _read(path, pq.read_metadata)
-    return sum(found.row_group(place).total_byte_size for place in range(found.num_row_groups))
 
 
 def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:

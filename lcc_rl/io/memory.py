@@ -20,20 +20,17 @@ VERSION_2 = ("memory.max", "memory.current", "inactive_file")
 UNITS = ("B", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB")
 
 
-def require_memory(
-    needs: Mapping[str, float], device: torch.device | str = "cpu", free: int | None = None
-) -> None:
+def require_memory(needs: Mapping[str, float], device: torch.device | str = "cpu") -> None:
     """Check that what is about to be allocated fits into the memory that is free.
 
     Args:
         needs: bytes by the option, as it was given, that they are due to.
         device: where the tensors will live.
-        free: bytes that were free before a part of it was allocated; by default those now.
 
     Raises:
         ConfigError: naming the option that needs most, how much, and how much is free.
     """
-    free, total = free or available(device), sum(needs.values())
+    free, total = available(device), sum(needs.values())
     if free is None or total <= free:
         return
     worst = max(needs, key=lambda name: needs[name])

@@ -169,10 +169,8 @@ class PathEnergy(RewardTerm):
 
     def setup(self, world: World) -> None:
         """Choose what is read by whose energy counts, and by which models."""
-        self.sections, self.energy = (
-            Sections(world.string, VEHICLES),
-            world.given("energy", self.name),
-        )
+        self.sections = Sections(world.string, VEHICLES)
+        self.energy = world.given("energy", self.title)
         self.mixed, behind = len(self.energy.models) > 1, self.of == "behind"
         space = VEHICLES if behind else "self"
         kind = [f"{space}.{CLASS[-1]}"] * self.mixed

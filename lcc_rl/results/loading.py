@@ -27,9 +27,7 @@ from lcc_rl.io.files import (
     schema_of,
     texts_of,
     unified,
-    unpacked_size,
 )
-from lcc_rl.io.memory import require_memory
 from lcc_rl.results.runs import CONFIG, FINAL, PARTS, flatten, read_settings
 
 log = logging.getLogger("lcc_rl")
@@ -130,7 +128,7 @@ def load(
         chosen settings. Text is categorical.
 
     Raises:
-        ConfigError: if the table, or a setting, is unknown, or the rows do not fit into memory.
+        ConfigError: if the table, or a setting, is unknown.
         ResultsError: if no such table below ``root`` can be read.
     """
     if table not in TABLES:
@@ -141,7 +139,6 @@ def load(
     constants = _chosen(runs, settings, schema.names)
     parts = {}
     if not lazy:
-        require_memory({f"reading {root}": 2 * sum(map(unpacked_size, runs))})
         for path in runs:
             with damaged.noting(path.parent):
                 parts[path] = read_table(path, texts_of(schema))

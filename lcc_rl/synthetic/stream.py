@@ -28,13 +28,11 @@ from lcc_rl.data.trajectories import (
     find_leaders,
 )
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
-from lcc_rl.errors import LARGEST_SIZE, LAST_SEED, ConfigError
-from lcc_rl.io.memory import require_memory
-from lcc_rl.settings import Count, Settings, Share, given_as
+from lcc_rl.errors import LAST_SEED, ConfigError
+from lcc_rl.settings import Settings, Share, given_as
 from lcc_rl.synthetic.lane import Stream, drive_platoons
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
-SAMPLE = 600  # bytes that a sample of a vehicle costs while the stream is made
 Duration = Annotated[float, Field(ge=1.0, le=36_000.0)]
 Range = Annotated[tuple[Duration, Duration], Field(strict=False)]
 Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
@@ -50,10 +48,11 @@ class StreamSource(Settings):
 
     WRITES = ("keep",)  # settings that name a place to write
 
-    recordings: Count = 3  # their leaders, drivers and vehicle ids are independent
-    platoons: Count = 30  # per recording, one after another
+    # Their leaders, drivers and vehicle ids are independent.
+    recordings: Annotated[int, Field(ge=1, le=1000)] = 3
+    platoons: Annotated[int, Field(ge=1, le=10_000)] = 30  # per recording, one after another
     # Per platoon, the stochastic leader included.
-    vehicles: Annotated[int, Field(ge=2, le=LARGEST_SIZE)] = 4
+    vehicles: Annotated[int, Field(ge=2, le=1000)] = 4
     duration_s: Range = (60.0, 90.0)  # of how long a platoon is seen [s]
     seed: Seed = 0  # of the data; the run's own seed leaves them alone
     noise: Share = 0.05  # drivers execute a(1 + ξ), ξ ~ U(0, noise) (A18)
@@ -70,9 +69,6 @@ class StreamSource(Settings):
 
     def generate(self) -> Stream:
         """Simulate all recordings."""
-        count, longest = self.recordings * self.platoons * self.vehicles, self.duration_s[1]
-        size = f"data: recordings × platoons × vehicles = {count}, up to {longest:g} s each,"
-        require_memory({size: count * longest / FRAME * SAMPLE})
         low, high = (round(value / FRAME) for value in self.duration_s)
         drawn = []
         for index in range(self.recordings):

@@ -67,7 +67,7 @@ FOREIGN: list[tuple[dict[str, object] | str, str]] = [
     ({TARGET: "os.system"}, rf"{TARGET} names 'os.system'"),
     ({TARGET: "mine.Comfort"}, "names 'mine.Comfort'.*trust="),
     ({TARGET: "lcc_rl.config.import_module"}, TARGET),
-    ({TARGET: "lcc_rl.data.episodes.write_episodes"}, TARGET),
+    ({TARGET: "lcc_rl.data.episodes.load_episodes"}, TARGET),
     ({"seed": "${oc.env:SECRET}"}, "seed refers to"),
     ("seed: !!python/object:os.system {}", "damaged"),
     (": [", "damaged"),

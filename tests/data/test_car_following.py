@@ -10,10 +10,11 @@ import pytest
 from ngsim_text import cells, csv_text, pair
 
 from lcc_rl.data.car_following import Criteria, ExtractionReport, extract
-from lcc_rl.data.episodes import SCHEMA, validate_episodes
+from lcc_rl.data.episodes import SCHEMA
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.errors import ConfigError, DataError
+from tests.helpers import check_episodes
 
 FOOT = 0.3048
 SHORT = Criteria(min_duration_s=1.0)
@@ -24,7 +25,7 @@ def extracted(
 ) -> tuple[pd.DataFrame, ExtractionReport]:
     (folder / "file.csv").write_text(csv_text(rows))
     episodes, report = extract(read_ngsim(folder / "file.csv"), criteria)
-    pd.testing.assert_frame_equal(validate_episodes(episodes, "extracted"), episodes)
+    pd.testing.assert_frame_equal(check_episodes(episodes), episodes)
     assert report.candidates - sum(report.removed.values()) == report.kept
     assert report.rows == len(episodes)
     return episodes, report

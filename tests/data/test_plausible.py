@@ -12,13 +12,14 @@ from ngsim_text import csv_text, native_text, pair
 from table_text import pairs
 
 from lcc_rl.data.agreement import agreement
-from lcc_rl.data.episodes import validate_episodes, write_episodes
 from lcc_rl.data.grid import Place
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import Plausible, hard_share
 from lcc_rl.data.sources import EpisodesSource, NgsimSource
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.errors import Concern, DataError
+from lcc_rl.io.files import write_parquet
+from tests.helpers import check_episodes
 
 # Column, value in row 95 (episode 3), what is said of it.
 FLAWS = [
@@ -36,15 +37,15 @@ def test_an_implausible_episode_is_left_out_and_many_are_refused(
 ) -> None:
     frame, path = pairs(), str(tmp_path / "pairs.parquet")
     frame.loc[95, column] = value
-    write_episodes(frame, path)
+    write_parquet(frame, path)
     loaded = EpisodesSource(path=path).load()
     assert sorted(set(range(20)) - set(loaded.episodes["episode"])) == [3]
-    validate_episodes(loaded.episodes, "what is left")
+    check_episodes(loaded.episodes)
     said = [line for line in loaded.report if line.startswith("left out")]
     assert len(said) <= 2  # a jump is one of two samples
     assert pd.Series(said).str.contains(rf"a, .*data row \d+, column '{column}' {words}").all()
     frame.loc[95:215:30, column] = value  # five of twenty
-    write_episodes(frame, path)
+    write_parquet(frame, path)
     with pytest.raises(DataError, match=r"pairs\.parquet: 2[58].* % of the samples are impl"):
         EpisodesSource(path=path).load()
     lenient = EpisodesSource(path=path, plausible=Plausible(max_share=0.3))
@@ -293,7 +294,7 @@ def test_a_bad_sample_costs_itself_and_divides_its_record(tmp_path: Path) -> Non
     path = tmp_path / "pairs.csv"
     frame.to_csv(path, index=False)
     loaded = EpisodesSource(path=str(path)).load()
-    validate_episodes(loaded.episodes, "what is left")
+    check_episodes(loaded.episodes)
     sizes = loaded.episodes.groupby("episode").size()
     assert sizes.to_dict() == {0: 200, 3: 399, 1: 554, 2: 600}
     report = "\n".join(loaded.report)

@@ -12,7 +12,6 @@ from helpers import POPULATION, compose, composed, followed_profiles, wavy_profi
 
 from lcc_rl.commands.evaluation import strategies_of
 from lcc_rl.config import load
-from lcc_rl.data.episodes import validate_episodes
 from lcc_rl.data.profiles import at_step, from_records, join, leader_profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import Inputs
@@ -20,6 +19,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import applies, baseline, baselines
 from lcc_rl.results.measures import FASTER
+from tests.helpers import check_episodes
 
 
 def drive(*overrides: str):
@@ -115,7 +115,7 @@ def test_followers_stay_beside_their_leaders() -> None:
             "leader_length_m": 0.0,
         }
     )
-    profiles = leader_profiles(validate_episodes(table, "made"), 0.1)
+    profiles = leader_profiles(check_episodes(table), 0.1)
     cut = profiles.windows(100).select([4, 1])
     # Windows of 101 samples: three of each episode; the fifth is the second of the second one.
     for index, (episode, start) in enumerate(((1, 101), (0, 101))):

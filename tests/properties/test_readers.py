@@ -14,10 +14,9 @@ import pandas as pd
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from table_text import long_table, openacc_text
+from table_text import long_table, openacc_text, pairs
 
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.episodes import COLUMNS, validate_episodes
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.sources import EpisodesSource
@@ -26,6 +25,7 @@ from lcc_rl.data.speed_records import read_drives
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.errors import DataError, LccError
 from lcc_rl.io.files import read_parquet, write_parquet
+from tests.helpers import check_episodes
 
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "60"))
 FUZZ = settings(
@@ -104,7 +104,7 @@ def rows_of(path: Path, layout: str) -> pd.DataFrame:
         "episodes": EpisodesSource(path=str(path)),
     }[layout]
     loaded = source.load()
-    validate_episodes(loaded.episodes, "what was read")
+    check_episodes(loaded.episodes)
     return loaded.episodes
 
 
@@ -113,7 +113,7 @@ def text_of(layout: str) -> str:
     if layout == "openacc":
         return openacc_text(rows=20)
     if layout == "episodes":
-        return pair_table().assign(leader_length_m=5.0).to_csv(index=False)
+        return pairs(1).to_csv(index=False)
     if layout == "record":
         record = pd.DataFrame({"time_s": np.arange(20) / 10, "speed_mps": 5.0})
         return record.to_csv(index=False)
@@ -143,34 +143,6 @@ def test_a_mutated_table_is_read_or_refused_by_name(tmp_path, layout, changes, s
         return
     assert np.isfinite(found[0].select_dtypes("number").to_numpy()).all()
     assert (found[0]["leader_speed_mps"] >= 0).all()
-
-
-def pair_table() -> pd.DataFrame:
-    """Return a valid episode table of one pair."""
-    steps = range(5)
-    frame = pd.DataFrame({name: [1.0 + 0.1 * i for i in steps] for name in COLUMNS})
-    whole = dict.fromkeys(("episode", "follower_id", "leader_id"), 1)
-    return frame.assign(recording="a", **whole)
-
-
-@FUZZ
-@given(
-    st.sampled_from(COLUMNS),
-    st.integers(0, 4),
-    st.one_of(st.floats(), st.text(max_size=5), st.none(), st.integers(), st.booleans()),
-)
-def test_a_mutated_episode_table_is_accepted_or_refused_by_name(column, row, value) -> None:
-    frame = pair_table()
-    values = frame[column].astype(object)
-    values[row] = value
-    changed = frame.assign(**{column: values})
-    error = refused(lambda: validate_episodes(changed, "table"))
-    if error is not None:
-        assert error.startswith("table: ")
-        return
-    checked = validate_episodes(changed, "table")
-    assert (checked["gap_m"] >= 0).all()
-    assert checked["time_s"].diff().dropna().gt(0).all()
 
 
 values = st.recursive(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pandas as pd
 import size
 
 MODULE = '''"""What the module contains."""
@@ -71,3 +72,16 @@ def test_the_structure_of_a_package(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(size, "ROOT", tmp_path)
     # SPEED stands in two modules; above and top import each other, so they share floor 2.
     assert list(size.structure(modules).values()) == [1, 2, 1]
+
+
+def test_a_number_above_its_ceiling_has_a_line() -> None:
+    numbers = {part: {"lines": 0, "code": 0, "yaml": 0} for part in size.CEILINGS}
+    found = pd.DataFrame.from_dict(numbers, orient="index")
+    assert size.above(found, dict(size.STRUCTURE)) == []
+    found.loc["conf", "yaml"] = size.CEILINGS["conf"]["yaml"] + 1
+    (line,) = size.above(found, dict(size.STRUCTURE))
+    assert line.startswith("conf, yaml: ")
+
+
+def test_the_suite_has_no_more_cases_than_agreed(request) -> None:
+    assert request.session.testscollected <= size.CASES
