@@ -13,7 +13,15 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.clock import is_whole, reset_options
 from lcc_rl.envs.rowwise import Array, Rowwise
-from lcc_rl.envs.step import TERMINATED, TRUNCATED, Step, closure, entries, pieces_of
+from lcc_rl.envs.step import (
+    TERMINATED,
+    TRUNCATED,
+    Step,
+    closure,
+    entries_of,
+    pieces_of,
+    read_before,
+)
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.finite import require_finite
 from lcc_rl.pieces.base import (
@@ -24,7 +32,6 @@ from lcc_rl.pieces.base import (
     STEP,
     Key,
     State,
-    StepTransform,
     as_key,
 )
 from lcc_rl.pieces.rewards import TERMS, TotalReward
@@ -66,10 +73,7 @@ class ArrayEpisodes:
         """Return the first moment of an episode, and choose what a step reads of a moment."""
         with torch.no_grad():
             first = self.one_step.begin(torch.zeros(1, 1, dtype=torch.int64))
-        read: set[Key] = {SEED, STEP}
-        for piece in pieces:
-            if isinstance(piece, StepTransform):
-                read |= {key for late, key in piece.needs if not late} | set(piece.constants)
+        read = read_before(pieces)
         self.keys = [key for key in first if key in read]
         self.types = [(first[key].shape[1:], first[key].dtype) for key in self.keys]
         self.sizes = [shape.numel() for shape, _ in self.types]
@@ -125,7 +129,7 @@ class ArrayEpisodes:
         if options:
             every = torch.zeros(self.count, 1, dtype=torch.int64)
             every[places] = torch.cat(drawn)
-            moment = entries(self.env.reset(self._given(every, options)))
+            moment = entries_of(self.env.reset(self._given(every, options)))
             state, seen = (
                 self._packed(moment)[places].numpy(),
                 moment[OBSERVATION[1:]][places].numpy(),

@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import AsyncEnvPool, EnvBase, TransformedEnv
 
-from lcc_rl.envs.compiled import settings
+from lcc_rl.envs.compiled import compile_settings
 from lcc_rl.envs.step import tick
 from lcc_rl.errors import LAST_SEED, ConfigError
 from lcc_rl.pieces.base import SEED, STEP, Entry, Key, as_key, require_option
@@ -172,7 +172,7 @@ class Traffic(TransformedEnv):
         Settings of pieces are not compared at every step, unless a ``mode``, a ``backend`` or
         ``options`` are given.
         """
-        own = {} if {"mode", "backend", "options"} & set(given) else settings()
+        own = {} if {"mode", "backend", "options"} & set(given) else compile_settings()
         super().compile(warmup=warmup, **{**own, **given})
         return self
 

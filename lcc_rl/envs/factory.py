@@ -31,7 +31,7 @@ from lcc_rl.pieces import (
     Corrected,
     EnergyClasses,
     Piece,
-    Places,
+    RolePlaces,
     Sensors,
     StringMotion,
     TotalReward,
@@ -186,7 +186,7 @@ def build_pieces(
         [own.bind(world, role) for role, own in group.items()]
         for group in (world.actuators, world.sensors)
     )
-    pieces += [Places().bind(world), *classes, *drivers, *actuators]
+    pieces += [RolePlaces().bind(world), *classes, *drivers, *actuators]
     pieces += [_motion(scenario, world), *sensors]
     pieces += _watchers(drivers, world)
     pieces += [_build(node, "scenario.pieces", world, name) for name, node in named.items()]

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.compiled import Compiled
-from lcc_rl.envs.step import DONE, TERMINATED, Step, closure, pieces_of, written
+from lcc_rl.envs.step import DONE, TERMINATED, Step, closure, pieces_of, read_before, written
 from lcc_rl.pieces.base import (
     ACTION,
     OBSERVATION,
@@ -65,10 +65,10 @@ class DifferentiableRollout:
             {key for piece in self.after for _, key in piece.needs} | every | {STEP, ACTION}
         )
         steps = [piece for piece in inside if isinstance(piece, StepTransform)]
-        read = {key for piece in steps for late, key in piece.needs if not late}
         # A compiled step takes its time for every entry that it returns: only those that are used.
         self.constants = sorted({SEED}.union(*(piece.constants for piece in steps)))
-        self.moving = sorted((kept | read & known | {STEP}) - {ACTION, *self.constants})
+        read = read_before(inside) & known
+        self.moving = sorted((kept | read | {STEP}) - {ACTION, *self.constants})
         self.recorded = sorted(kept)
         self.advance = Compiled(self._advance, "the simulator", compiled)
 

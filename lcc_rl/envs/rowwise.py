@@ -139,11 +139,11 @@ def translated(
     names = ", ".join(f"{name}{i}" for name, each in counts for i in range(len(each)))
     body = "".join(f"        {line}\n" for line in lines)
     source = f"def kernel({names}):\n    for row in range(len(x0)):\n{body}"
-    return compiled(source), [table.numpy() for table in recorder.tables]
+    return kernel_of(source), [table.numpy() for table in recorder.tables]
 
 
 @cache
-def compiled(source: str) -> Callable[..., None]:
+def kernel_of(source: str) -> Callable[..., None]:
     """Return a function as machine code; environments of the same settings share it."""
     scope = dict(NAMES)
     exec(source, scope)

@@ -10,7 +10,7 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import Entry, Key
 
 # Entries of the group that the view shows at the root, without the dimension of one.
-SHOWN = ("observation", "reward", "reward_terms")
+GROUP_ENTRIES = ("observation", "reward", "reward_terms")
 
 
 class SingleAgent(Transform):
@@ -33,7 +33,7 @@ class SingleAgent(Transform):
         if group is None:
             return next_tensordict
         group = group.copy()
-        for name in SHOWN:
+        for name in GROUP_ENTRIES:
             entry = group.pop(name, None)
             if entry is not None:
                 next_tensordict.set(name, _without(entry))
@@ -91,4 +91,4 @@ def _flat(terms: Composite) -> Composite:
 
 def group_key(key: Key) -> Key:
     """Return the key of the group that the view shows under a key of the root."""
-    return (AUTOMATED, *key) if key[0] in (*SHOWN, "action") else key
+    return (AUTOMATED, *key) if key[0] in (*GROUP_ENTRIES, "action") else key

@@ -101,6 +101,15 @@ def written(pieces: Iterable[Piece]) -> set[Key]:
     return found
 
 
+def read_before(pieces: Iterable[Piece]) -> set[Key]:
+    """Return the entries of a moment that the next step reads, constants included."""
+    found: set[Key] = {SEED, STEP}
+    for piece in pieces:
+        if isinstance(piece, StepTransform):
+            found |= {key for late, key in piece.needs if not late} | set(piece.constants)
+    return found
+
+
 def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] = ()) -> list[Piece]:
     """Return the chosen pieces and all that they or the wanted entries depend on, in order."""
     kept = list(chosen)
@@ -113,13 +122,13 @@ def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] =
     return [piece for piece in pieces if piece in kept]
 
 
-def entries(td: TensorDictBase) -> State:
+def entries_of(td: TensorDictBase) -> State:
     """Return the entries of a moment by their full keys."""
     # Copies: entries that begin as one tensor would cost the compiler a graph of their own.
-    return {as_key(key): td.get(key).clone() for key in td.keys(True, True)}
+    return {key: value.clone() for key, value in _read(td).items()}
 
 
-def leaves(key: NestedKey, known: Iterable[Key]) -> list[Key]:
+def leaf_keys(key: NestedKey, known: Iterable[Key]) -> list[Key]:
     """Return the keys of an entry, or of all entries below it, among those known."""
     name, place = root_key(key), as_key(key)
     prefix = place[: len(place) - len(name)]
@@ -286,7 +295,7 @@ def _apply(pieces: list[Piece], td: TensorDictBase, next_td: TensorDictBase) -> 
     return _tensordict(spaces, batch, device)
 
 
-def _tensordict(entries: dict[str, Any], batch: BatchSize, device: device | None) -> TensorDict:
+def _tensordict(entries_of: dict[str, Any], batch: BatchSize, device: device | None) -> TensorDict:
     """Return nested entries as a TensorDict.
 
     TensorDict's own check of every shape costs as much as the physics; the shapes were checked
@@ -294,6 +303,6 @@ def _tensordict(entries: dict[str, Any], batch: BatchSize, device: device | None
     """
     made = {
         name: _tensordict(value, batch, device) if isinstance(value, dict) else value
-        for name, value in entries.items()
+        for name, value in entries_of.items()
     }
     return TensorDict._new_unsafe(made, batch_size=batch, device=device)

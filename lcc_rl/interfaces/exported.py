@@ -18,7 +18,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import with_weights
 from lcc_rl.pieces import Action, CBFFilter, Observation
 from lcc_rl.pieces.base import ROLE, Piece, declared
-from lcc_rl.pieces.cbf import STATE
+from lcc_rl.pieces.cbf import FILTER_READS
 from lcc_rl.pieces.knowledge import ObservationMemory
 from lcc_rl.pieces.views import VEHICLES
 from lcc_rl.results.policies import load_policy
@@ -61,7 +61,7 @@ class ExportedPolicy(nn.Module):
         self.register_buffer("constants", observation.constants.clone())
         seen = observation.columns()
         needed = [name for column in seen for name in column]
-        needed += STATE if safety is not None else ()
+        needed += FILTER_READS if safety is not None else ()
         flat = [base for name in needed for base in DERIVED.get(name, (name,))]
         self.names = list(dict.fromkeys(flat))
         self.columns = [[self._places(name) for name in column] for column in seen]
@@ -87,7 +87,7 @@ class ExportedPolicy(nn.Module):
         command = action.clamp(-1.0, 1.0) * self.largest
         if self.safety is None:
             return command
-        measured = (self._value(state, self._places(name)) for name in STATE)
+        measured = (self._value(state, self._places(name)) for name in FILTER_READS)
         filtered: Tensor = self.safety.filtered(command, *measured)
         return filtered
 

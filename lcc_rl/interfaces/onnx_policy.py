@@ -24,7 +24,7 @@ from lcc_rl.errors import ConfigError, ResultsError, how_to_install, one_line, r
 from lcc_rl.pieces.base import Entry, Piece, declared
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, VEHICLES
-from lcc_rl.pieces.world import World
+from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import Positive, Settings, given_as, parse
 
 ABOUT = "lcc_rl"  # key of the metadata
@@ -172,7 +172,7 @@ class OnnxPolicy(Controller):
     """
 
     path: str  # the program's file
-    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
 
     def validate(self) -> None:
         """Read the program, so that a wrong one is refused before anything starts."""

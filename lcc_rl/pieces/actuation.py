@@ -17,9 +17,8 @@ HARDEST = 1e3  # braking that nobody commands [m/s²]
 class Actuation(RoleTransform):
     """Makes accelerations of commands: after a delay, with a first-order lag, within the brakes.
 
-    Reads ``("command", role)`` and writes what the vehicles obey, ``("obeyed", role)``, both
-    ``[*batch, n, 1]`` [m/s²]. Keeps ``(role, "actuation")``, ``[*batch, n, 1 + steps]``: the last
-    acceleration and the commands that do not act yet, the oldest first [m/s²]; zeros at the start.
+    It keeps the last acceleration and the commands that do not act yet, the oldest first; zeros at
+    the start.
     """
 
     delay: NonNegative = 0.0  # between a command and its first effect, a number of steps [s]

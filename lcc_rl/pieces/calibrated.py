@@ -11,7 +11,7 @@ from torch import Tensor
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import DriverConstants, DriverLaw
 from lcc_rl.functional.laws import LAWS
-from lcc_rl.pieces.drivers import LONGEST, Drivers
+from lcc_rl.pieces.drivers import LONGEST_TIME_GAP, Drivers
 from lcc_rl.pieces.world import World
 
 
@@ -51,7 +51,9 @@ class CalibratedDrivers(Drivers):
     ) -> Tensor:
         """Return the gap at which drivers follow steadily, each by its own model."""
         steady = (speed, desired_speed, time_gap)
-        return self._each(driver, lambda law, own: law.equilibrium_gap(*steady, own, LONGEST))
+        return self._each(
+            driver, lambda law, own: law.equilibrium_gap(*steady, own, LONGEST_TIME_GAP)
+        )
 
     def _each(self, driver: Tensor, quantity: Callable[[DriverLaw, Any], Tensor]) -> Tensor:
         kind, found = self.kinds[driver], None

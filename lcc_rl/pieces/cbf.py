@@ -10,7 +10,7 @@ import torch
 from pydantic import InstanceOf
 from torch import Tensor
 
-from lcc_rl.functional.actuation import Motion, predicted
+from lcc_rl.functional.actuation import PairState, predicted
 from lcc_rl.functional.braking import (
     Braking,
     least_room,
@@ -22,13 +22,13 @@ from lcc_rl.functional.layout import join
 from lcc_rl.functional.sensing import brought_up
 from lcc_rl.pieces.actuation import ACTUATION, Actuation
 from lcc_rl.pieces.base import Entry, RoleTransform
-from lcc_rl.pieces.sensors import ACCELERATION, AHEAD_ACCELERATION, SENSORS, Sensors, frames_of
+from lcc_rl.pieces.sensors import SENSORS, Sensors, frames_of
 from lcc_rl.pieces.string import COMMANDED, WANTED
-from lcc_rl.pieces.world import World
+from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import NonNegative, Positive
 
 ROUNDING = 5e-3  # of gaps [m] and accelerations [m/s²] in single precision
-STATE = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
+FILTER_READS = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
 SLOWEST = 1.0  # slower speeds count as this, as in the time gap: the limit has a slope [m/s]
 
 
@@ -48,7 +48,7 @@ class CBFFilter(RoleTransform):
     braking maintains the first limit even if the vehicle ahead brakes by ``braking_ahead`` until
     it stands (:mod:`lcc_rl.functional.braking`). A vehicle that starts there has no TTC below τ at
     any sample as long as the vehicle ahead brakes no harder; which steps that covers, the
-    :class:`Promised` of :meth:`watch` writes. If a measurement or the command is no number, the
+    :class:`CBFGuarantee` of :meth:`watch` writes. If a measurement or the command is no number, the
     filter brakes fully.
 
     With a ``shortest_time_gap``, ``gap − shortest_time_gap·v`` is kept positive, too, by the same
@@ -71,11 +71,10 @@ class CBFFilter(RoleTransform):
     with; and full braking is reached with the lag
     (:func:`lcc_rl.functional.braking.safe_command`). Comfort is that of the state expected.
 
-    Reads ``("wanted", role)``, which the controller of a filtered role writes, and writes
-    ``("command", role)``, both ``[*batch, n, 1]`` [m/s²]. Differentiable.
+    It reads ``("wanted", role)``, which the controller of a filtered role writes. Differentiable.
     """
 
-    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
     # Reckon with the actuators and sensors of the scenario; false: as if both were exact.
     robust: bool = True
     time_to_collision: Positive = 4.0  # shortest allowed [s]
@@ -115,13 +114,13 @@ class CBFFilter(RoleTransform):
         self.remembers = {ACTUATION: self.late, SENSORS: self.sensing.oldest > 0}
         self.memories = [f"{self.role}.{name}" for name, needed in self.remembers.items() if needed]
         self.from_step = world.steps(self.from_s, "from_s")
-        seen = [f"next.{WANTED}.{self.role}", *STATE, *self.memories]
+        seen = [f"next.{WANTED}.{self.role}", *FILTER_READS, *self.memories]
         self.declare(world, [*seen, *["episode.step"] * (self.from_step > 0)])
         self.limits = Braking(self.response.braking, self.braking_ahead, self.time_to_collision)
 
-    def watch(self) -> Promised:
+    def watch(self) -> CBFGuarantee:
         """Return the piece that records the steps for which the filter promises its limit."""
-        return Promised(safety=self).bind(World(self.string), self.role)
+        return CBFGuarantee(safety=self).bind(World(self.string), self.role)
 
     def compute(self, wanted: Tensor, *more: Tensor) -> Tensor:
         """Return the commands that the vehicles obey."""
@@ -136,10 +135,10 @@ class CBFFilter(RoleTransform):
         return [next(given) if needed else nothing for needed in self.remembers.values()]
 
     def _when_it_acts(
-        self, motion: Motion, acceleration: Tensor | float, actuation: Tensor, sensors: Tensor
-    ) -> Motion:
+        self, motion: PairState, acceleration: Tensor | float, actuation: Tensor, sensors: Tensor
+    ) -> PairState:
         """Return the motion when the command begins to act, from one as old as the measurement."""
-        past = frames_of(sensors, ACCELERATION)[..., : self.sensing.oldest]
+        past = frames_of(sensors, "self.acceleration")[..., : self.sensing.oldest]
         now = brought_up(motion, sensors[..., :1], past, acceleration, self.time_step)
         return predicted(now, actuation[..., 1:], acceleration, self.response)[-1]
 
@@ -162,7 +161,7 @@ class CBFFilter(RoleTransform):
         # Any of them that is no number, or infinite, shows in the sum.
         known = (wanted + speed + gap + ahead + ahead_acceleration).isfinite()
         kept = self.kept(memories, wanted)
-        measured = Motion(speed, gap, ahead, kept[0][..., :1])
+        measured = PairState(speed, gap, ahead, kept[0][..., :1])
         worst = self._when_it_acts(self.sensing.worst(measured), -self.braking_ahead, *kept)
         safe = self._safe(replace(worst, gap=worst.gap - self.margin))
         now = self._when_it_acts(measured, ahead_acceleration, *kept)
@@ -170,7 +169,7 @@ class CBFFilter(RoleTransform):
         command = command.clamp(-self.max_acceleration, self.max_acceleration)
         return torch.where(known, command, -self.max_acceleration)
 
-    def _safe(self, worst: Motion) -> Tensor:
+    def _safe(self, worst: PairState) -> Tensor:
         """Return the largest command that leaves the vehicle where braking suffices."""
         if self.late:
             return safe_command(worst, self.response, self.limits)
@@ -178,7 +177,7 @@ class CBFFilter(RoleTransform):
         return safe_acceleration(*state, self.limits, self.time_step)
 
     def _comfortable(
-        self, wanted: Tensor, now: Motion, ahead_acceleration: Tensor, safe: Tensor
+        self, wanted: Tensor, now: PairState, ahead_acceleration: Tensor, safe: Tensor
     ) -> Tensor:
         """Return the command nearest to what is wanted within all bounds, not clamped."""
         speed, gap, closing = now.speed, now.gap, now.speed - now.ahead
@@ -213,12 +212,9 @@ class CBFFilter(RoleTransform):
 
 
 class Corrected(RoleTransform):
-    """Writes by how much the command differs from a policy's action, ``(role, "correction")``.
+    """By how much the command differs from a policy's action: zero where the filter is inactive."""
 
-    ``[*batch, n, 1]`` [m/s²]: zero where the filter lets the policy drive.
-    """
-
-    max_acceleration: Positive = 3.0  # acceleration of action 1 [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # acceleration of action 1 [m/s²]
 
     writes = (
         Entry("role.correction", "m/s²", "what the safety filter added to a policy's command"),
@@ -233,7 +229,7 @@ class Corrected(RoleTransform):
         return command - self.max_acceleration * action
 
 
-class Promised(RoleTransform):
+class CBFGuarantee(RoleTransform):
     """Writes for which steps a filter answers, ``(role, "promised")``, ``[*batch, n, 1]``.
 
     1 where the vehicle was safe when the step began and the vehicle ahead braked no harder than
@@ -266,12 +262,12 @@ class Promised(RoleTransform):
         """Return 1 for the steps that are covered, and for those that begin safe."""
         safety, (*memories, step) = self.safety, more
         actuation, sensors = safety.kept(memories, speed)
-        now = Motion(speed, gap - safety.margin, ahead, actuation[..., :1])
+        now = PairState(speed, gap - safety.margin, ahead, actuation[..., :1])
         if safety.late:
             room = least_room_to_come(now, actuation[..., 1:], safety.response, safety.limits)
         else:
             room = least_room(speed, now.gap, ahead, safety.limits)
-        past = frames_of(sensors, AHEAD_ACCELERATION)[..., : safety.sensing.oldest]
+        past = frames_of(sensors, "ahead.acceleration")[..., : safety.sensing.oldest]
         hardest = join([acceleration, past], -1).amin(-1, keepdim=True)
         kept_up = hardest >= -safety.braking_ahead - ROUNDING
         safe = room >= -ROUNDING

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -24,21 +25,16 @@ from lcc_rl.functional.string import entries_ahead, gather
 from lcc_rl.pieces.base import Entry, Feature
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import LEADER, VEHICLES
-from lcc_rl.pieces.world import World
+from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import NonNegative, Number, Positive
 
 # How the leader's next speed is predicted: by v0 + a0 T, by v0, or known, as an upper bound only.
 Lookahead = Literal["causal", "hold", "oracle"]
-ERRORS = ("gap_error", "speed_error", "leader_gap_error", "leader_speed_error")
+PLATOON_ERRORS = ("gap_error", "speed_error", "leader_gap_error", "leader_speed_error")
 
 
 class Communication(Feature):
     """Writes what vehicles know of their platoon by radio (HCFS H1–H2).
-
-    Under ``"vehicles"``, ``[*batch, N, 1]``: ``gap_error`` e_x(i,i−1) and ``leader_gap_error``
-    e_x(i,0) [m], ``speed_error`` e_v(i,i−1) and ``leader_speed_error`` e_v(i,0) [m/s], positive
-    where the vehicle is too far behind or too slow; ``received_gap``, the gap as the message says
-    [m]; speed [m/s] and acceleration [m/s²] of its leader.
 
     A connected vehicle hears the connected vehicles ahead of it without a gap in the chain. The
     vehicle ahead of the first of them is the chain's leader; if it is not connected, the first
@@ -113,7 +109,7 @@ class Communication(Feature):
 class CACC(Controller):
     """Cooperative adaptive cruise control (HCFS H11)."""
 
-    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
     k1: Number = 0.04  # gain of e_x(i,i−1) [1/s]
     k2: Number = 0.12  # gain of e_v(i,i−1)
     k3: Number = 1.4  # gain of e_x(i,0) [1/s]
@@ -123,7 +119,7 @@ class CACC(Controller):
     # close to its leader. Stability is not checked.
     literal: bool = False
 
-    reads = tuple(f"self.{name}" for name in ERRORS)
+    reads = tuple(f"self.{name}" for name in PLATOON_ERRORS)
 
     def setup(self, world: World) -> None:
         """Refuse gains at which the closed loop is unstable, naming the condition that fails."""
@@ -134,9 +130,9 @@ class CACC(Controller):
 
     def command(self, *read: Tensor) -> Tensor:
         """Return the commands."""
-        errors, speed = Errors(*read[: len(ERRORS)]), read[len(ERRORS) :]
-        limits = self.time_step, self.max_acceleration
-        return cacc_acceleration(errors, self.gains, *limits, *speed)
+        errors, speed = Errors(*read[: len(PLATOON_ERRORS)]), read[len(PLATOON_ERRORS) :]
+        # Within the limits of every controller, which a hybrid leaves out.
+        return cacc_acceleration(errors, self.gains, self.time_step, inf, *speed)
 
 
 class DeadBeat(Controller):
@@ -147,7 +143,7 @@ class DeadBeat(Controller):
     stay, so it is a baseline, not a controller to drive with.
     """
 
-    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
     lookahead: Lookahead = "causal"
 
     def setup(self, world: World) -> None:
@@ -158,7 +154,7 @@ class DeadBeat(Controller):
     def command(self, speed: Tensor, *leader: Tensor) -> Tensor:
         """Return the commands."""
         target = next_leader_speed(leader, self.lookahead, self.time_step)
-        return dead_beat_acceleration(speed, target, self.time_step, self.max_acceleration)
+        return dead_beat_acceleration(speed, target, self.time_step, inf)
 
 
 def leader_names(lookahead: str) -> list[str]:

@@ -29,12 +29,11 @@ from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.pieces.base import ACTION, ROLE, Entry, RoleTransform, as_key
 from lcc_rl.pieces.string import COMMANDED, WISHED
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF
-from lcc_rl.pieces.world import World
+from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import Number, Positive
 
 # The names of the random streams: an episode's seed means the same episode under either.
 STREAMS = {AUTOMATED: "cav", HUMAN: "hdv"}
-LARGEST = 3.0  # command to automated vehicles, in both directions [m/s²]
 
 
 def stream_name(role: str) -> str:
@@ -99,7 +98,8 @@ class Controller(RoleTransform):
             remembers: what it remembers; by default what the class does.
         """
         self.time_step = world.time_step
-        largest = getattr(self, "max_acceleration", LARGEST if self.role == AUTOMATED else None)
+        otherwise = MAX_ACCELERATION if self.role == AUTOMATED else None
+        largest = getattr(self, "max_acceleration", otherwise)
         # Of the commands [m/s²]; None where they are executed as they are.
         self.limits: tuple[float, float] | None = None if largest is None else (-largest, largest)
         memory = self.remembers if remembers is None else remembers
@@ -128,7 +128,7 @@ class Action(Controller):
     sees actions beyond the range as its ends (:mod:`lcc_rl.pieces.views`).
     """
 
-    max_acceleration: Positive = 3.0  # acceleration of action 1, braking of action −1 [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # of action 1, in both directions [m/s²]
 
     reads = (".".join(ACTION),)
 

@@ -9,13 +9,14 @@ from torch import Tensor
 
 from lcc_rl.functional.rules import idm_acc, linear_acc
 from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.world import MAX_ACCELERATION
 from lcc_rl.settings import Positive
 
 
 class Cruise(Controller):
     """A rule of own speed, gap and relative speed, held within the largest acceleration."""
 
-    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
 
     reads = ("self.speed", "self.gap", "self.relative_speed")
     law: ClassVar[Callable[..., Tensor]]

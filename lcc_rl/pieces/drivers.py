@@ -20,27 +20,23 @@ from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.functional.random import between, choose, normal, stream_id, uniform
 from lcc_rl.pieces.base import SEED, Entry, require_option
 from lcc_rl.pieces.controllers import Controller, stream_name
-from lcc_rl.pieces.string import LEADER_SPEED
+from lcc_rl.pieces.leader import LEADER_SPEED
 from lcc_rl.pieces.views import MOTION
 from lcc_rl.pieces.world import MOST_LATE, World
 from lcc_rl.settings import Factors, NonNegative, Positive, Share
 
 INT = torch.int64
 # Draws that all drivers of an episode share.
-SPREAD, TIME_GAP = stream_id("drivers.wiener"), stream_id("drivers.time_gap")
-LONGEST = 1000.0  # time gap up to which an equilibrium gap is written [s]
+WIENER_STREAM, TIME_GAP_STREAM = stream_id("drivers.wiener"), stream_id("drivers.time_gap")
+LONGEST_TIME_GAP = 1000.0  # time gap up to which an equilibrium gap is written [s]
 
 
 class Drivers(Controller):
     """Base of human drivers: each has its own (v0, T), noise and a reaction delay.
 
     Every vehicle draws a driver by the episode's seed, unless ``(role, "driver")`` is given to
-    ``env.reset``. Constants of the episode under the role, ``[*batch, n, 1]``: driver,
-    desired_speed [m/s], desired_time_gap [s]; of other models than the IDM behind a leader also
-    equilibrium_gap, at which the driver follows at the leader's first speed [m]. With a delay,
-    ``(role, "motion_history")``, ``[*batch, n, 3 · delay]``, holds past speeds [m/s], gaps [m] and
-    relative speeds [m/s], latest first; with a noise of the acceleration ``(role,
-    "acceleration_noise")``, ``[*batch, n, 2]``, holds its latest values [m/s²].
+    ``env.reset``. The equilibrium gap is written for other models than the IDM behind a leader,
+    the past motion with a delay, and the latest values of the noise where there is one.
     """
 
     # Largest relative error ξ of the executed acceleration a·(1 + ξ), drawn anew each step from
@@ -150,7 +146,7 @@ class Drivers(Controller):
             draw = uniform(seed, step, self.noise_stream + self.index)
             command = command * (1.0 + self.noise * draw)
         if self.wiener:
-            spread = between(self.spreads, seed, SPREAD)
+            spread = between(self.spreads, seed, WIENER_STREAM)
             command = command + spread * normal(seed, step, self.wiener_stream + self.index)
         if self.strays:
             command = command + kept[-1][..., :1]
@@ -184,7 +180,9 @@ class Drivers(Controller):
         self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor, driver: Tensor
     ) -> Tensor:
         """Return the gap at which drivers follow steadily [m], all ``[*batch, n, 1]``."""
-        return self.law.equilibrium_gap(speed, desired_speed, time_gap, self.drivers, LONGEST)
+        return self.law.equilibrium_gap(
+            speed, desired_speed, time_gap, self.drivers, LONGEST_TIME_GAP
+        )
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         super().begin(given, start)
@@ -195,7 +193,7 @@ class Drivers(Controller):
             driver = choose(seed, count, self.driver_stream + self.index)
         else:
             require_option(self.reset_options[0], driver, count)
-        factor = between(self.time_gap_factors, start.get(SEED).unsqueeze(-2), TIME_GAP)
+        factor = between(self.time_gap_factors, start.get(SEED).unsqueeze(-2), TIME_GAP_STREAM)
         values = [driver, self.desired_speeds[driver], factor * self.time_gaps[driver]]
         if self.starts:
             speed = start.get(LEADER_SPEED).unsqueeze(-2).expand_as(values[1])

@@ -23,11 +23,7 @@ class DriverEstimator(StepTransform):
     During the first ``learning_time`` the prediction is the mean over the calibrated drivers;
     afterwards it is the IDM with the (v0, T) fitted to this episode so far. Only speeds and gaps
     up to now are used; a driver's acceleration is the difference of its speeds.
-
-    Writes under the role: ``"predicted_acceleration"`` of the step just taken, as predicted at
-    its start, ``[*batch, n, 1]`` [m/s²], and the belief ``"estimate"`` ``[*batch, n, 2]`` and
-    ``"covariance"`` ``[*batch, n, 3]`` (see
-    :mod:`lcc_rl.functional.estimation`).
+    The belief is that of :mod:`lcc_rl.functional.estimation`.
     """
 
     learning_time: NonNegative | None = 5.0  # until the fit is trusted; None: never [s]

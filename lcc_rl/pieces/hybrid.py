@@ -33,14 +33,14 @@ from lcc_rl.pieces.connected import (
     leader_names,
 )
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.pieces.world import World
+from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import NonNegative, Positive
 
 WINNER = ("hybrid", "winner")
 COUNTERS = SWITCHES, CLAMPS, CAPS = tuple(
     ("hybrid", name) for name in ("switches", "clamps", "cap_interventions")
 )
-OWN = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
+HYBRID_READS = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
 INT = torch.int64
 SPARE = 2.0  # beyond the gap that the cap needs, for what vehicles deviate from it [m]
 
@@ -49,14 +49,11 @@ class HCFS(Controller):
     """The hybrid car-following strategy: a rule or the action, the better of both each step.
 
     Composes two candidates by H12–H14, see :func:`lcc_rl.functional.hcfs.hybrid_decision`: the
-    command of a rule and the action of a policy. Writes under ``"hybrid"``, ``[*batch, n, 1]``,
-    int64: ``winner`` (0 rule, 1 policy; −1 at reset) and since the start of the episode the
-    numbers of ``switches``, ``clamps`` (the jerk bound cut a candidate) and
-    ``cap_interventions``.
+    command of a rule and the action of a policy.
     """
 
     rule: InstanceOf[Controller]  # whose command is one candidate
-    max_acceleration: Positive = 3.0  # acceleration of action 1 [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # acceleration of action 1 [m/s²]
     jerk_bound: Positive = 30.0  # J; the paper's 2 a_max/T = 30 never binds [m/s³]
     lookahead: Lookahead = "causal"
     clamp: bool = True  # hold the candidates within the jerk bound; false: the literal rule
@@ -85,7 +82,7 @@ class HCFS(Controller):
         Entry(WINNER, "–", "candidate chosen: 0 rule, 1 policy, −1 at reset", 1, INT),
         Entry(SWITCHES, "–", "changes of the winner since the start", 1, INT),
         Entry(CLAMPS, "–", "steps in which the jerk bound cut a candidate", 1, INT),
-        Entry(CAPS, "–", "steps in which the cap cut a candidate", 1, INT),
+        Entry(CAPS, "–", "steps in which the safe cap cut a candidate", 1, INT),
     )
 
     def validate(self) -> None:
@@ -98,8 +95,7 @@ class HCFS(Controller):
     def setup(self, world: World) -> None:
         """Read what both candidates and the decision need."""
         self.rule = rule = self.rule.bind(world, self.name)
-        rule.max_acceleration = math.inf  # the decision limits what is executed
-        reads = [f"{self.name}.action", *(f"self.{name}" for name in OWN)]
+        reads = [f"{self.name}.action", *(f"self.{name}" for name in HYBRID_READS)]
         self.declare(world, [*reads, *leader_names(self.lookahead), *rule.names])
         check_leader(self.lookahead, self)
         if self.choice == "first":

@@ -15,7 +15,7 @@ from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
 from lcc_rl.pieces.base import SEED, STEP, Entry, Feature, StepTransform
-from lcc_rl.pieces.leader import FIRST, PROFILE
+from lcc_rl.pieces.leader import PROFILE, PROFILE_START
 from lcc_rl.pieces.views import EPISODE, NEXT, Views
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative
@@ -37,7 +37,7 @@ class LeaderPreview(Feature):
     delay: Seconds = 0.0  # age of the message: the speed of that long before is given instead [s]
 
     role = EPISODE
-    reads = (PROFILE, FIRST, SEED, STEP)
+    reads = (PROFILE, PROFILE_START, SEED, STEP)
     known = Entry("preview.speed", "m/s", "speed of the leader at each horizon ahead")
     speeds: ClassVar[Tensor]
     offsets: ClassVar[Tensor]

@@ -16,8 +16,8 @@ from lcc_rl.pieces.views import EPISODE
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative
 
-PROFILE, FIRST = ("leader", "profile"), ("leader", "start")
-SPEED, ACCELERATION, NEXT_SPEED = (
+PROFILE, PROFILE_START = ("leader", "profile"), ("leader", "start")
+LEADER_SPEED, LEADER_ACCELERATION, NEXT_SPEED = (
     ("leader", name) for name in ("speed", "acceleration", "next_speed")
 )
 
@@ -28,10 +28,6 @@ class NGSIMLeader(StepTransform):
     The record is random by the episode's seed, or given to ``env.reset`` as ``("leader",
     "profile")`` and ``("leader", "start")``, one per episode: an id, or a list paired with
     drivers.
-
-    Writes ``("leader", "speed")`` [m/s] and ``("leader", "acceleration")``, the backward
-    difference [m/s²], ``[*batch, 1]``; with ``foresight`` also ``("leader", "next_speed")``, the
-    speed one step ahead, which only an oracle may read [m/s].
 
     A perturbed leader drives max(0, (1 + p c) v + p A sin(2π t/τ + φ)): every episode has its own
     c ~ U(−0.2, 0.2), A ~ U(0, 1) m/s, τ ~ U(4, 20) s and φ, all by its seed.
@@ -45,11 +41,18 @@ class NGSIMLeader(StepTransform):
     role = EPISODE
     keeps = (
         Entry(PROFILE, "–", "id of the speed record that the leader plays", 1, torch.int64, True),
-        Entry(FIRST, "–", "sample of the record at which the episode begins", 1, torch.int64, True),
+        Entry(
+            PROFILE_START,
+            "–",
+            "sample of the record at which the episode begins",
+            1,
+            torch.int64,
+            True,
+        ),
     )
     writes = (
-        Entry(SPEED, "m/s", "speed of the leader"),
-        Entry(ACCELERATION, "m/s²", "backward difference of its speed"),
+        Entry(LEADER_SPEED, "m/s", "speed of the leader"),
+        Entry(LEADER_ACCELERATION, "m/s²", "backward difference of its speed"),
         Entry(NEXT_SPEED, "m/s", "its speed one step ahead, for oracles"),
     )
     speeds: ClassVar[Tensor]
@@ -64,7 +67,7 @@ class NGSIMLeader(StepTransform):
         Raises:
             DataError: if no record is as long as the horizon.
         """
-        reads = [PROFILE, FIRST, SPEED, next_key(STEP), SEED]
+        reads = [PROFILE, PROFILE_START, LEADER_SPEED, next_key(STEP), SEED]
         self.declare(world, reads, self.writes[: 2 + self.foresight])
         self.perturbed = 0.0 if world.nominal else self.perturbation
         profiles = world.given("profiles", self.title).at_least(world.horizon)
@@ -113,9 +116,9 @@ class NGSIMLeader(StepTransform):
         still = torch.zeros_like(seed)
         speed = self.speed_at(profile, first, still, seed)
         start.set(PROFILE, profile)
-        start.set(FIRST, first)
-        start.set(SPEED, speed)
-        start.set(ACCELERATION, torch.zeros_like(speed))
+        start.set(PROFILE_START, first)
+        start.set(LEADER_SPEED, speed)
+        start.set(LEADER_ACCELERATION, torch.zeros_like(speed))
         if self.foresight:
             start.set(NEXT_SPEED, self.speed_at(profile, first, still + 1, seed))
 
@@ -129,7 +132,7 @@ class NGSIMLeader(StepTransform):
 
     def _window(self, given: TensorDictBase, seed: Tensor) -> tuple[Tensor, Tensor]:
         """Return the record and its first sample, as given or else drawn."""
-        profile, first = given.get(PROFILE, None), given.get(FIRST, None)
+        profile, first = given.get(PROFILE, None), given.get(PROFILE_START, None)
         if profile is None and self.profile is not None:
             profile = torch.full_like(seed, self.profile)
         elif profile is None:
@@ -141,5 +144,5 @@ class NGSIMLeader(StepTransform):
             if self.start == "random":
                 first = choose(seed, self.starts[profile], self.start_stream)
         else:
-            require_option(FIRST, first, self.starts[profile])
+            require_option(PROFILE_START, first, self.starts[profile])
         return profile, first

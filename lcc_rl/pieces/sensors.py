@@ -17,9 +17,8 @@ from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Share
 
 SENSORS = "sensors"
-# Columns of a frame of the memory.
-GAP, SPEED, AHEAD, AHEAD_ACCELERATION, ACCELERATION = range(5)
-SEEN = ("self.gap", "self.speed", "ahead.speed", "ahead.acceleration", "self.acceleration")
+# What is measured, the columns of a frame of the memory.
+TRUE_STATE = ("self.gap", "self.speed", "ahead.speed", "ahead.acceleration", "self.acceleration")
 
 
 class Sensors(RoleTransform):
@@ -32,9 +31,8 @@ class Sensors(RoleTransform):
     within their bounds by the episode's seed: for each measurement, or every ``error_time``, and
     linear in time between.
 
-    Keeps ``(role, "sensors")``, ``[*batch, n, 1 + 5·(oldest + 1)]``: the age of the measurement in
-    steps, then what :data:`SEEN` names, true, at present and in the steps before. Before the
-    episode began, speeds were what they are at its start.
+    It keeps the age of the measurement in steps, then what :data:`TRUE_STATE` names, at present and
+    in the steps before. Before the episode began, speeds were what they are at its start.
     """
 
     gap_error: NonNegative = 0.0  # largest, of the gap [m]
@@ -65,11 +63,11 @@ class Sensors(RoleTransform):
         self.sensing = self.sensing_in(world, role)
         self.apart = max(1, world.steps(self.error_time, f"scenario.sensors.{role}.error_time"))
         drawn = ["episode.seed", "next.episode.step"]
-        seen = [f"{role}.{SENSORS}", *(f"next.{name}" for name in SEEN), *drawn]
-        width = 1 + len(SEEN) * (self.sensing.oldest + 1)
+        seen = [f"{role}.{SENSORS}", *(f"next.{name}" for name in TRUE_STATE), *drawn]
+        width = 1 + len(TRUE_STATE) * (self.sensing.oldest + 1)
         self.declare(world, seen, [*self.measured, self.kept.wide(width)])
         # The same entries at reset, where there is no step before.
-        self.first = Views(world.string, role, [*SEEN, "episode.seed", "episode.step"])
+        self.first = Views(world.string, role, [*TRUE_STATE, "episode.seed", "episode.step"])
         self.streams = [stream_id(f"{role}.sensors.{name}") for name in ("gap", "speed", "ahead")]
         self.missing = stream_id(f"{role}.sensors.missing")
         self.register_buffer("index", torch.arange(*self.rows).unsqueeze(-1))
@@ -89,7 +87,7 @@ class Sensors(RoleTransform):
     def compute(self, memory: Tensor, *seen: Tensor) -> tuple[Tensor, ...]:
         """Return what is measured, and what is kept."""
         *now, seed, step = seen
-        frames = join([*now, memory[..., 1 : -len(SEEN)]], -1)
+        frames = join([*now, memory[..., 1 : -len(TRUE_STATE)]], -1)
         dropped = memory[..., :1] - self.sensing.late
         missing = uniform(seed, step, self.missing + self.index) < self.dropouts
         dropped = torch.where(missing & (dropped < self.sensing.longest), dropped + 1.0, 0.0)
@@ -100,7 +98,7 @@ class Sensors(RoleTransform):
     ) -> tuple[Tensor, ...]:
         """Return what is measured of frames, the latest first, and what is kept."""
         number = age.long()
-        columns = len(SEEN) * number + torch.arange(len(SEEN), device=frames.device)
+        columns = len(TRUE_STATE) * number + torch.arange(len(TRUE_STATE), device=frames.device)
         chosen = reverse(reverse(frames).gather(0, reverse(columns)))
         gap, speed, ahead, acceleration, _ = chosen.split(1, -1)
         bounds = (self.sensing.gap, self.sensing.speed, self.sensing.ahead)
@@ -122,9 +120,10 @@ class Sensors(RoleTransform):
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         *now, seed, step = self.first.of(start)
-        closing = self.time_step * (now[SPEED] - now[AHEAD])
+        gap, speed, ahead, *_ = now
+        closing = self.time_step * (speed - ahead)
         frames = [
-            join([now[GAP] + number * closing, *now[SPEED:]], -1)
+            join([gap + number * closing, *now[1:]], -1)
             for number in range(self.sensing.oldest + 1)
         ]
         age = torch.full_like(closing, self.sensing.late)
@@ -133,6 +132,6 @@ class Sensors(RoleTransform):
             start.set(key, value)
 
 
-def frames_of(memory: Tensor, column: int) -> Tensor:
-    """Return a column of :data:`SEEN` in all frames, the latest first, ``[*batch, n, frames]``."""
-    return memory[..., 1 + column :: len(SEEN)]
+def frames_of(memory: Tensor, name: str) -> Tensor:
+    """Return one of :data:`TRUE_STATE` in all frames, latest first, ``[*batch, n, frames]``."""
+    return memory[..., 1 + TRUE_STATE.index(name) :: len(TRUE_STATE)]

@@ -16,7 +16,8 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import between, stream_id, uniform
 from lcc_rl.functional.string import advance_string, entries_ahead, selector
 from lcc_rl.pieces.base import SEED, Entry, StepTransform, next_key
-from lcc_rl.pieces.views import EPISODE, LEADER, VEHICLES
+from lcc_rl.pieces.leader import LEADER_SPEED
+from lcc_rl.pieces.views import EPISODE, VEHICLES
 from lcc_rl.pieces.world import Part, World
 from lcc_rl.settings import Factors, Positive, Speed
 
@@ -24,10 +25,9 @@ RING_GAP = stream_id("string.ring_gap")
 WANTED, COMMAND, OBEYED = "wanted", "command", "obeyed"
 COMMANDED = Entry("command.role", "m/s²", "acceleration that the role's controller commands")
 WISHED = Entry("wanted.role", "m/s²", "acceleration commanded before the safety filter")
-LEADER_SPEED = (LEADER, "speed")
 
 
-class Places(StepTransform):
+class RolePlaces(StepTransform):
     """Writes which vehicles have which role, ``(role, "index")``, ``[*batch, n]``, int64.
 
     If the places of a string are drawn, they are written for every role, anew in every episode by
@@ -82,12 +82,7 @@ class Start(Protocol):
 
 
 class StringMotion(StepTransform):
-    """Moves all vehicles by their commands (A18): the one place with physics.
-
-    Writes under ``"vehicles"``, ``[*batch, N, 1]``: speed [m/s], gap to the vehicle ahead,
-    bumper to bumper [m], relative_speed v_ahead − v [m/s], the executed acceleration [m/s²], its
-    jerk [m/s³], and the command [m/s²].
-    """
+    """Moves all vehicles by their commands (A18): the one place with physics."""
 
     start: Mapping[str, Any] = field(default_factory=dict)  # by role: a :class:`Start`
     circumference: Positive | None = None  # of a ring road [m]

@@ -12,6 +12,7 @@ from lcc_rl.errors import require
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.settings import Settings, values
 
+MAX_ACCELERATION = 3.0  # of vehicles by default, in both directions [m/s²]
 MOST_LATE = 1000  # steps that a sensor, an actuator or a driver may be late; each is kept
 # Views that a role with sensors has from them, and the entries of the role that hold them.
 SENSED = {

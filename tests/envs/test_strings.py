@@ -33,7 +33,7 @@ from lcc_rl.pieces import (
     Action,
     Feature,
     NGSIMLeader,
-    Places,
+    RolePlaces,
     StringMotion,
     TimeGapStart,
     TimeToCollision,
@@ -146,7 +146,7 @@ MOTION = StringMotion(start={"automated": TimeGapStart()})
 
 
 def pieces(*more):
-    needed = (NGSIMLeader(), Places(), Action(), MOTION)
+    needed = (NGSIMLeader(), RolePlaces(), Action(), MOTION)
     return [*(piece.bind(WORLD) for piece in needed), *more]
 
 
