@@ -158,7 +158,7 @@ def _by_role(scenario: Any, group: str, kind: type[Piece]) -> dict[str, Any]:
 def _size(pieces: Sequence[Piece], batch_size: Sequence[int] | int) -> int:
     """Return the bytes that a step of a batch of episodes needs at the least."""
     one = torch.Size([1])
-    specs = [spec for piece in pieces for spec in piece.specs(one, None).values()]
+    specs = [spec for piece in pieces for spec in piece.specs(one, None, piece.targets).values()]
     moment = sum(spec.shape.numel() * spec.dtype.itemsize for spec in specs)
     return MOMENTS * moment * math.prod(batch_shape(batch_size))
 

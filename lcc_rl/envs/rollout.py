@@ -64,9 +64,8 @@ class DifferentiableRollout:
         kept = known & (
             {key for piece in self.after for _, key in piece.needs} | every | {STEP, ACTION}
         )
-        steps = [piece for piece in inside if isinstance(piece, StepTransform)]
         # A compiled step takes its time for every entry that it returns: only those that are used.
-        self.constants = sorted({SEED}.union(*(piece.constants for piece in steps)))
+        self.constants = sorted({SEED}.union(*(piece.constants for piece in inside)))
         read = read_before(inside) & known
         self.moving = sorted((kept | read | {STEP}) - {ACTION, *self.constants})
         self.recorded = sorted(kept)
@@ -139,6 +138,4 @@ class DifferentiableRollout:
 
 def _is_recurrent(piece: Piece) -> bool:
     """Whether a piece reads what it wrote one moment before."""
-    if not isinstance(piece, StepTransform):
-        return False
     return bool({key for late, key in piece.needs if not late} & written([piece]))

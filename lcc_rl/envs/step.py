@@ -93,20 +93,14 @@ class Step:
 
 def written(pieces: Iterable[Piece]) -> set[Key]:
     """Return the keys that pieces write, without ``"next"``, their constants included."""
-    found: set[Key] = set()
-    for piece in pieces:
-        found |= set(piece.targets)
-        if isinstance(piece, StepTransform):
-            found |= set(piece.constants)
-    return found
+    return {key for piece in pieces for key in piece.entries}
 
 
 def read_before(pieces: Iterable[Piece]) -> set[Key]:
     """Return the entries of a moment that the next step reads, constants included."""
     found: set[Key] = {SEED, STEP}
     for piece in pieces:
-        if isinstance(piece, StepTransform):
-            found |= {key for late, key in piece.needs if not late} | set(piece.constants)
+        found |= {key for late, key in piece.needs if not late} | set(piece.constants)
     return found
 
 

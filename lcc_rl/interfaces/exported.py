@@ -58,7 +58,7 @@ class ExportedPolicy(nn.Module):
         super().__init__()
         self.network, self.largest, self.safety = network, action.max_acceleration, safety
         self.memory = memory
-        self.register_buffer("constants", observation.constants.clone())
+        self.register_buffer("constants", observation.factors.clone())
         seen = observation.columns()
         needed = [name for column in seen for name in column]
         needed += FILTER_READS if safety is not None else ()

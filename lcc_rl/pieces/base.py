@@ -122,6 +122,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
     reads: ClassVar[Sequence[NestedKey]] = ()
     # What compute returns, in order; a plain key holds one number per row.
     writes: ClassVar[Sequence[Entry | NestedKey]] = ()
+    keeps: ClassVar[Sequence[Entry]] = ()  # constants of an episode, which begin sets at reset
     measures: ClassVar[bool] = False  # what sensors measure is read as they measure it
     # Maps what is read to what is written; a pure function of tensors.
     compute: ClassVar[Callable[..., Any]]
@@ -154,14 +155,15 @@ class Piece(Part, TensorDictModuleBase, Transform):
         world: World,
         reads: Sequence[NestedKey] | Views | None = None,
         writes: Sequence[Entry | NestedKey] | None = None,
+        keeps: Sequence[Entry] | None = None,
     ) -> None:
-        """Set what the piece reads and writes, where it depends on settings.
+        """Set what the piece reads and writes; by default what its class names.
 
         Args:
             world: what the pieces of the environment share.
-            reads: what :meth:`compute` is given, in order; by default what the class reads.
-            writes: what :meth:`compute` returns, in order; by default what the class writes. A
-                plain key holds one number per row.
+            reads: what :meth:`compute` is given, in order.
+            writes: what :meth:`compute` returns, in order, without ``"next"``.
+            keeps: constants of an episode.
         """
         string = self.string = world.string
         if not isinstance(reads, Views):
@@ -169,13 +171,16 @@ class Piece(Part, TensorDictModuleBase, Transform):
             names = world.sensed(self.role, names) if self.measures else names
             reads = Views(string, self.role, names)
         self.views = reads
-        # As plain tuples: TorchRL's properties convert at every access.
-        self.needs = [(key[0] == NEXT, root_key(key)) for key in reads.keys]
+        # Whether of the moment reached, and the key, as a plain tuple: TorchRL's properties convert
+        # at every access.
+        self.needs = [(True, key) for key in reads.keys]
         self.read_names = [".".join(key) for key in reads.keys]
         count = len(string) if self.role == VEHICLES else string.count(self.role)
         self.rows = () if self.role == EPISODE else (count,)
         self.entries: dict[Key, Entry] = {}
         self.targets = self._declared(self.writes if writes is None else writes)
+        self.constants = self._declared(self.keeps if keeps is None else keeps)
+        self.reset_options = [key for key in self.constants if self.entries[key].option]
         self.in_keys, self.out_keys = list(reads.keys), list(self.targets)
         self.event_shape = self.shape_of(self.targets[0]) if self.targets else (*self.rows, 1)
 
@@ -196,7 +201,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
         device: torch.device | None,
         keys: Sequence[Key] | None = None,
     ) -> dict[Key, Any]:
-        """Return the specs of declared entries, by default of those that each step writes."""
+        """Return the specs of declared entries, by default of all."""
         plain = torch.get_default_dtype()
         return {
             key: Unbounded(
@@ -204,7 +209,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
                 dtype=self.entries[key].dtype or plain,
                 device=device,
             )
-            for key in (self.targets if keys is None else keys)
+            for key in (self.entries if keys is None else keys)
         }
 
     def derive(self, before: State, reached: State, detached: bool = False) -> None:
@@ -265,9 +270,12 @@ class Piece(Part, TensorDictModuleBase, Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         return add_specs(self, observation_spec)
 
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
+        return add_specs(self, state_spec, self.reset_options)
+
 
 def add_specs(piece: Piece, spec: Composite, keys: Sequence[Key] | None = None) -> Composite:
-    """Add declared entries of a piece to a spec, by default those that each step writes."""
+    """Add declared entries of a piece to a spec, by default all of them."""
     for key, entry in piece.specs(spec.shape, spec.device, keys).items():
         spec[key] = entry
     return spec
@@ -275,9 +283,6 @@ def add_specs(piece: Piece, spec: Composite, keys: Sequence[Key] | None = None) 
 
 class Feature(Piece):
     """A piece that reads one moment, at reset as well as after every step."""
-
-    def _entries(self, before: State, reached: State) -> list[Tensor]:
-        return [reached[key] for _, key in self.needs]
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
@@ -291,9 +296,6 @@ class Feature(Piece):
 class StepTransform(Piece):
     """A piece that reads the states before and after a step."""
 
-    # Constants of an episode, which begin sets at reset.
-    keeps: ClassVar[Sequence[Entry]] = ()
-
     def declare(
         self,
         world: World,
@@ -301,18 +303,10 @@ class StepTransform(Piece):
         writes: Sequence[Entry | NestedKey] | None = None,
         keeps: Sequence[Entry] | None = None,
     ) -> None:
-        """Set what the piece reads and writes, where it depends on settings.
-
-        Args:
-            world: what the pieces of the environment share.
-            reads: what :meth:`compute` is given, in order; ``next.`` for the moment reached.
-            writes: what is written in the next state, given without ``"next"``.
-            keeps: what :meth:`begin` sets at reset and keeps its value for the whole episode.
-        """
-        super().declare(world, reads, writes)
+        """Set what the piece reads, under ``next.`` of the moment reached, and what it writes."""
+        super().declare(world, reads, writes, keeps)
+        self.needs = [(key[0] == NEXT, root_key(key)) for _, key in self.needs]
         self.out_keys = [next_key(key) for key in self.targets]
-        self.constants = self._declared(self.keeps if keeps is None else keeps)
-        self.reset_options = [key for key in self.constants if self.entries[key].option]
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         """Set the written entries and the constants at reset; zeros unless overridden.
@@ -321,7 +315,7 @@ class StepTransform(Piece):
             given: what the caller passed to ``env.reset``: the reset options may be in it.
             start: the first moment of the episodes, written by the pieces before this one.
         """
-        for key, spec in self.specs(start.batch_size, start.device).items():
+        for key, spec in self.specs(start.batch_size, start.device, self.targets).items():
             start.set(key, spec.zero())
 
     def derive(self, before: State, reached: State, detached: bool = False) -> None:
@@ -344,12 +338,6 @@ class StepTransform(Piece):
         for key in (*self.targets, *self.constants):  # as a step lays them out
             tensordict_reset.set(key, batch_innermost(tensordict_reset.get(key)))
         return tensordict_reset
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return add_specs(self, add_specs(self, observation_spec), self.constants)
-
-    def transform_state_spec(self, state_spec: Composite) -> Composite:
-        return add_specs(self, state_spec, self.reset_options)
 
 
 class RoleTransform(StepTransform):

@@ -43,7 +43,7 @@ class Observation(Feature):
 
     measures = True
     gathered = Entry(OBSERVATION, "–", "observed entries, each times its constant")
-    constants: ClassVar[Tensor]
+    factors: ClassVar[Tensor]
 
     def validate(self) -> None:
         zeros = [".".join(key) for key, scale in self._flat().items() if not scale]
@@ -81,8 +81,8 @@ class Observation(Feature):
         self.seen, self.names = [".".join(key) for key in seen], [".".join(key) for key in names]
         self.bases = [[names.index(key) for key in keys] for keys in bases]
         self.repeats = [n // max(len(keys), 1) for n, keys in zip(counts, bases, strict=True)]
-        constants = [1.0] * len(values) if self.raw else values
-        self.register_buffer("constants", torch.tensor(constants))
+        factors = [1.0] * len(values) if self.raw else values
+        self.register_buffer("factors", torch.tensor(factors))
 
     def column(self, name: str) -> int:
         """Return the column of an entry, e.g. ``"self.gap"``.
@@ -120,7 +120,7 @@ class Observation(Feature):
             entry if entry.shape[-2] == vehicles else entry.expand(*entry.shape[:-2], vehicles, -1)
             for entry in seen
         ]
-        return torch.cat(rows, dim=-1) * self.constants
+        return torch.cat(rows, dim=-1) * self.factors
 
 
 def _bases(

@@ -88,7 +88,7 @@ def test_a_ring_wraps() -> None:
 def test_a_raw_observation_is_in_si_units() -> None:
     scales = {"self": {"speed": 0.1, "gap": 0.5}, "behind": {"speed": 0.1}}
     pair = World(parse_string("automated human"))
-    scaled, raw = (Observation(scales=scales, raw=x).bind(pair).constants for x in (False, True))
+    scaled, raw = (Observation(scales=scales, raw=x).bind(pair).factors for x in (False, True))
     assert scaled.tolist() == pytest.approx([0.1, 0.5, 0.1])
     assert raw.tolist() == [1.0, 1.0, 1.0]
 

@@ -68,7 +68,7 @@ class PlainLoop:
         self.leader, self.motion = pieces["NGSIMLeader"], pieces["StringMotion"]
         self.max_acceleration = pieces["Action"].max_acceleration
         self.human, self.estimator = pieces["IDM"], pieces["DriverEstimator"]
-        self.scales, self.penalty = pieces["Observation"].constants, terms["collision"].weight
+        self.scales, self.penalty = pieces["Observation"].factors, terms["collision"].weight
         self.safety, self.efficiency = terms["safety"], terms["efficiency"]
         self.horizon, self.rows = env.base_env.horizon, env.batch_size.numel()
         energies = (terms["cav_energy"], terms["hdv_energy"])
