@@ -179,8 +179,8 @@ class Broken(Feature):
 @pytest.mark.parametrize(
     ("piece", "words"),
     [
-        (Wide().bind(), r"Wide writes vehicles\.wide as \[4, 4, 1\] .* expected \[4, 1\]"),
-        (Broken().bind(), "Broken does not fit the string of vehicles"),
+        (Wide().bind(WORLD), r"Wide writes vehicles\.wide as \[4, 4, 1\] .* expected \[4, 1\]"),
+        (Broken().bind(WORLD), "Broken does not fit the string of vehicles"),
         (
             MOTION.bind(WORLD),
             r"vehicles\.speed is written by more than one piece: \['StringMotion', 'StringMot",
