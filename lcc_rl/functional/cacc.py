@@ -53,7 +53,7 @@ def platoon_errors(
         gap: bumper-to-bumper gap to the vehicle ahead [m].
         headway: h, the gap to be kept [m].
         delay: of vehicle-to-vehicle messages [s].
-        chain: who hears whom; None: all vehicles are one chain behind a leader that sends.
+        chain: the radio links; None: all vehicles are one chain behind a leader that sends.
     """
     excess = gap - headway
     received = excess - delay * ahead
