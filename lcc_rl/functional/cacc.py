@@ -1,4 +1,4 @@
-"""Cooperative adaptive cruise control and dead-beat control (HCFS H1–H2, H11).
+"""Cooperative adaptive cruise control (HCFS H1–H2, H11).
 
 Signs: an error is positive where the follower is too far behind or too slow; the signs of H1–H2 as
 printed would make the gap negative. Tensors of vehicles are ``[*batch, N, 1]``.
@@ -169,18 +169,3 @@ def next_leader_speed(leader: Sequence[Tensor], lookahead: str, time_step: float
     if lookahead == "hold":
         return speed
     return advance_speed(speed, acceleration, time_step)[0]
-
-
-def dead_beat_acceleration(
-    speed: Tensor, target: Tensor, time_step: float, max_acceleration: float
-) -> Tensor:
-    """Compute the acceleration that reaches the leader's predicted speed in one step [m/s²].
-
-    Args:
-        speed: v_i, ``[*batch, N, 1]`` [m/s].
-        target: the predicted speed of each vehicle's leader [m/s].
-        time_step: T [s].
-        max_acceleration: bound in both directions [m/s²].
-    """
-    wanted = (target - speed) / time_step
-    return wanted.clamp(-max_acceleration, max_acceleration)

@@ -14,7 +14,6 @@ from lcc_rl.functional.cacc import (
     Errors,
     Gains,
     cacc_acceleration,
-    dead_beat_acceleration,
     find_chains,
     next_leader_speed,
     platoon_errors,
@@ -150,7 +149,7 @@ class DeadBeat(Controller):
     def command(self, speed: Tensor, *leader: Tensor) -> Tensor:
         """Return the commands."""
         target = next_leader_speed(leader, self.lookahead, self.time_step)
-        return dead_beat_acceleration(speed, target, self.time_step, self.max_acceleration)
+        return (target - speed) / self.time_step
 
 
 def leader_names(lookahead: str) -> list[str]:

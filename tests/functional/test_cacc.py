@@ -14,7 +14,6 @@ from lcc_rl.functional.cacc import (
     Errors,
     Gains,
     cacc_acceleration,
-    dead_beat_acceleration,
     find_chains,
     platoon_errors,
 )
@@ -191,17 +190,6 @@ def test_one_step_reward_with_spacing(seconds, error) -> None:
     torch.testing.assert_close(got, column(wanted))
     # The paper's rule knows no place.
     assert torch.equal(PlatoonReward().one_step(*given, place), PlatoonReward().one_step(*given))
-
-
-# -- dead-beat -------------------------------------------------------------------------------------
-
-
-def test_dead_beat_reaches_the_target_in_one_step() -> None:
-    speed, target = column(9.8, 10.3), torch.tensor([10.0], dtype=torch.float64)
-    acceleration = dead_beat_acceleration(speed, target, T, A_MAX)
-    torch.testing.assert_close(advance_speed(speed, acceleration, T)[0], column(10.0, 10.0))
-    far = dead_beat_acceleration(column(0.0), target, T, A_MAX)
-    torch.testing.assert_close(far, column(A_MAX))
 
 
 # -- safe cap --------------------------------------------------------------------------------------
