@@ -51,7 +51,7 @@ class Rule(nn.Module):
         self.logarithms = nn.Parameter(torch.tensor([math.log(x) for x in values.values()]))
         self.max_acceleration = max_acceleration
         self.columns = [observation.column(name) for name in kind.reads]
-        self.register_buffer("scales", observation.constants[self.columns].clone(), False)
+        self.register_buffer("scales", observation.factors[self.columns].clone(), False)
 
     def constants(self) -> dict[str, float]:
         """Return the constants by name."""

@@ -96,7 +96,7 @@ class Calibrator(Settings):
         default_factory=_wide
     )
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         law = find_law(self.model)
         given = {name: x for name, x in self.constants.items() if x is not None}
         for name in given:

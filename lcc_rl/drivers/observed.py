@@ -31,7 +31,7 @@ class Selection(Settings):
     # Slower episodes are dropped: the relative error divides by speed [m/s].
     min_mean_speed_mps: NonNegative = 0.5
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         longest = self.max_duration_s
         if longest is not None and longest < self.min_duration_s:
             raise ValueError(

@@ -38,7 +38,7 @@ class ElectricCar(EnergyModel):
     fade_speed: Positive = 5.0  # below it recuperation fades in proportion to it [m/s]
     grade: Grade = 0.0  # of the road [rad]
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         self.resistance = 0.5 * AIR * self.drag * self.area  # of the air [N/(m/s)²]
         slope = self.rolling * math.cos(self.grade) + math.sin(self.grade)
         self.rolling_force = self.mass * GRAVITY * slope  # [N]

@@ -11,7 +11,7 @@ from torch import Tensor
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import DriverConstants
 from lcc_rl.functional.laws import LAWS
-from lcc_rl.pieces.drivers import LONGEST, Drivers
+from lcc_rl.pieces.drivers import LONGEST_TIME_GAP, Drivers
 from lcc_rl.pieces.world import World
 
 
@@ -50,7 +50,7 @@ class CalibratedDrivers(Drivers):
         self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor, driver: Tensor
     ) -> Tensor:
         """Return the gap at which drivers follow steadily, each by its own model."""
-        steady = (speed, desired_speed, time_gap, LONGEST)
+        steady = (speed, desired_speed, time_gap, LONGEST_TIME_GAP)
         return self._each(driver, lambda law: law.equilibrium_gap(*steady))
 
     def _each(self, driver: Tensor, quantity: Callable[[DriverConstants], Tensor]) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.world import MAX_ACCELERATION
 from lcc_rl.settings import Positive, defaults
 
 Constant = Tensor | float
@@ -20,7 +21,7 @@ class Cruise(Controller):
     The settings of a class besides that are the constants of its law, in this order.
     """
 
-    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
 
     reads = ("self.speed", "self.gap", "self.relative_speed")
 

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Any
 
 import torch
 from pydantic import Field, InstanceOf
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Unbounded
 
 from lcc_rl.functional.layout import join, total
-from lcc_rl.pieces.base import Key
+from lcc_rl.pieces.base import Entry
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
@@ -35,21 +32,19 @@ class Averaging(Controller):
     max_acceleration: Positive = 1.5  # of the command [m/s²]
     max_deceleration: Positive = 3.0  # of the command [m/s²]
 
+    history = Entry("role.speed_history", "m/s", "own speeds of the last steps, latest first")
+
     @property
     def averages(self) -> bool:
         """Whether the mean is kept."""
         return True
 
     def setup(self, world: World) -> None:
-        """Read what the rule reads, and the history."""
-        self.average(world, self.reads)
-
-    def average(self, world: World, reads: Sequence[str], writes: Sequence[NestedKey] = ()) -> None:
-        """Set what is read and written besides the history, where it is kept."""
-        kept = [(self.name, "speed_history")] if self.averages else []
-        known = ["episode.step", *(".".join(key) for key in kept)] if kept else []
-        self.drive(world, [*reads, *known], [*kept, *writes])
-        self.samples = max(world.steps(self.window, "window"), 1) if kept else 0
+        """Read what the rule reads, and the history where it is kept."""
+        self.samples = max(world.steps(self.window, "window"), 1) if self.averages else 0
+        memory = [self.history.wide(self.samples), *self.remembers] if self.averages else []
+        reads = [*self.reads, *["episode.step"] * self.averages]
+        self.declare(world, reads, remembers=memory)
         self.limits = (-self.max_deceleration, self.max_acceleration)
 
     def mean(self, speed: Tensor, step: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
@@ -60,13 +55,6 @@ class Averaging(Controller):
     def towards(self, wanted: Tensor, speed: Tensor) -> Tensor:
         """Return the acceleration [m/s²] to a speed."""
         return (wanted - speed) / self.time_step
-
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        specs = super().written_specs(batch, device)
-        if self.samples:
-            shape = (*batch, self.event_shape[0], self.samples)
-            specs[self.role, "speed_history"] = Unbounded(shape=shape, device=device)
-        return specs
 
 
 class FollowerStopper(Averaging):
@@ -86,7 +74,7 @@ class FollowerStopper(Averaging):
 
     reads = ("self.speed", "self.gap", "ahead.speed")
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if list(self.gaps) != sorted(self.gaps):
             raise ValueError(f"gaps must increase, got {list(self.gaps)}")
 
@@ -137,22 +125,27 @@ class PISaturation(Averaging):
     closing_time: Positive = 2.0  # how long closing in may take [s]
     transition: Positive = 2.0  # γ, range of gaps over which it changes from one to the other [m]
 
-    def __post_init__(self) -> None:
+    reads = ("self.speed", "self.gap", "ahead.speed")
+    remembers = (
+        Entry("role.commanded_speed", "m/s", "speed that PI with saturation commanded last"),
+    )
+
+    def validate(self) -> None:
         if self.gaps[0] >= self.gaps[1]:
             raise ValueError(f"gaps must be two increasing numbers, got {list(self.gaps)}")
 
-    def setup(self, world: World) -> None:
-        """Keep the speed commanded before."""
-        before = (self.name, "commanded_speed")
-        reads = ("self.speed", "self.gap", "ahead.speed", ".".join(before))
-        self.average(world, reads, [before])
-
     def command(
-        self, speed: Tensor, gap: Tensor, ahead: Tensor, before: Tensor, *kept: Tensor
+        self,
+        speed: Tensor,
+        gap: Tensor,
+        ahead: Tensor,
+        step: Tensor,
+        history: Tensor,
+        before: Tensor,
     ) -> Any:
         """Return the commands, the history and the speed commanded."""
-        mean, past = self.mean(speed, *kept)
-        before = torch.where(kept[0] == 0, speed, before)
+        mean, past = self.mean(speed, step, history)
+        before = torch.where(step == 0, speed, before)
         wanted = self.wanted(speed, gap, ahead, mean, before)
         return self.towards(wanted, speed), past, wanted
 
@@ -182,12 +175,11 @@ class Handover(Controller):
         """Read and write what both do."""
         both = [inner.bind(world, self.name) for inner in (self.before, self.after)]
         self.before, self.after = both
-        self.drive(
+        self.declare(
             world,
             ["episode.step", *(name for inner in both for name in inner.names)],
-            [key for inner in both for key in inner.targets[1:]],
-            constants=[key for inner in both for key in inner.constants],
-            reset_options=[key for inner in both for key in inner.reset_options],
+            [inner.entries[key] for inner in both for key in inner.targets[1:]],
+            [inner.entries[key] for inner in both for key in inner.constants],
         )
         self.limits = None  # each has its own
         self.from_step = world.steps(self.from_s, "from_s")
@@ -195,23 +187,11 @@ class Handover(Controller):
     def command(self, step: Tensor, *entries: Tensor) -> Any:
         """Return the commands of the one that drives, and what both write besides."""
         place = len(self.before.names)
-        first = self.before.limited(*entries[:place])
-        second = self.after.limited(*entries[place:])
+        first = self.before.compute(*entries[:place])
+        second = self.after.compute(*entries[place:])
         first, second = (x if isinstance(x, tuple) else (x,) for x in (first, second))
         command = torch.where(step < self.from_step, first[0], second[0])
         return (command, *first[1:], *second[1:])
-
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        return {
-            **self.before.written_specs(batch, device),
-            **self.after.written_specs(batch, device),
-        }
-
-    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        return {
-            **self.before.constant_specs(batch, device),
-            **self.after.constant_specs(batch, device),
-        }
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         self.before.begin(given, start)

@@ -14,10 +14,10 @@ from lcc_rl.pieces.controllers import stream_name
 from lcc_rl.pieces.world import Part, World
 from lcc_rl.settings import Factors, NonNegative, Positive
 
-GAP, SPEED = stream_id("platoon.gap"), stream_id("platoon.speed")
+GAP_STREAM, SPEED_STREAM = stream_id("platoon.gap"), stream_id("platoon.speed")
 
 
-def draw(start: TensorDictBase, stream: int, like: Tensor) -> Tensor:
+def draw_uniform(start: TensorDictBase, stream: int, like: Tensor) -> Tensor:
     """Draw from U[0, 1) for every vehicle of a role, by the seed of its episode."""
     index = torch.arange(like.shape[-2], device=like.device).unsqueeze(-1)
     return uniform(start.get(SEED).unsqueeze(-2), 0, stream + index)
@@ -41,7 +41,7 @@ class TimeGapStart(Part):
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
-        uniformly = draw(start, self.stream, speed)
+        uniformly = draw_uniform(start, self.stream, speed)
         factor = self.lowest + (self.highest - self.lowest) * uniformly
         return speed, factor * (self.standstill_gap + self.time_gap * speed)
 
@@ -84,7 +84,7 @@ class HeadwayStart(Part):
     gap_spread: NonNegative = 2.0  # largest deviation of a gap from it; evaluation takes 0 [m]
     speed_spread: NonNegative = 1.0  # … and of a speed from the leader's [m/s]
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.gap_spread >= self.headway:
             raise ValueError(f"gap_spread={self.gap_spread} must be below headway={self.headway}")
 
@@ -95,7 +95,7 @@ class HeadwayStart(Part):
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
-        shift = 2.0 * draw(start, GAP, speed) - 1.0
+        shift = 2.0 * draw_uniform(start, GAP_STREAM, speed) - 1.0
         gap = self.headway + self.gaps * shift
-        shift = 2.0 * draw(start, SPEED, speed) - 1.0
+        shift = 2.0 * draw_uniform(start, SPEED_STREAM, speed) - 1.0
         return (speed + self.speeds * shift).clamp(min=0.0), gap
