@@ -132,17 +132,13 @@ class Gains:
 
 
 def cacc_acceleration(
-    errors: Errors,
-    gains: Gains,
-    time_step: float,
-    max_acceleration: float,
-    speed: Tensor | None = None,
+    errors: Errors, gains: Gains, time_step: float, speed: Tensor | None = None
 ) -> Tensor:
     """Compute the acceleration of the CACC law (H11), ``[*batch, N, 1]`` [m/s²].
 
     H11 is dimensionally a speed command, v_cmd = v_i + k1 e_x(i,i−1) + k2 e_v(i,i−1) +
-    k3 e_x(i,0) + k4 e_v(i,0), reached in one step: a = clip((v_cmd − v_i)/T, ±a_max). With
-    ``speed``, v_i, the law is as printed, where v_cmd is the acceleration: a = clip(v_cmd, ±a_max).
+    k3 e_x(i,0) + k4 e_v(i,0), reached in one step: a = (v_cmd − v_i)/T. With ``speed``, v_i, the
+    law is as printed, where v_cmd is the acceleration. The controller clips it to ±a_max.
     """
     change = (
         gains.k1 * errors.gap
@@ -150,8 +146,7 @@ def cacc_acceleration(
         + gains.k3 * errors.leader_gap
         + gains.k4 * errors.leader_speed
     )
-    wanted = change / time_step if speed is None else speed + change
-    return wanted.clamp(-max_acceleration, max_acceleration)
+    return change / time_step if speed is None else speed + change
 
 
 def next_leader_speed(leader: Sequence[Tensor], lookahead: str, time_step: float) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import inf
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -131,7 +130,7 @@ class CACC(Controller):
         """Return the commands."""
         errors, speed = Errors(*read[: len(PLATOON_ERRORS)]), read[len(PLATOON_ERRORS) :]
         # Within the limits of every controller, which a hybrid leaves out.
-        return cacc_acceleration(errors, self.gains, self.time_step, inf, *speed)
+        return cacc_acceleration(errors, self.gains, self.time_step, *speed)
 
 
 class DeadBeat(Controller):
