@@ -18,7 +18,7 @@ from lcc_rl.data.profiles import Profiles, from_records, join
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.evaluation.cases import drive
 from lcc_rl.evaluation.strategies import Strategy, deployed
-from lcc_rl.functional.cacc import dead_beat_acceleration, next_leader_speed
+from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.random import uniform
 from lcc_rl.pieces.base import SEED, STEP
 
@@ -138,7 +138,7 @@ class Actor(TensorDictModuleBase):
         )
         if kind in ("good", "hasty"):
             target = next_leader_speed([*heard, heard[0]], "causal", T)
-            own = dead_beat_acceleration(speed, target, T, A_MAX) / A_MAX
+            own = ((target - speed) / T).clamp(-A_MAX, A_MAX) / A_MAX
             return own + (0.1 / T / A_MAX if kind == "hasty" else 0.0)
         if kind == "bad":
             return torch.ones_like(speed)

@@ -23,7 +23,7 @@ class Rule(nn.Module):
     """A cruise control whose constants are learned: their logarithms, so that they stay positive.
 
     Args:
-        kind: whose law it is, and whose defaults are the constants at the start.
+        kind: the controller that has the law; its defaults are the constants at the start.
         observation: where the vehicle's own speed, gap and relative speed are found.
         constants: other constants at the start, by name.
         max_acceleration: acceleration of action 1 [m/s²].
@@ -113,7 +113,7 @@ def make_policy(
         hidden: sizes of the ReLU layers of a network.
         seed: seed of its initial weights.
         constants: constants of a rule at the start.
-        max_acceleration: acceleration of action 1 [m/s²]; None if nobody knows.
+        max_acceleration: acceleration of action 1 [m/s²]; None if it is unknown.
 
     Returns:
         A module that reads ``"observation"`` ``[*batch, n]`` and writes ``"action"``

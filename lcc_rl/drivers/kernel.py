@@ -35,7 +35,7 @@ def kernel(apart, leader, follower, gaps, samples, parameters, total):
 {step}
                 gap[i] += advance - {half} * (speed[i] + {reached})
                 speed[i] = {reached}
-                error[i] += (speed[i] - truth) * (speed[i] - truth)
+                error[i] += ({reached} - truth) * ({reached} - truth)
                 if apart is not None:
                     distance[i] += (gap[i] - seen) * (gap[i] - seen)
 """

@@ -202,7 +202,7 @@ def from_table(table: pd.DataFrame) -> DriverPopulation:
 
 
 def mode_of(table: pd.DataFrame) -> str | None:
-    """Return the calibration that the drivers of a table are of; None where it does not tell."""
+    """Return the mode of calibration in a driver table; None without that column."""
     return str(table["mode"].iloc[0]) if "mode" in table else None
 
 

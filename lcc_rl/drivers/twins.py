@@ -1,11 +1,11 @@
 """Twins: calibrated drivers, each behind the leader of the driver that it was fitted to.
 
 A calibration that minimises the error of speed or gap finds drivers that accelerate too little,
-because it punishes every acceleration at the wrong moment. How true drivers are in energy is seen
-when each drives where the recorded one did. The reaction that the fit leaves out, a delay and a
-noise that all drivers share, is chosen by the spectrum of the acceleration, by the energy lost to
-accelerating, and so that energy does not grow along a string of such drivers: a delay alone would
-do for the first driver, whose successors then amplify what it does until they collide.
+because it punishes every acceleration at the wrong moment. Energy is compared by driving each
+calibrated driver behind its own recorded leader. The reaction that the fit leaves out is a delay
+and a noise that all drivers share. It is chosen by the spectrum of the acceleration, by the energy
+spent on accelerating, and so that energy does not grow along a string of such drivers. With a
+delay alone the first driver fits, but its successors amplify its motion until they collide.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ SPECTRUM_WINDOW = 20.0  # part of a record whose spectrum is taken; parts overla
 LONG_GAP = 2.5  # time gap above which a driver is far behind, above 1 m/s [s]
 REPEATS = 2  # draws of the noise of every driver
 AT_ONCE = 20_000  # trajectories side by side; more would only take memory
-DRIVER_FOLDS = 5  # parts of the drivers; each is judged by a reaction chosen on the others
+DRIVER_FOLDS = 5  # each fold is evaluated with the reaction chosen on the other folds
 DELAYS = tuple(round(0.1 * number, 1) for number in range(10))  # among which is chosen [s]
 NOISES = tuple(round(0.05 * number, 2) for number in range(13))  # likewise [m/s²]
-TOLERANCES = {"lost": 0.05, "spectrum": 0.2, "growth": 0.05}  # relative; see choose
-CARS = 5  # drivers in a row, along whom energy must not grow
+TOLERANCES = {"lost": 0.05, "spectrum": 0.2, "growth": 0.05}  # relative; see choose_reaction
+CARS = 5  # cars in the string over which energy must not grow
 HELD = "the recorded drivers hold their speeds"
 LEAST_LOST = 1e-6  # share of the energy that drivers in traffic lose at least to accelerating
 DENSITY, HERTZ = "density_", "hz"  # around the frequency in the name of a column
@@ -178,7 +178,7 @@ def growth(
 
     Behind every recorded leader, drivers follow one another, drawn from all of them, from their
     own equilibrium. What is returned is the logarithm of the ratio of both energies per distance,
-    for every reaction; infinity if anybody collides.
+    for every reaction; infinity after a collision.
     """
     law, own = _people(observed, drivers)
     leader = observed.leader_speed.double().cpu()
@@ -346,7 +346,7 @@ def choose_reaction(
 
 
 def cross_chosen(tries: Mapping[Reaction, Tried], records: pd.DataFrame) -> pd.DataFrame:
-    """Return drivers who each have the reaction that was chosen on other drivers."""
+    """Return drivers with the reaction that was chosen on the other folds."""
     fold = np.arange(len(records)) % DRIVER_FOLDS
     parts = []
     for own in (fold == number for number in range(min(DRIVER_FOLDS, len(records)))):

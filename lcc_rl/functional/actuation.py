@@ -1,4 +1,4 @@
-"""What engine and brakes make of commands: they act late, with a lag, and within their limits."""
+"""Engine and brakes: commands act with a delay, a lag and within limits."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ class Response:
         """Time for which the last acceleration, held, covers what the lag loses [s].
 
         Braking fully from acceleration a reaches, step by step, a speed that lies above that of
-        braking at once by T·(a + braking)·(1 − share + (1 − share)² + …). Holding a for this time
-        and braking at once afterwards lies above by as much in the end, and never by less.
+        braking at once by T·(a + braking)·(1 − share + (1 − share)² + …). Holding a for this time,
+        then braking fully, bounds the lagged speed from above.
         """
         return self.time_step * (1.0 - self.share) / self.share
 

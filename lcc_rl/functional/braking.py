@@ -1,4 +1,4 @@
-"""How hard a vehicle may accelerate and still keep its distance by braking, whatever comes.
+"""Largest acceleration from which full braking still keeps a safe distance.
 
 A vehicle is *safe* where full braking keeps ``gap − τ·(v − v_ahead)`` from becoming negative at
 all times to come, while the vehicle ahead brakes as hard as is expected of it until it stands. No

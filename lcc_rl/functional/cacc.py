@@ -1,4 +1,4 @@
-"""Cooperative adaptive cruise control and dead-beat control (HCFS H1–H2, H11).
+"""Cooperative adaptive cruise control (HCFS H1–H2, H11).
 
 Signs: an error is positive where the follower is too far behind or too slow; the signs of H1–H2 as
 printed would make the gap negative. Tensors of vehicles are ``[*batch, N, 1]``.
@@ -53,7 +53,7 @@ def platoon_errors(
         gap: bumper-to-bumper gap to the vehicle ahead [m].
         headway: h, the gap to be kept [m].
         delay: of vehicle-to-vehicle messages [s].
-        chain: who hears whom; None: all vehicles are one chain behind a leader that sends.
+        chain: the radio links; None: all vehicles are one chain behind a leader that sends.
     """
     excess = gap - headway
     received = excess - delay * ahead
@@ -132,17 +132,13 @@ class Gains:
 
 
 def cacc_acceleration(
-    errors: Errors,
-    gains: Gains,
-    time_step: float,
-    max_acceleration: float,
-    speed: Tensor | None = None,
+    errors: Errors, gains: Gains, time_step: float, speed: Tensor | None = None
 ) -> Tensor:
     """Compute the acceleration of the CACC law (H11), ``[*batch, N, 1]`` [m/s²].
 
     H11 is dimensionally a speed command, v_cmd = v_i + k1 e_x(i,i−1) + k2 e_v(i,i−1) +
-    k3 e_x(i,0) + k4 e_v(i,0), reached in one step: a = clip((v_cmd − v_i)/T, ±a_max). With
-    ``speed``, v_i, the law is as printed, where v_cmd is the acceleration: a = clip(v_cmd, ±a_max).
+    k3 e_x(i,0) + k4 e_v(i,0), reached in one step: a = (v_cmd − v_i)/T. With ``speed``, v_i, the
+    law is as printed, where v_cmd is the acceleration. The controller clips it to ±a_max.
     """
     change = (
         gains.k1 * errors.gap
@@ -150,8 +146,7 @@ def cacc_acceleration(
         + gains.k3 * errors.leader_gap
         + gains.k4 * errors.leader_speed
     )
-    wanted = change / time_step if speed is None else speed + change
-    return wanted.clamp(-max_acceleration, max_acceleration)
+    return change / time_step if speed is None else speed + change
 
 
 def next_leader_speed(leader: Sequence[Tensor], lookahead: str, time_step: float) -> Tensor:
@@ -169,18 +164,3 @@ def next_leader_speed(leader: Sequence[Tensor], lookahead: str, time_step: float
     if lookahead == "hold":
         return speed
     return advance_speed(speed, acceleration, time_step)[0]
-
-
-def dead_beat_acceleration(
-    speed: Tensor, target: Tensor, time_step: float, max_acceleration: float
-) -> Tensor:
-    """Compute the acceleration that reaches the leader's predicted speed in one step [m/s²].
-
-    Args:
-        speed: v_i, ``[*batch, N, 1]`` [m/s].
-        target: the predicted speed of each vehicle's leader [m/s].
-        time_step: T [s].
-        max_acceleration: bound in both directions [m/s²].
-    """
-    wanted = (target - speed) / time_step
-    return wanted.clamp(-max_acceleration, max_acceleration)

@@ -69,7 +69,7 @@ def predict_and_update(
     """Predict the acceleration of this step, then learn from the one measured (A15).
 
     The prediction uses the belief from before the measurement. A step in which the follower
-    stands still or its acceleration meets its physical limit tells nothing of (v0, T) and leaves
+    stands still or its acceleration meets its physical limit contains nothing on (v0, T) and leaves
     the belief as it was.
 
     Args:

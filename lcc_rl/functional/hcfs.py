@@ -208,7 +208,7 @@ def _nearest(
     shares = torch.cat([torch.zeros_like(rule), between, torch.ones_like(rule)], -1)
     rewards = earned(torch.lerp(rule, learned, shares))
     wanted = torch.maximum(rewards[..., :1], rewards[..., -1:])
-    # Within the stretch at whose end as much is reached for the first time.
+    # Within the interval in which this level is first reached.
     end = (rewards >= wanted).to(torch.int64).argmax(-1, keepdim=True)
     begin = (end - 1).clamp(min=0)
     low, high = rewards.gather(-1, begin), rewards.gather(-1, end)

@@ -1,4 +1,4 @@
-"""What sensors make of a state: late, within bounds of their errors, and what that leaves open."""
+"""Measurements with delay and bounded errors, and the states that they allow."""
 
 from __future__ import annotations
 

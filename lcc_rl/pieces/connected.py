@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import inf
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -15,7 +14,6 @@ from lcc_rl.functional.cacc import (
     Errors,
     Gains,
     cacc_acceleration,
-    dead_beat_acceleration,
     find_chains,
     next_leader_speed,
     platoon_errors,
@@ -132,7 +130,7 @@ class CACC(Controller):
         """Return the commands."""
         errors, speed = Errors(*read[: len(PLATOON_ERRORS)]), read[len(PLATOON_ERRORS) :]
         # Within the limits of every controller, which a hybrid leaves out.
-        return cacc_acceleration(errors, self.gains, self.time_step, inf, *speed)
+        return cacc_acceleration(errors, self.gains, self.time_step, *speed)
 
 
 class DeadBeat(Controller):
@@ -154,7 +152,7 @@ class DeadBeat(Controller):
     def command(self, speed: Tensor, *leader: Tensor) -> Tensor:
         """Return the commands."""
         target = next_leader_speed(leader, self.lookahead, self.time_step)
-        return dead_beat_acceleration(speed, target, self.time_step, inf)
+        return (target - speed) / self.time_step
 
 
 def leader_names(lookahead: str) -> list[str]:

@@ -167,8 +167,8 @@ class Handover(Controller):
     Both compute from the start, so that one which remembers is ready when its turn comes.
     """
 
-    before: InstanceOf[Controller]  # who drives first, a human driver say
-    after: InstanceOf[Controller]  # who drives from then on
+    before: InstanceOf[Controller]  # drives first, for example a human driver
+    after: InstanceOf[Controller]  # drives from then on
     from_s: NonNegative  # that moment [s]
 
     def setup(self, world: World) -> None:
@@ -185,7 +185,7 @@ class Handover(Controller):
         self.from_step = world.steps(self.from_s, "from_s")
 
     def command(self, step: Tensor, *entries: Tensor) -> Any:
-        """Return the commands of whoever drives, and what both write besides."""
+        """Return the commands of the one that drives, and what both write besides."""
         place = len(self.before.names)
         first = self.before.compute(*entries[:place])
         second = self.after.compute(*entries[place:])
