@@ -25,7 +25,6 @@ from lcc_rl.pieces.views import MOTION
 from lcc_rl.pieces.world import MOST_LATE, World
 from lcc_rl.settings import Factors, NonNegative, Positive, Share
 
-INT = torch.int64
 # Draws that all drivers of an episode share.
 WIENER_STREAM, TIME_GAP_STREAM = stream_id("drivers.wiener"), stream_id("drivers.time_gap")
 LONGEST_TIME_GAP = 1000.0  # time gap up to which an equilibrium gap is written [s]
@@ -55,7 +54,7 @@ class Drivers(Controller):
 
     name = HUMAN
     known = (
-        Entry("role.driver", "–", "id of each vehicle's driver in the population", 1, INT, True),
+        Entry("role.driver", "–", "id of each vehicle's driver in the population", option=True),
         Entry("role.desired_speed", "m/s", "desired speed v0 of the driver"),
         Entry("role.desired_time_gap", "s", "desired time gap T of the driver"),
         Entry(
