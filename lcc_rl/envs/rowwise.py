@@ -44,7 +44,7 @@ def read(table: Any, place: Any) -> Any:
     return table[place]
 
 
-NAMES = {
+KERNEL_SCOPE = {
     "pick": pick,
     "read": read,
     "ndtri": ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(
@@ -145,6 +145,6 @@ def translated(
 @cache
 def kernel_of(source: str) -> Callable[..., None]:
     """Return a function as machine code; environments of the same settings share it."""
-    scope = dict(NAMES)
+    scope = dict(KERNEL_SCOPE)
     exec(source, scope)
     return numba.njit(error_model="numpy")(scope["kernel"])

@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 
 MASK = 0xFFFFFFFF
-STEP = 0x9E3779B9  # golden-ratio increment: consecutive counters differ in about half the bits
+STEP_FACTOR = (
+    0x9E3779B9  # golden-ratio increment: consecutive counters differ in about half the bits
+)
 STREAM = 0x85EBCA6B
 
 
@@ -43,7 +45,7 @@ def uniform(seed: Tensor, step: Tensor | int, stream: Tensor | int = 0) -> Tenso
         float32 of the broadcast shape.
     """
     # The mask keeps what counts, within 64 bits.
-    bits = hash_bits(seed + step * STEP + (stream * STREAM & MASK))
+    bits = hash_bits(seed + step * STEP_FACTOR + (stream * STREAM & MASK))
     return (bits >> 8).to(torch.float32) * 2.0**-24
 
 

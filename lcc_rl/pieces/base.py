@@ -42,7 +42,7 @@ STEP = (EPISODE, "step")
 # What learners read and write, and are rewarded by.
 OBSERVATION, ACTION, REWARD = ((AUTOMATED, x) for x in ("observation", "action", "reward"))
 # Parts of declared keys that stand for the role of a piece, and for its name.
-ROLE, NAME = "role", "name"
+ROLE, TERM = "role", "name"
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Entry:
 
     def of(self, role: str, name: str = "") -> Entry:
         """Return the entry of a role or of a name."""
-        held = {ROLE: role, NAME: name}
+        held = {ROLE: role, TERM: name}
         return replace(self, key=tuple(held.get(part) or part for part in as_key(self.key)))
 
     def wide(self, width: int | tuple[int, ...]) -> Entry:

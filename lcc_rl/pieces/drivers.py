@@ -21,7 +21,7 @@ from lcc_rl.functional.random import between, choose, normal, stream_id, uniform
 from lcc_rl.pieces.base import SEED, Entry, require_option
 from lcc_rl.pieces.controllers import Controller, stream_name
 from lcc_rl.pieces.leader import LEADER_SPEED
-from lcc_rl.pieces.views import MOTION
+from lcc_rl.pieces.views import MOTION_READS
 from lcc_rl.pieces.world import MOST_LATE, World
 from lcc_rl.settings import Factors, NonNegative, Positive, Share
 
@@ -86,7 +86,7 @@ class Drivers(Controller):
         self.starts = self.tells_gap and not world.string.ring
         memory = [self.history.wide(3 * self.late)] * (self.late > 0)
         memory += [self.latest] * (self.noise_spread > 0)
-        names = [*MOTION, f"{role}.desired_speed", f"{role}.desired_time_gap", "episode.seed"]
+        names = [*MOTION_READS, f"{role}.desired_speed", f"{role}.desired_time_gap", "episode.seed"]
         names += ["episode.step", *(f"{role}.{name}" for name in self.further)]
         self.declare(world, names, keeps=self.known[: 3 + self.starts], remembers=memory)
         self.limits = None  # drives as a person, in automated vehicles, too

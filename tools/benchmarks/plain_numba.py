@@ -15,7 +15,7 @@ from benchmarks.plain import PlainLoop
 from lcc_rl.functional.estimation import REFERENCE_SPEED
 from lcc_rl.functional.power import POWER_COEFFICIENTS
 from lcc_rl.functional.random import MASK, STREAM
-from lcc_rl.functional.random import STEP as STRIDE
+from lcc_rl.functional.random import STEP_FACTOR as STRIDE
 
 compiled: Callable[[Any], Any] = numba.njit(fastmath=True, error_model="numpy")
 
