@@ -15,14 +15,14 @@ from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import SingleAgent, build_env
-from lcc_rl.envs.clock import Clock, reset_options
+from lcc_rl.envs.clock import Clock, option_specs
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.envs.single import group_key
 from lcc_rl.envs.step import pieces_of, written
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces import Handover, Piece
-from lcc_rl.pieces.base import NAME, ROLE, Key, as_key, declared
+from lcc_rl.pieces.base import ROLE, TERM, Key, as_key, declared
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "entries.md"
@@ -89,7 +89,7 @@ def entry_key(key: Key, roles: Collection[str]) -> Key:
         ConfigError: if none declares it.
     """
     by_role = tuple(ROLE if part in roles else part for part in key)
-    for known in (key, by_role, (*key[:-1], NAME)):
+    for known in (key, by_role, (*key[:-1], TERM)):
         if known in ENTRIES:
             return known
     raise ConfigError(f"no class declares unit and meaning of {'.'.join(key)}")
@@ -133,7 +133,7 @@ def collect(found_in: Iterable[tuple[TransformedEnv, VehicleString]]) -> dict[Ke
     rows: dict[Key, list[str]] = {}
     for env, string in found_in:
         parts = [getattr(env, f"full_{x}_spec") for x in SPECS]
-        options = reset_options(env)
+        options = option_specs(env)
         specs = {as_key(key): spec for part in parts for key, spec in part.items(True, True)}
         for key, spec in specs.items():
             if ("observation",) in specs and group_key(key) == key:
@@ -158,7 +158,7 @@ def page(rows: dict[Key, list[str]]) -> str:
     """Return the page."""
     entries = [("key", "shape", "unit", "meaning", "written by")]
     for key, (shape, mark, *names) in rows.items():
-        shown = ", ".join(part if part in (ROLE, NAME) else f'"{part}"' for part in key)
+        shown = ", ".join(part if part in (ROLE, TERM) else f'"{part}"' for part in key)
         entry = ENTRIES[key]
         known = (f"`{shown}`", f"`{shape}`", entry.unit, entry.meaning + mark)
         entries.append((*known, ", ".join(names)))

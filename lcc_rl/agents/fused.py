@@ -82,13 +82,13 @@ class Network:
         return slope
 
 
-class Judged(NamedTuple):
+class CriticBatch(NamedTuple):
     """Observations and actions side by side, and what each layer of each critic returns."""
 
     input: Tensor
     outputs: list[list[Tensor]]
 
-    def place(self, observation: Tensor, action: Tensor) -> Judged:
+    def place(self, observation: Tensor, action: Tensor) -> CriticBatch:
         """Write what is to be judged."""
         torch.cat([observation, action], -1, out=self.input)
         return self
@@ -102,9 +102,9 @@ class Judged(NamedTuple):
 class Workspace(NamedTuple):
     """What an update judges: the actions of the data and, below them, those of the actor."""
 
-    both: Judged
-    data: Judged
-    own: Judged
+    both: CriticBatch
+    data: CriticBatch
+    own: CriticBatch
     slope: Tensor  # of the mean value of the actor's actions, negated
 
 
@@ -141,16 +141,16 @@ class ActorCritic:
         if rows not in self.spaces:
             first = self.critics[0].layers[0][0]
             outputs = [critic.room(2 * rows)[0] for critic in self.critics]
-            both = Judged(first.new_empty(2 * rows, first.shape[1]), outputs)
+            both = CriticBatch(first.new_empty(2 * rows, first.shape[1]), outputs)
             data, own = (
-                Judged(both.input[part], [[x[part] for x in output] for output in outputs])
+                CriticBatch(both.input[part], [[x[part] for x in output] for output in outputs])
                 for part in (slice(rows), slice(rows, None))
             )
             slope = first.new_full((rows, 1), -1.0 / rows)
             self.spaces[rows] = Workspace(both, data, own, slope)
         return self.spaces[rows]
 
-    def future(self, reached: Tensor, action: Tensor, into: Judged) -> Tensor:
+    def future(self, reached: Tensor, action: Tensor, into: CriticBatch) -> Tensor:
         """Return the least value of actions by the target networks, ``[batch, 1]``."""
         into.place(reached, action)
         pairs = zip(self.target_critics, into.outputs, strict=True)
@@ -162,12 +162,12 @@ class ActorCritic:
         future = future.masked_fill(after.get("terminated"), 0.0)
         return future.mul_(self.gamma).add_(after.get("reward"))
 
-    def judge(self, what: Judged, count: int | None = None) -> list[Tensor]:
+    def judge(self, what: CriticBatch, count: int | None = None) -> list[Tensor]:
         """Return the values by the first critics, all unless a count is given."""
         pairs = zip(self.critics[:count], what.outputs, strict=False)
         return [critic.forward(what.input, out) for critic, out in pairs]
 
-    def critic_step(self, data: Judged, wanted: Tensor) -> Tensor:
+    def critic_step(self, data: CriticBatch, wanted: Tensor) -> Tensor:
         """Write the gradient of the critics' loss, their mean square errors; return the loss."""
         errors = [value.sub_(wanted) for value in data.values]
         loss = reduce(torch.add, [error.square().mean() for error in errors])
@@ -175,7 +175,7 @@ class ActorCritic:
             critic.backward(data.input, error.mul_(2.0 / len(error)), outputs)
         return loss
 
-    def through_critics(self, own: Judged, slopes: Sequence[Tensor], count: int) -> Tensor:
+    def through_critics(self, own: CriticBatch, slopes: Sequence[Tensor], count: int) -> Tensor:
         """Return the derivative by the actions, ``count`` inputs, from that by the values."""
         found = []
         for critic, slope, outputs in zip(self.critics, slopes, own.outputs, strict=False):

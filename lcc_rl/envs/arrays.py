@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.envs.clock import is_whole, reset_options
+from lcc_rl.envs.clock import is_whole, option_specs
 from lcc_rl.envs.rowwise import Array, Rowwise
 from lcc_rl.envs.step import (
     TERMINATED,
@@ -146,7 +146,7 @@ class ArrayEpisodes:
     def _given(self, seeds: Tensor, options: Mapping[str, Any]) -> TensorDict:
         """Return seeds and reset options as the TorchRL environment takes them."""
         given = TensorDict({SEED: seeds}, [self.count])
-        specs = {".".join(key): spec for key, spec in reset_options(self.env).items()}
+        specs = {".".join(key): spec for key, spec in option_specs(self.env).items()}
         for name, value in options.items():
             if (spec := specs.get(name)) is None:
                 raise unknown_name("reset option", str(name), specs)

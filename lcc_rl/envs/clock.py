@@ -149,7 +149,7 @@ class Clock(EnvBase):
         return moment
 
 
-def reset_options(env: EnvBase) -> dict[Key, Any]:
+def option_specs(env: EnvBase) -> dict[Key, Any]:
     """Return the spec of every entry that a caller may give to ``env.reset``."""
     specs = {as_key(key): spec for key, spec in env.state_spec.items(True, True)}
     return {key: spec for key, spec in specs.items() if key != STEP}
@@ -219,7 +219,7 @@ class Traffic(TransformedEnv):
         Raises:
             ConfigError: naming the key, what was expected and the options that exist.
         """
-        options = reset_options(self)
+        options = option_specs(self)
         names = ", ".join(".".join(key) for key in options)
         keys = set(map(as_key, given.keys(True, True, is_leaf=is_leaf_nontensor)))
         keys -= {as_key(key) for key in (*self.reset_keys, AsyncEnvPool._env_idx_key)}

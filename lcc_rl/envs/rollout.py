@@ -24,7 +24,7 @@ from lcc_rl.pieces.base import (
 )
 from lcc_rl.pieces.views import NEXT
 
-Network = Callable[[Tensor], Tensor]
+ActionFunction = Callable[[Tensor], Tensor]
 
 
 class DifferentiableRollout:
@@ -90,7 +90,7 @@ class DifferentiableRollout:
         return state
 
     def play(
-        self, state: State, network: Network, steps: int, shifts: Tensor | None = None
+        self, state: State, network: ActionFunction, steps: int, shifts: Tensor | None = None
     ) -> tuple[State, list[list[Tensor]]]:
         """Let a policy drive for some steps.
 

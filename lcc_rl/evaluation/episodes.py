@@ -19,7 +19,7 @@ from lcc_rl.envs.inputs import Inputs, build_energy
 from lcc_rl.errors import require
 from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.rows import (
-    BEHIND,
+    FILTER_ENTRIES,
     INDEX,
     KEYS,
     as_frame,
@@ -171,7 +171,7 @@ class Episodes:
         )
         self.energy = build_energy(self.cfg)
         filtered = bool(self.cfg.scenario.filters.get(AUTOMATED))
-        keys = [*KEYS, INDEX, CLASS, *(BEHIND if filtered else ())]
+        keys = [*KEYS, INDEX, CLASS, *(FILTER_ENTRIES if filtered else ())]
         self.player = Player(env, strategy.policy, keys, strategy.title, compiled)
         count = min(sample_episodes, len(plan))
         self.samples = set(np.linspace(0, len(plan) - 1, count).round().astype(int).tolist())

@@ -31,7 +31,7 @@ from lcc_rl.functional.string import gather
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.string import COMMAND, WANTED
-from lcc_rl.results.windows import DRIVE, LEADER, REPEAT, SOURCE
+from lcc_rl.results.windows import DRIVE, LEADER_COLUMNS, REPEAT, SOURCE
 
 RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
 SUMMED = (
@@ -55,8 +55,8 @@ KEYS = [("leader", name) for name in ("speed", "acceleration")]
 KEYS += [("vehicles", name) for name in RECORDED]
 INDEX = (AUTOMATED, "index")
 # Behind a safety filter: for which steps it answers, what it was told and what it commanded.
-BEHIND = tuple((AUTOMATED, name) for name in ("promised", "safe"))
-BEHIND += ((WANTED, AUTOMATED), (COMMAND, AUTOMATED))
+FILTER_ENTRIES = tuple((AUTOMATED, name) for name in ("promised", "safe"))
+FILTER_ENTRIES += ((WANTED, AUTOMATED), (COMMAND, AUTOMATED))
 # The record of each group of vehicles, ``[time, batch, n, 1]`` by entry.
 Groups = dict[str, dict[str, Tensor]]
 
@@ -70,7 +70,7 @@ def grouped(record: Record, string: VehicleString) -> Groups:
     own = list(string.places(AUTOMATED))
     others = [place for place in range(len(string)) if place not in own]
     for (space, name), entry in record.items():
-        if (space, name) in BEHIND:
+        if (space, name) in FILTER_ENTRIES:
             groups["cav"][name if space == AUTOMATED else space] = entry
         elif space == "leader":
             groups["leader"][name] = entry.unsqueeze(-2)
@@ -220,7 +220,7 @@ def leader_measures(
         power = fleet.path_power(speed[:-1], speed.diff() / profiles.time_step)
         drawn = power.sum() * profiles.time_step * KILO
         found[index] = (float(drawn), float(speed.mean()))
-    return pd.DataFrame([found[index] for index in profile.tolist()], columns=list(LEADER))
+    return pd.DataFrame([found[index] for index in profile.tolist()], columns=list(LEADER_COLUMNS))
 
 
 def sample(

@@ -43,7 +43,7 @@ from lcc_rl.results.report import AGAINST, RULE, Report, several
 from lcc_rl.results.runs import stored_config
 from lcc_rl.results.windows import Means, by_driver
 
-VEHICLES = {
+VEHICLE_STYLES = {
     "leader": ("leader", INK),
     "cav": ("controlled car", "#0072b2"),
     "hdv": ("human behind", "#d55e00"),
@@ -181,7 +181,7 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, report:
 
 def _over_time(axis: Axes, rows: pd.DataFrame, entry: str) -> None:
     """Draw a line per vehicle that has the entry."""
-    for vehicle, (name, hue) in VEHICLES.items():
+    for vehicle, (name, hue) in VEHICLE_STYLES.items():
         column = f"{vehicle}_{entry}"
         if column in rows and rows[column].notna().any():
             axis.plot(rows["time_s"], rows[column], color=hue, label=name, lw=1.3)

@@ -29,12 +29,12 @@ from lcc_rl.results.policies import load_policy
 
 # Each driven vehicle is an episode of its own: who is ahead leads, who is behind follows.
 STRING = VehicleString((AUTOMATED, HUMAN))
-COMMAND = ("command", AUTOMATED)
-PRESENT = ("behind", "present")
+COMMAND_KEY = ("command", AUTOMATED)
+PRESENT_KEY = ("behind", "present")
 MEASURED: tuple[Key, ...] = (
     *(("leader", name) for name in ("speed", "acceleration")),
     *(("vehicles", name) for name in ("speed", "gap", "relative_speed", "acceleration")),
-    *(PRESENT, SEED, STEP),
+    *(PRESENT_KEY, SEED, STEP),
 )
 
 
@@ -60,7 +60,7 @@ def entries(rows: Sequence[Measured]) -> State:
     """Return measurements as entries of an environment, one row per vehicle."""
     table = torch.tensor(rows, dtype=torch.float32)
     seen = dict(zip(Measured._fields, table.split(1, -1), strict=True))
-    state: State = {PRESENT: seen["present"]}
+    state: State = {PRESENT_KEY: seen["present"]}
     for name in ("speed", "acceleration"):
         state["leader", name] = seen[f"{name}_ahead"]
     for name in ("speed", "gap", "acceleration"):
@@ -103,7 +103,7 @@ class Driver:
             pieces.append(self._build(Controller, controller_of(who), AUTOMATED))
         self.pieces = pieces
         self.kept = [key for piece in pieces for key in (*piece.targets, *piece.constants)]
-        self.kept = [key for key in self.kept if key != COMMAND]
+        self.kept = [key for key in self.kept if key != COMMAND_KEY]
         self._check()
 
     def _policy(self, name: str, trust: Sequence[str]) -> list[StepTransform]:
@@ -170,7 +170,7 @@ class Driver:
             piece.derive({**measured, **kept}, reached)
         after = {key: reached[key] for key in self.kept}
         if self.module is None:
-            return reached[COMMAND].flatten(), after
+            return reached[COMMAND_KEY].flatten(), after
         columns = [value(reached, name) for name in self.module.names]
         return self.module(torch.stack(columns, -1)).flatten(), after
 
@@ -178,8 +178,8 @@ class Driver:
 def place(name: str) -> tuple[Key, int]:
     """Return the key of an exported policy's input, and its row or column in that entry."""
     view, entry, *column = name.split(".")
-    if (view, entry) == PRESENT:
-        return PRESENT, int(*column)
+    if (view, entry) == PRESENT_KEY:
+        return PRESENT_KEY, int(*column)
     if view == "memory":
         return (view, entry), int(*column)
     key = {"self": "vehicles", "ahead": "leader", "behind": "vehicles"}.get(view, view)

@@ -28,7 +28,7 @@ DERIVED = {
     "self.relative_speed": ("ahead.speed", "self.speed"),
     "behind.relative_speed": ("self.speed", "behind.speed"),
 }
-PRESENT, REMEMBERED = "behind.present", "memory.entries."
+BEHIND_PRESENT, REMEMBERED = "behind.present", "memory.entries."
 
 
 class Input(NamedTuple):
@@ -68,8 +68,8 @@ class ExportedPolicy(nn.Module):
 
     def _places(self, name: str) -> tuple[int, ...]:
         bases = DERIVED.get(name, (name,))
-        if name == "behind.relative_speed" and PRESENT in self.names:
-            bases = (*bases, PRESENT)
+        if name == "behind.relative_speed" and BEHIND_PRESENT in self.names:
+            bases = (*bases, BEHIND_PRESENT)
         return tuple(self.names.index(base) for base in bases)
 
     def _value(self, state: Tensor, places: tuple[int, ...]) -> Tensor:

@@ -20,7 +20,7 @@ from unittest.mock import patch
 import torch
 
 from lcc_rl.errors import ConfigError, Diverged, how_to_install
-from lcc_rl.interfaces.driver import PRESENT, Driver, Measured, entries
+from lcc_rl.interfaces.driver import PRESENT_KEY, Driver, Measured, entries
 from lcc_rl.pieces.base import SEED, STEP, State
 
 EXACT, RELEASED = 0, -1.0  # SUMO's speed mode without checks, and the speed that releases
@@ -77,7 +77,7 @@ class Bridge:
         names = {vehicles} if isinstance(vehicles, str) else vehicles
         self.chosen = names if callable(names) else set(names).__contains__
         self.sight, self.seed, self.begun = sight, seed, 0
-        self.tells = PRESENT in self.driver.reads()
+        self.tells = PRESENT_KEY in self.driver.reads()
         self.keys = [*self.driver.kept, SEED, STEP]
         self.driven: dict[str, State] = {}  # what each vehicle remembers: the keys
         self.modes: dict[str, int] = {}  # of those commanded, their speed modes before

@@ -42,7 +42,7 @@ STEP = (EPISODE, "step")
 # What learners read and write, and are rewarded by.
 OBSERVATION, ACTION, REWARD = ((AUTOMATED, x) for x in ("observation", "action", "reward"))
 # Parts of declared keys that stand for the role of a piece, and for its name.
-ROLE, NAME = "role", "name"
+ROLE, TERM = "role", "name"
 
 
 @dataclass(frozen=True)
@@ -54,24 +54,23 @@ class Entry:
         unit: of its numbers; "–" for none.
         meaning: what it holds, for docs/entries.md.
         width: how many numbers a row has; a tuple for several dimensions.
-        dtype: of its numbers; None for torch's default.
-        option: whether a caller may set it through ``env.reset``; of constants only.
+        whole: whether it holds whole numbers, int64.
+        option: whether a caller may set it, a whole constant, through ``env.reset``.
     """
 
     key: NestedKey
     unit: str = "–"
     meaning: str = ""
     width: int | tuple[int, ...] = 1
-    dtype: torch.dtype | None = None
+    whole: bool = False
     option: bool = False
 
-    def of(self, role: str, name: str = "", width: int | tuple[int, ...] | None = None) -> Entry:
-        """Return the entry of a role or of a name, and with a width that depends on settings."""
-        held = {ROLE: role, NAME: name}
-        key = tuple(held.get(part) or part for part in as_key(self.key))
-        return replace(self, key=key, width=self.width if width is None else width)
+    def of(self, role: str, name: str = "") -> Entry:
+        """Return the entry of a role or of a name."""
+        held = {ROLE: role, TERM: name}
+        return replace(self, key=tuple(held.get(part) or part for part in as_key(self.key)))
 
-    def wide(self, width: int) -> Entry:
+    def wide(self, width: int | tuple[int, ...]) -> Entry:
         """Return the entry with a width that depends on settings."""
         return replace(self, width=width)
 
@@ -202,15 +201,13 @@ class Piece(Part, TensorDictModuleBase, Transform):
         keys: Sequence[Key] | None = None,
     ) -> dict[Key, Any]:
         """Return the specs of declared entries, by default of all."""
-        plain = torch.get_default_dtype()
-        return {
-            key: Unbounded(
-                shape=(*batch, *self.shape_of(key)),
-                dtype=self.entries[key].dtype or plain,
-                device=device,
-            )
-            for key in (self.entries if keys is None else keys)
-        }
+        found = {}
+        for key in self.entries if keys is None else keys:
+            entry, shape = self.entries[key], (*batch, *self.shape_of(key))
+            whole = entry.whole or entry.option
+            dtype = torch.int64 if whole else torch.get_default_dtype()
+            found[key] = Unbounded(shape=shape, dtype=dtype, device=device)
+        return found
 
     def derive(self, before: State, reached: State, detached: bool = False) -> None:
         """Compute the entries written from plain mappings of entries.
@@ -295,6 +292,8 @@ class Feature(Piece):
 
 class StepTransform(Piece):
     """A piece that reads the states before and after a step."""
+
+    compute: ClassVar[Callable[..., Any]] = staticmethod(lambda: ())  # of one that only keeps
 
     def declare(
         self,

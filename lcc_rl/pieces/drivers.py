@@ -21,11 +21,10 @@ from lcc_rl.functional.random import between, choose, normal, stream_id, uniform
 from lcc_rl.pieces.base import SEED, Entry, require_option
 from lcc_rl.pieces.controllers import Controller, stream_name
 from lcc_rl.pieces.leader import LEADER_SPEED
-from lcc_rl.pieces.views import MOTION
+from lcc_rl.pieces.views import MOTION_READS
 from lcc_rl.pieces.world import MOST_LATE, World
 from lcc_rl.settings import Factors, NonNegative, Positive, Share
 
-INT = torch.int64
 # Draws that all drivers of an episode share.
 WIENER_STREAM, TIME_GAP_STREAM = stream_id("drivers.wiener"), stream_id("drivers.time_gap")
 LONGEST_TIME_GAP = 1000.0  # time gap up to which an equilibrium gap is written [s]
@@ -55,7 +54,7 @@ class Drivers(Controller):
 
     name = HUMAN
     known = (
-        Entry("role.driver", "–", "id of each vehicle's driver in the population", 1, INT, True),
+        Entry("role.driver", "–", "id of each vehicle's driver in the population", option=True),
         Entry("role.desired_speed", "m/s", "desired speed v0 of the driver"),
         Entry("role.desired_time_gap", "s", "desired time gap T of the driver"),
         Entry(
@@ -65,7 +64,7 @@ class Drivers(Controller):
     history = Entry(
         "role.motion_history", "m/s, m, m/s", "past (speed, gap, relative speed), latest first"
     )
-    stray = Entry("role.acceleration_noise", "m/s²", "noise of the acceleration, latest first", 2)
+    latest = Entry("role.acceleration_noise", "m/s²", "noise of the acceleration, latest first", 2)
     law: ClassVar[type[DriverConstants]] = IDMConstants
     takes_population: ClassVar[bool] = True
     tells_gap: ClassVar[bool] = False  # whether the equilibrium gap is written
@@ -79,15 +78,15 @@ class Drivers(Controller):
         role = self.name
         speeds, time_gaps, self.drivers = self.described(world, f"scenario.controllers.{role}")
         reaction = self.reaction(world)
-        late, strays = self.delay, self.acceleration_noise
+        late, spread = self.delay, self.acceleration_noise
         what = "the reaction delay of drivers"
         self.late = world.late(reaction.delay, what) if late is None else late
-        self.strays = reaction.noise if strays is None else strays
+        self.noise_spread = reaction.noise if spread is None else spread
         self.noise_step = NoiseStep.of(world.time_step)
         self.starts = self.tells_gap and not world.string.ring
         memory = [self.history.wide(3 * self.late)] * (self.late > 0)
-        memory += [self.stray] * (self.strays > 0)
-        names = [*MOTION, f"{role}.desired_speed", f"{role}.desired_time_gap", "episode.seed"]
+        memory += [self.latest] * (self.noise_spread > 0)
+        names = [*MOTION_READS, f"{role}.desired_speed", f"{role}.desired_time_gap", "episode.seed"]
         names += ["episode.step", *(f"{role}.{name}" for name in self.further)]
         self.declare(world, names, keeps=self.known[: 3 + self.starts], remembers=memory)
         self.limits = None  # drives as a person, in automated vehicles, too
@@ -96,7 +95,7 @@ class Drivers(Controller):
         self.time_gap_factors = world.deviations(self.time_gap_range)
         self.noise_stream = stream_id(f"{stream_name(role)}.noise")
         self.wiener_stream = stream_id(f"{stream_name(role)}.wiener")
-        self.stray_streams = [
+        self.noise_streams = [
             stream_id(f"{stream_name(role)}.acceleration_noise{end}") for end in ("", ".before")
         ]
         self.driver_stream = stream_id(f"{stream_name(role)}.driver")
@@ -131,9 +130,9 @@ class Drivers(Controller):
         """Return the commands, then the history and the noise where they are kept."""
         motion = (speed, gap, relative_speed)
         kept: list[Tensor] = []
-        if self.strays:
+        if self.noise_spread:
             *more, before = more  # type: ignore[assignment]
-            kept.append(self._strayed(before, seed, step))
+            kept.append(self._noise_of(before, seed, step))
         if self.late:
             *more, history = more  # type: ignore[assignment]
             now = join(motion, -1)
@@ -148,14 +147,15 @@ class Drivers(Controller):
         if self.wiener:
             spread = between(self.spreads, seed, WIENER_STREAM)
             command = command + spread * normal(seed, step, self.wiener_stream + self.index)
-        if self.strays:
+        if self.noise_spread:
             command = command + kept[-1][..., :1]
         return (command, *kept) if kept else command
 
-    def _strayed(self, before: Tensor, seed: Tensor, step: Tensor) -> Tensor:
+    def _noise_of(self, before: Tensor, seed: Tensor, step: Tensor) -> Tensor:
         """Return the latest two values of the noise from those before [m/s²]."""
         drawn, further = (
-            self.strays * normal(seed, step, stream + self.index) for stream in self.stray_streams
+            self.noise_spread * normal(seed, step, stream + self.index)
+            for stream in self.noise_streams
         )
         first = join(self.noise_step.start(drawn, further), -1)
         latest, last = before.split(1, -1)

@@ -12,7 +12,7 @@ from torch import Tensor
 from lcc_rl.functional.estimation import Belief, PopulationMean, predict_and_update, prior
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.pieces.base import Entry, StepTransform
-from lcc_rl.pieces.views import MOTION
+from lcc_rl.pieces.views import MOTION_READS
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
 
@@ -43,7 +43,7 @@ class DriverEstimator(StepTransform):
         role, time_step = self.role, world.time_step
         population = world.given("population", self.title)
         belief = (f"{role}.estimate", f"{role}.covariance")
-        self.declare(world, [*MOTION, *belief, "episode.step", "next.self.speed"])
+        self.declare(world, [*MOTION_READS, *belief, "episode.step", "next.self.speed"])
         self.time_step = time_step
         self.learning_steps = inf if self.learning_time is None else self.learning_time / time_step
         self.drivers = population.constants.mean()

@@ -56,19 +56,13 @@ class EnergyClasses(StepTransform):
     """
 
     role = VEHICLES
-    keeps = (
-        Entry(CLASS, "–", "number of the vehicle's energy model, of a mixture", dtype=torch.int64),
-    )
+    keeps = (Entry(CLASS, "–", "number of the vehicle's energy model, of a mixture", whole=True),)
 
     def setup(self, world: World) -> None:
         """Take the classes and their shares from the world."""
         self.declare(world)
         self.energy = world.given("energy", self.title)
         self.stream = stream_id("vehicles.energy_class")
-
-    def compute(self) -> tuple[()]:
-        """Return nothing: classes are constant within an episode."""
-        return ()
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         count, seed = len(self.string), start.get(SEED).unsqueeze(-2)

@@ -41,7 +41,6 @@ COUNTERS = SWITCHES, CLAMPS, CAPS = tuple(
     ("hybrid", name) for name in ("switches", "clamps", "cap_interventions")
 )
 HYBRID_READS = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
-INT = torch.int64
 SPARE = 2.0  # beyond the gap that the cap needs, for what vehicles deviate from it [m]
 
 
@@ -79,10 +78,10 @@ class HCFS(Controller):
 
     reads = (f"{AUTOMATED}.action",)
     remembers = (
-        Entry(WINNER, "–", "candidate chosen: 0 rule, 1 policy, −1 at reset", 1, INT),
-        Entry(SWITCHES, "–", "changes of the winner since the start", 1, INT),
-        Entry(CLAMPS, "–", "steps in which the jerk bound cut a candidate", 1, INT),
-        Entry(CAPS, "–", "steps in which the safe cap cut a candidate", 1, INT),
+        Entry(WINNER, "–", "candidate chosen: 0 rule, 1 policy, −1 at reset", whole=True),
+        Entry(SWITCHES, "–", "changes of the winner since the start", whole=True),
+        Entry(CLAMPS, "–", "steps in which the jerk bound cut a candidate", whole=True),
+        Entry(CAPS, "–", "steps in which the safe cap cut a candidate", whole=True),
     )
 
     def validate(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -48,7 +47,7 @@ class LeaderPreview(Feature):
     def setup(self, world: World) -> None:
         """Take the leader's records."""
         profiles = world.profiles
-        self.declare(world, writes=[replace(self.known, width=(1, len(self.horizons)))])
+        self.declare(world, writes=[self.known.wide((1, len(self.horizons)))])
         self.stream = stream_id("preview.noise")
         where = f"scenario.pieces.{self.name}"
         late = world.steps(self.delay, f"{where}.delay")

@@ -40,15 +40,8 @@ class NGSIMLeader(StepTransform):
 
     role = EPISODE
     keeps = (
-        Entry(PROFILE, "–", "id of the speed record that the leader plays", 1, torch.int64, True),
-        Entry(
-            PROFILE_START,
-            "–",
-            "sample of the record at which the episode begins",
-            1,
-            torch.int64,
-            True,
-        ),
+        Entry(PROFILE, "–", "id of the speed record that the leader plays", option=True),
+        Entry(PROFILE_START, "–", "sample of it at which the episode begins", option=True),
     )
     writes = (
         Entry(LEADER_SPEED, "m/s", "speed of the leader"),

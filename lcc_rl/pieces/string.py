@@ -35,24 +35,18 @@ class RolePlaces(StepTransform):
     """
 
     role = EPISODE
-    placed = Entry(
-        "role.index", "–", "places of the role's vehicles, 0 at the front", 1, torch.int64
-    )
+    placed = Entry("role.index", "–", "places of the role's vehicles, 0 at the front", whole=True)
     index: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
         """Choose the roles whose places are written."""
         string = world.string
         roles = string.names if string.drawn else tuple({AUTOMATED} & set(string.names))
-        keeps = [self.placed.of(role, width=string.count(role)) for role in roles]
+        keeps = [self.placed.of(role).wide(string.count(role)) for role in roles]
         self.declare(world, keeps=keeps)
         self.roles = roles
         self.stream = stream_id("string.places")
         self.register_buffer("index", torch.arange(len(string)))
-
-    def compute(self) -> tuple[()]:
-        """Return nothing: places are constant within an episode."""
-        return ()
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         if not self.string.drawn:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
-from lcc_rl.pieces.base import Entry, Feature
+from lcc_rl.pieces.base import Feature
 from lcc_rl.pieces.views import EPISODE
 
 
@@ -20,12 +19,7 @@ class Collision(Feature):
 
     role = EPISODE
     reads = (("done",), ("terminated",), "vehicles.gap")
-    writes = (
-        Entry("done", "–", "terminated or truncated", 1, torch.bool),
-        Entry(
-            "terminated", "–", "a collision ended the episode, where collisions do", 1, torch.bool
-        ),
-    )
+    writes = ("done", "terminated")
 
     def compute(self, done: Tensor, terminated: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
         """Return done and terminated, ``[*batch, 1]``."""

@@ -36,7 +36,7 @@ NEXT = "next"
 VEHICLES, LEADER, EPISODE = "vehicles", "leader", "episode"
 SELF, AHEAD, BEHIND = "self", "ahead", "behind"
 PRESENT = "present"
-MOTION = ("self.speed", "self.gap", "self.relative_speed")
+MOTION_READS = ("self.speed", "self.gap", "self.relative_speed")
 
 
 Resolver = Callable[[Sequence[Tensor]], Tensor]

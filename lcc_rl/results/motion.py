@@ -16,7 +16,7 @@ from lcc_rl.errors import ResultsError
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING, parse_string
 
 Series = NDArray[np.float64]
-EPISODE = ("profile", "driver_id", "repeat")  # columns by which sample episodes differ
+EPISODE_COLUMNS = ("profile", "driver_id", "repeat")  # columns by which sample episodes differ
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def sample_episodes(steps: pd.DataFrame, strategy: str) -> dict[str, pd.DataFram
     else:
         if rows["training_seed"].notna().any():
             rows = rows[rows["training_seed"] == rows["training_seed"].min()]
-        keys = [name for name in EPISODE if name in rows]
+        keys = [name for name in EPISODE_COLUMNS if name in rows]
         groups = rows.groupby(keys, sort=False)
         found = {f"profile {key[0]}, driver {key[1]}": part for key, part in groups}
     if not found:

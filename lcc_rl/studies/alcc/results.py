@@ -16,7 +16,7 @@ from lcc_rl.io.files import read_parquet
 from lcc_rl.results.names import in_words
 from lcc_rl.results.report import sample_of
 from lcc_rl.results.runs import EPISODES, STEPS
-from lcc_rl.results.windows import LEADER, WINDOWS, Means
+from lcc_rl.results.windows import LEADER_COLUMNS, WINDOWS, Means
 from lcc_rl.studies.alcc import figures, paper_tables, tables
 from lcc_rl.studies.alcc.study import ABLATIONS, DRIVERS, EVALUATION
 from lcc_rl.studies.results import StudyResults
@@ -79,7 +79,7 @@ def add_main(found: StudyResults, means: Means) -> None:
     windows, size = means.windows, sample_of(means.windows, means.drivers)
     found.table("headline", f"Energy of both saved, {size}", tables.headline(windows))
     found.table("energies", f"Energy per episode, {size}", tables.energies(windows))
-    if set(LEADER) <= set(windows):
+    if set(LEADER_COLUMNS) <= set(windows):
         caption = "Path energy saved in thirds of the windows, by the leader's energy and speed"
         found.table("strata", caption, tables.strata(windows))
     caption = "Path energy of controlled car and human driver by strategy (Fig. 11)"

@@ -16,7 +16,7 @@ from lcc_rl.results.measures import PATH
 from lcc_rl.results.names import heading
 from lcc_rl.results.render import MISSING
 from lcc_rl.results.report import UNTRAINED
-from lcc_rl.results.windows import LEADER, SOURCE, by_source, per_seed, savings
+from lcc_rl.results.windows import LEADER_COLUMNS, SOURCE, by_source, per_seed, savings
 
 PARTS = ("total_steady_energy_kj", "total_acceleration_loss_kj")
 BASELINES = ("idm", "human", "recorded", "idm_acc_filtered", "idm_acc", "rule", "reference")
@@ -107,7 +107,7 @@ def _thirds(windows: pd.DataFrame) -> Iterator[tuple[str, str, float, float, pd.
     if SOURCE in windows:
         for source, rows in by_source(windows):
             yield SOURCE, source, np.nan, np.nan, rows
-    for column in LEADER:
+    for column in LEADER_COLUMNS:
         values = windows.groupby("profile_id")[column].first().sort_values()
         parts = np.array_split(np.arange(len(values)), len(TERCILES))
         for name, part in zip(TERCILES, (values.iloc[chosen] for chosen in parts), strict=True):
