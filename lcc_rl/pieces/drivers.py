@@ -59,7 +59,6 @@ class Drivers(Controller):
 
     name = HUMAN
     law: ClassVar[DriverLaw] = IDM_LAW
-    takes_population: ClassVar[bool] = True
     tells_gap: ClassVar[bool] = False  # whether the equilibrium gap is written
     further: ClassVar[tuple[str, ...]] = ()  # entries of the role that acceleration reads, too
     desired_speeds: ClassVar[Tensor]

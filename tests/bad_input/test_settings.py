@@ -79,17 +79,14 @@ IGNORED = {
     "variant=idm training.episodes=20": "variant idm learns nothing",
     "variant=alcc scenario.string=human*3 training.episodes=20": "no vehicle .* is automated",
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",
-    "variant=idm scenario.string=automated controller@scenario.controllers.automated=acc "
-    "drivers=highway": "no human driver in scenario.string=automated",
     "sweep=mine": "names the folder of a sweep, -m",
-    "evaluation.full_length=true": "unused with evaluation.rows=episodes",
 }
 
 
 def train_without_data(words: list[str], folder: Path) -> None:
     cfg = load("train", [*NO_AGENT, "variant=alcc", *words])
     if not any(word.startswith("data.") for word in words):
-        cfg.data = {"_target_": "lcc_rl.data.sources.EpisodesSource", "path": "nowhere.parquet"}
+        cfg.data = load("train", ["data=episodes", "data.path=nowhere.parquet"]).data
     training.run(cfg, folder, quiet=True)
 
 
@@ -108,12 +105,6 @@ def test_a_bad_setting_is_one_line_before_the_data_are_read(tmp_path, typed) -> 
 def test_options_without_effect_are_refused(typed) -> None:
     with pytest.raises(ConfigError, match=rf"has no effect: .*({IGNORED[typed]})"):
         load("train", typed.split())
-
-
-@pytest.mark.parametrize("controller", ["calibrated", "ovm", "fvdm", "gipps", "human", "handover"])
-def test_drivers_have_an_effect_on_whatever_drives_as_they_do(controller) -> None:
-    words = ("variant=idm", "scenario.string=automated", f"controller@{AUTO}={controller}")
-    assert load("train", [*words, "drivers=highway"]).drivers != load("train", words).drivers
 
 
 @pytest.mark.parametrize(

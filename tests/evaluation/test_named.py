@@ -13,17 +13,17 @@ from helpers import POPULATION, compose, wavy_profiles
 import lcc_rl
 from lcc_rl.commands import evaluation
 from lcc_rl.config import load
-from lcc_rl.config.nodes import TARGET
+from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.envs import build_env
 from lcc_rl.errors import LccError
-from lcc_rl.evaluation.named import controller_of, label_of
+from lcc_rl.evaluation.named import controller_of, label_of, setting_of
 from lcc_rl.evaluation.strategies import baseline
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet
 from lcc_rl.pieces import ConstantAcceleration, Controller, Law
 from lcc_rl.results.policies import load_policy
-from lcc_rl.settings import Positive
+from lcc_rl.settings import TARGET, Positive
 
 
 class Steady(Controller):
@@ -77,7 +77,7 @@ def test_a_class_a_function_an_object_a_node_and_a_file_drive_alike(tmp_path, mo
     ],
 )
 def test_an_own_controller_never_has_the_name_of_a_shipped_one(who, label: str) -> None:
-    assert label_of(who) == label
+    assert label_of(setting_of(who)) == label
 
 
 def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None:
@@ -102,11 +102,11 @@ def test_constants_tuned_behind_a_filter_need_its_longest_gap(longest: str, own:
         baseline(load("evaluate", words), name).cfg.scenario.controllers["automated"]
         for name in ("idm_acc", "idm_acc_filtered")
     )
-    assert (behind["desired_speed"] < plain["desired_speed"]) == own
+    assert (behind.made().desired_speed < plain.made().desired_speed) == own
     asked = baseline(load("evaluate", words), "idm_acc_filtered", "idm_acc_filtered")  # compare=
     assert asked.cfg.scenario.controllers["automated"] == behind
     alone = baseline(load("evaluate", words), "constant_filtered").cfg.scenario
-    assert alone.controllers["automated"]["acceleration"] == 3.0  # full throttle
+    assert alone.controllers["automated"].made().acceleration == 3.0  # full throttle
 
 
 @pytest.mark.parametrize(
@@ -321,7 +321,8 @@ class Harder(Hard):
 )
 def test_commands_to_automated_vehicles_alone_are_bounded(node, least) -> None:
     cfg = compose("idm", "scenario.start.human=${scenario.start.automated}")
-    cfg.scenario.controllers |= {AUTOMATED: node, "human": {TARGET: f"{__name__}.Hard"}}
+    drivers = {AUTOMATED: node, "human": {TARGET: f"{__name__}.Hard"}}
+    cfg.scenario.controllers |= {role: Node.of(own, role) for role, own in drivers.items()}
     command = build_env(cfg, wavy_profiles(), POPULATION, 2).rollout(3)["next", "command"]
     expected = torch.tensor(least).expand(2, 3)
     assert torch.equal(command[AUTOMATED][..., 0, 0], expected)
