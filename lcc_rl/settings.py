@@ -20,6 +20,7 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from functools import wraps
+from importlib import import_module
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
 from pydantic import (
@@ -55,6 +56,7 @@ def _increasing(factors: tuple[float, float]) -> tuple[float, float]:
 # Least and largest factor that a training episode draws by its seed; an evaluation takes 1.
 Factors = Annotated[tuple[Positive, Positive], Field(strict=False), AfterValidator(_increasing)]
 
+TARGET = "_target_"  # the key that names the class of a node
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 S = TypeVar("S", bound="Settings")
@@ -190,3 +192,39 @@ def given_as(kind: type[Settings]) -> Any:
             raise ValueError(str(error)) from error
 
     return Annotated[kind, BeforeValidator(made)]
+
+
+def path_of(kind: Any) -> str:
+    """Return the ``_target_`` that names a class or function.
+
+    Raises:
+        ConfigError: if a module does not hold it by its name.
+    """
+    module, name = (getattr(kind, key, None) for key in ("__module__", "__qualname__"))
+    if not module or not name or getattr(import_module(module), name, None) is not kind:
+        raise ConfigError(
+            f"{name or kind!r} cannot be named in a configuration: define it at the top of a "
+            "module, of a script or of a notebook"
+        )
+    return f"{module}.{name}"
+
+
+def find_target(target: str, where: str) -> Any:
+    """Return the class or function that a ``_target_`` names.
+
+    Raises:
+        ConfigError: if there is none, naming its place in the configuration.
+    """
+    module, _, name = target.rpartition(".")
+    try:
+        found = getattr(import_module(module), name)
+    except Exception as error:  # a module of the user's own may raise anything
+        hint = ""
+        if not isinstance(error, (ImportError, AttributeError, ValueError)):
+            raise ConfigError(f"{where}: {module} cannot be imported: {error}") from error
+        if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("lcc_rl"):
+            hint = "; if it is a file of your own, export PYTHONPATH=<its folder>"
+        raise ConfigError(f"{where}.{TARGET}: cannot find {target!r}: {error}{hint}") from error
+    if not callable(found):
+        raise ConfigError(f"{where}.{TARGET}: {target!r} is no class or function")
+    return found

@@ -46,7 +46,7 @@ def ramps() -> Profiles:
 def windows(limit: int | None = None) -> Profiles:
     """The held-out windows of the shipped default."""
     cfg = composed("variant=cacc")
-    held = {k: dict(v) for k, v in cfg.leader["held_out"].items()}
+    held = {k: dict(v) for k, v in cfg.leader.settings["held_out"].items()}
     found = RecordLeaders(training={"x": {"path": "udds"}}, held_out=held).load(T, 100, 6)
     return found.windows.spread(limit)
 

@@ -32,7 +32,6 @@ from matplotlib.image import imread
 from lcc_rl.cli import calibrate, console, evaluate, pipeline, train
 from lcc_rl.commands.pipeline import COMMAND
 from lcc_rl.config import load
-from lcc_rl.config.nodes import build
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.io.settings import read_json
@@ -216,7 +215,7 @@ def compare(whole: Path, killed: Path) -> None:
 
 def jobs(folder: Path) -> dict[str, Job]:
     """Return the commands that are killed, each run once to its end."""
-    source = build(load("train", ["data.platoons=4", "data.recordings=2"]).data, "data")
+    source = load("train", ["data.platoons=4", "data.recordings=2"]).data.made()
     write_parquet(source.load().episodes, folder / "pairs.parquet")
     small = ["experiment=smoke", "scenario.horizon=40", "data=episodes"]
     small += [f"data.path={folder / 'pairs.parquet'}"]

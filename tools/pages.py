@@ -24,8 +24,7 @@ from matplotlib.figure import Figure
 
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.config import load
-from lcc_rl.config.nodes import build
-from lcc_rl.config.schemas import as_plain
+from lcc_rl.config.nodes import as_plain
 from lcc_rl.data.leaders import stretch
 from lcc_rl.errors import require
 from lcc_rl.figures.calibration import twins_figure
@@ -166,10 +165,8 @@ def measured(measure: Measure, value: float) -> str:
 def figure_of_record() -> Figure:
     """Draw the speed record that platoons train on, and their test cases."""
     cfg = load("evaluate", ["variant=cacc"])
-    step, used = cfg.scenario.time_step, cfg.leader["training"]["udds"]
-    leaders = build(cfg.leader, "leader").load(
-        step, cfg.scenario.horizon, len(cfg.scenario.vehicles)
-    )
+    step, used = cfg.scenario.time_step, cfg.leader.settings["training"]["udds"]
+    leaders = cfg.leader.made().load(step, cfg.scenario.horizon, len(cfg.scenario.vehicles))
     record = stretch(used["path"], step, used["scale"])
     return record_figure(record, used["from_s"], leaders.cases)
 

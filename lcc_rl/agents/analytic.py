@@ -14,7 +14,7 @@ from dataclasses import field
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import Field
+from pydantic import Field, InstanceOf
 from torch import Tensor, nn
 
 from lcc_rl.agents.actor import seeded_mlp
@@ -24,6 +24,7 @@ from lcc_rl.agents.objective import Objective
 from lcc_rl.agents.rules import make_policy
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import require
+from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.settings import Count, NonNegative, Positive, Share
 
 
@@ -38,14 +39,15 @@ class Analytic(Agent):
     policy: Any = "network"
     constants: dict[str, Positive] | None = None  # of a rule at the start; the others keep theirs
     hidden: Sequence[Count] = (200, 100, 50)  # ReLU layers of a network
-    # Nodes of reward terms that take the place of those of the same name in the objective; their
+    # Reward terms that take the place of those of the same name in the objective; their
     # weights multiply the terms' own. Those of terms that the reward lacks are ignored.
-    surrogates: dict[str, Any] = field(default_factory=dict)
+    surrogates: dict[str, InstanceOf[RewardTerm] | None] = field(default_factory=dict)
     # Largest share of the time in which a surrogate's limit may be missed, by its name, or that of
     # the recorded drivers; its weight is the price at the start, see lcc_rl.agents.limits.
     limits: dict[str, Share | Literal["recorded"] | None] = field(default_factory=dict)
     limit_rate: Positive = 0.1  # largest change of the logarithm of such a price at once
-    regularizers: dict[str, Any] = field(default_factory=dict)  # terms of the objective only
+    # Terms of the objective only.
+    regularizers: dict[str, InstanceOf[RewardTerm] | None] = field(default_factory=dict)
     learning_rate: Positive = 3e-3  # of the policy at the start; it falls along half a cosine
     final_lr_fraction: Fraction = 0.05  # of it that is left at the end
     # Gradients longer than this are shortened to it; through 300 steps of traffic they can become

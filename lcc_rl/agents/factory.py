@@ -8,7 +8,6 @@ from typing import Any
 from lcc_rl.agents.agent import Agent, Scene
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.config import identity
-from lcc_rl.config.nodes import build
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
@@ -33,10 +32,11 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
     if not learns(cfg):
         raise ConfigError(f"variant {cfg.variant} learns nothing: it has no agent")
     world = world_of(cfg, population=population)
-    observation = build(cfg.observation, "observation", Observation, world=world)
-    limit = (cfg.scenario.controllers.get(AUTOMATED) or {}).get("max_acceleration")
+    observation = cfg.observation.made(Observation).bind(world)
+    driver = cfg.scenario.controllers.get(AUTOMATED)
+    limit = driver and getattr(driver.made(), "max_acceleration", None)
     scene = Scene(observation.event_shape[-1], cfg.seed, device, world, observation, limit)
-    agent: Agent = build(cfg.agent, "agent", Agent)
+    agent: Agent = cfg.agent.made(Agent)
     return agent.start(scene)
 
 
@@ -69,7 +69,8 @@ def check_lengths(cfg: StudyConfig) -> None:
         horizon % settings.segment == 0,
         f"training.segment ({settings.segment}) must divide scenario.horizon ({horizon})",
     )
-    window, count = cfg.agent.get("best_window") or 0, settings.environments
+    window = getattr(cfg.agent.made(), "best_window", None) or 0
+    count = settings.environments
     require(
         window % count == 0 and window <= settings.episodes,
         f"agent.best_window ({window}) must be a multiple of training.environments ({count}) and "

@@ -10,7 +10,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.agents.limits import Limits
-from lcc_rl.config.nodes import build
 from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.functional.finite import any_lost
 from lcc_rl.pieces.base import Key, next_key
@@ -34,9 +33,9 @@ class Objective:
     def __init__(self, settings: Any, device: str, world: World) -> None:
         def made(where: str) -> dict[str, RewardTerm]:
             return {
-                name: build(node, f"agent.{where}.{name}", world=world, name=name).to(device)
-                for name, node in getattr(settings, where).items()
-                if node is not None
+                name: term.bind(world, name).to(device)
+                for name, term in getattr(settings, where).items()
+                if term is not None
             }
 
         self.surrogates, self.regularizers = made("surrogates"), made("regularizers")

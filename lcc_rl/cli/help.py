@@ -104,7 +104,7 @@ def _option(entry: str, key: str, cfg: Any) -> Iterator[str]:
 def meaning(entry: str, key: str) -> str:
     """Return the comment of a setting in the first file of conf/ that has one."""
     folder, (root, _, last) = Path(str(files(CONF))), key.rpartition(".")
-    places = [folder / f"{entry}.yaml", folder / "study.yaml"]
+    places = [folder / f"{name}.yaml" for name in (entry, "study", "base")]
     if root:
         places = sorted((folder / root).glob("*.yaml"))
     line = re.compile(rf"^\s*(?:# )?{re.escape(last)}: [^#\n]*#\s*(.*)$", re.MULTILINE)

@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lcc_rl.config import config_hash
-from lcc_rl.config.nodes import CALLED, build
+from lcc_rl.config.nodes import CALLED
 from lcc_rl.config.schemas import CalibrateConfig
 from lcc_rl.drivers.calibrator import OUT, Calibration, count_records
 from lcc_rl.drivers.parameters import MODEL, parameters_of
@@ -73,7 +73,7 @@ def _run(
 ) -> pd.DataFrame:
     device = prepare_torch(cfg)
     # Settings are checked before the data are read, which may take long.
-    calibrator = build(cfg.calibration, "calibration", CALLED)
+    calibrator = cfg.calibration.made(CALLED)
     dataset = load_episodes(cfg.data)
     tell(dataset.report)
     start = perf_counter()

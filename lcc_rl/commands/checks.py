@@ -10,13 +10,13 @@ from tensordict import TensorDictBase
 
 from lcc_rl.agents.factory import build_agent, check_lengths, learns, make_trainer
 from lcc_rl.config import load
-from lcc_rl.config.nodes import CALLED, TARGET, build, find_target, settings_at
+from lcc_rl.config.nodes import CALLED, nodes_in
 from lcc_rl.config.schemas import StudyConfig, TrainConfig
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.envs.factory import after_humans
 from lcc_rl.envs.inputs import (
+    LOADS,
     build_drivers,
-    build_source,
     constant_profiles,
 )
 from lcc_rl.envs.rollout import OBSERVATION
@@ -47,8 +47,8 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
         )
     check_installed(cfg)
     build_logger(cfg)
-    build_source(cfg.data)
-    build(cfg.split, "split", CALLED)
+    cfg.data.made(LOADS)
+    cfg.split.made(CALLED)
     population = build_drivers(cfg)
     check_variant(cfg)
     trial = any_leader(cfg)
@@ -88,7 +88,7 @@ def training_bytes(cfg: StudyConfig, moment: TensorDictBase) -> dict[str, float]
         cfg: its configuration.
         moment: the entries of one episode at one moment.
     """
-    settings, agent = cfg.training, cfg.agent
+    settings, agent = cfg.training, cfg.agent.settings
     count, vehicles = settings.environments, moment[OBSERVATION].shape[-2]
     transition = 4 * (2 * moment[OBSERVATION].shape[-1] + 2)  # before, after, action and reward
     needs = {f"training.episodes={settings.episodes}": settings.episodes / count * RECORD}
@@ -124,15 +124,13 @@ def check_installed(cfg: StudyConfig, compared: Sequence[Any] = ()) -> None:
     """
     own = [name for name in cfg.evaluation.baselines if applies(cfg, name)]
     others = [controller_of(who) for who in (*own, *compared) if who != DIRECT]
-    for key, _, target in settings_at([cfg.scenario.controllers, *others]):
-        if key.endswith(f".{TARGET}"):
-            getattr(find_target(str(target), key), "check_installed", lambda: None)()
+    for node in nodes_in([cfg.scenario.controllers, *others]):
+        getattr(node.kind, "check_installed", lambda: None)()
 
 
 def build_logger(cfg: TrainConfig) -> Any:
     """Build the logger of the training rows; a silent one where the run names none."""
-    node = cfg.logger
-    return Silent() if node is None else build(node, "logger", ("opened",))
+    return Silent() if cfg.logger is None else cfg.logger.made(("opened",))
 
 
 def check_variant(cfg: StudyConfig) -> None:
@@ -162,8 +160,8 @@ def check_variant(cfg: StudyConfig) -> None:
 
 def _is_driven_as(cfg: StudyConfig, own: StudyConfig) -> bool:
     """Whether there is somebody to drive, by the same kind of controller as in another one."""
-    kinds = [part.scenario.controllers[AUTOMATED].get(TARGET) for part in (cfg, own)]
-    return cfg.scenario.vehicles.count(AUTOMATED) > 0 and kinds[0] == kinds[1]
+    kinds = [part.scenario.controllers[AUTOMATED].kind for part in (cfg, own)]
+    return cfg.scenario.vehicles.count(AUTOMATED) > 0 and kinds[0] is kinds[1]
 
 
 def check_measured(cfg: StudyConfig) -> None:

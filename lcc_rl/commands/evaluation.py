@@ -20,7 +20,7 @@ from lcc_rl.commands.checks import (
     check_variant,
 )
 from lcc_rl.config import identity, with_inputs
-from lcc_rl.config.nodes import TARGET, build
+from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.config.words import FILTERED
 from lcc_rl.envs import Inputs, load_inputs
@@ -66,11 +66,11 @@ from lcc_rl.results.windows import by_source
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import CONFIG, check_present, claim, forget, run_folders
+from lcc_rl.settings import parse
 
 log = logging.getLogger("lcc_rl")
 
 IDENTITY = "lcc_rl.config"
-TASK = f"{Task.__module__}.{Task.__name__}"
 
 
 def run(
@@ -160,7 +160,7 @@ def task_of(cfg: StudyConfig) -> Task | None:
     """Return the task of a configuration; None without one."""
     if cfg.task is None:
         return None
-    task: Task = build({TARGET: TASK, **cfg.task}, "task", Task)
+    task = parse(Task, cfg.task, "task")
     check_unit(task.unit, build_energy(cfg))
     return task
 
@@ -188,7 +188,7 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], list[tuple[str, str]]
     named = cfg.compare
     for who in named.values() if isinstance(named, Mapping) else named:
         require(
-            isinstance(who, (str, Mapping)),
+            isinstance(who, (str, Node)),
             f"compare names {who!r}: expected a name, a path or a node; of several runs the folder "
             "that holds them",
         )

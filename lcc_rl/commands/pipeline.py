@@ -12,16 +12,16 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from rich.console import Console
 
 from lcc_rl import results
+from lcc_rl.agents import Analytic
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.checks import check_measured, check_settings
 from lcc_rl.config import NOT_IDENTITY, load, root_key, with_inputs
-from lcc_rl.config.nodes import TARGET, with_defaults
+from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import (
     KINDS,
     CalibrateConfig,
@@ -30,8 +30,10 @@ from lcc_rl.config.schemas import (
     TrainConfig,
 )
 from lcc_rl.data.episodes import SCHEMA
+from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.drivers.calibrator import count_records
-from lcc_rl.envs.inputs import build_energy, build_source, load_inputs
+from lcc_rl.drivers.population import bootstrap
+from lcc_rl.envs.inputs import LOADS, build_energy, load_inputs
 from lcc_rl.errors import Concern, ConfigError, Interrupted
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
@@ -57,6 +59,7 @@ from lcc_rl.runs.output import tell
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch
 from lcc_rl.runs.states import claim
+from lcc_rl.settings import TARGET, path_of
 from lcc_rl.version import __version__
 
 log = logging.getLogger("lcc_rl")
@@ -65,10 +68,7 @@ log = logging.getLogger("lcc_rl")
 # all others are passed on to calibration and trainings.
 OWN = ("calibration", "variants", "jobs", "variant", "resume", "hydra", "data")
 COMMAND, TRAJECTORIES = "command.txt", "trajectories.parquet"
-EPISODES_SOURCE = "lcc_rl.data.sources.EpisodesSource"
 NETWORKS = ("reference", "alcc")  # trained by default, and the rule by the gradient
-ANALYTIC = "lcc_rl.agents.Analytic"
-BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"
 
 
 def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
@@ -127,7 +127,7 @@ def composed(
     shared = [item for item in overrides if root_key(item) not in OWN]
     names = cfg.variants or NETWORKS
     trainings = {name: load("train", [*shared, f"variant={name}"]) for name in names}
-    if cfg.variants is None and str(trainings[names[-1]].agent[TARGET]) == ANALYTIC:
+    if cfg.variants is None and trainings[names[-1]].agent.kind is Analytic:
         trainings = {RULE: load("train", [*shared, f"variant={RULE}"]), **trainings}
     final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={names[-1]}"])
     for part in (*trainings.values(), final):
@@ -146,8 +146,8 @@ def _run(
     read_once(cfg, folder)
     drivers = calibrate_once(cfg, folder)
     for part in (*trainings.values(), final):
-        part.data = with_defaults(_episodes(cfg, folder))
-        part.drivers = with_defaults({"_target_": BOOTSTRAP, "path": str(drivers)})
+        part.data = _episodes(cfg, folder)
+        part.drivers = Node.of({TARGET: path_of(bootstrap), "path": str(drivers)}, "drivers")
     tell(f"training {', '.join(trainings)}, {cfg.jobs} at a time; details in */train.log")
     try:
         train_all(trainings, folder, cfg.jobs)
@@ -177,19 +177,19 @@ def _run(
     return rows
 
 
-def _episodes(cfg: PipelineConfig, folder: Path) -> dict[str, Any]:
+def _episodes(cfg: PipelineConfig, folder: Path) -> Node:
     """Return the node of the trajectories that a job keeps in its folder."""
-    node: dict[str, Any] = {"_target_": EPISODES_SOURCE, "path": str(folder / TRAJECTORIES)}
-    if cfg.data.get("plausible"):
-        node["plausible"] = cfg.data["plausible"]
-    return node
+    settings = {TARGET: path_of(EpisodesSource), "path": str(folder / TRAJECTORIES)}
+    if plausible := cfg.data.settings.get("plausible"):
+        settings["plausible"] = plausible
+    return Node.of(settings, "data")
 
 
 def read_once(cfg: PipelineConfig, folder: Path) -> None:
     """Read the trajectories, check that they can be split, and keep them; skip what is there."""
     if (folder / TRAJECTORIES).exists():
         return
-    loaded = build_source(cfg.data).load()
+    loaded = cfg.data.made(LOADS).load()
     _pass_on(loaded.report)
     counts = [line for line in loaded.report if line.startswith(("kept ", "read "))]
     tell(f"data: {(counts or loaded.report)[-1]}")

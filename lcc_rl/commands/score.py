@@ -32,10 +32,10 @@ from lcc_rl.commands.checks import check_evaluation, check_installed
 from lcc_rl.commands.evaluation import evaluate_and_write, task_of
 from lcc_rl.config import check_overrides, choices, identity, load, root_key
 from lcc_rl.config.inputs import compared_files
-from lcc_rl.config.nodes import TARGET
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.config.words import FILTERED
 from lcc_rl.data.profiles import Profiles
+from lcc_rl.drivers.population import fixed
 from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.inputs import build_drivers, build_energy, constant_profiles
 from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, require
@@ -72,7 +72,6 @@ SOURCES: dict[str, tuple[str, ...]] = {
 }
 OF_A_SOURCE = ("data", "split", "leader", "drivers")
 GIVEN = (*OF_A_SOURCE, "task", "variant", "policy", "compare", "agent", "observation", "reward")
-FIXED = "lcc_rl.drivers.population.fixed"
 PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "onnxruntime")
 FILE = "score.json"
 
@@ -96,7 +95,7 @@ class Scored(NamedTuple):
         else:
             require(applies(cfg, self.label), "it has no vehicle to drive in this string")
             require(
-                bool(scenario.filters.get(AUTOMATED)) or not self.label.endswith(FILTERED),
+                scenario.filters.get(AUTOMATED) is not None or not self.label.endswith(FILTERED),
                 f"the task has no safety filter: score {self.who.removesuffix(FILTERED)}, which "
                 "drives without one; with +filter=cbf the leaderboard refuses the row",
             )
@@ -143,10 +142,10 @@ def roads(
     who.strategy(own)
     if own.scenario.road == RING:
         return {"ring": own}
-    if own.leader is not None and "held_out" in own.leader:
-        return {" ".join(own.leader["held_out"]): own}
+    if own.leader is not None and "held_out" in own.leader.settings:
+        return {" ".join(own.leader.settings["held_out"]): own}
     # Drivers that a task fixes are part of it; a population is that of the source.
-    people = HUMAN in own.scenario.vehicles.names and own.drivers[TARGET] != FIXED
+    people = HUMAN in own.scenario.vehicles.names and own.drivers.kind is not fixed
     left = () if people else ("drivers",)
     return {
         name: load("evaluate", [*words, *(word for word in of if root_key(word) not in left)])

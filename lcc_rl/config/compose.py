@@ -22,19 +22,13 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from lcc_rl.config.inputs import inputs_of
-from lcc_rl.config.nodes import (
-    TARGET,
-    find_target,
-    forget_places,
-    settings_of,
-    takes_action,
-    with_defaults,
-)
-from lcc_rl.config.schemas import KINDS, SECTIONS, as_plain, parse_config
+from lcc_rl.config.nodes import as_nodes, as_plain, settings_of, takes_action, with_defaults
+from lcc_rl.config.schemas import AUTO, KINDS, SECTIONS, parse_config
 from lcc_rl.config.unused import check_used
 from lcc_rl.config.words import key_of
 from lcc_rl.errors import ConfigError, how_to_install, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
+from lcc_rl.settings import TARGET, find_target
 
 CONF = "lcc_rl.conf"
 # Settings that do not change any row of a result.
@@ -44,6 +38,7 @@ NOT_IDENTITY = (
 )
 # Launchers that come with other packages: which extra brings them.
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
+NEEDED = ("data", "split", "drivers", "observation", "calibration")  # of commands that have them
 NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =
 # Hydra's keys are without quotes.
 NAMES = (
@@ -198,7 +193,10 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         if not group or not choices(group):
             raise
         raise ConfigError(f"{error} Other choices: {group}={'|'.join(choices(group))}") from None
-    check_used(content, overrides, sweep)
+    for name in NEEDED:
+        if getattr(tree, name, TARGET) is None:
+            raise ConfigError(f"{name}: expected a node with {TARGET}, got None")
+    check_used(tree, overrides, sweep)
     return with_inputs(tree)
 
 
@@ -218,7 +216,7 @@ def _learns(content: Mapping[str, Any]) -> bool:
     driver = scenario.get("controllers", {})
     if not isinstance(driver, Mapping) or AUTOMATED not in driver:
         return True
-    return takes_action(driver[AUTOMATED])
+    return takes_action(as_nodes(driver[AUTOMATED], AUTO))
 
 
 def leave_out_foreign(content: dict[str, Any], overrides: Sequence[str]) -> None:
@@ -274,9 +272,6 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
             f"{typed}: cannot be read as a setting. Brackets must be closed, and text "
             f"with spaces, commas or signs needs quotes within quotes: \"{key}='…'\"{names}"
         )
-    found = re.search(r"(\S+) appears more than once|Multiple values for (\S+)\.", str(error))
-    if found is not None:
-        return _twice(found.group(1) or found.group(2), overrides)
     found = re.search(
         r"Could not (?:override|append to config|delete from config)\S* '([^']+)'", str(error)
     )
@@ -288,31 +283,16 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
     return ConfigError(" ".join(words))
 
 
-def _twice(group: str, overrides: Sequence[str]) -> ConfigError:
-    """Return the error for a choice that is added where there is one already."""
-    chosen = [word.partition("=")[2] for word in overrides if key_of(word) == "experiment"]
-    if any(word.startswith("+experiment=") for word in overrides):
-        both = ",".join(name.strip("[]") for name in chosen)
-        return ConfigError(f"+experiment=…: there is one already; use 'experiment=[{both}]'")
-    source = f" by experiment={','.join(chosen)}" if chosen else ""
-    return ConfigError(
-        f"+{group}=…: {group} is chosen already{source}; {group}=…, without +, replaces it"
-    )
-
-
 def _unknown_option(name: str) -> ConfigError:
     """Return the error for an option that does not exist; many belong into a section."""
-    root = name.partition(".")[0]
-    places = {key: section for section, kind in SECTIONS.items() for key in settings_of(kind) or ()}
-    places |= dict.fromkeys((HUMAN, AUTOMATED), "scenario.controllers")
+    places = {key: at for at, kind in SECTIONS.items() for key in settings_of(kind) or ()}
+    root, known = name.partition(".")[0], _top_level() | _groups()
     if root in places:
         return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")
-    if root in ("out", "output", "folder", "dir"):
-        return ConfigError(f"unknown option {name!r}: hydra.run.dir=… sets the folder")
-    known = _top_level() | _groups()
     if root in known:
         return ConfigError(f"this command has no option {root!r}, as others have: -h shows its own")
-    return unknown_name("option", name, known)
+    error = unknown_name("option", name, known)
+    return ConfigError(f"{error}; hydra.run.dir=… sets the folder") if root == "out" else error
 
 
 def check_own_files() -> None:
@@ -346,8 +326,7 @@ def identity(cfg: Any, *unused: str) -> str:
         cfg: the configuration.
         *unused: further keys of settings that do not.
     """
-    content = as_plain(cfg)
-    forget_places(content)
+    content = as_plain(cfg, places=False)
     for key in (*NOT_IDENTITY, *unused):
         *path, last = key.split(".")
         node = content

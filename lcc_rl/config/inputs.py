@@ -18,10 +18,11 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 
-from lcc_rl.config.nodes import TARGET, find_target, is_node, settings_at
+from lcc_rl.config.nodes import settings_at
 from lcc_rl.config.words import FILTERED
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.settings import parse_yaml, read_text
+from lcc_rl.settings import TARGET, find_target
 
 Inputs = dict[str, dict[str, str]]
 NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
@@ -70,9 +71,15 @@ def _files(last: str, named: bool, holder: Any, name: str) -> Iterator[Path]:
         yield from _module(name)
     elif named:
         yield from compared_files(name)
-    elif last == "path" or (is_node(holder) and not str(holder[TARGET]).startswith(OURS)):
+    elif last == "path" or not _ours(holder):
         found = [path] if path.exists() else map(Path, sorted(glob(str(path), recursive=True)))
         yield from sorted(path.iterdir()) if path.is_dir() else found
+
+
+def _ours(holder: Any) -> bool:
+    """Whether what holds a setting is not the node of a class or function of the user's own."""
+    target = holder.get(TARGET, OURS) if isinstance(holder, Mapping) else OURS
+    return str(target).startswith(OURS)
 
 
 def compared_files(name: str) -> Iterator[Path]:

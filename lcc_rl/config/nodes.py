@@ -1,60 +1,201 @@
-"""Nodes of a configuration: a mapping whose ``_target_`` names the class that it describes."""
+"""Nodes of a configuration: each describes an object by its class and its settings.
+
+What is stored is a mapping whose ``_target_`` names the class. At the door of the package
+(:func:`lcc_rl.config.schemas.parse_config`) each becomes a :class:`Node`, nested ones too.
+"""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator, Mapping, Sequence
-from importlib import import_module
-from typing import Any
+from functools import cached_property
+from typing import Any, Self
 
-from lcc_rl.errors import LARGEST, ConfigError, LccError, unknown_name
-from lcc_rl.settings import Settings, defaults, parse
+from lcc_rl.errors import LARGEST, ConfigError, LccError, require, unknown_name
+from lcc_rl.settings import TARGET, Settings, defaults, find_target, parse, values
 
-TARGET = "_target_"
 MISSING = "???"
 CALLED = ("__call__",)  # what a node that is used as a function makes
 
 
-def is_node(value: Any) -> bool:
-    """Whether a setting describes an object."""
-    return isinstance(value, Mapping) and TARGET in value
+class Node:
+    """An object that a configuration describes: its class, its settings and their place.
 
+    It does not change: :meth:`changed` returns another one. Copies share the object, and a node
+    that goes to another process takes its settings alone.
 
-def short_name(target: object) -> str:
-    """Return what tables call the class that a ``_target_`` names: ``ddpg`` of the agent DDPG."""
-    return str(target).rpartition(".")[2].lower()
-
-
-def path_of(kind: Any) -> str:
-    """Return the ``_target_`` that names a class or function.
-
-    Raises:
-        ConfigError: if a module does not hold it by its name.
+    Args:
+        settings: by name, as they are stored, with ``_target_`` and the defaults of the class;
+            those that describe objects are nodes.
+        where: their place in the configuration, for messages.
     """
-    module, name = (getattr(kind, key, None) for key in ("__module__", "__qualname__"))
-    if not module or not name or getattr(import_module(module), name, None) is not kind:
-        raise ConfigError(
-            f"{name or kind!r} cannot be named in a configuration: define it at the top of a "
-            "module, of a script or of a notebook"
-        )
-    return f"{module}.{name}"
+
+    def __init__(self, settings: Mapping[str, Any], where: str) -> None:
+        self.settings, self.where = settings, where
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any], where: str) -> Self:
+        """Return the node of a mapping with ``_target_``, its defaults completed and checked.
+
+        Raises:
+            ConfigError: naming the setting at fault.
+        """
+        node = as_nodes(with_defaults(settings, where), where)
+        if not isinstance(node, cls):
+            raise ConfigError(f"{where}: expected {TARGET}: module.Class, got {settings!r}")
+        check_nodes(node)
+        return node
+
+    def changed(self, **settings: Any) -> Self:
+        """Return the node with other settings."""
+        return self.of({**self.settings, **settings}, self.where)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Node) and self.settings == other.settings
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __deepcopy__(self, memo: Any) -> Self:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.settings, self.where)
+
+    def __repr__(self) -> str:
+        return repr(as_plain(self))
+
+    @cached_property
+    def kind(self) -> Any:
+        """The class or function."""
+        return find_target(str(self.settings[TARGET]), self.where)
+
+    @property
+    def name(self) -> str:
+        """What tables call it: ``ddpg`` of the agent DDPG."""
+        return str(self.settings[TARGET]).rpartition(".")[2].lower()
+
+    @property
+    def places(self) -> list[str]:
+        """The settings that name a place to write; a class lists them as ``WRITES``."""
+        named = getattr(self.kind, "WRITES", ())
+        return [name for name in named if self.settings.get(name) is not None]
+
+    def made(self, needed: type | Sequence[str] = object) -> Any:
+        """Return the object: of a class with :class:`Settings` always the same, else a new one.
+
+        Args:
+            needed: the class of the object, or the methods and attributes that it must have.
+
+        Raises:
+            ConfigError: if it cannot be made, or is another one.
+        """
+        made = self._object if has_settings(self.kind) else self._made()
+        if isinstance(needed, type):
+            fits, called = isinstance(made, needed), needed.__name__
+        else:
+            fits, called = all(hasattr(made, x) for x in needed), f"an object with {needed[0]}"
+        require(fits, f"{self.where}: expected {called}, got {type(made).__name__}")
+        return made
+
+    def check(self) -> None:
+        """Check the settings; a class or function without :class:`Settings` is not called."""
+        if has_settings(self.kind):
+            self.made()
+        else:
+            self._check_names()
+
+    @cached_property
+    def _object(self) -> Any:
+        return self._made()
+
+    def _made(self) -> Any:
+        held = {key: x for key, x in self.settings.items() if not str(key).startswith("_")}
+        try:
+            given = {key: _objects(value) for key, value in held.items()}
+            if has_settings(self.kind):
+                return parse(self.kind, given, self.where)
+            self._check_names()
+            for key in (key for key, value in given.items() if value == MISSING):
+                raise ConfigError(f"{self.where}.{key} is required: use {self.where}.{key}=…")
+            return self.kind(**given)
+        except (LccError, OSError):  # an OSError names its file, which says more than the node
+            raise
+        except Exception as error:  # a class of the user's own may raise anything
+            reason = f"{self.kind.__name__} cannot be built: {type(error).__name__}: {error}"
+            raise ConfigError(f"{self.where}: {reason}") from error
+
+    def _check_names(self) -> None:
+        known = settings_of(self.kind)
+        for key in self.settings if known is not None else ():
+            if key not in (known or ()) and not str(key).startswith("_"):
+                what = f"setting of {self.where} ({self.kind.__name__})"
+                raise unknown_name(what, key, known or ())
 
 
-def find_target(target: str, where: str) -> Any:
-    """Return the class or function that a ``_target_`` names."""
-    module, _, name = target.rpartition(".")
-    try:
-        found = getattr(import_module(module), name)
-    except Exception as error:  # a module of the user's own may raise anything
-        hint = ""
-        if not isinstance(error, (ImportError, AttributeError, ValueError)):
-            raise ConfigError(f"{where}: {module} cannot be imported: {error}") from error
-        if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("lcc_rl"):
-            hint = "; if it is a file of your own, export PYTHONPATH=<its folder>"
-        raise ConfigError(f"{where}.{TARGET}: cannot find {target!r}: {error}{hint}") from error
-    if not callable(found):
-        raise ConfigError(f"{where}.{TARGET}: {target!r} is no class or function")
-    return found
+def _objects(value: Any) -> Any:
+    """Return a setting with the objects that its nodes describe."""
+    if isinstance(value, Node):
+        return value.made()
+    if isinstance(value, Mapping):
+        return {key: _objects(item) for key, item in value.items()}
+    return [_objects(item) for item in value] if isinstance(value, list) else value
+
+
+def as_nodes(value: Any, where: str = "") -> Any:
+    """Return a setting in which every mapping with ``_target_`` is a :class:`Node`.
+
+    Args:
+        value: a setting as plain containers, or with nodes in them.
+        where: its place in the configuration.
+    """
+    if isinstance(value, list):
+        return [as_nodes(item, f"{where}[{place}]") for place, item in enumerate(value)]
+    if not isinstance(value, Mapping):
+        return value
+    found = {key: as_nodes(x, f"{where}.{key}".removeprefix(".")) for key, x in value.items()}
+    return Node(found, where) if TARGET in found else found
+
+
+def as_plain(value: Any, places: bool = True) -> Any:
+    """Return settings as plain containers, as files store them.
+
+    Args:
+        value: a configuration, a part of one or a node.
+        places: with the places that it names to write to; else they are null.
+    """
+    if isinstance(value, Node):
+        hidden = () if places else value.places
+        found = {key: as_plain(item, places) for key, item in value.settings.items()}
+        return found | dict.fromkeys(hidden)
+    if isinstance(value, Settings):
+        value = values(value)
+    if isinstance(value, Mapping):
+        return {key: as_plain(item, places) for key, item in value.items()}
+    return [as_plain(item, places) for item in value] if isinstance(value, list) else value
+
+
+def nodes_in(value: Any) -> Iterator[Node]:
+    """Yield the nodes in a configuration or a part of one, each before those nested in it."""
+    if isinstance(value, Node):
+        yield value
+        value = value.settings
+    elif isinstance(value, Settings):
+        value = values(value)
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    for inner in value if isinstance(value, list) else ():
+        yield from nodes_in(inner)
+
+
+def check_nodes(value: Any) -> None:
+    """Check every node in a configuration or a part of one."""
+    for node in nodes_in(value):
+        node.check()
+
+
+def has_settings(kind: Any) -> bool:
+    """Whether this is a class with :class:`Settings`."""
+    return inspect.isclass(kind) and issubclass(kind, Settings)
 
 
 def settings_of(target: Any) -> list[str] | None:
@@ -69,7 +210,7 @@ def settings_of(target: Any) -> list[str] | None:
 
 
 def with_defaults(value: Any, where: str = "") -> Any:
-    """Return a setting in which every node holds the defaults of its class, too.
+    """Return a setting in which every mapping with ``_target_`` holds the defaults of its class.
 
     Args:
         value: a setting as plain containers; references to other settings may be unresolved.
@@ -82,8 +223,8 @@ def with_defaults(value: Any, where: str = "") -> Any:
     found = {
         key: with_defaults(item, f"{where}.{key}".removeprefix(".")) for key, item in value.items()
     }
-    kind = find_target(str(found[TARGET]), where) if TARGET in found else None
-    if inspect.isclass(kind) and issubclass(kind, Settings):
+    kind: Any = find_target(str(found[TARGET]), where) if TARGET in found else None
+    if has_settings(kind):
         for key, default in defaults(kind).items():
             own = found.setdefault(key, default)
             if isinstance(own, Mapping) and isinstance(default, Mapping):
@@ -91,106 +232,10 @@ def with_defaults(value: Any, where: str = "") -> Any:
     return found
 
 
-def check_nodes(value: Any, where: str) -> None:
-    """Check every node in a setting.
-
-    Args:
-        value: a setting as plain containers.
-        where: its place in the configuration, for messages.
-    """
-    for key, _, node in [(where, None, value), *settings_at(value, where)]:
-        if is_node(node):
-            kind = find_target(str(node[TARGET]), key)
-            if inspect.isclass(kind) and issubclass(kind, Settings):
-                build(node, key)
-            else:
-                _check_names(kind, node, key)
-
-
-def build(
-    node: Any,
-    where: str,
-    needed: type | Sequence[str] = object,
-    world: Any = None,
-    name: str | None = None,
-    **resources: Any,
-) -> Any:
-    """Construct the object that a node describes, and first those nested in it.
-
-    Args:
-        node: a mapping with ``_target_``; its other keys are the settings of that class, or the
-            arguments of that function.
-        where: the node's place in the configuration, for messages.
-        needed: the class of the object, or the methods and attributes that it must have.
-        world: the :class:`lcc_rl.pieces.world.World` that a part of an environment is put into.
-        name: the name of the part there.
-        **resources: further arguments of a class or function without :class:`Settings`, given
-            where its parameters have these names.
-    """
-    if not is_node(node):
-        without = f"; to leave it out, use ~{where}" if node is None else ""
-        raise ConfigError(f"{where}: expected a node with {TARGET}, got {node!r}{without}")
-    kind = find_target(str(node[TARGET]), where)
-    given = {key: value for key, value in node.items() if not str(key).startswith("_")}
-    for key, value in given.items():
-        if is_node(value):
-            given[key] = build(value, f"{where}.{key}", **resources)
-    try:
-        made = _made(kind, given, where, resources)
-        if world is not None and hasattr(made, "bind"):
-            made = made.bind(world, name)
-    except (LccError, OSError):  # an OSError names its file, which says more than the node
-        raise
-    except Exception as error:  # a class of the user's own may raise anything
-        reason = f"{type(error).__name__}: {error}"
-        raise ConfigError(f"{where}: {kind.__name__} cannot be built: {reason}") from error
-    if not _fits(made, needed):
-        called = needed.__name__ if isinstance(needed, type) else f"an object with {needed[0]}"
-        raise ConfigError(f"{where}: expected {called}, got {type(made).__name__}")
-    return made
-
-
-def _made(kind: Any, given: dict[str, Any], where: str, resources: dict[str, Any]) -> Any:
-    if inspect.isclass(kind) and issubclass(kind, Settings):
-        return parse(kind, given, where)
-    known = _check_names(kind, given, where)
-    for key, value in given.items():
-        if value == MISSING:
-            raise ConfigError(f"{where}.{key} is required: use {where}.{key}=…")
-    offered = {k: v for k, v in resources.items() if k in known and k not in given}
-    return kind(**given, **offered)
-
-
-def _check_names(kind: Any, given: Mapping[str, Any], where: str) -> list[str]:
-    """Refuse settings that a class or function without :class:`Settings` does not have."""
-    known = settings_of(kind)
-    for key in given if known is not None else ():
-        if key not in known and not key.startswith("_"):  # type: ignore[operator]
-            raise unknown_name(f"setting of {where} ({kind.__name__})", key, known or ())
-    return known or []
-
-
-def _fits(made: Any, needed: type | Sequence[str]) -> bool:
-    if isinstance(needed, type):
-        return isinstance(made, needed)
-    return all(hasattr(made, name) for name in needed)
-
-
-def takes_action(node: Any) -> bool:
+def takes_action(node: Node) -> bool:
     """Whether a controller, or one inside it, carries out the action of a policy."""
-    reads = (getattr(kind, "reads", ()) for kind in _kinds(node))
+    reads = (getattr(inner.kind, "reads", ()) for inner in nodes_in(node))
     return any(name.endswith(".action") for names in reads for name in names)
-
-
-def takes_population(node: Any) -> bool:
-    """Whether a controller, or one inside it, drives as the drivers of a population."""
-    return any(getattr(kind, "takes_population", False) for kind in _kinds(node))
-
-
-def _kinds(node: Any) -> list[Any]:
-    """Return the classes of a controller and of those inside it."""
-    nodes = [node, *(inner for _, _, inner in settings_at(node))]
-    return [find_target(str(one[TARGET]), "controller") for one in nodes if is_node(one)]
 
 
 def check_numbers(value: Any, where: str) -> None:
@@ -212,28 +257,3 @@ def settings_at(content: Any, where: str = "") -> Iterator[tuple[str, Any, Any]]
             name = f"{where}.{key}" if where else str(key)
             yield name, content, value
             yield from settings_at(value, name)
-
-
-def forget_places(content: Mapping[str, Any]) -> list[str]:
-    """Set every setting that names a place to write to null; a class lists them as ``WRITES``.
-
-    Args:
-        content: a configuration as plain containers, changed in place.
-
-    Returns:
-        The settings that named one, as ``key=value``.
-    """
-    found = []
-    for key, node, target in list(settings_at(content)):
-        if key.rpartition(".")[2] != TARGET:
-            continue
-        where = key.removesuffix(TARGET)
-        try:
-            names = getattr(find_target(str(target), where), "WRITES", ())
-        except ConfigError:  # building the node says so
-            continue
-        for name in names:
-            if node.get(name) is not None:
-                found.append(f"{where}{name}={node[name]}")
-                node[name] = None
-    return found

@@ -1,7 +1,7 @@
 """The typed tree of a configuration: its sections, with the types and ranges of their settings.
 
-Values stand in conf/. Nodes with a ``_target_`` (pieces, agents, data …) stay mappings until they
-are built; :mod:`lcc_rl.config.nodes` checks them and completes their defaults.
+Values stand in conf/. What has a ``_target_`` (pieces, agents, data …) is a
+:class:`lcc_rl.config.nodes.Node`.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import AfterValidator, Field
 
-from lcc_rl.config.nodes import TARGET, check_nodes, check_numbers, is_node, with_defaults
+from lcc_rl.config.nodes import Node, as_nodes, as_plain, check_nodes, check_numbers
 from lcc_rl.errors import LAST_SEED, ConfigError
 from lcc_rl.functional.pattern import VehicleString, parse_string
 from lcc_rl.settings import (
+    TARGET,
     Count,
     Million,
     NonNegative,
@@ -36,22 +37,22 @@ Format = Literal["png", "pdf", "svg"]
 
 
 def _described(node: Any) -> Any:
-    if node is not None and not is_node(node):
+    if node is not None and not isinstance(node, Node):
         raise ValueError(f"expected a node with {TARGET} or null, got {node!r}")
     return node
 
 
 def _all_described(nodes: dict[str, Any]) -> dict[str, Any]:
     for name, node in nodes.items():
-        if isinstance(node, Mapping) and not is_node(node):
+        if isinstance(node, Mapping):
             known = ", ".join(key for key in nodes if key != name)
             raise ValueError(f"unknown name {name!r}, which has no {TARGET}; valid: {known}")
-        if node is not None and not is_node(node):
+        if node is not None and not isinstance(node, Node):
             raise ValueError(f"{name}: expected a node with {TARGET} or null, got {node!r}")
     return nodes
 
 
-Node = Annotated[Any, AfterValidator(_described)]
+Described = Annotated[Any, AfterValidator(_described)]  # a node or None
 Nodes = Annotated[dict[str, Any], AfterValidator(_all_described)]
 AUTO = "scenario.controllers.automated"
 
@@ -90,6 +91,10 @@ class RewardConfig(Settings):
     """The reward: named terms."""
 
     terms: Nodes
+
+    def settled(self) -> None:
+        for name in (name for name, node in self.terms.items() if node is None):
+            raise ConfigError(f"reward.terms.{name} is null; ~reward.terms.{name} leaves it out")
 
 
 class TrainingConfig(Settings):
@@ -137,7 +142,7 @@ class BaseConfig(Settings):
     device: Device  # cpu, cuda or cuda:<number>
     threads: Parallel
     matmul_precision: Literal["highest", "high", "medium"] = "highest"
-    data: Node
+    data: Described  # null, as drivers and split, in policies that ship
     figure_formats: list[Format]
     trust: list[str] = dataclasses.field(default_factory=list)
     # Hashes of the files that it reads, see lcc_rl.config.inputs; a run notes them itself.
@@ -153,25 +158,25 @@ class BaseConfig(Settings):
 class CalibrateConfig(BaseConfig):
     """``lcc-rl calibrate``."""
 
-    calibration: Node
+    calibration: Described
 
 
 class StudyConfig(BaseConfig):
     """What every command that drives vehicles shares."""
 
     variant: str
-    drivers: Node
-    split: Node
-    leader: Node = None
-    energy: Node = None
+    drivers: Described
+    split: Described
+    leader: Described = None
+    energy: Described = None
     task: dict[str, Any] | None = None
     scenario: ScenarioConfig
-    observation: Node
+    observation: Described
     reward: RewardConfig
-    agent: Node
+    agent: Described
     gains: Any = None
     # Drives the automated vehicles once the policy is trained; None: the policy itself.
-    deployed: Node = None
+    deployed: Described = None
     # Here, not in TrainConfig, so that one recipe serves every entry point.
     training: TrainingConfig
     evaluation: EvaluationConfig
@@ -184,7 +189,7 @@ class StudyConfig(BaseConfig):
 class TrainConfig(StudyConfig):
     """``lcc-rl train``."""
 
-    logger: Node = None
+    logger: Described = None
 
 
 class EvaluateConfig(StudyConfig):
@@ -197,7 +202,7 @@ class EvaluateConfig(StudyConfig):
 class PipelineConfig(TrainConfig):
     """``lcc-rl run``."""
 
-    calibration: Node
+    calibration: Described
     variants: Variants | None = None  # at least one
     jobs: Parallel
 
@@ -220,14 +225,16 @@ def parse_config(content: Mapping[str, Any], kind: type[BaseConfig] | None = Non
     """Return the typed tree of a configuration: the door through which settings come in.
 
     Args:
-        content: a configuration as plain containers.
+        content: a configuration as plain containers or nodes, each with the defaults of its class.
         kind: class of the tree; by default the command's that has these settings.
+
+    Raises:
+        ConfigError: naming the first setting that is unknown or wrong.
     """
     kind = kind or _kind_of(content)
     check_numbers(content, "")
-    found, known = with_defaults(content), {item.name for item in dataclasses.fields(kind)}
-    for key, value in found.items():
-        check_nodes(value, key)
+    found, known = as_nodes(content), {item.name for item in dataclasses.fields(kind)}
+    check_nodes(found)
     for name, section in SECTIONS.items():
         if name in found and name in known:
             if not isinstance(found[name], Mapping):
@@ -246,8 +253,3 @@ def _kind_of(content: Mapping[str, Any]) -> type[BaseConfig]:
 def as_text(cfg: Settings) -> str:
     """Return a typed tree as the text of a file, see :func:`parse_config`."""
     return str(yaml.safe_dump(as_plain(cfg), sort_keys=False, allow_unicode=True))
-
-
-def as_plain(cfg: Settings) -> dict[str, Any]:
-    """Return a typed tree as plain containers, as files store it."""
-    return dataclasses.asdict(cfg)  # type: ignore[call-overload]

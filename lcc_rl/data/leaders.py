@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -305,6 +306,7 @@ class DriveLeaders(Settings):
         each = 1 < len(drives) == len(find_files(self.path))  # a file is a drive
         if each and self.together and len({*map(self._family, drives)}) == 1:
             report.append(f"each file is a trip: leader.together={self.together} is in all names")
+            self = copy(self)  # the settings stay
             self.together = None
         divide = self._by_time if single else self._by_name
         training, held_out = nothing(time_step), profiles

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,8 +13,8 @@ from tensordict.utils import NestedKey
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import load
-from lcc_rl.config.nodes import CALLED, TARGET, build
-from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config.nodes import CALLED, Node
+from lcc_rl.config.schemas import AUTO, ScenarioConfig, StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.clock import Clock, Traffic, batch_shape
@@ -30,6 +31,7 @@ from lcc_rl.pieces import (
     Controller,
     Corrected,
     EnergyClasses,
+    Handover,
     Piece,
     RolePlaces,
     Sensors,
@@ -40,7 +42,7 @@ from lcc_rl.pieces.base import ACTION
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.hybrid import check_spacing
 from lcc_rl.pieces.world import World
-from lcc_rl.settings import parse
+from lcc_rl.settings import TARGET, parse, path_of
 
 MOMENTS = 3  # in memory at the least: the one left, the one reached, and what they are made with
 
@@ -72,7 +74,8 @@ def build_env(
         ConfigError: naming the option at fault, or saying what the batch needs in memory.
     """
     scenario, device = cfg.scenario, device and torch_device(device)
-    pieces = build_pieces(cfg, profiles, population, nominal)
+    world = world_of(cfg, profiles, population, nominal)
+    pieces = build_pieces(cfg, world)
     if (dtype := torch.get_default_dtype()) != torch.float32:  # in which inputs are stored
         pieces = [piece.to(dtype) for piece in pieces]
     acts = any(key == ACTION for piece in pieces for _, key in piece.needs)
@@ -83,7 +86,7 @@ def build_env(
     check_pieces(pieces, scenario.horizon, actions)
     clock = Clock(scenario.horizon, batch_size, actions, seed, device)
     acting = Pieces(*pieces)
-    acting.world = world_of(cfg)
+    acting.world = replace(world, profiles=None, population=None, nominal=False)
     env = Traffic(clock, acting)
     return env.to(device) if device is not None else env
 
@@ -101,9 +104,9 @@ def world_of(
         population,
         build_energy(cfg),
         nominal,
-        _by_role(scenario, "actuators", Actuation),
-        _by_role(scenario, "sensors", Sensors),
-        list(_nodes(scenario, "filters")),
+        {role: node.made(Actuation) for role, node in _by_role(scenario, "actuators")},
+        {role: node.made(Sensors) for role, node in _by_role(scenario, "sensors")},
+        [role for role, _ in _by_role(scenario, "filters")],
     )
 
 
@@ -120,19 +123,15 @@ def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
     cfg = deepcopy(cfg)
     drivers, filters = cfg.scenario.controllers, cfg.scenario.filters
     if drivers[AUTOMATED] != drivers[HUMAN]:
-        drivers[AUTOMATED] = {
-            TARGET: "lcc_rl.pieces.Handover",
-            "before": drivers[HUMAN],
-            "after": drivers[AUTOMATED],
-            "from_s": seconds,
-        }
+        both = {"before": drivers[HUMAN], "after": drivers[AUTOMATED], "from_s": seconds}
+        drivers[AUTOMATED] = Node.of({TARGET: path_of(Handover), **both}, AUTO)
     if filters.get(AUTOMATED) is not None:
-        filters[AUTOMATED] = {**filters[AUTOMATED], "from_s": seconds}
+        filters[AUTOMATED] = filters[AUTOMATED].changed(from_s=seconds)
     cfg.scenario.horizon += steps
     return cfg
 
 
-def _nodes(scenario: Any, group: str) -> dict[str, Any]:
+def _by_role(scenario: ScenarioConfig, group: str) -> list[tuple[str, Node]]:
     """Return what a group describes by role, of the roles that the string has.
 
     Raises:
@@ -140,19 +139,13 @@ def _nodes(scenario: Any, group: str) -> dict[str, Any]:
     """
     nodes = getattr(scenario, group)
     _check_roles(nodes, f"scenario.{group}", scenario)
-    return {role: nodes[role] for role in scenario.vehicles.names if nodes.get(role) is not None}
+    return [(role, nodes[role]) for role in scenario.vehicles.names if nodes.get(role) is not None]
 
 
-def _check_roles(roles: Iterable[str], where: str, scenario: Any) -> None:
+def _check_roles(roles: Iterable[str], where: str, scenario: ScenarioConfig) -> None:
     for role in roles:
         if role not in scenario.controllers:
             raise unknown_name(f"role ({where})", role, list(scenario.controllers))
-
-
-def _by_role(scenario: Any, group: str, kind: type[Piece]) -> dict[str, Any]:
-    """Build the settings of a group of pieces by role."""
-    nodes = _nodes(scenario, group)
-    return {role: build(node, f"scenario.{group}.{role}", kind) for role, node in nodes.items()}
 
 
 def _size(pieces: Sequence[Piece], batch_size: Sequence[int] | int) -> int:
@@ -163,20 +156,21 @@ def _size(pieces: Sequence[Piece], batch_size: Sequence[int] | int) -> int:
     return MOMENTS * moment * math.prod(batch_shape(batch_size))
 
 
-def build_pieces(
-    cfg: StudyConfig, profiles: Profiles, population: Population, nominal: bool = False
-) -> list[Piece]:
+def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
     """Build the pieces of a configuration in the order in which they act.
 
     The leader; the controllers of the roles that occur, their filters and actuators; the motion of
     the string; sensors; the further pieces of the scenario; and, where there are automated
-    vehicles, what they observe and are rewarded with. Arguments as of :func:`build_env`.
+    vehicles, what they observe and are rewarded with.
+
+    Args:
+        cfg: configuration with the nodes ``scenario``, ``observation`` and ``reward``.
+        world: what the pieces share.
 
     Raises:
         ConfigError: naming the option at fault.
     """
-    scenario, world = cfg.scenario, world_of(cfg, profiles, population, nominal)
-    string, energy = world.string, world.energy
+    scenario, string, energy = cfg.scenario, world.string, world.energy
     named = {name: node for name, node in scenario.pieces.items() if node is not None}
     pieces = _leader(scenario, named.pop("leader", None), world)
     drivers = _drivers(scenario, world)
@@ -189,13 +183,13 @@ def build_pieces(
     pieces += [RolePlaces().bind(world), *classes, *drivers, *actuators]
     pieces += [_motion(scenario, world), *sensors]
     pieces += _watchers(drivers, world)
-    pieces += [_build(node, "scenario.pieces", world, name) for name, node in named.items()]
-    check_spacing(pieces, profiles)
+    pieces += [node.made(Piece).bind(world, name) for name, node in named.items()]
+    check_spacing(pieces, world.profiles)
     if not string.count(AUTOMATED):
         return pieces
-    pieces.append(build(cfg.observation, "observation", Piece, world=world))
+    pieces.append(cfg.observation.made(Piece).bind(world))
     terms = cfg.reward.terms
-    pieces += [_build(node, "reward.terms", world, name) for name, node in terms.items()]
+    pieces += [node.made(Piece).bind(world, name) for name, node in terms.items()]
     # The sum stays last, before collisions of the next step.
     return [*pieces, TotalReward(terms=list(terms)).bind(world)]
 
@@ -211,51 +205,35 @@ def _watchers(drivers: Sequence[Controller | CBFFilter], world: World) -> list[P
     return [*(piece.watch() for piece in filters.values() if piece.answers), *changed]
 
 
-def _build(node: Any, group: str, world: World, name: str) -> Any:
-    """Build a piece.
-
-    Raises:
-        ConfigError: if the node describes something else.
-    """
-    return build(node, f"{group}.{name}", Piece, world=world, name=name)
-
-
-def _leader(scenario: Any, node: Any, world: World) -> list[Piece]:
+def _leader(scenario: ScenarioConfig, node: Any, world: World) -> list[Piece]:
     """Build the leader of an open road; a ring road has none."""
     if (node is None) != (scenario.road == RING):
         raise ConfigError(
             "scenario.pieces.leader: a ring road has no leader, an open road needs one, got "
             f"scenario.road={scenario.road} and leader={node}"
         )
-    return [] if node is None else [_build(node, "scenario.pieces", world, "leader")]
+    return [] if node is None else [node.made(Piece).bind(world, "leader")]
 
 
-def _drivers(scenario: Any, world: World) -> list[Any]:
+def _drivers(scenario: ScenarioConfig, world: World) -> list[Any]:
     """Build the controllers of the roles that occur, and their safety filters."""
-    drivers = _nodes(scenario, "controllers")
     for role in world.string.names:
-        if role not in drivers:
+        if scenario.controllers.get(role) is None:
             known = ", ".join(name for name, node in scenario.controllers.items() if node)
             raise ConfigError(
                 f"scenario.string has the role {role!r}, but scenario.controllers names only "
                 f"{known}; use +controller@scenario.controllers.{role}=… for another"
             )
-    return [
-        _build(node, f"scenario.{group}", world, role)
-        for group in ("controllers", "filters")
-        for role, node in _nodes(scenario, group).items()
-    ]
+    nodes = [*_by_role(scenario, "controllers"), *_by_role(scenario, "filters")]
+    return [node.made(Piece).bind(world, role) for role, node in nodes]
 
 
-def _motion(scenario: Any, world: World) -> StringMotion:
+def _motion(scenario: ScenarioConfig, world: World) -> StringMotion:
     string = world.string
-    start = {
-        role: build(node, f"scenario.start.{role}", CALLED)
-        for role, node in scenario.start.items()
-        if role in string.names and node is not None and not string.ring
-    }
     if not string.ring and scenario.circumference is not None:
         raise ConfigError("scenario.circumference is of use on scenario.road=ring only")
+    named = {role: node for role, node in scenario.start.items() if role in string.names and node}
+    start = {} if string.ring else {role: node.made(CALLED) for role, node in named.items()}
     names = ("circumference", "circumference_range", "vehicle_length", "initial_speed")
     of_ring = {name: getattr(scenario, name) for name in names} if string.ring else {}
     return parse(StringMotion, {"start": start, **of_ring}, "scenario").bind(world)

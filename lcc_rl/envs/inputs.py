@@ -12,17 +12,19 @@ import torch
 
 from lcc_rl.config import is_sweep
 from lcc_rl.config.inputs import inputs_of
-from lcc_rl.config.nodes import CALLED, TARGET, build, short_name
+from lcc_rl.config.nodes import CALLED, Node, as_plain
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.leaders import Case, TrajectoryLeaders
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.data.sources import LoadedEpisodes
-from lcc_rl.energy import EnergyModel, Fleet, as_fleet
+from lcc_rl.energy import Fleet, as_fleet
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import RING
 from lcc_rl.pieces.controllers import Population
+from lcc_rl.settings import TARGET
 
 BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"  # of a table, by default the shipped one
+LOADS = ("load",)  # what sources of episodes and of leaders have
 MEANT = ("power", "path_power", "stored_energy", "acceleration_loss", "infeasible")
 
 
@@ -67,7 +69,7 @@ def build_drivers(cfg: StudyConfig) -> Population:
         ConfigError: naming the option at fault.
     """
     needed = ("desired_speed", "time_gap", "constants")
-    return cast(Population, build(cfg.drivers, "drivers", needed))
+    return cast(Population, cfg.drivers.made(needed))
 
 
 def build_energy(cfg: StudyConfig) -> Fleet:
@@ -76,23 +78,7 @@ def build_energy(cfg: StudyConfig) -> Fleet:
     Raises:
         ConfigError: naming the option at fault.
     """
-    node = cfg.energy
-    if node is not None and isinstance(node.get("models"), Mapping):
-        models = {
-            name: build(model, f"energy.models.{name}", EnergyModel)
-            for name, model in node["models"].items()
-        }
-        node = {**node, "models": models}
-    return as_fleet(node and build(node, "energy", MEANT))
-
-
-def build_source(node: Any) -> Any:
-    """Build the source of episodes that the node ``data`` describes.
-
-    Raises:
-        ConfigError: naming the option at fault.
-    """
-    return build(node, "data", ("load",))
+    return as_fleet(cfg.energy and cfg.energy.made(MEANT))
 
 
 def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
@@ -133,9 +119,9 @@ def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
 def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
     """Build what ``leader`` describes; without it, the leaders of ``data`` divided by ``split``."""
     if cfg.leader is not None:
-        return build(cfg.leader, "leader", ("load",))
+        return cfg.leader.made(LOADS)
     loaded = load_episodes(cfg.data) if episodes is None else LoadedEpisodes(episodes, [])
-    split = build(cfg.split, "split", CALLED)
+    split = cfg.split.made(CALLED)
     # Every window is kept: the low-variation filter is for platoons, whose errors are relative.
     return TrajectoryLeaders(source=loaded, split=split, least_variation=0.0)
 
@@ -143,8 +129,9 @@ def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
 def described(population: Population, cfg: StudyConfig) -> str:
     """Return a line on who drives, and behind whom."""
     speed, gap = population.desired_speed, population.time_gap
-    leaders = cfg.leader if cfg.leader is not None and "source" not in cfg.leader else cfg.data
-    whose = leaders.get("path") or "synthetic or shipped traffic"
+    own = cfg.leader is not None and "source" not in cfg.leader.settings
+    leaders = cfg.leader if own else cfg.data
+    whose = leaders.settings.get("path") or "synthetic or shipped traffic"
     behind = "on a ring" if cfg.scenario.road == RING else f"behind leaders of {whose}"
     mode = getattr(population, "mode", None)
     taken = f", drivers.mode={mode}" if mode else ""
@@ -156,11 +143,11 @@ def described(population: Population, cfg: StudyConfig) -> str:
     return f"{line}, reaction delay {reaction.delay:g} s, noise {reaction.noise:g} m/s²"
 
 
-def _origin(drivers: Mapping[str, Any]) -> str:
+def _origin(drivers: Node) -> str:
     """Return where drivers come from; of a function of the user's own only its name is known."""
-    if drivers[TARGET] != BOOTSTRAP:
-        return short_name(drivers[TARGET])
-    path = drivers.get("path")
+    if drivers.settings[TARGET] != BOOTSTRAP:
+        return drivers.name
+    path = drivers.settings.get("path")
     return f"calibrated, {path}" if path else "fitted to NGSIM I-80, shipped"
 
 
@@ -177,7 +164,7 @@ _loaded: dict[str, LoadedEpisodes] = {}
 SHARED = "data: read once, by an earlier run of this process; the lines of that reading:"
 
 
-def load_episodes(node: Mapping[str, Any]) -> LoadedEpisodes:
+def load_episodes(node: Node) -> LoadedEpisodes:
     """Load episodes; the runs of a sweep that one process does share those of the same files.
 
     Args:
@@ -187,11 +174,12 @@ def load_episodes(node: Mapping[str, Any]) -> LoadedEpisodes:
         DataError, ConfigError: naming the file, row or option at fault.
     """
     if not is_sweep():
-        return build_source(node).load()
-    key = json.dumps([node, inputs_of({"data": node})])
+        return cast(LoadedEpisodes, node.made(LOADS).load())
+    plain = as_plain(node)
+    key = json.dumps([plain, inputs_of({"data": plain})])
     if key in _loaded:
         return replace(_loaded[key], report=[SHARED, *_loaded[key].report])
-    loaded = build_source(node).load()
+    loaded: LoadedEpisodes = node.made(LOADS).load()
     _loaded.clear()
     _loaded[key] = loaded
     return loaded

@@ -12,7 +12,7 @@ from torch import Tensor
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.leaders import Case
 from lcc_rl.envs import build_env
-from lcc_rl.envs.factory import build_pieces
+from lcc_rl.envs.factory import build_pieces, world_of
 from lcc_rl.envs.inputs import Inputs
 from lcc_rl.evaluation.rollout import play, reset_options
 from lcc_rl.evaluation.strategies import Strategy
@@ -74,7 +74,8 @@ def check_cases(cfg: StudyConfig, inputs: Inputs) -> None:
     """Check that the vehicles of a configuration can follow the fastest leader."""
     if cfg.evaluation.rows == "vehicles":
         case = max(cases_of(cfg, inputs), key=lambda case: float(case.profile.speeds.max()))
-        build_pieces(of_case(cfg, case), case.profile, inputs.population, True)
+        own = of_case(cfg, case)
+        build_pieces(own, world_of(own, case.profile, inputs.population, True))
 
 
 def of_case(cfg: StudyConfig, case: Case) -> StudyConfig:

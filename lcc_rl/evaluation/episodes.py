@@ -170,7 +170,7 @@ class Episodes:
             self.cfg, inputs.evaluation, inputs.population, plan.size, 0, device, nominal=True
         )
         self.energy = build_energy(self.cfg)
-        filtered = bool(self.cfg.scenario.filters.get(AUTOMATED))
+        filtered = self.cfg.scenario.filters.get(AUTOMATED) is not None
         keys = [*KEYS, INDEX, CLASS, *(FILTER_ENTRIES if filtered else ())]
         self.player = Player(env, strategy.policy, keys, strategy.title, compiled)
         count = min(sample_episodes, len(plan))
@@ -251,6 +251,6 @@ def any_leader(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration whose leader plays any record, not the one chosen for training."""
     cfg = deepcopy(cfg)
     leader = cfg.scenario.pieces.get("leader")
-    if leader is not None and "profile" in leader:
-        leader["profile"] = None
+    if leader is not None and "profile" in leader.settings:
+        cfg.scenario.pieces["leader"] = leader.changed(profile=None)
     return cfg

@@ -8,6 +8,7 @@ from typing import Any
 
 from tensordict.nn import TensorDictModule
 
+from lcc_rl.config.nodes import as_plain
 from lcc_rl.config.schemas import AUTO, StudyConfig
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED
@@ -43,7 +44,8 @@ def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
 
 def _check_entries(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
     """Check that an observation has the entries of the training, before its settings."""
-    one, other = ({key for key, _ in flatten(x.observation.get("scales", {}))} for x in (own, cfg))
+    scales = (x.observation.settings.get("scales", {}) for x in (own, cfg))
+    one, other = ({key for key, _ in flatten(found)} for found in scales)
     parts = (("with", one - other), ("without", other - one))
     words = [f"{how} {', '.join(sorted(keys))}" for how, keys in parts if keys]
     require(
@@ -55,11 +57,11 @@ def _check_entries(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
 
 def _observed(cfg: StudyConfig) -> dict[str, Any]:
     """Return what makes an observation: its settings, the order of its entries, the memory."""
-    node = cfg.observation
+    node = as_plain(cfg.observation)
     order = [key for key, _ in flatten(node) if key.startswith("scales.")]
     memory = cfg.scenario.pieces.get("memory")
     found = {"observation": {**node, "order of scales": order}}
-    return found if memory is None else {**found, "scenario.pieces.memory": memory}
+    return found if memory is None else {**found, "scenario.pieces.memory": as_plain(memory)}
 
 
 def check_scenario(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
@@ -89,7 +91,7 @@ def check_action(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
     one, other = (
         {
             "scenario.time_step": node.scenario.time_step,
-            AUTO: node.scenario.controllers[AUTOMATED],
+            AUTO: as_plain(node.scenario.controllers[AUTOMATED]),
         }
         for node in (own, cfg)
     )
@@ -118,7 +120,8 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     changed = [name for name in TRAFFIC if getattr(own, name) != getattr(cfg, name)]
     if not changed:
         return ""
-    places = {name: (getattr(own, name) or {}).get("path") for name in changed}
+    nodes = {name: getattr(own, name) for name in changed}
+    places = {name: node and node.settings.get("path") for name, node in nodes.items()}
     others = ", ".join(name + (f" (path={at})" if at else "") for name, at in places.items())
     options = " ".join(f"{name}=…" for name in changed)
     return (

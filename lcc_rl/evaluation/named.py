@@ -9,33 +9,29 @@ from functools import cache
 from importlib.resources import files
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any
-
-from hydra.core.global_hydra import GlobalHydra
+from typing import Any, TypeGuard
 
 from lcc_rl.config import choices, load, own_file
-from lcc_rl.config.nodes import TARGET, build, find_target, path_of
+from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.config.words import FILTERED
-from lcc_rl.errors import ConfigError, require, unknown_name
+from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.pieces.controllers import Controller, Law
 from lcc_rl.results.policies import PRETRAINED
-from lcc_rl.settings import values
+from lcc_rl.settings import TARGET, find_target, path_of, values
 
-PLACE = f"controller@{AUTO}"
 # Cruise controls with tuned constants. Behind the safety filter they have constants of their own.
 TUNED = ("idm_acc", "acc")
-# Settings that make the controller of each baseline.
-BASELINES = {
-    "idm": ("variant=idm",),
-    **{f"cacc {x}": ("variant=cacc", f"gains={x}") for x in ("path", "paper_like", "tuned")},
+# Baselines that are a controller of conf/ with other settings.
+BASELINES: dict[str, tuple[str, dict[str, Any]]] = {
     # Time gaps above 2.5 s for 2 % of the time, the limit of idm_acc and acc; mpc keeps 1 %.
-    "mpc_far": ("variant=idm", f"{AUTO}.longest_gap=-4.0", f"{PLACE}=mpc"),
-    "deadbeat": ("variant=deadbeat",),
-    "deadbeat oracle": ("variant=deadbeat", f"{AUTO}.lookahead=oracle"),
+    "mpc_far": ("mpc", {"longest_gap": -4.0}),
+    "deadbeat oracle": ("deadbeat", {"lookahead": "oracle"}),
 }
+GAINS = ("path", "paper_like", "tuned")  # files of conf/gains
+OF_CACC = tuple(f"cacc {name}" for name in GAINS)
 DIRECT = "direct"  # a string without automated vehicles
 RECORDED = "recorded"  # the first vehicle driven as the one recorded behind the leader
 PEOPLE = "human"  # automated vehicles driven as the scenario's human drivers drive
@@ -57,7 +53,7 @@ OTHERS = (
 def rules() -> tuple[str, ...]:
     """Return the names of all baselines and of the files of ``controller`` in conf/ and beside."""
     found = [name for name in choices("controller") if name not in NEEDY]
-    return tuple(dict.fromkeys([DIRECT, PEOPLE, *BASELINES, *found]))
+    return tuple(dict.fromkeys([DIRECT, PEOPLE, "idm", *OF_CACC, *BASELINES, "deadbeat", *found]))
 
 
 def is_shipped(name: str) -> bool:
@@ -65,10 +61,10 @@ def is_shipped(name: str) -> bool:
 
     A variant's, such as ``alcc``, says who learned; a user's own controller never has such a name.
     """
-    return name.removesuffix(FILTERED) in {DIRECT, PEOPLE, *BASELINES, *_files()}
+    return name.removesuffix(FILTERED) in {DIRECT, PEOPLE, *OF_CACC, *BASELINES, *_files()}
 
 
-def setting_of(who: Any) -> Any:
+def setting_of(who: Any) -> str | Node:
     """Return what a configuration calls a policy or a controller that a program names.
 
     Args:
@@ -77,16 +73,18 @@ def setting_of(who: Any) -> Any:
     Raises:
         ConfigError: if a class or function is not at the top of a module.
     """
+    if isinstance(who, Node):
+        return who
     if isinstance(who, Controller):
-        return {TARGET: path_of(type(who)), **values(who)}
+        who = {TARGET: path_of(type(who)), **values(who)}
     if isinstance(who, Mapping):
-        return dict(who)
+        return Node.of(who, "compare")
     if isinstance(who, PathLike):
         return fspath(who)
     return path_of(who) if callable(who) else str(who)
 
 
-def is_policy(who: Any) -> bool:
+def is_policy(who: Any) -> TypeGuard[str]:
     """Whether a name is that of a trained policy's file or folder."""
     if not isinstance(who, str) or who.endswith((*YAML, ONNX, MODULE)):
         return False
@@ -94,7 +92,7 @@ def is_policy(who: Any) -> bool:
     return path.exists() or path.parts[:1] == (PRETRAINED,) or path.suffix == ".pt"
 
 
-def controller_of(who: Any, behind: bool = False) -> Any:
+def controller_of(who: Any, behind: bool = False) -> Node:
     """Return the node of a controller.
 
     Args:
@@ -109,14 +107,13 @@ def controller_of(who: Any, behind: bool = False) -> Any:
     """
     if isinstance(who, str):
         plain = who.removesuffix(FILTERED)
-        own = (behind or plain not in TUNED) and _words(who)
-        if words := own or _words(plain):
-            return _loaded(words, id(GlobalHydra.instance().hydra))
+        own = _named(who) if behind or plain not in TUNED else None
+        if node := own or _named(plain):
+            return node
         who = plain
-    node, where = _node(who), f"compare={who}"
-    require(isinstance(node, Mapping) and TARGET in node, f"{where}: expected {TARGET}: module.X")
-    build(node, where, Controller)
-    return dict(node)
+    node = who if isinstance(who, Node) else Node.of(_described(who), f"compare={who}")
+    node.made(Controller)
+    return node
 
 
 def label_of(who: Any) -> str:
@@ -124,8 +121,8 @@ def label_of(who: Any) -> str:
 
     A file whose name is one of the package's keeps its ending: ``idm_acc.yaml``.
     """
-    if isinstance(who, Mapping):
-        who = str(who.get("law") or who.get(TARGET))
+    if isinstance(who, Node):
+        who = str(who.settings.get("law") or who.settings[TARGET])
     known, plain = {*rules(), *choices("variant")}, who.removesuffix(FILTERED)
     file = Path(plain)
     if file.suffix in (*YAML, ONNX):
@@ -133,13 +130,24 @@ def label_of(who: Any) -> str:
     return who if who in known else str(who).rpartition(".")[2]
 
 
-def _words(who: str) -> tuple[str, ...]:
-    """Return the settings that make a controller which has a name; none if it has none."""
-    if who in BASELINES:
-        return BASELINES[who]
+def _named(who: str) -> Node | None:
+    """Return the controller that has a name; None if none has it."""
+    if who in (shipped := _shipped()):
+        return shipped[who]
     if who in choices("controller"):
-        return ("variant=idm", f"{PLACE}={who}")
-    return (f"variant={who}",) if who in choices("variant") else ()
+        words = ["variant=idm", f"controller@{AUTO}={who}"]
+    elif who in choices("variant"):
+        words = [f"variant={who}"]
+    else:
+        return None
+    cfg = load("evaluate", words)
+    if cfg.agent is not None:
+        raise ConfigError(
+            f"variant {who} is learned: compare its run folder or policy.pt, which "
+            f"lcc-rl train variant={who} makes"
+        )
+    found: Node = cfg.scenario.controllers[AUTOMATED]
+    return found
 
 
 @cache
@@ -150,29 +158,20 @@ def _files() -> frozenset[str]:
 
 
 @cache
-def _shipped(_hydra: int) -> dict[str, Any]:
-    """Compose the controllers of the package, all at once: an evaluation has several of them."""
+def _shipped() -> dict[str, Node]:
+    """Compose the controllers and baselines of the package, all at once: that takes a while."""
     names = sorted(_files() - {"action", "human", "hcfs"})
-    nodes = [f"+controller@scenario.controllers.{name}={name}" for name in names]
-    return dict(load("evaluate", ["variant=idm", "+gains=tuned", *nodes]).scenario.controllers)
+    drivers = [f"+controller@scenario.controllers.{name}={name}" for name in names]
+    gains = ["+gains=tuned", *(f"+gains@gains.{name}={name}" for name in GAINS)]
+    cfg = load("evaluate", ["variant=idm", *gains, *drivers])
+    found: dict[str, Node] = dict(cfg.scenario.controllers)
+    del found[AUTOMATED], found[PEOPLE]
+    found |= {name: found[file].changed(**own) for name, (file, own) in BASELINES.items()}
+    return found | {f"cacc {x}": found["cacc"].changed(**cfg.gains[x]) for x in GAINS}
 
 
-@cache
-def _loaded(words: tuple[str, ...], _hydra: int) -> Any:
-    """Compose a controller, once for every command of a process."""
-    *first, last = words
-    if first == ["variant=idm"] and (node := _shipped(_hydra).get(last.removeprefix(f"{PLACE}="))):
-        return node
-    cfg = load("evaluate", words)
-    if cfg.agent is not None:
-        raise ConfigError(
-            f"variant {cfg.variant} is learned: compare its run folder or policy.pt, which "
-            f"lcc-rl train variant={cfg.variant} makes"
-        )
-    return cfg.scenario.controllers[AUTOMATED]
-
-
-def _node(who: Any) -> Any:
+def _described(who: Any) -> Any:
+    """Return the mapping that describes a controller which has no name."""
     if isinstance(who, Mapping):
         return who
     if who.endswith(ONNX):

@@ -13,7 +13,6 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from lcc_rl.config.nodes import with_defaults
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.energy import Fleet, as_fleet
 from lcc_rl.evaluation import named
@@ -191,7 +190,7 @@ def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:
     """Return v0 [m/s] by episode: the strategy's own, or the driver's; NaN of recorded drivers."""
     controllers = strategy.cfg.scenario.controllers
     own = controllers.get(AUTOMATED) if strategy.cfg.scenario.vehicles.count(AUTOMATED) else None
-    given = None if own is None else with_defaults(own).get("desired_speed")
+    given = None if own is None else own.settings.get("desired_speed")
     if strategy.name == named.RECORDED:
         given = np.nan
     drivers = episodes["desired_speed_mps"].to_numpy()

@@ -19,8 +19,8 @@ from typing import Any
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import NOT_IDENTITY, load
-from lcc_rl.config.nodes import TARGET, short_name
-from lcc_rl.config.schemas import StudyConfig, as_plain
+from lcc_rl.config.nodes import Node, as_plain
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import FILTERED
 from lcc_rl.errors import ConfigError, ResultsError, require
 from lcc_rl.evaluation.fit import check_action, check_scenario, check_width
@@ -33,8 +33,10 @@ from lcc_rl.evaluation.named import (
 )
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
+from lcc_rl.pieces import RecordedStart
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.results.runs import differing, flatten
+from lcc_rl.settings import TARGET, path_of
 
 log = logging.getLogger("lcc_rl")
 
@@ -45,7 +47,6 @@ OF_NO_TRAINING = tuple(
 )
 DATED = re.compile(r"^\d{4}-\d\d-\d\d_(\d\d-\d\d-\d\d)-\d{6}_.*")
 KNOWLEDGE = ("memory", "preview")  # pieces that belong to a policy's observation
-RECORDED_START = "lcc_rl.pieces.RecordedStart"
 TrainedPolicy = tuple[dict[str, Any], StudyConfig]  # weights and configuration
 
 
@@ -80,7 +81,7 @@ def deployed(cfg: StudyConfig) -> StudyConfig:
     return cfg if cfg.deployed is None else driven_by(cfg, cfg.deployed)
 
 
-def driven_by(cfg: StudyConfig, controller: Any) -> StudyConfig:
+def driven_by(cfg: StudyConfig, controller: Node) -> StudyConfig:
     """Return a configuration in which another controller drives the automated vehicles."""
     cfg = deepcopy(cfg)
     cfg.scenario.controllers[AUTOMATED] = controller
@@ -122,29 +123,31 @@ def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
         return Strategy(name, by_people(driven_by(cfg, cfg.scenario.controllers[HUMAN])))
     if name == RECORDED:
         cfg = by_people(driven_by(cfg, controller_of(name)))
-        cfg.scenario.start[AUTOMATED] = {TARGET: RECORDED_START}
+        start = Node.of({TARGET: path_of(RecordedStart)}, f"scenario.start.{AUTOMATED}")
+        cfg.scenario.start[AUTOMATED] = start
         return Strategy(name, cfg)
-    kept = cfg.scenario.filters.get(AUTOMATED) or {}
+    kept = cfg.scenario.filters.get(AUTOMATED)
     named = any(str(word).endswith(FILTERED) for word in (name, who))
     words = f"{name} drives behind the safety filter, and there is none (+filter=cbf adds one)"
-    require(bool(kept) or not named, words)
-    held = bool(kept) and kept.get("time_gap", True) is not None
+    require(kept is not None or not named, words)
+    held = kept is not None and kept.settings.get("time_gap", True) is not None
     controller = controller_of(who or name, held)
     if named:
         return Strategy(name, driven_by(cfg, controller))
-    if cfg.variant == name and _target(cfg) == controller[TARGET]:
+    if cfg.variant == name and _kind(cfg) is controller.kind:
         return Strategy(name, cfg)
     return Strategy(name, without_filter(driven_by(cfg, controller)))
 
 
 def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[Strategy]:
     """Build the baselines that a filtered policy is to be seen beside, behind its filter."""
-    found = [one.cfg.scenario.filters.get(AUTOMATED) for one in strategies if one.policy]
-    if not any(found):
+    filters = (one.cfg.scenario.filters.get(AUTOMATED) for one in strategies if one.policy)
+    own = next((node for node in filters if node is not None), None)
+    if own is None:
         return []
     names = {one.name for one in strategies}
     cfg = deepcopy(cfg)
-    cfg.scenario.filters[AUTOMATED] = next(filter(None, found))
+    cfg.scenario.filters[AUTOMATED] = own
     return [baseline(cfg, name) for name in cfg.evaluation.behind_filter if name not in names]
 
 
@@ -179,15 +182,15 @@ def rule(cfg: StudyConfig) -> Strategy:
     if not cfg.scenario.vehicles.count(AUTOMATED):
         return Strategy(DIRECT, cfg)
     try:
-        own = _target(load("evaluate", [f"variant={cfg.variant}"]))
+        own = _kind(load("evaluate", [f"variant={cfg.variant}"]))
     except ConfigError:  # a variant of the user's own that only this command line knows
-        own = _target(cfg)
-    name = cfg.variant if _target(cfg) == own else label_of(cfg.scenario.controllers[AUTOMATED])
+        own = _kind(cfg)
+    name = cfg.variant if _kind(cfg) is own else label_of(cfg.scenario.controllers[AUTOMATED])
     return Strategy(name, deployed(cfg))
 
 
-def _target(cfg: StudyConfig) -> str:
-    return str(cfg.scenario.controllers[AUTOMATED].get(TARGET))
+def _kind(cfg: StudyConfig) -> Any:
+    return cfg.scenario.controllers[AUTOMATED].kind
 
 
 def _baseline_controllers(cfg: StudyConfig) -> list[Any]:
@@ -246,13 +249,13 @@ def hybrids(strategy: Strategy) -> list[Strategy]:
     """Build a hybrid strategy, the parents it is composed of, and its oracle."""
     cfg = strategy.cfg
     parent = driven_by(cfg, cfg.scenario.controllers[AUTOMATED])
-    found = [replace(strategy, name=short_name(cfg.agent[TARGET]), cfg=parent)]
-    parent_rule = cfg.deployed.get("rule")
+    found = [replace(strategy, name=cfg.agent.name, cfg=parent)]
+    parent_rule = cfg.deployed.settings.get("rule")
     if parent_rule is not None and parent_rule not in _baseline_controllers(cfg):
         found.insert(0, Strategy("cacc", driven_by(cfg, parent_rule)))
     found.append(replace(strategy, cfg=deployed(cfg)))
     if set(cfg.scenario.vehicles.names) == {AUTOMATED}:
-        knowing = driven_by(cfg, {**cfg.deployed, "lookahead": "oracle"})
+        knowing = driven_by(cfg, cfg.deployed.changed(lookahead="oracle"))
         found.append(replace(strategy, name=f"{strategy.name} oracle", cfg=knowing))
     return found
 
@@ -312,7 +315,7 @@ def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
     seeds of one training keep one name, that of the folder that holds them. Where one folder holds
     several trainings, these get the settings that differ.
     """
-    kinds = [short_name(one.cfg.agent[TARGET]) if one.policy else "" for one in strategies]
+    kinds = [one.cfg.agent.name if one.policy else "" for one in strategies]
     found = _where_several(strategies, kinds, kinds)
     marks = _trainings(found)
     return _where_several(found, marks, _labels(found, marks))

@@ -42,7 +42,8 @@ def held_to(trainings: Iterable[StudyConfig]) -> str:
     Args:
         trainings: configuration of each.
     """
-    found = [((cfg.agent or {}).get("limits") or {}).get(LIMIT) for cfg in trainings]
+    agents = (cfg.agent.settings for cfg in trainings if cfg.agent is not None)
+    found = [(agent.get("limits") or {}).get(LIMIT) for agent in agents]
     limits = sorted({f"{limit:.2g}" if limit != RECORDED else limit for limit in found if limit})
     if not limits:
         return ""

@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from lcc_rl.config.nodes import build
+from lcc_rl.config.nodes import Node
 from lcc_rl.config.words import FILTERED
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.checks import BATCH, check_step
@@ -116,11 +116,10 @@ class Driver:
             )
         memory = cfg.scenario.pieces.get("memory")
         wanted = any(column.startswith("memory.") for column in self.module.names)
-        return [self._build(ObservationMemory, memory, "memory")] if wanted else []
+        return [self._build(ObservationMemory, memory, "memory")] if wanted and memory else []
 
-    def _build(self, kind: type[StepTransform], node: Any, name: str) -> Any:
-        world = World(STRING, self.time_step, population=bootstrap())
-        return build(node, self.name, kind, world=world, name=name)
+    def _build(self, kind: type[StepTransform], node: Node, name: str) -> Any:
+        return node.made(kind).bind(World(STRING, self.time_step, population=bootstrap()), name)
 
     def _check(self) -> None:
         for key in self.reads():

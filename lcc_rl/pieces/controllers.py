@@ -23,14 +23,13 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lcc_rl.config.nodes import find_target
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.pieces.base import ACTION, ROLE, Entry, RoleTransform, as_key
 from lcc_rl.pieces.string import COMMANDED, WISHED
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF
 from lcc_rl.pieces.world import MAX_ACCELERATION, World
-from lcc_rl.settings import Number, Positive
+from lcc_rl.settings import Number, Positive, find_target
 
 # The names of the random streams: an episode's seed means the same episode under either.
 STREAMS = {AUTOMATED: "cav", HUMAN: "hdv"}

@@ -66,7 +66,6 @@ class Drivers(Controller):
     )
     latest = Entry("role.acceleration_noise", "m/s²", "noise of the acceleration, latest first", 2)
     law: ClassVar[type[DriverConstants]] = IDMConstants
-    takes_population: ClassVar[bool] = True
     tells_gap: ClassVar[bool] = False  # whether the equilibrium gap is written
     further: ClassVar[tuple[str, ...]] = ()  # entries of the role that acceleration reads, too
     desired_speeds: ClassVar[Tensor]

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from lcc_rl.config.nodes import TARGET
 from lcc_rl.errors import ResultsError
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING, parse_string
+from lcc_rl.settings import TARGET
 
 Series = NDArray[np.float64]
 EPISODE_COLUMNS = ("profile", "driver_id", "repeat")  # columns by which sample episodes differ

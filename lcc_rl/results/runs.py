@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from lcc_rl.config.inputs import inputs_of
-from lcc_rl.config.schemas import SECTIONS, BaseConfig, as_plain, as_text
+from lcc_rl.config.nodes import as_plain
+from lcc_rl.config.schemas import SECTIONS, BaseConfig, as_text
 from lcc_rl.errors import LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import parse_yaml, read_text

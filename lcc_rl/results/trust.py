@@ -6,9 +6,10 @@ import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lcc_rl.config.nodes import TARGET, find_target, forget_places, settings_at
+from lcc_rl.config.nodes import as_nodes, as_plain, nodes_in, settings_at, with_defaults
 from lcc_rl.config.schemas import parse_config
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.settings import TARGET, find_target
 
 # Packages whose classes a stored configuration may name, and the one whose functions it may.
 ROOMS = "agents data drivers energy evaluation functional pieces runs.loggers synthetic"
@@ -39,11 +40,16 @@ def trusted(
             raise ResultsError(f"{where}: {key} refers to {value!r}; expected plain values")
     check_targets(content, where, trust)
     content = {key: value for key, value in content.items() if key not in RETIRED}
-    places = forget_places(content)
     if "trust" in content:
         content["trust"] = list(trust)
     try:
-        return parse_config(content), places
+        nodes = as_nodes(with_defaults(content))
+        places = [
+            f"{node.where}.{name}={node.settings[name]}"
+            for node in nodes_in(nodes)
+            for name in node.places
+        ]
+        return parse_config(as_plain(nodes, places=False)), places
     except ConfigError as error:
         raise ResultsError(f"{where}: not the configuration of a run: {error}") from error
 

@@ -9,6 +9,7 @@ from helpers import compose, make_agent
 
 from lcc_rl.agents.rules import make_policy
 from lcc_rl.commands import evaluation, training
+from lcc_rl.config.nodes import Node
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.pieces import Observation
@@ -51,7 +52,9 @@ class Scaled(Controller):
 
 def test_a_rule_whose_actions_have_an_unknown_scale_is_refused() -> None:
     cfg = tiny("train", "variant=alcc", "agent=analytic", "agent.policy=idm", agent=False)
-    cfg.scenario.controllers["automated"] = {"_target_": f"{__name__}.Scaled", "scale": 2.0}
+    cfg.scenario.controllers["automated"] = Node.of(
+        {"_target_": f"{__name__}.Scaled", "scale": 2.0}, "automated"
+    )
     with pytest.raises(ConfigError, match="needs to know the acceleration of action 1"):
         make_agent(cfg)
 

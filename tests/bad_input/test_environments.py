@@ -11,6 +11,7 @@ from commands import DATA
 from helpers import check_refused, compose, single_env, small_env, wavy_profiles
 from tensordict import TensorDict
 
+from lcc_rl.config.nodes import Node
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import DifferentiableRollout, StringCollector, build_env, make_env
 from lcc_rl.errors import ConfigError
@@ -157,7 +158,7 @@ class RememberingFeature(Feature):
 
 def driven_by(group: str, name: str, node: dict) -> None:
     cfg = compose("idm")
-    getattr(cfg.scenario, group)[name] = node
+    getattr(cfg.scenario, group)[name] = Node.of(node, name)
     build_env(cfg, wavy_profiles(), bootstrap(), 2)
 
 

@@ -86,8 +86,8 @@ def test_a_stored_configuration_writes_nowhere_but_into_its_folder(run, tmp_path
     change(run, {"data.keep": str(tmp_path / "new.csv"), "logger": logger})
     with caplog.at_level("WARNING", logger="lcc_rl"):
         cfg = load_config(run)
-    assert (cfg.data["keep"], cfg.logger["where"]) == (None, None)
-    assert cfg.logger["kind"] == "tensorboard"
+    assert (cfg.data.made().keep, cfg.logger.made().where) == (None, None)
+    assert cfg.logger.made().kind == "tensorboard"
     assert "data.keep=" in caplog.text
     assert "names a place to write and is left out" in caplog.text
     change(run, {"logger": None})

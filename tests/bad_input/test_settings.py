@@ -71,17 +71,14 @@ IGNORED = {
     "variant=idm training.episodes=20": "variant idm learns nothing",
     "variant=alcc scenario.string=human*3 training.episodes=20": "no vehicle .* is automated",
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",
-    "variant=idm scenario.string=automated controller@scenario.controllers.automated=acc "
-    "drivers=highway": "no human driver in scenario.string=automated",
     "sweep=mine": "names the folder of a sweep, -m",
-    "evaluation.full_length=true": "unused with evaluation.rows=episodes",
 }
 
 
 def train_without_data(words: list[str], folder: Path) -> None:
     cfg = load("train", [*NO_AGENT, "variant=alcc", *words])
     if not any(word.startswith("data.") for word in words):
-        cfg.data = {"_target_": "lcc_rl.data.sources.EpisodesSource", "path": "nowhere.parquet"}
+        cfg.data = load("train", ["data=episodes", "data.path=nowhere.parquet"]).data
     training.run(cfg, folder, quiet=True)
 
 

@@ -13,17 +13,17 @@ from helpers import POPULATION, check_refused, compose, wavy_profiles
 import lcc_rl
 from lcc_rl.commands import evaluation
 from lcc_rl.config import load
-from lcc_rl.config.nodes import TARGET
+from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.envs import build_env
 from lcc_rl.errors import LccError
-from lcc_rl.evaluation.named import controller_of, label_of
+from lcc_rl.evaluation.named import controller_of, label_of, setting_of
 from lcc_rl.evaluation.strategies import baseline
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet
 from lcc_rl.pieces import ConstantAcceleration, Controller, Law
 from lcc_rl.results.policies import load_policy
-from lcc_rl.settings import Positive
+from lcc_rl.settings import TARGET, Positive
 
 
 class Steady(Controller):
@@ -74,7 +74,7 @@ def test_an_own_controller_never_has_the_name_of_a_shipped_one() -> None:
         ({TARGET: "lcc_rl.pieces.Law", "law": f"{__name__}.steady"}, "steady"),
         ("idm_acc", "idm_acc"),
     ):
-        assert label_of(who) == label
+        assert label_of(setting_of(who)) == label
 
 
 def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None:
@@ -95,22 +95,16 @@ def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None
 def test_constants_tuned_behind_a_filter_need_its_longest_gap(subtests) -> None:
     for longest, own in [("2.45", True), ("null", False)]:
         with subtests.test(longest=longest):
-            words = [
-                "variant=alcc",
-                "+filter=cbf",
-                f"scenario.filters.automated.time_gap={longest}",
-            ]
-            plain, behind = (
-                baseline(load("evaluate", words), name).cfg.scenario.controllers["automated"]
-                for name in ("idm_acc", "idm_acc_filtered")
+            words = ["variant=alcc", "+filter=cbf"]
+            cfg = load("evaluate", [*words, f"scenario.filters.automated.time_gap={longest}"])
+            names = ("idm_acc", "idm_acc_filtered", "constant_filtered")
+            plain, behind, alone = (
+                baseline(cfg, name).cfg.scenario.controllers["automated"] for name in names
             )
-            assert (behind["desired_speed"] < plain["desired_speed"]) == own
-            asked = baseline(
-                load("evaluate", words), "idm_acc_filtered", "idm_acc_filtered"
-            )  # compare=
+            assert (behind.made().desired_speed < plain.made().desired_speed) == own
+            asked = baseline(cfg, "idm_acc_filtered", "idm_acc_filtered")  # compare=
             assert asked.cfg.scenario.controllers["automated"] == behind
-            alone = baseline(load("evaluate", words), "constant_filtered").cfg.scenario
-            assert alone.controllers["automated"]["acceleration"] == 3.0  # full throttle
+            assert alone.made().acceleration == 3.0  # full throttle
 
 
 @pytest.mark.parametrize(
@@ -302,7 +296,8 @@ def test_commands_to_automated_vehicles_alone_are_bounded() -> None:
     handover = {TARGET: "lcc_rl.pieces.Handover", "before": harder, "after": hard, "from_s": 0.2}
     for node, least in ((hard, -3.0), (harder, -4.0), (handover, (-4.0, -4.0, -3.0))):
         cfg = compose("idm", "scenario.start.human=${scenario.start.automated}")
-        cfg.scenario.controllers |= {AUTOMATED: node, "human": hard}
+        drivers = {AUTOMATED: node, "human": hard}
+        cfg.scenario.controllers |= {role: Node.of(own, role) for role, own in drivers.items()}
         command = build_env(cfg, wavy_profiles(), POPULATION, 2).rollout(3)["next", "command"]
         expected = torch.tensor(least).expand(2, 3)
         assert torch.equal(command[AUTOMATED][..., 0, 0], expected), node

@@ -26,9 +26,9 @@ def test_a_tuned_rule_behind_the_filter_is_called_so_and_has_constants_for_it(na
     cfg = compose("alcc", "+filter=cbf")
     free, filtered = (baseline(cfg, one).cfg.scenario for one in (name, f"{name}_filtered"))
     assert free.filters.get(AUTOMATED) is None
-    assert filtered.filters[AUTOMATED]["time_gap"] == 2.45
+    assert filtered.filters[AUTOMATED].settings["time_gap"] == 2.45
     one, two = (scenario.controllers[AUTOMATED] for scenario in (free, filtered))
-    assert one["time_gap"] != two["time_gap"]
+    assert one.made().time_gap != two.made().time_gap
     named = baseline(cfg, "behind the filter", f"{name}_filtered").cfg.scenario
     assert named.filters[AUTOMATED]
     assert named.controllers[AUTOMATED] == two

@@ -83,7 +83,7 @@ def test_the_example_of_the_page_needs_no_lcc_rl_and_drives(tmp_path) -> None:
 def test_commands_are_held_within_the_largest_acceleration(tmp_path) -> None:
     path = tenth(tmp_path / "a.onnx")
     assert not is_policy(path)  # a file of weights
-    bound = OnnxPolicy(path=controller_of(path)["path"]).bind()
+    bound = OnnxPolicy(path=controller_of(path).settings["path"]).bind()
     found = bound.compute(torch.tensor([[[20.0], [400.0]]]))[0]
     assert found.flatten().tolist() == [pytest.approx(2.0), 3.0]
 

@@ -16,6 +16,7 @@ from helpers import check_refused, slow_but
 from tensordict import TensorDict
 
 from lcc_rl.config import load
+from lcc_rl.config.nodes import Node
 from lcc_rl.energy import CirclesFuel
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import load_inputs
@@ -97,7 +98,8 @@ def driven(policy: str, driver: str, start: int, string: str) -> tuple[torch.Ten
     settings = [f"scenario.horizon={STEPS}", f"scenario.string={string}"]
     cfg, actor = load("evaluate", [*TASK, *settings]), None
     human, inputs = cfg.scenario.controllers["human"], load_inputs(cfg)
-    human["wiener"] *= LOUDER
+    human = human.changed(wiener=LOUDER * human.made().wiener)
+    cfg.scenario.controllers["human"] = human
     if driver == "network":
         weights, own = load_policy(policy)
         own.scenario.name = cfg.scenario.name  # one was trained on an open road
@@ -107,7 +109,9 @@ def driven(policy: str, driver: str, start: int, string: str) -> tuple[torch.Ten
     else:
         after = human if driver == "human" else controller_of(driver)
         both = {"before": human, "after": after, "from_s": 0.1 * start}
-        cfg = by_people(driven_by(cfg, {"_target_": "lcc_rl.pieces.Handover", **both}))
+        cfg = by_people(
+            driven_by(cfg, Node.of({"_target_": "lcc_rl.pieces.Handover", **both}, "own"))
+        )
     env = build_env(cfg, inputs.evaluation, inputs.population, (1,), nominal=True)
     given = TensorDict({SEED: torch.tensor([[EPISODE]])}, batch_size=[1])
     kept = [("vehicles", name) for name in ("speed", "gap", "power")]

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from benchmarks import sumo
 from lcc_rl.config import load
+from lcc_rl.config.nodes import Node
 from lcc_rl.data.profiles import from_records
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import build_env
@@ -49,7 +50,7 @@ def own_motion(driver: str) -> tuple[Tensor, Tensor]:
     """Return speeds and gaps, ``[time + 1, 2]``, in this package's environment."""
     cfg = load("evaluate", ["variant=alcc", "task=i24-follow5", f"scenario.horizon={STEPS}"])
     cfg.scenario.string = "automated human"
-    cfg.scenario.controllers["human"] = HUMAN
+    cfg.scenario.controllers["human"] = Node.of(HUMAN, "human")
     policy: Any = None
     if driver.startswith("pretrained"):
         weights, own = load_policy(driver)
@@ -198,7 +199,7 @@ def test_a_policy_keeps_a_wave_from_growing(driver, tmp_path) -> None:
     sumo.start(cfg, tmp_path, cfg.scenario.circumference)
     bridge = Bridge(driver, "car0") if driver else None
     noise = np.random.default_rng(0)
-    deviation = cfg.scenario.controllers["human"]["wiener"] * STEP**0.5
+    deviation = cfg.scenario.controllers["human"].made().wiener * STEP**0.5
     cars, names = libsumo.vehicle, [f"car{number}" for number in range(22)]
     for _ in range(6000):
         if bridge is not None:

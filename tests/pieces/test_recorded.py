@@ -25,7 +25,8 @@ from tests.helpers import check_episodes
 def drive(*overrides: str):
     """Play 20 steps behind two leaders from a chosen sample."""
     cfg = compose("idm", "controller@scenario.controllers.automated=recorded", *overrides)
-    cfg.scenario.pieces["leader"]["start"] = "first"
+    node = cfg.scenario.pieces["leader"].changed(start="first")
+    cfg.scenario.pieces["leader"] = node
     profiles = followed_profiles()
     env = build_env(cfg, profiles, POPULATION, 4, 0, nominal=True)
     return env.rollout(20, break_when_any_done=False), profiles
@@ -50,7 +51,8 @@ def test_a_speedometer_that_errs_leads_nobody_away() -> None:
         "controller@scenario.controllers.automated=recorded",
         "scenario.start.automated={_target_: lcc_rl.pieces.RecordedStart}",
     )
-    cfg.scenario.pieces["leader"]["start"] = "first"
+    node = cfg.scenario.pieces["leader"].changed(start="first")
+    cfg.scenario.pieces["leader"] = node
     cfg.scenario.horizon = 250
     data = build_env(cfg, biased, POPULATION, 4, 0, nominal=True).rollout(250)
     for episode in range(4):

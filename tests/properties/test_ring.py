@@ -11,7 +11,6 @@ import torch
 from helpers import composed, string
 from torch import Tensor
 
-from lcc_rl.config.nodes import build
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.evaluation.rollout import play
@@ -30,7 +29,7 @@ def speeds(seconds: float, circumference: float, *overrides: str) -> Tensor:
     steps = round(seconds / 0.1)
     sizes = [f"scenario.horizon={steps}", f"scenario.circumference={circumference}"]
     cfg = composed(*RING, string("human*22"), *overrides, *sizes)
-    population = build(cfg.drivers, "drivers")
+    population = cfg.drivers.made()
     env = build_env(cfg, constant_profiles(0.0, steps, 0.1, ["ring"]), population, 4)
     record, alive = play(env, None, None, [SPEED, ("vehicles", "gap")])
     assert alive.all()  # no collision

@@ -39,7 +39,7 @@ def test_every_run_composes_and_each_ablation_changes_the_recipe(tmp_path) -> No
     assert as_plain(found) == main
     single = study.Change(("split.profile=5",), recipes=("single_profile",))
     cfg = study.trainings(own, single)["alcc/seed_0"]
-    assert (cfg.split["profile"], cfg.scenario.pieces["leader"]["start"]) == (5, "first")
+    assert (cfg.split.made().profile, cfg.scenario.pieces["leader"].made().start) == (5, "first")
     assert cfg.training.episodes == 3000
 
 
@@ -57,7 +57,7 @@ def test_wrong_settings_come_before_any_work(tmp_path) -> None:
 def test_paths_with_any_character_reach_hydra_whole(tmp_path) -> None:
     folder = tmp_path / "it's a, [strange]=folder"
     cfg = study.trainings(one(folder, "smoke"), study.MAIN)["alcc/seed_0"]
-    assert Path(cfg.data["path"]) == folder / "trajectories.parquet"
+    assert Path(cfg.data.made().path) == folder / "trajectories.parquet"
 
 
 def of_one_file(folder: Path, *overrides: str) -> Study:

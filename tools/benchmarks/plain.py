@@ -48,7 +48,8 @@ def alcc(options: Namespace, batch: int, far: bool = False, followers: int = 1) 
     cfg, inputs = study(options.quick)
     cfg = deepcopy(cfg)
     start = {"standstill_gap": 500.0, "time_gap": 30.0} if far else {}
-    cfg.scenario.start["automated"] |= {**start, "gap_range": [1.0, 1.0]}
+    own = cfg.scenario.start["automated"].changed(**start, gap_range=[1.0, 1.0])
+    cfg.scenario.start["automated"] = own
     cfg.scenario.string = f"automated human*{followers}"
     return build_env(cfg, inputs.training, inputs.population, batch)
 

@@ -45,7 +45,7 @@ def write_network(path: Path, circumference: float) -> None:
 
 def write_vehicles(path: Path, cfg: StudyConfig, around: float) -> None:
     """Write the vehicles, evenly spread; each follows the one of the number before."""
-    scenario, driver = cfg.scenario, cfg.drivers
+    scenario, driver = cfg.scenario, cfg.drivers.settings
     count = len(parse_string(scenario.string).roles)
     root = ElementTree.Element("routes")
     of_type = {

@@ -117,7 +117,7 @@ def hybrid_strategies(cfg: StudyConfig, learned: Strategy) -> list[Strategy]:
     gains = load("evaluate", ["variant=cacc", f"gains={UNTUNED}"]).gains
     changes: dict[str, dict[str, Any]] = {
         "hcfs": {},
-        "hcfs untuned": {"rule": {**hybrid["rule"], **gains}},
+        "hcfs untuned": {"rule": hybrid.settings["rule"].changed(**gains)},
         "hcfs J=10": {"jerk_bound": 10.0},
         "hcfs literal": {"jerk_bound": 10.0, "clamp": False, "safe_cap": False},
         "hcfs oracle": {"lookahead": "oracle"},
@@ -126,7 +126,7 @@ def hybrid_strategies(cfg: StudyConfig, learned: Strategy) -> list[Strategy]:
     return [
         replace(learned, name=LEARNED, cfg=alone),
         *(
-            replace(learned, name=name, cfg=driven_by(cfg, {**hybrid, **change}))
+            replace(learned, name=name, cfg=driven_by(cfg, hybrid.changed(**change)))
             for name, change in changes.items()
         ),
     ]
