@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
-from lcc_rl.settings import Settings
+from lcc_rl.settings import Settings, defaults
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "settings.md"
@@ -49,15 +49,15 @@ def settings(kind: type[Settings]) -> Iterator[tuple[str, str, str, str]]:
     assert isinstance(body, ast.ClassDef)
     for node in body.body:
         if isinstance(node, ast.AnnAssign) and "ClassVar" not in ast.unparse(node.annotation):
-            value = "required" if node.value is None else default(kind, ast.unparse(node.value))
+            value = "required" if node.value is None else default(kind, node)
             yield ast.unparse(node.target), ast.unparse(node.annotation), value, said(lines, node)
 
 
-def default(kind: type[Settings], source: str) -> str:
-    """Return a default without the words of dataclasses; of a named number its value."""
-    named = vars(import_module(kind.__module__)).get(source)
-    if isinstance(named, float):
-        return repr(named)
+def default(kind: type[Settings], node: ast.AnnAssign) -> str:
+    """Return a default without the words of dataclasses; of a name its value."""
+    if isinstance(node.value, ast.Name | ast.Attribute):
+        return repr(defaults(kind)[ast.unparse(node.target)])
+    source = ast.unparse(node.value) if node.value else ""
     return re.sub(r"^field\(default_factory=(?:lambda: )?(.*)\)$", r"\1", source)
 
 

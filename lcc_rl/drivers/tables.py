@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from lcc_rl.drivers.observed import PAIR_IDENTITY
 from lcc_rl.drivers.parameters import DEFAULT_MODEL, MODEL, REACTION, parameters_of, users
 from lcc_rl.errors import DataError, ResultsError
 from lcc_rl.functional.driver_models import Reaction
@@ -15,7 +16,6 @@ from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import read_parquet
 
 SHIPPED_DRIVERS = "i80_drivers.parquet"
-PAIR_IDENTITY = ("recording", "follower_id", "leader_id")
 
 
 def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.DataFrame:
