@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lcc_rl.config import config_hash
-from lcc_rl.config.nodes import CALLED
+from lcc_rl.config.nodes import CALLED, as_plain
 from lcc_rl.config.schemas import CalibrateConfig
 from lcc_rl.drivers.calibrator import OUT, Calibration, count_records
 from lcc_rl.drivers.parameters import MODEL, parameters_of
@@ -97,7 +97,8 @@ def _named(result: Calibration, vehicles: Mapping[int, str]) -> Calibration:
 
 
 def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: Path) -> None:
-    settings = {key: getattr(cfg, key) for key in ("data", "calibration", "seed", "inputs")}
+    plain = as_plain(cfg)
+    settings = {key: plain[key] for key in ("data", "calibration", "seed", "inputs")}
     metadata = {
         "config": json.dumps(settings),
         "config_hash": config_hash(settings),

@@ -57,8 +57,7 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
 
 @pytest.mark.parametrize("model", slow_but(["gipps"], list(LAWS)))
 def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
-    cfg.calibration["model"], cfg.calibration["objective"] = model, "both"
-    cfg.calibration["holdout"] = 0.3
+    cfg.calibration = cfg.calibration.changed(model=model, objective="both", holdout=0.3)
     out = io.StringIO()
     calibration.run(cfg, tmp_path / "run", Console(file=out, width=100))
     for text in ("held out: RMSPE", "gap NRMSE [%], held out", "time gap [s]"):
@@ -135,7 +134,7 @@ def test_the_report_counts_records_and_drivers(cfg, source, tmp_path):
     table["gap_m"] = table["gap_m"].where(table.index != 438)  # a blank cell in the middle of one
     table.to_parquet(path)
     out, lines = io.StringIO(), []
-    cfg.calibration["modes"] = ["local"]
+    cfg.calibration = cfg.calibration.changed(modes=["local"])
     tell = lines.extend
     drivers = calibration.run(cfg, tmp_path / "run", Console(file=out, width=100), tell)
     assert len(drivers) == 4

@@ -52,7 +52,7 @@ def test_classes_are_drawn_by_share_and_constant(string) -> None:
     data = env.rollout(2, break_when_any_done=False)
     kinds = data[CLASS]
     assert (kinds[:, 0] == kinds[:, 1]).all()
-    names = list(load("train", overrides).energy["models"])
+    names = list(load("train", overrides).energy.settings["models"])
     index = data["automated", "index"][:, 0]
     own = kinds[:, 0].squeeze(-1).gather(-1, index)
     assert (own == names.index("electric")).all()

@@ -77,8 +77,8 @@ def test_a_study_of_one_file_divides_it_by_vehicle(tmp_path, monkeypatch) -> Non
     assert (own.folder / study.DRIVERS).is_file()
     change = study.ABLATIONS["one_training_profile"]
     single = study.trainings(own, change)["alcc/seed_0"]
-    assert single.split["held_out"]["by"] == "vehicle"
-    assert single.split["profile"] == 0
+    assert single.split.settings["held_out"].settings["by"] == "vehicle"
+    assert single.split.settings["profile"] == 0
 
 
 def test_a_study_whose_data_cannot_be_divided_leaves_no_file(tmp_path) -> None:

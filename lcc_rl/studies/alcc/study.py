@@ -152,7 +152,7 @@ def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dic
     found = {study.folder / TRAIN: MAIN} if "main" in parts else {}
     if "ablations" in parts:
         # Ablations that change nothing are left out, and of short runs those that train long.
-        gamma = settings(study, "train", "alcc", MAIN).agent["gamma"]
+        gamma = settings(study, "train", "alcc", MAIN).agent.made().gamma
         left_out = {f"gamma_{gamma:g}", f"recipe_{study.recipe}"}
         if study.recipe in (None, SMOKE):
             left_out |= set(OF_DDPG)
