@@ -172,7 +172,9 @@ def defaults(kind: type[Settings]) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, Settings):
-        return {name: _plain(held) for name, held in values(value).items()}
+        value = values(value)
+    if isinstance(value, Mapping):
+        return {name: _plain(held) for name, held in value.items()}
     return list(value) if isinstance(value, tuple) else value
 
 

@@ -14,7 +14,7 @@ from lcc_rl.envs.step import TERMINATED, Step, closure, entries_of, pieces_of, w
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.finite import require_finite
 from lcc_rl.functional.pattern import HUMAN
-from lcc_rl.functional.random import MASK, STREAM, hash_bits
+from lcc_rl.functional.random import LOW_BITS, STREAM_INCREMENT, hash_bits
 from lcc_rl.pieces.base import ACTION, SEED, STEP, Key, Piece, State, as_key
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.leader import PROFILE, PROFILE_START
@@ -178,9 +178,9 @@ def reset_options(
     batch = env.batch_size
     # Every episode gets its own stream. A string begins with the driver it is named after, those
     # of the next ids follow: every driver is met equally often in every place.
-    number = profile * drivers + driver + repeat * STREAM
+    number = profile * drivers + driver + repeat * STREAM_INCREMENT
     given = TensorDict(batch_size=batch, device=env.device)
-    given.set(SEED, (hash_bits(number + (seed * 0x9E3779B1 & MASK)) >> 1).unsqueeze(-1))
+    given.set(SEED, (hash_bits(number + (seed * 0x9E3779B1 & LOW_BITS)) >> 1).unsqueeze(-1))
     spec = env.full_state_spec
     known = [as_key(key) for key in spec.keys(True, True)]
     if PROFILE in known:

@@ -11,11 +11,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, NoiseStep, Reaction
-from lcc_rl.functional.gipps import GIPPS_LAW
-from lcc_rl.functional.idm import IDM_LAW
+from lcc_rl.functional.driver_models import DriverConstants, NoiseStep, Reaction
+from lcc_rl.functional.gipps import GippsConstants
+from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.layout import join
-from lcc_rl.functional.ovm import FVDM_LAW, OVM_LAW
+from lcc_rl.functional.ovm import FVDMConstants, OVMConstants
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.functional.random import between, choose, normal, stream_id, uniform
 from lcc_rl.pieces.base import SEED, Entry, require_option
@@ -65,7 +65,7 @@ class Drivers(Controller):
         "role.motion_history", "m/s, m, m/s", "past (speed, gap, relative speed), latest first"
     )
     latest = Entry("role.acceleration_noise", "m/s²", "noise of the acceleration, latest first", 2)
-    law: ClassVar[DriverLaw] = IDM_LAW
+    law: ClassVar[type[DriverConstants]] = IDMConstants
     takes_population: ClassVar[bool] = True
     tells_gap: ClassVar[bool] = False  # whether the equilibrium gap is written
     further: ClassVar[tuple[str, ...]] = ()  # entries of the role that acceleration reads, too
@@ -172,17 +172,13 @@ class Drivers(Controller):
         *more: Tensor,
     ) -> Tensor:
         """Return what the drivers wish without noise [m/s²], all ``[*batch, n, 1]``."""
-        return self.law.acceleration(
-            speed, gap, -relative_speed, desired_speed, time_gap, self.drivers
-        )
+        return self.drivers(speed, gap, -relative_speed, desired_speed, time_gap)
 
     def equilibrium_gap(
         self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor, driver: Tensor
     ) -> Tensor:
         """Return the gap at which drivers follow steadily [m], all ``[*batch, n, 1]``."""
-        return self.law.equilibrium_gap(
-            speed, desired_speed, time_gap, self.drivers, LONGEST_TIME_GAP
-        )
+        return self.drivers.equilibrium_gap(speed, desired_speed, time_gap, LONGEST_TIME_GAP)
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         super().begin(given, start)
@@ -217,7 +213,7 @@ class DriverModel(Drivers):
     They execute what they wish with a relative error (A18).
 
     A model of your own overrides :meth:`acceleration`, or sets ``law`` to a
-    :class:`lcc_rl.functional.driver_models.DriverLaw` and ``tells_gap``.
+    :class:`lcc_rl.functional.driver_models.DriverConstants` and ``tells_gap``.
     """
 
     # v0 of every vehicle; None: of the population [m/s]. Needs time_gap, too.
@@ -239,7 +235,7 @@ class DriverModel(Drivers):
         one = self.desired_speed is not None
         if one:
             own = torch.tensor([[float(x)] for x in (self.desired_speed, self.time_gap)])  # type: ignore[arg-type]
-            known = self.law.constants() if world.population is None else world.population.constants
+            known = self.law() if world.population is None else world.population.constants
             found = (own[0], own[1], known)
         else:
             found = super().described(world, where)
@@ -251,8 +247,8 @@ class DriverModel(Drivers):
                 f"controller@{where}=calibrated drives each by its own model"
             )
         constants = found[2] if self.parameters is None else self.parameters
-        if not isinstance(constants, self.law.constants):
-            expected = self.law.constants.__name__
+        if not isinstance(constants, self.law):
+            expected = self.law.__name__
             raise ConfigError(f"{where}.parameters: expected {expected}, got {constants!r}")
         if any(isinstance(value, Tensor) for value in vars(constants).values()):
             raise ConfigError(
@@ -268,27 +264,27 @@ class IDM(DriverModel):
 
 
 class OVM(DriverModel):
-    """Drivers of the optimal velocity model, see :func:`lcc_rl.functional.ovm.ovm_acceleration`.
+    """Drivers of the optimal velocity model, see :class:`lcc_rl.functional.ovm.OVMConstants`.
 
     It does not regard the speed difference, and may collide.
     """
 
-    law = OVM_LAW
+    law = OVMConstants
     tells_gap = True
 
 
 class FVDM(DriverModel):
     """Drivers of the full velocity difference model.
 
-    See :func:`lcc_rl.functional.ovm.fvdm_acceleration`.
+    See :class:`lcc_rl.functional.ovm.FVDMConstants`.
     """
 
-    law = FVDM_LAW
+    law = FVDMConstants
     tells_gap = True
 
 
 class Gipps(DriverModel):
-    """Drivers of Gipps' model, see :func:`lcc_rl.functional.gipps.gipps_acceleration`."""
+    """Drivers of Gipps' model, see :class:`lcc_rl.functional.gipps.GippsConstants`."""
 
-    law = GIPPS_LAW
+    law = GippsConstants
     tells_gap = True

@@ -46,7 +46,7 @@ class DriverEstimator(StepTransform):
         self.declare(world, [*MOTION_READS, *belief, "episode.step", "next.self.speed"])
         self.time_step = time_step
         self.learning_steps = inf if self.learning_time is None else self.learning_time / time_step
-        self.drivers = population.constants.shared()
+        self.drivers = population.constants.mean()
         self.mean = PopulationMean(population.desired_speed, population.time_gap, self.drivers)
         start = prior(population.desired_speed, population.time_gap, self.drivers.exponent)
         self.register_buffer("prior_estimate", start.estimate)

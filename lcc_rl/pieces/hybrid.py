@@ -13,15 +13,15 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.braking import Braking, safe_acceleration
 from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.hcfs import (
     Choice,
     Decision,
-    Place,
+    PlatoonPlace,
     PlatoonReward,
     hybrid_decision,
     jerk_interval,
-    safe_acceleration,
 )
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import Entry, Piece
@@ -68,13 +68,13 @@ class HCFS(Controller):
     margin: NonNegative = 0.5  # gap that it keeps at standstill [m]
     # Settings of the compared lcc_rl.functional.hcfs.PlatoonReward; with spacing_weight 0,
     # the paper's rule, gap_scale and spacing_time have no effect.
-    velocity_weight: NonNegative = 10.0
-    speed_scale: Positive = 27.1  # [m/s]
-    jerk_weight: NonNegative = 0.036
-    jerk_scale: Positive = 30.0  # [m/s³]
-    spacing_weight: NonNegative = 0.0
-    gap_scale: Positive = 1.0  # [m]
-    spacing_time: NonNegative = 0.0  # e_x counts so long after the step [s]
+    velocity_weight: NonNegative = PlatoonReward.velocity_weight
+    speed_scale: Positive = PlatoonReward.speed_scale  # [m/s]
+    jerk_weight: NonNegative = PlatoonReward.jerk_weight
+    jerk_scale: Positive = PlatoonReward.jerk_scale  # [m/s³]
+    spacing_weight: NonNegative = PlatoonReward.spacing_weight
+    gap_scale: Positive = PlatoonReward.gap_scale  # [m]
+    spacing_time: NonNegative = PlatoonReward.spacing_time  # e_x counts so long after the step [s]
 
     reads = (f"{AUTOMATED}.action",)
     remembers = (
@@ -101,6 +101,7 @@ class HCFS(Controller):
             check_platoon(self, "choice=first", "needs a string that is one platoon", "between")
         own = {field.name: getattr(self, field.name) for field in fields(PlatoonReward)}
         self.reward = PlatoonReward(**own)
+        self.both_brake = Braking(self.braking, self.braking, time_to_collision=0.0)
 
     def command(self, action: Tensor, *entries: Tensor) -> tuple[Tensor, ...]:
         """Return the commands, the winners and the counters."""
@@ -122,9 +123,8 @@ class HCFS(Controller):
         """Return the decision and what led to it."""
         speed, last, gap, speed_error, leader_gap = own
         interval = jerk_interval(last, self.jerk_bound, self.time_step, self.max_acceleration)
-        cap = safe_acceleration(
-            gap, speed, speed + speed_error, self.time_step, self.braking, self.margin
-        )
+        ahead, time_step = speed + speed_error, self.time_step
+        cap = safe_acceleration(speed, gap - self.margin, ahead, self.both_brake, time_step)
         return hybrid_decision(
             rule,
             action * self.max_acceleration,
@@ -137,7 +137,7 @@ class HCFS(Controller):
             self.reward,
             self.time_step,
             self.max_acceleration,
-            Place(leader_gap, leader[0]),
+            PlatoonPlace(leader_gap, leader[0]),
             self.choice,
         )
 

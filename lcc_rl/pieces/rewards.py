@@ -23,6 +23,7 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.functional.layout import total
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.safety import time_to_collision
@@ -149,8 +150,8 @@ class CollisionPenalty(RewardTerm):
 class VelocityReward(RewardTerm):
     """−|e_v(i,0)|/v_max, at the state reached (HCFS H4–H5)."""
 
-    weight: NonNegative = 10.0  # ω1; Table IV determines ω1/v_max only
-    speed_scale: Positive = 27.1  # v_max [m/s]
+    weight: NonNegative = PlatoonReward.velocity_weight  # ω1; Table IV determines ω1/v_max only
+    speed_scale: Positive = PlatoonReward.speed_scale  # v_max [m/s]
 
     reads = ("self.leader_speed_error",)
 
@@ -162,8 +163,8 @@ class VelocityReward(RewardTerm):
 class JerkReward(RewardTerm):
     """−|jerk|/(2 a_max/T) (HCFS H6)."""
 
-    weight: NonNegative = 0.036  # ω2
-    jerk_scale: Positive = 30.0  # 2 a_max/T [m/s³]
+    weight: NonNegative = PlatoonReward.jerk_weight  # ω2
+    jerk_scale: Positive = PlatoonReward.jerk_scale  # 2 a_max/T [m/s³]
 
     reads = ("self.jerk",)
 

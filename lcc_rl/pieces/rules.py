@@ -10,7 +10,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.functional.layout import join, total
-from lcc_rl.functional.rules import follower_stopper_speed, pi_saturation_speed
 from lcc_rl.pieces.base import Entry
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.world import World
@@ -61,10 +60,11 @@ class Averaging(Controller):
 class FollowerStopper(Averaging):
     """FollowerStopper in its time-headway form (Stern et al. 2018, arXiv 1705.01693).
 
-    Drives at a desired speed unless the vehicle ahead is near; see
-    :func:`lcc_rl.functional.rules.follower_stopper_speed`. The command is (v_cmd − v)/T within
-    the limits. The desired speed is fixed, or the mean of the vehicle's own speed during the last
-    ``window`` seconds, kept in ``(role, "speed_history")``, ``[*batch, n, samples]`` [m/s].
+    Three gaps Δx_k = max(Δx⁰_k, h_k v) + Δv₋²/(2 d_k), Δv₋ = min(v_ahead − v, 0), bound regions of
+    the gap: below Δx₁ stop, then rise to ṽ = min(max(v_ahead, 0), v_d) at Δx₂, then to v_d at Δx₃.
+    The command is (v_cmd − v)/T within the limits. The desired speed v_d is fixed, or the mean of
+    the vehicle's own speed during the last ``window`` seconds, kept in ``(role,
+    "speed_history")``, ``[*batch, n, samples]`` [m/s].
     """
 
     desired_speed: Positive | None = None  # v_d; None: the vehicle's own mean [m/s]
@@ -86,31 +86,44 @@ class FollowerStopper(Averaging):
     def command(self, speed: Tensor, gap: Tensor, ahead: Tensor, *kept: Tensor) -> Any:
         """Return the commands, and the history where it is kept."""
         if self.desired_speed is not None:
-            return self._beside(speed, gap, ahead, torch.full_like(speed, self.desired_speed))
+            desired = torch.full_like(speed, self.desired_speed)
+            return self.towards(self.wanted(speed, gap, ahead, desired), speed)
         mean, past = self.mean(speed, *kept)
-        return self._beside(speed, gap, ahead, mean), past
+        return self.towards(self.wanted(speed, gap, ahead, mean), speed), past
 
-    def _beside(self, speed: Tensor, gap: Tensor, ahead: Tensor, desired: Tensor) -> Tensor:
-        wanted = follower_stopper_speed(
-            speed, gap, ahead, desired, self.gaps, self.time_gaps, self.decelerations
+    def wanted(self, speed: Tensor, gap: Tensor, ahead: Tensor, desired: Tensor) -> Tensor:
+        """Return v_cmd [m/s] for the desired speed v_d [m/s]."""
+        closing = (ahead - speed).clamp(max=0.0).square()
+        near, middle, far = (
+            (time_gap * speed).clamp(min=least) + closing / (2.0 * deceleration)
+            for least, time_gap, deceleration in zip(
+                self.gaps, self.time_gaps, self.decelerations, strict=True
+            )
         )
-        return self.towards(wanted, speed)
+        safe = torch.minimum(ahead.clamp(min=0.0), desired)
+        rising = safe * (gap - near) / (middle - near)
+        freeing = safe + (desired - safe) * (gap - middle) / (far - middle)
+        commanded = torch.where(gap < far, freeing, desired)
+        commanded = torch.where(gap < middle, rising, commanded)
+        return torch.where(gap < near, torch.zeros_like(commanded), commanded)
 
 
 class PISaturation(Averaging):
     """PI with saturation (Stern et al. 2018, arXiv 1705.01693).
 
-    Drives at the mean of its own speed, a little faster where the gap is large, and like the
-    vehicle ahead where it is small; see :func:`lcc_rl.functional.rules.pi_saturation_speed`. The
-    command before is kept in ``(role, "commanded_speed")``, ``[*batch, n, 1]`` [m/s].
+    Drives at the mean of its own speed v_d, a little faster where the gap is large, and like the
+    vehicle ahead where it is small: v_target = v_d + c·min(max((Δx − g_l)/(g_u − g_l), 0), 1);
+    Δx_s = max(2 s·(v − v_ahead), 4 m); α = min(max((Δx − Δx_s)/γ, 0), 1), β = 1 − α/2; the command
+    becomes β(α v_target + (1 − α) v_ahead) + (1 − β) times the command before, which is kept in
+    ``(role, "commanded_speed")``, ``[*batch, n, 1]`` [m/s].
     """
 
     window: Window = 38.0  # length of the mean [s]
-    gaps: Pair = (7.0, 30.0)  # between which catching up sets in [m]
-    catch_up: NonNegative = 1.0  # by how much the target may exceed the mean [m/s]
-    least_gap: NonNegative = 4.0  # gap below which it drives like the vehicle ahead [m]
+    gaps: Pair = (7.0, 30.0)  # g_l and g_u, between which catching up sets in [m]
+    catch_up: NonNegative = 1.0  # c, by how much the target may exceed the mean [m/s]
+    least_gap: NonNegative = 4.0  # least Δx_s, below which it drives like the vehicle ahead [m]
     closing_time: Positive = 2.0  # how long closing in may take [s]
-    transition: Positive = 2.0  # range of gaps over which it changes from one to the other [m]
+    transition: Positive = 2.0  # γ, range of gaps over which it changes from one to the other [m]
 
     reads = ("self.speed", "self.gap", "ahead.speed")
     remembers = (
@@ -133,9 +146,19 @@ class PISaturation(Averaging):
         """Return the commands, the history and the speed commanded."""
         mean, past = self.mean(speed, step, history)
         before = torch.where(step == 0, speed, before)
-        shape = (self.gaps, self.catch_up, self.least_gap, self.closing_time, self.transition)
-        wanted = pi_saturation_speed(speed, gap, ahead, mean, before, *shape)
+        wanted = self.wanted(speed, gap, ahead, mean, before)
         return self.towards(wanted, speed), past, wanted
+
+    def wanted(
+        self, speed: Tensor, gap: Tensor, ahead: Tensor, mean: Tensor, before: Tensor
+    ) -> Tensor:
+        """Return the speed commanded [m/s] after the one before [m/s]."""
+        lower, upper = self.gaps
+        target = mean + self.catch_up * ((gap - lower) / (upper - lower)).clamp(0.0, 1.0)
+        safe = (self.closing_time * (speed - ahead)).clamp(min=self.least_gap)
+        share = ((gap - safe) / self.transition).clamp(0.0, 1.0)
+        weight = 1.0 - 0.5 * share
+        return weight * (share * target + (1.0 - share) * ahead) + (1.0 - weight) * before
 
 
 class Handover(Controller):

@@ -7,8 +7,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.driver_models import capped
-from lcc_rl.functional.idm import equilibrium_gap
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.pieces.base import SEED
@@ -54,12 +52,12 @@ class EquilibriumStart(Part):
     By the parameters that the drivers of the population share.
     """
 
-    # Bounds the gap, see lcc_rl.functional.idm.equilibrium_gap [s].
+    # Bounds the gap, see DriverConstants.equilibrium_gap [s].
     cap_time_gap: Positive = 3.0
 
     def setup(self, world: World) -> None:
         """Take what the drivers share."""
-        self.drivers = world.population.constants.shared()
+        self.drivers = world.population.constants.mean()
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
@@ -74,9 +72,9 @@ class EquilibriumStart(Part):
             )
         known = start.get((role, "equilibrium_gap"), None)
         if known is not None:
-            return speed, capped(known, speed, self.drivers, self.cap_time_gap)
-        gap = equilibrium_gap(speed, desired_speed, time_gap, self.drivers, self.cap_time_gap)
-        return speed, gap
+            return speed, self.drivers.capped(known, speed, self.cap_time_gap)
+        own = (desired_speed, time_gap, self.cap_time_gap)
+        return speed, self.drivers.equilibrium_gap(speed, *own)
 
 
 class HeadwayStart(Part):

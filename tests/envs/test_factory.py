@@ -24,7 +24,6 @@ from torchrl.envs.utils import step_mdp
 from lcc_rl.drivers.population import DriverPopulation, fixed
 from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.step import Step, closure, entries_of, pieces_of
-from lcc_rl.functional.idm import equilibrium_gap
 from lcc_rl.functional.power import motor_power
 
 T = 0.1
@@ -73,8 +72,8 @@ def test_initial_state() -> None:
     assert torch.equal(speed, lead.unsqueeze(-2).expand(6, 2, 1))
     torch.testing.assert_close(gap[:, 0], 2.0 + 1.5 * lead)
     human = td["human"]
-    expected = equilibrium_gap(
-        speed[:, 1:], human["desired_speed"], human["desired_time_gap"], POPULATION.constants
+    expected = POPULATION.constants.equilibrium_gap(
+        speed[:, 1:], human["desired_speed"], human["desired_time_gap"]
     )
     torch.testing.assert_close(gap[:, 1:], expected)
 

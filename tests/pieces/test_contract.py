@@ -162,7 +162,7 @@ def steady(gap, speed, ahead_speed):
 
 
 def driver(kind: type[DriverModel], delay: int) -> DriverModel:
-    return kind(wiener=0.1, delay=delay, parameters=kind.law.constants())
+    return kind(wiener=0.1, delay=delay, parameters=kind.law())
 
 
 def controllers() -> dict[str, tuple[str, Piece]]:

@@ -11,7 +11,6 @@ from lcc_rl.envs import build_env
 from lcc_rl.evaluation.strategies import driven_by
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.pattern import VehicleString
-from lcc_rl.functional.rules import follower_stopper_speed
 from lcc_rl.functional.string import advance_string
 from lcc_rl.pieces import (
     Collision,
@@ -234,10 +233,9 @@ def test_contact_of_any_two_vehicles_ends_the_episode() -> None:
     ],
 )
 def test_follower_stopper_by_region(speed, gap, ahead, wanted) -> None:
-    gaps, zeros, decelerations = (4.5, 5.25, 6.0), (0.0, 0.0, 0.0), (1.5, 1.0, 0.5)
+    piece = FollowerStopper(time_gaps=(0.0, 0.0, 0.0))  # the original form
     values = (torch.tensor([x], dtype=torch.float64) for x in (speed, gap, ahead, 8.0))
-    got = follower_stopper_speed(*values, gaps, zeros, decelerations)
-    assert float(got) == pytest.approx(wanted)
+    assert float(piece.wanted(*values)) == pytest.approx(wanted)
 
 
 def test_follower_stopper_keeps_time_gaps_and_its_limits() -> None:

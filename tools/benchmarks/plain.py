@@ -19,7 +19,6 @@ from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.envs import Inputs, build_env, load_inputs
 from lcc_rl.functional.estimation import Belief, predict_and_update
-from lcc_rl.functional.idm import equilibrium_gap, idm_acceleration
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.power import motor_power
 from lcc_rl.functional.random import choose, uniform
@@ -101,7 +100,7 @@ class PlainLoop:
         cav_gap = advance_gap(now["cav_gap"], now["leader"], now["cav"], leader, cav, dt)
         ahead = following(now["cav"], now["speed"])
         motion = (now["speed"], now["gap"], now["speed"] - ahead)
-        wish = idm_acceleration(*motion, now["desired_speed"], now["desired_time_gap"], drivers)
+        wish = drivers(*motion, now["desired_speed"], now["desired_time_gap"])
         draws = uniform(
             now["seed"][:, None], now["step"][:, None], self.human.noise_stream + self.human.index
         )
@@ -163,7 +162,7 @@ class PlainLoop:
             "cav": speed,
             "cav_gap": factor * (own.standstill_gap + own.time_gap * speed),
             "speed": humans,
-            "gap": equilibrium_gap(humans, v0, headway, human.drivers, cap),
+            "gap": human.drivers.equilibrium_gap(humans, v0, headway, cap),
             "estimate": believed.prior_estimate.expand(*v0.shape[:2], 2),
             "covariance": believed.prior_covariance.expand(*v0.shape[:2], 3),
             "desired_speed": v0,
