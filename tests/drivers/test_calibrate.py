@@ -82,12 +82,16 @@ def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
 )
 def test_bad_input_ends_in_an_error_that_names_it(cfg, tmp_path, key, value, error, message):
     entry, *path, last = key.split(".")
-    node = getattr(cfg, entry)
+    own = {last: value}
     for part in path:
-        node = node[part]
-    node[last] = value
-    with pytest.raises(error, match=message):
+        own = {part: getattr(cfg, entry).settings[part] | own}
+
+    def run() -> None:
+        setattr(cfg, entry, getattr(cfg, entry).changed(**own))
         calibration.run(cfg, tmp_path / "run", Console(file=io.StringIO()))
+
+    with pytest.raises(error, match=message):
+        run()
     assert not (tmp_path / "run").exists()
 
 
