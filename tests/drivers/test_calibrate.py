@@ -71,12 +71,12 @@ def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
 
 def test_bad_input_ends_in_an_error_that_names_it(cfg, tmp_path):
     def calibrate(key: str, value: object) -> None:
-        changed = deepcopy(cfg)
         entry, *path, last = key.split(".")
-        node = getattr(changed, entry)
+        node, own = getattr(cfg, entry), {last: value}
         for part in path:
-            node = node[part]
-        node[last] = value
+            own = {part: node.settings[part] | own}
+        changed = deepcopy(cfg)
+        setattr(changed, entry, node.changed(**own))
         calibration.run(changed, tmp_path / "run", Console(file=io.StringIO()))
 
     cases = [

@@ -159,7 +159,7 @@ def test_it_remembers_as_the_piece_does(kind) -> None:
     pieces = pieces_of(env)
     kinds = (Observation, Action, ObservationMemory)
     seen, action, memory = (next(p for p in pieces if isinstance(p, k)) for k in kinds)
-    network = torch.nn.Linear(len(seen.constants), 1)
+    network = torch.nn.Linear(len(seen.factors), 1)
     driver = Remembering(ExportedPolicy(network, seen, action, None, memory))
     kept = torch.zeros(3, driver.width)
 
