@@ -54,9 +54,12 @@ def settings(kind: type[Settings]) -> Iterator[tuple[str, str, str, str]]:
 
 
 def default(kind: type[Settings], source: str) -> str:
-    """Return a default without the words of dataclasses; of a named number its value."""
-    named = vars(import_module(kind.__module__)).get(source)
-    if isinstance(named, float):
+    """Return a default without the words of dataclasses; of a named constant its value."""
+    name, *attributes = source.split(".")
+    named = vars(import_module(kind.__module__)).get(name)
+    for attribute in attributes:
+        named = getattr(named, attribute, None)
+    if isinstance(named, float | str):
         return repr(named)
     return re.sub(r"^field\(default_factory=(?:lambda: )?(.*)\)$", r"\1", source)
 
