@@ -33,7 +33,7 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
-from lcc_rl.errors import LARGEST, LARGEST_SIZE, ConfigError, unknown_name
+from lcc_rl.errors import LARGEST, LARGEST_SIZE, ConfigError, LccError, unknown_name
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
@@ -78,14 +78,20 @@ class Settings:
         def checked(self: Any, **given: Any) -> None:
             try:
                 construct(self, **given)
-            except ValidationError as error:
+                self.validate()
+            except LccError:
+                raise
+            except ValueError as error:  # pydantic's ValidationError is one
                 raise refused(error, cls, cls.__name__) from error
-            self.settled()
 
         cls.__init__ = checked  # type: ignore[method-assign]
 
-    def settled(self) -> None:
-        """Do what has to be done once all settings are there."""
+    def validate(self) -> None:
+        """Check relations between the settings, and derive from them what needs nothing else.
+
+        Raises:
+            ValueError: saying what is wrong; its message gets the place of the settings.
+        """
 
 
 def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
@@ -101,27 +107,37 @@ def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
     """
     try:
         return kind(**{key: value for key, value in given.items() if value != "???"})
-    except ConfigError as error:
-        if isinstance(error.__cause__, ValidationError):
-            raise refused(error.__cause__, kind, where) from None
-        raise
+    except RefusedSetting as error:
+        if error.__cause__ is None:  # its place is named already
+            raise
+        raise refused(error.__cause__, kind, where) from None
 
 
-def refused(error: ValidationError, kind: Any, where: str) -> ConfigError:
-    """Return the one-line error for the first setting that pydantic refused."""
+class RefusedSetting(ConfigError):
+    """A setting that its class refuses; caused by the ValueError that says why."""
+
+
+def refused(error: Any, kind: Any, where: str) -> ConfigError:
+    """Return the one-line error for a ValueError, or the first setting that pydantic refused."""
+    return RefusedSetting(_reason(error, kind, where))
+
+
+def _reason(error: Any, kind: Any, where: str) -> str:
+    if not isinstance(error, ValidationError):
+        return f"{where}: {error}".removeprefix(": ")
     first = error.errors()[0]
     if first["type"] in ("unexpected_keyword_argument", "unexpected_positional_argument"):
         known = [field.name for field in dataclasses.fields(kind)]
         what = f"setting of {where} ({kind.__name__})" if where else "option"
-        return unknown_name(what, str(first["loc"][-1]), known)
+        return str(unknown_name(what, str(first["loc"][-1]), known))
     parts = "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in first["loc"])
     key = (where + parts).removeprefix(".")
     if first["type"] == "missing" and len(first["loc"]) == 1:
-        return ConfigError(f"{key} is required: use {key}=…")
+        return f"{key} is required: use {key}=…"
     if first["type"] == "value_error":
-        return ConfigError(f"{key}: {first['ctx']['error']}")
+        return f"{key}: {first['ctx']['error']}"
     wanted = re.sub(r"^\w+ should", "must", first["msg"])
-    return ConfigError(f"{key} {wanted}, got {repr(first['input'])[:200]}")
+    return f"{key} {wanted}, got {repr(first['input'])[:200]}"
 
 
 def checked(function: Callable[..., R]) -> Callable[..., R]:
@@ -158,7 +174,9 @@ def defaults(kind: type[Settings]) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, Settings):
-        return {name: _plain(held) for name, held in values(value).items()}
+        value = values(value)
+    if isinstance(value, Mapping):
+        return {name: _plain(held) for name, held in value.items()}
     return list(value) if isinstance(value, tuple) else value
 
 

@@ -35,9 +35,9 @@ class Comfort(RewardTerm):
 class Kinetic(Feature):
     """Half the square of the speed."""
 
-    def setup(self, world):
-        key = ("vehicles", "kinetic")
-        self.wire([("vehicles", "speed")], [key], (len(world.string), 1))
+    role = "vehicles"
+    reads = ("vehicles.speed",)
+    writes = ("vehicles.kinetic",)
 
     def compute(self, speed):
         return 0.5 * speed.square()

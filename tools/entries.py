@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 import torch
@@ -15,21 +15,21 @@ from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import SingleAgent, build_env
-from lcc_rl.envs.clock import reset_options
+from lcc_rl.envs.clock import Clock, reset_options
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.envs.single import group_key
-from lcc_rl.envs.step import pieces_of, tick, written
+from lcc_rl.envs.step import pieces_of, written
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
-from lcc_rl.pieces import Handover
-from lcc_rl.pieces.base import Key, as_key
-from lcc_rl.pieces.entries import ENTRIES, NAME, ROLE, entry_key
+from lcc_rl.pieces import Handover, Piece
+from lcc_rl.pieces.base import NAME, ROLE, Key, as_key, declared
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "entries.md"
 SPECS = ("observation", "action", "reward", "done")
 WIDEST = 3  # the width of wider entries depends on settings
-CLOCK = set(tick(torch.zeros(1), torch.zeros(1), 1))
+CLOCK = declared(Clock)
+ENTRIES = declared(Piece, Clock, SingleAgent)
 SIZES = "scenario.string=automated*3 human*5"
 HEAD = """# Entries and equations
 
@@ -60,7 +60,8 @@ def configurations() -> Iterator[StudyConfig]:
     for drawn_or_single in ({"size": 6, "penetration": 0.34}, "automated human*4"):
         cfg.scenario.string = drawn_or_single
         yield cfg
-    late = ["controller@scenario.controllers.human=ovm", "scenario.controllers.human.delay=4"]
+    human = "scenario.controllers.human"
+    late = [f"controller@{human}=ovm", f"{human}.delay=4", f"{human}.acceleration_noise=0.3"]
     yield load("train", ["variant=alcc", SIZES, *late])
     handover = "controller@scenario.controllers.automated=handover"
     yield load("train", ["variant=reference", "scenario=ring", handover, SIZES])
@@ -79,6 +80,19 @@ def environments() -> Iterator[tuple[TransformedEnv, VehicleString]]:
         env = build_env(cfg, profiles, population, batch_size=7)
         single = string.count(AUTOMATED) == 1
         yield env.append_transform(SingleAgent()) if single else env, string
+
+
+def entry_key(key: Key, roles: Collection[str]) -> Key:
+    """Return the key by which a class declares an entry.
+
+    Raises:
+        ConfigError: if none declares it.
+    """
+    by_role = tuple(ROLE if part in roles else part for part in key)
+    for known in (key, by_role, (*key[:-1], NAME)):
+        if known in ENTRIES:
+            return known
+    raise ConfigError(f"no class declares unit and meaning of {'.'.join(key)}")
 
 
 def symbols(key: Key, shape: Iterable[int], string: VehicleString) -> str:
@@ -131,7 +145,7 @@ def collect(found_in: Iterable[tuple[TransformedEnv, VehicleString]]) -> dict[Ke
             if row[0] != shape:
                 raise ConfigError(f"{'.'.join(key)} has two shapes, {row[0]} and {shape}")
             row += [name for name in writers(env, key) if name not in row]
-    return {key: rows[key] for key in ENTRIES if key in rows}
+    return {key: rows[key] for key in sorted(rows)}
 
 
 def table(*rows: Iterable[str]) -> str:
@@ -145,8 +159,9 @@ def page(rows: dict[Key, list[str]]) -> str:
     entries = [("key", "shape", "unit", "meaning", "written by")]
     for key, (shape, mark, *names) in rows.items():
         shown = ", ".join(part if part in (ROLE, NAME) else f'"{part}"' for part in key)
-        unit, meaning = ENTRIES[key]
-        entries.append((f"`{shown}`", f"`{shape}`", unit, meaning + mark, ", ".join(names)))
+        entry = ENTRIES[key]
+        known = (f"`{shown}`", f"`{shape}`", entry.unit, entry.meaning + mark)
+        entries.append((*known, ", ".join(names)))
     equations = [("equation", "formula", "symbols and units", "implemented by", "deviation")]
     for number, formula, symbols, functions, deviation in EQUATIONS:
         paths = ", ".join(f"`{path}`" for path in functions)

@@ -49,12 +49,15 @@ def settings(kind: type[Settings]) -> Iterator[tuple[str, str, str, str]]:
     assert isinstance(body, ast.ClassDef)
     for node in body.body:
         if isinstance(node, ast.AnnAssign) and "ClassVar" not in ast.unparse(node.annotation):
-            value = "required" if node.value is None else default(ast.unparse(node.value))
+            value = "required" if node.value is None else default(kind, ast.unparse(node.value))
             yield ast.unparse(node.target), ast.unparse(node.annotation), value, said(lines, node)
 
 
-def default(source: str) -> str:
-    """Return a default without the words of dataclasses."""
+def default(kind: type[Settings], source: str) -> str:
+    """Return a default without the words of dataclasses; of a named number its value."""
+    named = vars(import_module(kind.__module__)).get(source)
+    if isinstance(named, float):
+        return repr(named)
     return re.sub(r"^field\(default_factory=(?:lambda: )?(.*)\)$", r"\1", source)
 
 

@@ -111,7 +111,8 @@ def above(found: pd.DataFrame, shape: dict[str, int]) -> list[str]:
         shape: of :func:`structure`.
     """
     wanted = [(part, what, most) for part, own in CEILINGS.items() for what, most in own.items()]
-    numbers = [(f"{part}, {what}", int(found.at[part, what]), most) for part, what, most in wanted]
+    counts: Any = found.to_dict("index")
+    numbers = [(f"{part}, {what}", int(counts[part][what]), most) for part, what, most in wanted]
     numbers += [(what, shape[what], most) for what, most in STRUCTURE.items()]
     return [
         f"{what}: {count:,}, above the ceiling of {most:,} in tools/size.py"

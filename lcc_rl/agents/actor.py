@@ -12,11 +12,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
-from lcc_rl.pieces.base import SEED, STEP
-
-OBSERVATION, ACTION = (AUTOMATED, "observation"), (AUTOMATED, "action")
+from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP
 
 
 def seeded_mlp(inputs: int, outputs: int, hidden: Sequence[int], seed: int) -> MLP:

@@ -71,7 +71,7 @@ class Analytic(Agent):
 
     loop = GradientLoop
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         require(not self.bootstrap or self.gamma < 1.0, "agent.bootstrap needs agent.gamma below 1")
 
     def setup(self, scene: Scene) -> None:

@@ -10,10 +10,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from lcc_rl.envs.finite import ACTION, check_numbers
 from lcc_rl.errors import Diverged
-from lcc_rl.functional.finite import lost_weight
-from lcc_rl.pieces.base import NEXT, as_key, root_key
+from lcc_rl.functional.finite import lost_weight, require_finite
+from lcc_rl.pieces.base import ACTION, NEXT, as_key, root_key
 
 
 def check_learner(
@@ -43,7 +42,7 @@ def check_batch(batch: TensorDictBase, begun: int = 0, who: str = "") -> None:
     Args:
         batch: ``[environments, steps]``.
         begun: steps played before the batch.
-        who: who drives, for the message.
+        who: what the message calls the policy.
 
     Raises:
         Diverged: naming the first entry that is not a number, its step and its episode.
@@ -53,4 +52,4 @@ def check_batch(batch: TensorDictBase, begun: int = 0, who: str = "") -> None:
     keys = [ACTION, *(key for key in known if key[0] == NEXT and root_key(key) != ACTION)]
     entries = {root_key(key): known[key].transpose(0, 1) for key in keys if key in known}
     running = torch.ones((*batch.shape[1::-1], 1), dtype=torch.bool, device=batch.device)
-    check_numbers(entries, running, begun + 1, who)
+    require_finite(entries, running, begun + 1, who)

@@ -10,12 +10,12 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import BaseCollector, Collector
 
-from lcc_rl.agents.actor import ACTION, OBSERVATION, shared_policy
+from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.checks import check_batch, check_learner
 from lcc_rl.agents.loop import REPORTED, AgentT, TrainingLoop, episode_statistics
 from lcc_rl.envs import StringCollector
-from lcc_rl.pieces.rewards import REWARD
+from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD
 
 # What is learned from, as the environment names it and as the losses do.
 LEARNED_FROM = {

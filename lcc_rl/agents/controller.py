@@ -5,10 +5,10 @@ from __future__ import annotations
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 
-from lcc_rl.agents.actor import ACTION
 from lcc_rl.errors import ConfigError, require_positive
-from lcc_rl.pieces.base import NEXT, root_key
+from lcc_rl.pieces.base import ACTION, NEXT, root_key
 from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.world import MAX_ACCELERATION
 
 
 class ControllerPolicy(TensorDictModuleBase):
@@ -25,7 +25,7 @@ class ControllerPolicy(TensorDictModuleBase):
         ConfigError: if the controller keeps entries of its own from step to step.
     """
 
-    def __init__(self, controller: Controller, max_acceleration: float = 3.0) -> None:
+    def __init__(self, controller: Controller, max_acceleration: float = MAX_ACCELERATION) -> None:
         require_positive("policy.max_acceleration", max_acceleration)
         if len(controller.targets) > 1 or any(key[0] == NEXT for key in controller.in_keys):
             raise ConfigError(

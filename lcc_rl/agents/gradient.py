@@ -17,8 +17,8 @@ from lcc_rl.agents.loop import REPORTED, TrainingLoop, episode_statistics
 from lcc_rl.agents.objective import Objective
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
-from lcc_rl.pieces.base import as_key, next_key
-from lcc_rl.pieces.rewards import REWARD, RewardTerm
+from lcc_rl.pieces.base import REWARD, as_key, next_key
+from lcc_rl.pieces.rewards import RewardTerm
 
 log = logging.getLogger("lcc_rl")
 

@@ -25,7 +25,8 @@ from lcc_rl.config.schemas import TrainingConfig
 from lcc_rl.errors import Diverged, Interrupted, ResultsError
 from lcc_rl.io.files import write_parquet
 from lcc_rl.io.tensors import check_like, write_torch
-from lcc_rl.pieces.rewards import REWARD, TERMS
+from lcc_rl.pieces.base import REWARD
+from lcc_rl.pieces.rewards import TERMS
 from lcc_rl.results.policies import read_checked
 from lcc_rl.runs.checkpoints import Checkpoint
 from lcc_rl.runs.interrupts import stop_signal

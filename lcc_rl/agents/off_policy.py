@@ -34,7 +34,7 @@ class Exploration(Settings):
     decay_share: Fraction | None = 0.5  # share of the training over which it falls linearly
     decay_per_update: Fraction | None = None  # instead: factor of every update, down to final
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         if (self.decay_share is None) == (self.decay_per_update is None):
             raise ConfigError(
                 "agent.exploration: give either decay_share or decay_per_update, and null for the "
@@ -83,7 +83,7 @@ class OffPolicy(Agent):
     critics: ClassVar[int] = 1
     joint: ClassVar[bool] = True  # whether one optimizer steps all that is learned at once
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         for name in ("batch_size", "learning_starts"):
             if getattr(self, name) > self.buffer_size:
                 raise ConfigError(

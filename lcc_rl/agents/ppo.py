@@ -18,7 +18,7 @@ from lcc_rl.agents.actor import make_actor, seeded_mlp
 from lcc_rl.agents.agent import Agent, Fraction, Scene, anneal, derived_seed
 from lcc_rl.agents.collecting import CollectingLoop, transitions
 from lcc_rl.agents.sac import SampledAction
-from lcc_rl.pieces.rewards import REWARD
+from lcc_rl.pieces.base import REWARD
 from lcc_rl.settings import Count, NonNegative, Positive, Share
 
 LOG_PROB = "action_log_prob"  # where TorchRL's loss expects it

@@ -7,9 +7,7 @@ simulator, or by search, can train them, and what is stored is a policy like any
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -17,47 +15,47 @@ from torch import Tensor, nn
 
 from lcc_rl.agents.actor import make_actor, seeded_mlp
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.functional.rules import idm_acc, linear_acc
+from lcc_rl.pieces.cruise import IDMACC, Cruise, LinearACC
 from lcc_rl.pieces.observation import Observation
 
-SEEN = ("self.speed", "self.gap", "self.relative_speed")
 
-
-class Rule(nn.Module, ABC):
-    """A rule whose constants are learned; their logarithms are, so that they stay positive.
+class Rule(nn.Module):
+    """A cruise control whose constants are learned: their logarithms, so that they stay positive.
 
     Args:
+        kind: whose law it is, and whose defaults are the constants at the start.
         observation: where the vehicle's own speed, gap and relative speed are found.
-        constants: constants at the start, by name; those left out have the class's values.
+        constants: other constants at the start, by name.
         max_acceleration: acceleration of action 1 [m/s²].
 
     Raises:
         ConfigError: if a constant is unknown or not positive, or an entry is not observed.
     """
 
-    START: ClassVar[Mapping[str, float]] = {}
     scales: Tensor
 
     def __init__(
         self,
+        kind: type[Cruise],
         observation: Observation,
         constants: Mapping[str, float] | None,
         max_acceleration: float,
     ) -> None:
         super().__init__()
-        given = dict(constants or {})
+        start, given = kind.constants_of_rule(), dict(constants or {})
         for name in given:
-            if name not in self.START:
-                raise unknown_name("constant of the rule", name, self.START)
-        values = {**self.START, **given}
+            if name not in start:
+                raise unknown_name("constant of the rule", name, start)
+        values = {**start, **given}
+        self.law, self.names = kind.law, tuple(values)
         self.logarithms = nn.Parameter(torch.tensor([math.log(x) for x in values.values()]))
         self.max_acceleration = max_acceleration
-        self.columns = [observation.column(name) for name in SEEN]
-        self.register_buffer("scales", observation.constants[self.columns].clone(), False)
+        self.columns = [observation.column(name) for name in kind.reads]
+        self.register_buffer("scales", observation.factors[self.columns].clone(), False)
 
     def constants(self) -> dict[str, float]:
         """Return the constants by name."""
-        return dict(zip(self.START, self.logarithms.exp().tolist(), strict=True))
+        return dict(zip(self.names, self.logarithms.exp().tolist(), strict=True))
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the action in [−1, 1], ``[*batch, 1]``, of the observation ``[*batch, n]``."""
@@ -65,48 +63,8 @@ class Rule(nn.Module, ABC):
             observation[..., column : column + 1] / scale
             for column, scale in zip(self.columns, self.scales, strict=True)
         )
-        command = self.acceleration(speed, gap, relative_speed, *self.logarithms.exp())
+        command = self.law(speed, gap, relative_speed, *self.logarithms.exp())
         return (command / self.max_acceleration).clamp(-1.0, 1.0)
-
-    @abstractmethod
-    def acceleration(
-        self, speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Tensor
-    ) -> Tensor:
-        """Return the acceleration [m/s²] for the constants in the order of ``START``."""
-
-
-class IDMRule(Rule):
-    """The Intelligent Driver Model with its five constants (A3–A4)."""
-
-    START: ClassVar[Mapping[str, float]] = {
-        "desired_speed": 25.0,
-        "time_gap": 1.2,
-        "acceleration": 1.0,
-        "deceleration": 1.5,
-        "min_gap": 2.0,
-    }
-
-    def acceleration(
-        self, speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Tensor
-    ) -> Tensor:
-        return idm_acc(speed, gap, relative_speed, *constants)
-
-
-class ACCRule(Rule):
-    """Linear adaptive cruise control, :func:`lcc_rl.functional.rules.linear_acc`."""
-
-    START: ClassVar[Mapping[str, float]] = {
-        "desired_speed": 25.0,
-        "time_gap": 1.5,
-        "min_gap": 2.0,
-        "gap_gain": 0.1,
-        "speed_gain": 0.5,
-    }
-
-    def acceleration(
-        self, speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Tensor
-    ) -> Tensor:
-        return linear_acc(speed, gap, relative_speed, *constants)
 
 
 class Residual(nn.Module):
@@ -133,8 +91,8 @@ class Residual(nn.Module):
         return (self.rule(observation) + correction).clamp(-1.0, 1.0)
 
 
-RULES: dict[str, type[Rule]] = {"idm": IDMRule, "acc": ACCRule}
-NETWORK = "network"
+RULE_KINDS: dict[str, type[Cruise]] = {"idm": IDMACC, "acc": LinearACC}
+NETWORK_ALONE = "network"
 RESIDUAL = "residual_"
 
 
@@ -166,20 +124,20 @@ def make_policy(
             does not know what its actions do.
     """
     size = observation.event_shape[-1]
-    if kind == NETWORK:
+    if kind == NETWORK_ALONE:
         if constants:
             raise ConfigError("agent.constants belong to a rule: use agent.policy=idm or acc")
         return make_actor(size, 1, hidden, seed)
     name = kind.removeprefix(RESIDUAL)
-    if name not in RULES:
-        known = (NETWORK, *RULES, *(RESIDUAL + rule for rule in RULES))
+    if name not in RULE_KINDS:
+        known = (NETWORK_ALONE, *RULE_KINDS, *(RESIDUAL + rule for rule in RULE_KINDS))
         raise unknown_name("agent.policy", kind, known)
     if max_acceleration is None:
         raise ConfigError(
             f"agent.policy={kind} needs to know the acceleration of action 1: the controller of "
             "automated vehicles has no setting max_acceleration [m/s²]"
         )
-    module: nn.Module = RULES[name](observation, constants, max_acceleration)
+    module: nn.Module = Rule(RULE_KINDS[name], observation, constants, max_acceleration)
     if kind != name:
         module = Residual(module, size, hidden, seed)  # type: ignore[arg-type]
     return TensorDictModule(module, in_keys=["observation"], out_keys=["action"])

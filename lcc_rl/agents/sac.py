@@ -14,12 +14,12 @@ from torch.nn.functional import softplus
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss
 
-from lcc_rl.agents.actor import ACTION, OBSERVATION, action_noise, seeded_mlp
+from lcc_rl.agents.actor import action_noise, seeded_mlp
 from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.fused import ActorCritic, Network
 from lcc_rl.agents.off_policy import Exploration, OffPolicy
 from lcc_rl.functional.random import stream_id
-from lcc_rl.pieces.base import SEED, STEP
+from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP
 from lcc_rl.settings import Number, Positive, given_as
 
 ONE = 1.0 - 1e-6  # the largest action whose inverse tanh exists in single precision

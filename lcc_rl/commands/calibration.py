@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,8 +19,8 @@ from rich.table import Table
 from lcc_rl.config import config_hash
 from lcc_rl.config.nodes import CALLED, as_plain
 from lcc_rl.config.schemas import CalibrateConfig
-from lcc_rl.drivers.calibrator import OUT, Calibration, counted
-from lcc_rl.drivers.parameters import COLUMNS
+from lcc_rl.drivers.calibrator import OUT, Calibration, count_records
+from lcc_rl.drivers.parameters import MODEL, parameters_of
 from lcc_rl.drivers.population import from_table
 from lcc_rl.envs.inputs import load_episodes
 from lcc_rl.figures.calibration import calibration_figure, joint_figure, twins_figure
@@ -122,17 +123,16 @@ def _summary(drivers: pd.DataFrame) -> Table:
     modes = list(drivers["mode"].unique())
     table = Table("", *modes, title="calibrated drivers, mean ± standard deviation", **PLAIN)
     parts = {mode: drivers[drivers["mode"] == mode] for mode in modes}
-    table.add_row("fitted", *map(counted, parts.values()))
+    table.add_row("fitted", *map(count_records, parts.values()))
     errors = [(column, column, label) for column, label in ERRORS]
     errors += [(column + OUT, column, f"{label}, held out") for column, label in ERRORS]
     for column, kind, label in errors:
         if column in drivers:
             scale = 1.0 if kind.endswith("_m") else 100.0
             table.add_row(escape(label), *(_spread(scale * p[column]) for p in parts.values()))
-    for column in COLUMNS.values():
-        if column in drivers:
-            row = (_spread(part[column]) for part in parts.values())
-            table.add_row(escape(_with_unit(column)), *row)
+    for one in parameters_of(drivers[MODEL].unique()).values():
+        row = (_spread(part[one.column]) for part in parts.values())
+        table.add_row(escape(re.sub(r" \$.*\$", "", one.label)), *row)
     populations = [from_table(part).summary() for part in parts.values()]
     correlations = (row["correlation"] for row in populations)
     shown = (f"{value:.2f}" if math.isfinite(value) else MISSING for value in correlations)
@@ -140,15 +140,6 @@ def _summary(drivers: pd.DataFrame) -> Table:
     shares = (f"{100 * row['share_at_bound']:.0f} %" for row in populations)
     table.add_row("v0 on a bound", *shares)
     return table
-
-
-def _with_unit(column: str) -> str:
-    """Return a column's name and unit: ``time gap [s]`` of ``time_gap_s``."""
-    name, _, unit = column.rpartition("_")
-    if not name:
-        return column
-    unit = unit.replace("mps", "m/s").replace("s2", "s²").replace("hz", "1/s")
-    return f"{name.replace('_', ' ')} [{unit}]"
 
 
 def _spread(values: pd.Series) -> str:

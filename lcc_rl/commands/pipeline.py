@@ -31,7 +31,7 @@ from lcc_rl.config.schemas import (
 )
 from lcc_rl.data.episodes import SCHEMA
 from lcc_rl.data.sources import EpisodesSource
-from lcc_rl.drivers.calibrator import counted
+from lcc_rl.drivers.calibrator import count_records
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.inputs import LOADS, build_energy, load_inputs
 from lcc_rl.errors import Concern, ConfigError, Interrupted
@@ -207,7 +207,8 @@ def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
         found = calibration.run(own, drivers.parent, Console(quiet=True), tell=_pass_on)
         modes = {str(mode): rows for mode, rows in found.groupby("mode", sort=False)}
         errors = (f"{mode} {100.0 * x['rmspe'].mean():.2f} %" for mode, x in modes.items())
-        tell(f"calibrated {counted(next(iter(modes.values())))}: mean RMSPE {', '.join(errors)}")
+        records = count_records(next(iter(modes.values())))
+        tell(f"calibrated {records}: mean RMSPE {', '.join(errors)}")
     return drivers
 
 

@@ -67,7 +67,7 @@ def inputs_of(content: Mapping[str, Any]) -> Inputs:
 def _files(last: str, named: bool, holder: Any, name: str) -> Iterator[Path]:
     """Yield the files that a setting names."""
     path = Path(expanduser(name))
-    if last in (TARGET, "law"):
+    if last in (TARGET, "law", "model"):
         yield from _module(name)
     elif named:
         yield from compared_files(name)

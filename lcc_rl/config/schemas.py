@@ -92,7 +92,7 @@ class RewardConfig(Settings):
 
     terms: Nodes
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         for name in (name for name, node in self.terms.items() if node is None):
             raise ConfigError(f"reward.terms.{name} is null; ~reward.terms.{name} leaves it out")
 
@@ -128,7 +128,7 @@ class EvaluationConfig(Settings):
     full_length: bool = False
     humans_first: NonNegative = 0.0  # on a ring: before what is measured [s]
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         if self.shard >= self.shards:
             raise ConfigError(
                 f"evaluation.shard must lie from 0 to {self.shards - 1}, got {self.shard}"
@@ -148,7 +148,7 @@ class BaseConfig(Settings):
     # Hashes of the files that it reads, see lcc_rl.config.inputs; a run notes them itself.
     inputs: dict[str, dict[str, str]] = dataclasses.field(default_factory=dict)
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         if "png" not in self.figure_formats:
             raise ConfigError(
                 f"figure_formats must name png, which pages show, got {self.figure_formats}"

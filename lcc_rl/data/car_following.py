@@ -45,7 +45,7 @@ class Criteria(Settings):
     passenger_cars_only: bool = True
     lane_changes: Literal["split", "reject"] = "split"
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         for quantity in ("duration_s", "gap_m"):
             low, high = (getattr(self, f"{end}_{quantity}") for end in ("min", "max"))
             if low is not None and high is not None and low > high:

@@ -284,7 +284,7 @@ class DriveLeaders(Settings):
     fastest: Positive | None = None  # highest mean speed of the leader in held-out windows [m/s]
     plausible: Plausible | None = None  # None for the defaults
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         self.columns = {**COLUMNS, **self.columns}
         check_map(FIELDS, self.columns, self.units, "leader")
         if self.tuning and self.evaluation_share == 1:

@@ -38,7 +38,7 @@ class SavitzkyGolay(Settings):
     window_s: Annotated[float, Field(gt=0.0, lt=600.0)] = 1.5
     order: Annotated[int, Field(ge=2, le=100)] = 3  # of the polynomial
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         if self.window_s < FRAME * (self.order + 1):
             raise ConfigError(
                 f"smoothing.window_s must be at least {FRAME * (self.order + 1):g} s for order "

@@ -87,7 +87,7 @@ class EpisodesSource(Settings):
     units: Mapping[str, str] = field(default_factory=dict)  # such as {gap: ft}; else SI
     plausible: Plausible | None = None  # None for the defaults
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         check_map(FIELDS, self.columns, self.units, "data")
 
     def load(self) -> LoadedEpisodes:

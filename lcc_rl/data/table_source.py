@@ -67,7 +67,7 @@ class TableSource(Settings):
     criteria: Criteria | None = None  # None for the defaults
     plausible: Plausible | None = None  # None for the defaults
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         self.columns = {**COLUMNS, **self.columns}
         check_map(FIELDS, self.columns, self.units, "data")
         given = {key for key, name in self.columns.items() if name is not None}

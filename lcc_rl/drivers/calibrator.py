@@ -12,32 +12,32 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.drivers.fit_error import GAP, GAP_SHARE, SPEED, FitError, Objective
-from lcc_rl.drivers.genetic import Evolution, GeneticSettings, Progress, minimise
-from lcc_rl.drivers.genetic import Objective as Minimised
+from lcc_rl.drivers.fit_error import GAP_NRMSE, GAP_RMSE, SPEED_RMSPE, FitError, FitMeasure
+from lcc_rl.drivers.genetic import Evolution, Fitness, GeneticSettings, Progress, minimise
 from lcc_rl.drivers.observed import Observed, Selection, observe
 from lcc_rl.drivers.parameters import (
-    COLUMNS,
+    DEFAULT_BOUNDS,
+    DEFAULT_MODEL,
     MODEL,
     REACTION,
-    Bounds,
+    BoundPair,
     Mode,
-    Model,
     at_bound,
+    find_law,
     fitted,
 )
-from lcc_rl.drivers.twins import HELD, accelerate, compare
-from lcc_rl.errors import Concern, DataError, unknown_name
-from lcc_rl.functional.driver_models import DriverConstants
+from lcc_rl.drivers.twins import HELD, accelerate, compare_twins
+from lcc_rl.errors import Concern, ConfigError, DataError, unknown_name
+from lcc_rl.functional.driver_models import INDIVIDUAL, PARAMETERS, DriverConstants, Parameter
 from lcc_rl.functional.laws import LAWS
-from lcc_rl.settings import Positive, Settings, given_as, values
+from lcc_rl.settings import Positive, Settings, given_as
 
 # Genetic algorithms of the choice of constants: over constants, and within each over (v0, T).
 OUTER = GeneticSettings(population=12, generations=12, founders=2, patience=4)
 INNER = GeneticSettings(population=16, generations=8)
 
 # Columns of the errors; those of the part held out end in ``_out``.
-ERRORS = {SPEED: "rmspe", GAP: "gap_rmse_m", GAP_SHARE: "gap_nrmse"}
+ERROR_COLUMNS = {SPEED_RMSPE: "rmspe", GAP_RMSE: "gap_rmse_m", GAP_NRMSE: "gap_nrmse"}
 OUT = "_out"
 IMPLAUSIBLE = 1.0  # relative error of the median driver's gap from which on the report says so
 CONGESTED = "; followers that never drive freely do not tell it"
@@ -50,7 +50,7 @@ class Calibration:
     Args:
         drivers: one row per driver, in the order of the episodes in the input.
         report: what was dropped, chosen and found, in plain lines.
-        twins: what :func:`lcc_rl.drivers.twins.compare` measured of the recorded and of the
+        twins: what :func:`lcc_rl.drivers.twins.compare_twins` measured of the recorded and of the
             calibrated drivers, with the column mode.
     """
 
@@ -59,16 +59,8 @@ class Calibration:
     twins: pd.DataFrame
 
 
-class Constants(Settings):
-    """Parameters that the local mode does not fit; None: the default of the driver model."""
-
-    acceleration: Positive | None = None  # a [m/s²]
-    deceleration: Positive | None = None  # b [m/s²]
-    min_gap: Positive | None = None  # s0 [m]
-    sensitivity: Positive | None = None  # κ of ovm and fvdm [1/s]
-    form: Positive | None = None  # β of ovm and fvdm
-    speed_gain: Positive | None = None  # λ of fvdm [1/s]
-    leader_deceleration: Positive | None = None  # b̂ of gipps [m/s²]
+# The parameters that the local mode does not fit; None: the default of the driver model.
+DEFAULT_CONSTANTS = dict.fromkeys(list(PARAMETERS)[len(INDIVIDUAL) :])
 
 
 def _wide() -> GeneticSettings:
@@ -82,12 +74,16 @@ class Calibrator(Settings):
     """
 
     modes: Annotated[Sequence[Mode], Field(min_length=1)] = ("local",)
-    model: Model = "idm"
-    objective: Objective = "speed_rmspe"  # see lcc_rl.drivers.fit_error.FitError
+    model: str = DEFAULT_MODEL  # idm, ovm, fvdm, gipps or the dotted path of a class of your own
+    objective: FitMeasure = "speed_rmspe"  # see lcc_rl.drivers.fit_error.FitError
     # Share of each episode, its end, that is predicted instead of fitted.
     holdout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
-    bounds: given_as(Bounds) = field(default_factory=Bounds)  # type: ignore[valid-type]
-    constants: given_as(Constants) = field(default_factory=Constants)  # type: ignore[valid-type]
+    # Lower and upper bound by parameter, see lcc_rl.functional.driver_models.PARAMETERS.
+    bounds: Mapping[str, BoundPair] = field(default_factory=lambda: dict(DEFAULT_BOUNDS))
+    # Parameters that the local mode does not fit; None: the default of the driver model.
+    constants: Mapping[str, Positive | None] = field(
+        default_factory=lambda: dict(DEFAULT_CONSTANTS)
+    )
     # Choose a reaction delay and a noise of the acceleration that all drivers share, so that they
     # need the energy of the recorded ones; see lcc_rl.drivers.twins.
     reaction: bool = False
@@ -100,13 +96,25 @@ class Calibrator(Settings):
         default_factory=_wide
     )
 
-    def settled(self) -> None:
-        given = {name: x for name, x in values(self.constants).items() if x is not None}
+    def validate(self) -> None:
+        law = find_law(self.model)
+        given = {name: x for name, x in self.constants.items() if x is not None}
         for name in given:
-            if name not in LAWS[self.model].shared:
-                known = LAWS[self.model].shared
-                raise unknown_name(f"constant of model {self.model}", name, known)
-        self.shared: DriverConstants = LAWS[self.model].constants(**given)
+            if name not in law.shared():
+                raise unknown_name(f"constant of model {self.model}", name, law.shared())
+        self.shared: DriverConstants = law(**given)
+        table = {**PARAMETERS, **law.own}
+        for name in self.bounds:
+            if name not in table:
+                raise unknown_name("parameter", name, table)
+        self.bounds = {**{name: one.bounds for name, one in table.items()}, **self.bounds}
+        for name, (lower, upper) in self.bounds.items():
+            low, high = table[name].plausible
+            if not low <= lower < upper <= high:
+                raise ConfigError(
+                    f"bounds of {name!r} must be {low:g} <= lower < upper <= {high:g}, "
+                    f"got [{lower:g}, {upper:g}]"
+                )
 
     def __call__(
         self,
@@ -138,7 +146,7 @@ class Calibrator(Settings):
         parts, twins, report = [], [], list(observed.report)
         for mode in dict.fromkeys(self.modes):
             drivers, lines = _Fit(self, mode, observed, seed, device, progress).drivers()
-            reaction, measured, more = compare(observed, drivers, self.reaction, progress)
+            reaction, measured, more = compare_twins(observed, drivers, self.reaction, progress)
             twins.append(measured.assign(mode=mode))
             if self.reaction:
                 own = {REACTION[name][0]: value for name, value in vars(reaction).items()}
@@ -163,8 +171,8 @@ class _Fit:
     ) -> None:
         self.settings, self.mode, self.observed = settings, mode, observed
         self.seed, self.progress = seed, progress
-        self.model, self.law = settings.model, LAWS[settings.model]
-        self.names, self.limits = fitted(mode, self.model), values(settings.bounds)
+        self.model, self.table_of = settings.model, LAWS[settings.model].table()
+        self.names, self.limits = fitted(mode, self.model), settings.bounds
         self.parts = {"": observed}
         if settings.holdout:
             self.parts[""], self.parts[OUT] = observed.split(settings.holdout)
@@ -175,21 +183,23 @@ class _Fit:
         constants, lines = self.settings.shared, []
         if self.settings.choose_constants and self.mode == "local":
             constants = self.chosen_constants()
-            shown = (f"{COLUMNS[x]} {getattr(constants, x):.3g}" for x in self.law.shared)
+            shown = (
+                f"{self.table_of[x].column} {getattr(constants, x):.3g}" for x in constants.shared()
+            )
             lines.append(f"constants chosen over all drivers: {', '.join(shown)}")
         error, genetic = self.error(constants), getattr(self.settings, f"{self.mode}_genetic")
         found = self.search(error, self.names, self.observed.count, genetic, self.progress)
         drivers = self.table(found.best.to("cpu", torch.float64), constants)
-        return drivers, lines + _findings(drivers, self.names, self.limits)
+        return drivers, lines + _findings(drivers, self.names, self.limits, self.table_of)
 
     def error(self, constants: DriverConstants) -> FitError:
         """Return what is minimised, as a function of the fitted parameters."""
         objective = self.settings.objective
-        return FitError(self.simulated, constants, self.names, self.model, objective)
+        return FitError(self.simulated, constants, self.names, objective)
 
     def search(
         self,
-        error: Minimised,
+        error: Fitness,
         names: Sequence[str],
         problems: int,
         genetic: GeneticSettings,
@@ -205,7 +215,11 @@ class _Fit:
 
         Its candidates have the shape ``[1, candidates, constants]``.
         """
-        drivers, shared, start = self.observed.count, self.law.shared, self.settings.shared
+        drivers, shared, start = (
+            self.observed.count,
+            self.settings.shared.shared(),
+            self.settings.shared,
+        )
 
         def mean_error(candidates: Tensor) -> Tensor:
             count = candidates.shape[1]
@@ -231,19 +245,23 @@ class _Fit:
         """
         columns: dict[str, Any] = {str(key): held for key, held in self.observed.identity.items()}
         own = dict(zip(self.names, best.numpy().T, strict=True))
-        for name in self.law.parameters:
-            columns[COLUMNS[name]] = own.get(name, getattr(constants, name, None))
+        for name, one in self.table_of.items():
+            columns[one.column] = own.get(name, getattr(constants, name, None))
         for end, part in self.parts.items():
-            exact = FitError(part.to("cpu", torch.float64), constants, self.names, self.model)
+            exact = FitError(part.to("cpu", torch.float64), constants, self.names)
             measures = exact.measures(best.unsqueeze(1))
-            for name, column in ERRORS.items():
+            for name, column in ERROR_COLUMNS.items():
                 columns[column + end] = measures[name].squeeze(1).numpy()
             columns[f"samples{end}"] = part.samples
-        for name in self.law.parameters:
+        for name in self.table_of:
             columns[f"{name}_at_bound"] = name in own and at_bound(own[name], self.limits[name])
         drivers = pd.DataFrame({**columns, "mode": self.mode, MODEL: self.model})
         objective = self.settings.objective
-        needed = [ERRORS[objective]] if objective in ERRORS else [ERRORS[SPEED], ERRORS[GAP_SHARE]]
+        needed = (
+            [ERROR_COLUMNS[objective]]
+            if objective in ERROR_COLUMNS
+            else [ERROR_COLUMNS[SPEED_RMSPE], ERROR_COLUMNS[GAP_NRMSE]]
+        )
         lost = ~np.isfinite(drivers[needed].to_numpy()).all(axis=1)
         if lost.any():
             raise DataError(
@@ -256,18 +274,23 @@ class _Fit:
         return drivers.sort_values("episode", kind="stable", ignore_index=True)
 
 
-def counted(drivers: pd.DataFrame) -> str:
+def count_records(drivers: pd.DataFrame) -> str:
     """Return how many records a calibration in one mode fitted, and of how many drivers."""
     people = len(drivers[["recording", "follower_id"]].drop_duplicates())
     whose = f"{people} driver{'s' * (people > 1)}"
     return whose if people == len(drivers) else f"{len(drivers)} records of {whose}"
 
 
-def _findings(drivers: pd.DataFrame, names: Sequence[str], limits: Mapping[str, Any]) -> list[str]:
+def _findings(
+    drivers: pd.DataFrame,
+    names: Sequence[str],
+    limits: Mapping[str, Any],
+    table: Mapping[str, Parameter],
+) -> list[str]:
     """Lines on the quality of the fit and on what it could not identify."""
     error = 100.0 * drivers["rmspe"]
     lines = [
-        f"RMSPE of {counted(drivers)}: mean {error.mean():.2f} %, "
+        f"RMSPE of {count_records(drivers)}: mean {error.mean():.2f} %, "
         f"median {error.median():.2f} %, worst {error.max():.1f} %"
     ]
     for end, part in (("", "fitted"), (OUT, "held out")):
@@ -278,10 +301,10 @@ def _findings(drivers: pd.DataFrame, names: Sequence[str], limits: Mapping[str, 
         bound = drivers[f"{name}_at_bound"]
         if bound.any():
             low, high = limits[name]
-            upper = drivers[COLUMNS[name]] > (low + high) / 2
+            upper = drivers[table[name].column] > (low + high) / 2
             shares = [100 * (bound & side).mean() for side in (~upper, upper)]
             line = (
-                f"{100 * bound.mean():.0f} % of the values of {COLUMNS[name]} lie on a bound: "
+                f"{100 * bound.mean():.0f} % of the values of {table[name].column} lie on a bound: "
                 f"{shares[0]:.0f} % on {low:g}, {shares[1]:.0f} % on {high:g} "
                 f"(calibration.bounds.{name}){CONGESTED if name == 'desired_speed' else ''}"
             )

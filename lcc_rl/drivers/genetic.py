@@ -14,7 +14,7 @@ from torch import Tensor
 from lcc_rl.errors import ConfigError
 from lcc_rl.settings import NonNegative, Positive, Settings
 
-Objective = Callable[[Tensor], Tensor]
+Fitness = Callable[[Tensor], Tensor]
 Progress = Callable[[int, int, str], None]
 
 Individuals = Annotated[int, Field(ge=1, le=100_000)]
@@ -57,7 +57,7 @@ class Evolution:
 
 
 def minimise(
-    objective: Objective,
+    objective: Fitness,
     lower: Tensor,
     upper: Tensor,
     problems: int,
@@ -92,7 +92,7 @@ def minimise(
 
 
 def _evolve(
-    evaluate: Objective,
+    evaluate: Fitness,
     problems: int,
     random: _Random,
     settings: GeneticSettings,
@@ -142,7 +142,7 @@ def _latin_hypercube(random: _Random, count: int) -> Tensor:
     return (strata + random.uniform(count, dims)) / count
 
 
-def _in_units(objective: Objective, lower: Tensor, upper: Tensor) -> Objective:
+def _in_units(objective: Fitness, lower: Tensor, upper: Tensor) -> Fitness:
     """Wrap the objective: genes of the unit box in, finite fitness out."""
     span = upper - lower
 

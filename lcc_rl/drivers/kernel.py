@@ -1,124 +1,139 @@
-"""Simulation of followers compiled by numba, for calibrations on a CPU (A3, A4, A6)."""
+"""Simulation of followers in machine code, for calibrations on a CPU (A6)."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
-from functools import cache, partial
-from types import FunctionType
+from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
-import numba
-import numpy as np
+import torch
+from torch import Tensor
 
-log = logging.getLogger("lcc_rl")
+from lcc_rl.functional.driver_models import DriverConstants, follow
+from lcc_rl.functional.machine_code import kept
+from lcc_rl.functional.recorder import NUMBER_TYPES, Recorder
+
+# The inner loop runs over the candidates of one driver, in which it becomes vector instructions.
+# numba drops the branch for an argument that is None. Gaps follow the trapezoidal rule (A18d), the
+# leader's part of which is the same for all candidates.
+TEMPLATE = """
+def kernel(apart, leader, follower, gaps, samples, parameters, total):
+    speed, gap = np.empty_like(total[0, 0]), np.empty_like(total[0, 0])
+{memory}
+    for driver in range(total.shape[1]):
+{own}
+        error, distance = total[0, driver], total[1, driver]
+        speed[:], gap[:] = follower[driver, 0], gaps[driver, 0]
+        error[:], distance[:] = {zero}, {zero}
+        for i in range(len(speed)):
+{before}
+        for step in range(samples[driver] - 1):
+            ahead, ahead_reached = leader[driver, step], leader[driver, step + 1]
+            advance = {half} * (ahead + ahead_reached)
+            truth, seen = follower[driver, step + 1], gaps[driver, step + 1]
+            for i in range(len(speed)):
+{step}
+                gap[i] += advance - {half} * (speed[i] + {reached})
+                speed[i] = {reached}
+                error[i] += (speed[i] - truth) * (speed[i] - truth)
+                if apart is not None:
+                    distance[i] += (gap[i] - seen) * (gap[i] - seen)
+"""
+STEP_INPUTS = ("speed[i]", "gap[i]", "ahead", "ahead_reached")  # what a step changes
 
 
 def squared_errors(
-    idm: Any,
-    ovm: Any,
-    exponent: Any,
-    apart: Any,
-    leader: Any,
-    follower: Any,
-    gaps: Any,
-    samples: Any,
-    parameters: Any,
-    settings: Any,
-    total: Any,
-) -> None:
-    """Sum up the squared errors of speed and gap of followers, for many candidates of each driver.
+    law: DriverConstants, time_step: float, dtype: torch.dtype
+) -> Callable[..., None]:
+    """Return what sums up the squared errors of followers, for many candidates of each driver.
 
-    The formulas are those of :func:`lcc_rl.functional.idm.simulate_follower`. The inner loop runs
-    over the candidates of one driver, in which it becomes vector instructions: numba drops the
-    branches for arguments that are None. Comparisons are such that what is not a number stays so.
+    It is made from :func:`lcc_rl.functional.driver_models.follow` with the law itself, as
+    ``kernel(apart, leader, follower, gaps, samples, parameters, total)``:
+
+    * apart: None unless the errors of the gap are summed up; else they are zero;
+    * leader, follower: observed speeds, ``[drivers, time]`` [m/s]; gaps: likewise [m];
+    * samples: number of samples, ``[drivers]``;
+    * parameters: those of the law's table, each ``[drivers, candidates]``;
+    * total: is overwritten with the sums of speed and gap, ``[2, drivers, candidates]``.
 
     Args:
-        idm: None unless the drivers are of the IDM.
-        ovm: None unless they are of optimal velocities; with both None, of Gipps' model.
-        exponent: of the IDM; None for 4.
-        apart: None unless the errors of the gap are summed up; else they are zero.
-        leader: observed speeds, ``[drivers, time]`` [m/s].
-        follower: the same of the followers [m/s].
-        gaps: observed gaps, ``[drivers, time]`` [m].
-        samples: number of samples, ``[drivers]``.
-        parameters: six, each ``[drivers, candidates]``; see
-            :data:`lcc_rl.drivers.fit_error.READY`.
-        settings: gap floor, braking limit, acceleration limit, time step, half of it and the
-            numbers 0, 1, 2, 0.025 and 1e-12: literals would be of double precision.
-        total: is overwritten with the sums of speed and gap, ``[2, drivers, candidates]``.
+        law: the driver model; of its constants those count that a calibration does not fit.
+        time_step: T [s].
+        dtype: of all numbers.
+
+    Raises:
+        Untranslatable: if the law has an operation without a counterpart on numbers.
     """
-    floor, braking, limit, time_step, half, zero, one, two, slow, tiny = settings
-    speed, gap = np.empty_like(total[0, 0]), np.empty_like(total[0, 0])
-    for driver in range(total.shape[1]):
-        p0, p1, p2 = parameters[0][driver], parameters[1][driver], parameters[2][driver]
-        p3, p4, p5 = parameters[3][driver], parameters[4][driver], parameters[5][driver]
-        error, distance = total[0, driver], total[1, driver]
-        speed[:], gap[:] = follower[driver, 0], gaps[driver, 0]
-        error[:], distance[:] = zero, zero
-        for step in range(samples[driver] - 1):
-            ahead, truth = leader[driver, step], follower[driver, step + 1]
-            seen, advance = gaps[driver, step + 1], half * (ahead + leader[driver, step + 1])
-            for i in range(len(speed)):
-                if idm is not None:
-                    wish = speed[i] * (p1[i] + (speed[i] - ahead) * p3[i])
-                    wish = (zero if wish < zero else wish) + p4[i]
-                    ratio = wish / (floor if gap[i] < floor else gap[i])
-                    free = speed[i] * p0[i]
-                    free = free * free * (free * free) if exponent is None else free**exponent
-                    command = p2[i] * (one - free - ratio * ratio)
-                elif ovm is not None:
-                    optimal = p0[i] * np.tanh(gap[i] * p1[i] - p2[i]) + p3[i]
-                    command = p4[i] * (optimal - speed[i]) + p5[i] * (ahead - speed[i])
-                else:
-                    share, brake = speed[i] * p0[i], p2[i] * p3[i]
-                    free = p1[i] * (one - share) * np.sqrt(slow + share)
-                    room = p2[i] * (two * (gap[i] - p4[i]) - speed[i] * p3[i])
-                    root = brake * brake + room + p5[i] * ahead * ahead
-                    root = np.sqrt(tiny if root < tiny else root)
-                    over = free - (root - brake - speed[i]) / p3[i]
-                    command = free - (zero if over < zero else over)
-                command = -braking if command < -braking else command
-                command = limit if command > limit else command
-                reached = speed[i] + time_step * command
-                reached = zero if reached < zero else reached
-                gap[i] += advance - half * (speed[i] + reached)
-                speed[i] = reached
-                error[i] += (reached - truth) * (reached - truth)
-                if apart is not None:
-                    distance[i] += (gap[i] - seen) * (gap[i] - seen)
+    constants = {name: x for name, x in vars(law).items() if name not in law.shared()}
+    return kept(_source(type(law), tuple(constants.items()), time_step, dtype))
 
 
 @cache
-def compiled(dtype: str) -> Callable[..., None]:
-    """Return :func:`squared_errors` for one precision; numba compiles it at its first call.
+def _source(
+    kind: type[DriverConstants],
+    constants: tuple[tuple[str, Any], ...],
+    time_step: float,
+    dtype: torch.dtype,
+) -> str:
+    """Return the source of a kernel, in which one step of a follower is recorded."""
+    recorder, names = Recorder(), list(kind.table())
 
-    numba keeps the machine code beside this file or, where that is read-only, in the user's cache
-    folder (``NUMBA_CACHE_DIR``). If it cannot be kept or read, the function is compiled for this
-    process. Each precision is a function of its own name: processes that compile at the same time
-    would mix up the files of one.
+    def number(expression: str) -> Tensor:
+        tensor = torch.ones(1, dtype=dtype)
+        recorder.add(tensor, torch.tensor([recorder.variable(expression, ())]))
+        return tensor
 
-    Args:
-        dtype: name of the precision, ``float32`` or ``float64``.
+    motion = [number(expression) for expression in STEP_INPUTS]
+    own = {name: number(f"p{place}[i]") for place, name in enumerate(names)}
+    with torch.no_grad(), recorder:
+        speed, gap, *leader = motion
+        law = kind(**dict(constants)).with_(**{name: own[name] for name in kind.shared()})
+        pair = own["desired_speed"], own["time_gap"]
+        reached, *_ = next(follow(law, torch.stack(leader), speed, gap, pair, time_step))
+    return _written(recorder, int(recorder.numbers(reached, dtype)), time_step, NUMBER_TYPES[dtype])
+
+
+def _written(recorder: Recorder, reached: int, time_step: float, number: str) -> str:
+    """Return the source: what depends on a driver's parameters only is computed before its steps.
+
+    So is the reciprocal of such a divisor: a step multiplies by it.
     """
-    name = f"squared_errors_{dtype}"
-    function = FunctionType(squared_errors.__code__, squared_errors.__globals__, name)
-    # Sums may be fused with products; nothing else is changed for speed.
-    compile_it = partial(numba.njit, fastmath={"contract"}, error_model="numpy", nogil=True)
-    uncached = compile_it()(function)
-    try:
-        chosen = compile_it(cache=True)(function)
-    except RuntimeError as error:  # there is no place for the code
-        log.info("compiling the drivers' simulation for this run only: %s", error)
-        return uncached
+    statements, inputs = recorder.statements, range(len(STEP_INPUTS))
+    changing = recorder.dependents(inputs)
+    for variable in sorted(changing):
+        formula, reads = statements[variable]
+        if formula == "{0} / {1}" and reads[1] not in changing:
+            inverse = recorder.variable(f"{number}(1) / {{0}}", reads[1:])
+            statements[variable] = ("{0} * {1}", (reads[0], inverse))
+    used = recorder.needed([reached])
+    parameters = [i for i in used if statements[i][0].startswith("p") and not statements[i][1]]
+    held = recorder.dependents(parameters)  # or changing
+    texts = {i: statements[i][0] for i in (*inputs, *parameters)}
+    before: list[str] = []
+    step: list[str] = []
+    # Reciprocals are the last that were recorded.
+    for i in sorted(set(used) - set(texts), key=lambda i: (i in changing, i)):
+        formula, reads = statements[i]
+        expression = formula.format(*(texts[x] for x in reads))
+        if i in changing:
+            step.append(f"v{i} = {expression}")
+            texts[i] = f"v{i}"
+        elif i in held:
+            before.append(f"h{i}[i] = {expression}")
+            texts[i] = f"h{i}[i]"
+        else:
+            texts[i] = f"({expression})"
+    places = [int(texts[i][1:-3]) for i in parameters]
+    return TEMPLATE.format(
+        memory=_indented(4, [f"{x.split('[')[0]} = np.empty_like(total[0, 0])" for x in before]),
+        own=_indented(8, [f"p{place} = parameters[{place}][driver]" for place in places]),
+        before=_indented(12, before or ["pass"]),
+        step=_indented(16, step),
+        reached=texts[reached],
+        half=f"{number}({0.5 * time_step!r})",
+        zero=f"{number}(0)",
+    )
 
-    def call(*arguments: Any) -> None:
-        nonlocal chosen
-        try:
-            chosen(*arguments)
-        except Exception as error:  # a damaged file raises whatever unpickling it meets
-            log.info("compiling the drivers' simulation for this run only: %r", error)
-            chosen = uncached
-            chosen(*arguments)
 
-    return call
+def _indented(spaces: int, lines: Sequence[str]) -> str:
+    return "\n".join(" " * spaces + line for line in lines)

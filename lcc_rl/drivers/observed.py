@@ -16,8 +16,8 @@ from lcc_rl.data.grid import places
 from lcc_rl.errors import Concern, DataError
 from lcc_rl.settings import NonNegative, Settings
 
-IDENTITY = ("recording", "follower_id", "leader_id")
-NUMERIC = ("time_s", "follower_speed_mps", "leader_speed_mps", "gap_m")
+PAIR_IDENTITY = ("recording", "follower_id", "leader_id")
+NUMERIC_COLUMNS = ("time_s", "follower_speed_mps", "leader_speed_mps", "gap_m")
 
 
 class Selection(Settings):
@@ -31,7 +31,7 @@ class Selection(Settings):
     # Slower episodes are dropped: the relative error divides by speed [m/s].
     min_mean_speed_mps: NonNegative = 0.5
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         longest = self.max_duration_s
         if longest is not None and longest < self.min_duration_s:
             raise ValueError(
@@ -164,7 +164,7 @@ def observe(episodes: pd.DataFrame, selection: Selection | None = None) -> Obser
         follower_speed=follower,
         gaps=gaps,
         samples=table["samples"].to_numpy(np.int64),
-        identity=table[["episode", *IDENTITY]].reset_index(drop=True),
+        identity=table[["episode", *PAIR_IDENTITY]].reset_index(drop=True),
         time_step=step,
         report=[*report, *lines, *shortened],
     )
@@ -174,17 +174,17 @@ def _canonical(episodes: pd.DataFrame) -> pd.DataFrame:
     """Check columns and types; order by episode and time."""
     aliases = {old: new for old, new in ALIASES.items() if new not in episodes.columns}
     frame = episodes.rename(columns=aliases)
-    missing = [name for name in ("episode", *NUMERIC) if name not in frame.columns]
+    missing = [name for name in ("episode", *NUMERIC_COLUMNS) if name not in frame.columns]
     if missing:
         raise DataError(f"episode table: missing column(s) {', '.join(missing)}")
     if frame.empty:
         raise DataError("episode table: no rows")
-    for name in NUMERIC:
+    for name in NUMERIC_COLUMNS:
         if not pd.api.types.is_numeric_dtype(frame[name]):
             raise DataError(f"episode table: column {name!r} is not numeric")
     if "follower_id" not in frame.columns:
         frame = frame.assign(follower_id=frame["episode"])
-    for name in IDENTITY:
+    for name in PAIR_IDENTITY:
         if name not in frame.columns:
             frame = frame.assign(**{name: "" if name == "recording" else -1})
     return frame.sort_values(["episode", "time_s"], kind="stable", ignore_index=True)
@@ -234,7 +234,7 @@ def _truncate(frame: pd.DataFrame, duration: float | None) -> tuple[pd.DataFrame
 
 def _summary(frame: pd.DataFrame, step: float) -> pd.DataFrame:
     """One row per episode: its first row and the values that the selection checks."""
-    values = frame[list(NUMERIC)]
+    values = frame[list(NUMERIC_COLUMNS)]
     frame = frame.assign(
         finite=np.isfinite(values.to_numpy(np.float64)).all(axis=1)
         & (values[["follower_speed_mps", "leader_speed_mps"]] >= 0.0).all(axis=1),

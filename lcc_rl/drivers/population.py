@@ -12,17 +12,17 @@ import torch
 from torch import Tensor
 
 from lcc_rl.drivers.parameters import (
-    COLUMNS,
     DEFAULT_BOUNDS,
-    IDM,
-    PLAUSIBLE,
+    DEFAULT_MODEL,
     REACTION,
     at_bound,
+    find_law,
+    parameters_of,
     users,
 )
-from lcc_rl.drivers.tables import IDENTITY, check_drivers, load_drivers, models_of, reaction_of
+from lcc_rl.drivers.tables import PAIR_IDENTITY, check_drivers, load_drivers, models_of, reaction_of
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.driver_models import Reaction
+from lcc_rl.functional.driver_models import INDIVIDUAL, PARAMETERS, Reaction
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.settings import NonNegative, Positive, checked
@@ -63,8 +63,9 @@ class DriverPopulation:
     def __post_init__(self) -> None:
         if not self.ids:
             raise ConfigError("driver population: holds no drivers")
+        table = parameters_of(self.models or (DEFAULT_MODEL,))
         for name, values in self.parameters().items():
-            low, high = PLAUSIBLE[name]
+            low, high = table[name].plausible
             unused = values.isnan() if self.models else torch.zeros(()).bool()
             wrong = ~((values >= low) & (values <= high)) & ~unused
             if bool(wrong.any()):
@@ -82,10 +83,6 @@ class DriverPopulation:
     def __len__(self) -> int:
         """Number of drivers."""
         return len(self.ids)
-
-    def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw drivers with replacement: indices ``[count]`` on the CPU."""
-        return torch.randint(len(self), (count,), generator=generator)
 
     def select(self, index: Tensor) -> DriverPopulation:
         """Return the drivers at ``index`` ``[chosen]``, in that order, repetitions included."""
@@ -125,7 +122,7 @@ class DriverPopulation:
         Of IDM drivers these are five; of a mixture of models NaN stands for what a driver lacks.
         """
         own = {"desired_speed": self.desired_speed, "time_gap": self.time_gap}
-        shared = {name: getattr(self.constants, name) for name in LAWS[IDM].shared}
+        shared = {name: getattr(self.constants, name) for name in LAWS[DEFAULT_MODEL].shared()}
         own |= shared if self.models is None else self.own
         device = self.desired_speed.device
         return {
@@ -141,6 +138,7 @@ def bootstrap(
     least_speed: Positive | None = None,
     reaction_delay: NonNegative | None = None,
     acceleration_noise: NonNegative | None = None,
+    law: str | None = None,
 ) -> DriverPopulation:
     """Population of the calibrated drivers themselves, the empirical joint distribution.
 
@@ -152,10 +150,13 @@ def bootstrap(
         reaction_delay: of all drivers [s]; None: as the table says, 0 where it says nothing.
         acceleration_noise: standard deviation [m/s²], likewise; see
             :class:`lcc_rl.functional.driver_models.Reaction`.
+        law: dotted path of a driver model of your own that drivers of the table have.
 
     Raises:
         DataError: if the table is not sound.
     """
+    if law is not None:
+        find_law(law)
     table = load_drivers(path, mode)
     found = replace(from_table(table), mode=mode_of(table))
     given = {"delay": reaction_delay, "noise": acceleration_noise}
@@ -176,15 +177,15 @@ def from_table(table: pd.DataFrame) -> DriverPopulation:
     """
     check_drivers(table, "driver table")
     models = models_of(table, "driver table")
-    shared = LAWS[IDM].shared if (models == IDM).all() else ()
-    own = {name: table[COLUMNS[name]].to_numpy(np.float64) for name in shared}
+    shared = LAWS[DEFAULT_MODEL].shared() if (models == DEFAULT_MODEL).all() else ()
+    own = {name: table[PARAMETERS[name].column].to_numpy(np.float64) for name in shared}
     constants = IDMConstants(
         **{name: float(values[0]) for name, values in own.items() if np.ptp(values) == 0.0}
     )
     varying = {name: _tensor(values) for name, values in own.items() if np.ptp(values) > 0.0}
     found = DriverPopulation(
-        desired_speed=_tensor(table[COLUMNS["desired_speed"]].to_numpy(np.float64)),
-        time_gap=_tensor(table[COLUMNS["time_gap"]].to_numpy(np.float64)),
+        desired_speed=_tensor(table[PARAMETERS["desired_speed"].column]),
+        time_gap=_tensor(table[PARAMETERS["time_gap"].column]),
         constants=constants.with_(**varying),
         ids=_identities(table),
         at_bound=_flags(table),
@@ -192,11 +193,10 @@ def from_table(table: pd.DataFrame) -> DriverPopulation:
     )
     if shared:
         return found
-    further = {name for model in models.unique() for name in LAWS[model].shared}
     more = {
-        name: _tensor(table[column].where(models.isin(users(name))))
-        for name, column in COLUMNS.items()
-        if name in further
+        name: _tensor(table[one.column].where(models.isin(users(name))))
+        for name, one in parameters_of(models.unique()).items()
+        if name not in INDIVIDUAL
     }
     return replace(found, models=tuple(models), own=more)
 
@@ -212,16 +212,18 @@ def _tensor(values: np.ndarray | pd.Series) -> Tensor:
 
 def _identities(table: pd.DataFrame) -> tuple[str, ...]:
     """``recording/follower/leader`` where known, else the row's number."""
-    if not set(IDENTITY) <= set(table.columns):
+    if not set(PAIR_IDENTITY) <= set(table.columns):
         return tuple(str(number) for number in range(len(table)))
-    return tuple("/".join(map(str, row)) for row in table[list(IDENTITY)].itertuples(index=False))
+    return tuple(
+        "/".join(map(str, row)) for row in table[list(PAIR_IDENTITY)].itertuples(index=False)
+    )
 
 
 def _flags(table: pd.DataFrame) -> Tensor:
     """Which desired speeds lie on a bound, as calibrated, or by the default bounds."""
     if "desired_speed_at_bound" in table.columns:
         return torch.tensor(table["desired_speed_at_bound"].to_numpy(bool))
-    values = table[COLUMNS["desired_speed"]].to_numpy(np.float64)
+    values = table[PARAMETERS["desired_speed"].column].to_numpy(np.float64)
     return torch.tensor(at_bound(values, DEFAULT_BOUNDS["desired_speed"]))
 
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lcc_rl.drivers.parameters import COLUMNS, IDM, MODEL, PLAUSIBLE, REACTION, users
+from lcc_rl.drivers.parameters import DEFAULT_MODEL, MODEL, REACTION, parameters_of, users
 from lcc_rl.errors import DataError, ResultsError
 from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import read_parquet
 
-SHIPPED = "i80_drivers.parquet"
-IDENTITY = ("recording", "follower_id", "leader_id")
+SHIPPED_DRIVERS = "i80_drivers.parquet"
+PAIR_IDENTITY = ("recording", "follower_id", "leader_id")
 
 
 def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.DataFrame:
@@ -34,13 +34,13 @@ def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.
     """
     try:
         if path is None:
-            with resources.as_file(resources.files("lcc_rl.assets") / SHIPPED) as file:
+            with resources.as_file(resources.files("lcc_rl.assets") / SHIPPED_DRIVERS) as file:
                 frame = read_parquet(file)
         else:
             frame = read_parquet(path)
     except ResultsError as error:
         raise DataError(str(error)) from error
-    name = SHIPPED if path is None else str(path)
+    name = SHIPPED_DRIVERS if path is None else str(path)
     check_drivers(frame, name)
     return _of_mode(frame, mode, name)
 
@@ -63,19 +63,19 @@ def models_of(frame: pd.DataFrame, name: str) -> pd.Series:
         DataError: naming the table and row, if a model is unknown.
     """
     if MODEL not in frame.columns:
-        return pd.Series(IDM, index=frame.index)
+        return pd.Series(DEFAULT_MODEL, index=frame.index)
     unknown = ~frame[MODEL].isin(list(LAWS)).to_numpy()
     if unknown.any():
         row = int(unknown.argmax())
         raise DataError(
-            f"{name}: row {row}, column {MODEL!r}: must be one of {', '.join(LAWS)}, "
-            f"got {frame[MODEL].iloc[row]!r}"
+            f"{name}: row {row}, column {MODEL!r}: must be one of {', '.join(LAWS)}, got "
+            f"{frame[MODEL].iloc[row]!r}; +drivers.law=<module.Class> adds a model of your own"
         )
     return frame[MODEL]
 
 
 def check_drivers(frame: pd.DataFrame, name: str) -> None:
-    """Check that a table holds drivers: their parameters, each within :data:`PLAUSIBLE`, once.
+    """Check that a table holds drivers: their parameters, each within its plausible range, once.
 
     Raises:
         DataError: naming the table, row and column of the first fault.
@@ -83,19 +83,15 @@ def check_drivers(frame: pd.DataFrame, name: str) -> None:
     if frame.empty:
         raise DataError(f"{name}: the table holds no drivers")
     models = models_of(frame, name)
-    found = {column: models.isin(users(parameter)) for parameter, column in COLUMNS.items()}
-    needed = {column: rows for column, rows in found.items() if rows.any()}
-    missing = [column for column in needed if column not in frame.columns]
+    needed = parameters_of(models.unique())
+    missing = [one.column for one in needed.values() if one.column not in frame.columns]
     if missing:
         raise DataError(f"{name}: missing column(s) {', '.join(missing)}")
-    for parameter, column in COLUMNS.items():
-        if column not in needed:
-            continue
+    for parameter, (column, _, _, (low, high)) in needed.items():
         if not pd.api.types.is_numeric_dtype(frame[column]):
             raise DataError(f"{name}: column {column!r} is not numeric")
         values = frame[column].to_numpy(np.float64, na_value=np.nan)
-        low, high = PLAUSIBLE[parameter]
-        bad = needed[column].to_numpy() & ~((values >= low) & (values <= high))
+        bad = models.isin(users(parameter)).to_numpy() & ~((values >= low) & (values <= high))
         if bad.any():
             row = int(bad.argmax())
             raise DataError(
@@ -126,11 +122,11 @@ def reaction_of(frame: pd.DataFrame, name: str) -> Reaction:
 
 def _check_identities(frame: pd.DataFrame, name: str) -> None:
     """Raise a DataError where a driver appears twice."""
-    if not set(IDENTITY) <= set(frame.columns):
+    if not set(PAIR_IDENTITY) <= set(frame.columns):
         return
     # A pair that was cut by a lane change is two drivers: its episodes tell them apart.
     columns = [
-        column for column in ("mode", MODEL, "episode", *IDENTITY) if column in frame.columns
+        column for column in ("mode", MODEL, "episode", *PAIR_IDENTITY) if column in frame.columns
     ]
     twice = frame.duplicated(columns).to_numpy()
     if twice.any():

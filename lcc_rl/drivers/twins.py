@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -22,37 +21,36 @@ from torch import Tensor
 
 from lcc_rl.drivers.genetic import Progress
 from lcc_rl.drivers.observed import Observed
-from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.energy import PaperMotor
 from lcc_rl.errors import Concern
-from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, NoiseStep, Reaction
-from lcc_rl.functional.kinematics import advance_gap, advance_speed
+from lcc_rl.functional.driver_models import DriverConstants, NoiseStep, Reaction, follow
 from lcc_rl.functional.laws import LAWS
 
 # Moving averages of the speeds before their energy is computed; the first one counts for the choice
 # of a reaction: shorter ones leave the noise of records, longer ones take what drivers do [s].
 SMOOTHINGS = (1.1, 3.1)
-BAND = (0.04, 0.26)  # frequencies compared; above them the records are smoothed [Hz]
-WINDOW = 20.0  # part of a record whose spectrum is taken; parts overlap by half [s]
+FREQUENCIES = (0.04, 0.26)  # frequencies compared; above them the records are smoothed [Hz]
+SPECTRUM_WINDOW = 20.0  # part of a record whose spectrum is taken; parts overlap by half [s]
 LONG_GAP = 2.5  # time gap above which a driver is far behind, above 1 m/s [s]
 REPEATS = 2  # draws of the noise of every driver
 AT_ONCE = 20_000  # trajectories side by side; more would only take memory
-FOLDS = 5  # parts of the drivers; each is judged by a reaction chosen on the others
+DRIVER_FOLDS = 5  # parts of the drivers; each is judged by a reaction chosen on the others
 DELAYS = tuple(round(0.1 * number, 1) for number in range(10))  # among which is chosen [s]
 NOISES = tuple(round(0.05 * number, 2) for number in range(13))  # likewise [m/s²]
 TOLERANCES = {"lost": 0.05, "spectrum": 0.2, "growth": 0.05}  # relative; see choose
 CARS = 5  # drivers in a row, along whom energy must not grow
-CAP = 3.0  # bounds the gaps that they start at, see lcc_rl.functional.idm.equilibrium_gap [s]
 HELD = "the recorded drivers hold their speeds"
 LEAST_LOST = 1e-6  # share of the energy that drivers in traffic lose at least to accelerating
 DENSITY, HERTZ = "density_", "hz"  # around the frequency in the name of a column
-RECORDED, TWINS, REACTING = "recorded", "as calibrated", "with reaction"
-Array = NDArray[np.float64]
-Rows = NDArray[np.bool_]
-People = tuple[DriverLaw, tuple[Tensor, Tensor], DriverConstants]  # model, (v0, T), the rest
+RECORDED_DRIVERS, TWINS, REACTING = "recorded", "as calibrated", "with reaction"
+_Array = NDArray[np.float64]
+_Rows = NDArray[np.bool_]
+People = tuple[DriverConstants, tuple[Tensor, Tensor]]  # model and (v0, T) of drivers
 
 
-def measure(speed: Array, gap: Array, samples: NDArray[np.int64], time_step: float) -> pd.DataFrame:
+def measure_motion(
+    speed: _Array, gap: _Array, samples: NDArray[np.int64], time_step: float
+) -> pd.DataFrame:
     """Measure drivers in motion, means over the draws of their noise.
 
     The energy is that of the paper's motor (A2) without the kinetic energy stored at the end.
@@ -66,10 +64,10 @@ def measure(speed: Array, gap: Array, samples: NDArray[np.int64], time_step: flo
     Returns:
         A row per driver: mean gap_m and long_gap_share of the time; for each of :data:`SMOOTHINGS`,
         such as 1.1 s, energy_1.1s_j, its part lost_1.1s_j and distance_1.1s_m; and for each
-        frequency within :data:`BAND`, such as 0.1 Hz, density_0.1hz of the acceleration [m²/s⁴/Hz],
-        NaN for records shorter than :data:`WINDOW`.
+        frequency within :data:`FREQUENCIES`, such as 0.1 Hz, density_0.1hz of the acceleration
+        [m²/s⁴/Hz], NaN for records shorter than :data:`SPECTRUM_WINDOW`.
     """
-    table: dict[str, Array] = {}
+    table: dict[str, _Array] = {}
     for smoothing in SMOOTHINGS:
         found = _energies(speed, samples, time_step, smoothing)
         units = {"energy": "j", "lost": "j", "distance": "m"}
@@ -88,8 +86,8 @@ def _inside(length: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def _energies(
-    speed: Array, samples: NDArray[np.int64], time_step: float, smoothing: float
-) -> dict[str, Array]:
+    speed: _Array, samples: NDArray[np.int64], time_step: float, smoothing: float
+) -> dict[str, _Array]:
     """Return energy [J], its part lost to accelerating [J] and distance [m], each ``[drivers]``."""
     width, motor = round(smoothing / time_step), PaperMotor()
     total = np.cumsum(np.concatenate([0.0 * speed[:1], speed]), axis=0)
@@ -105,11 +103,11 @@ def _energies(
     return {name: (rate * time_step * inside).sum(0).mean(0) for name, rate in rates.items()}
 
 
-def _spectrum(speed: Array, samples: NDArray[np.int64], time_step: float) -> dict[str, Array]:
+def _spectrum(speed: _Array, samples: NDArray[np.int64], time_step: float) -> dict[str, _Array]:
     """Return the acceleration's density by Welch's method, ``[drivers]`` for each frequency."""
-    acceleration, width = np.diff(speed, axis=0) / time_step, round(WINDOW / time_step)
+    acceleration, width = np.diff(speed, axis=0) / time_step, round(SPECTRUM_WINDOW / time_step)
     frequency = np.fft.rfftfreq(width, time_step)
-    inside = (frequency >= BAND[0]) & (frequency <= BAND[1])
+    inside = (frequency >= FREQUENCIES[0]) & (frequency <= FREQUENCIES[1])
     taper = np.hanning(width)[:, None, None]
     total, count = np.zeros((int(inside.sum()), speed.shape[-1])), np.zeros(speed.shape[-1])
     for start in range(0, len(acceleration) - width + 1, width // 2):
@@ -131,14 +129,14 @@ def densities(table: pd.DataFrame) -> pd.DataFrame:
     return table[found].rename(columns=named).dropna()
 
 
-def recorded(observed: Observed) -> pd.DataFrame:
+def measure_recorded(observed: Observed) -> pd.DataFrame:
     """Measure the recorded drivers."""
     series = (observed.follower_speed, observed.gaps)
     speed, gap = (x.double().cpu().numpy()[:, None] for x in series)
-    return measure(speed, gap, observed.samples, observed.time_step)
+    return measure_motion(speed, gap, observed.samples, observed.time_step)
 
 
-def drive(
+def drive_twins(
     observed: Observed,
     drivers: pd.DataFrame,
     reactions: Sequence[Reaction],
@@ -168,7 +166,7 @@ def drive(
     found = []
     for speed, gap in motion:
         share = np.sqrt((((speed - truth) * alive) ** 2).sum(0) / norm).mean(0)
-        table = measure(speed, gap, observed.samples, observed.time_step)
+        table = measure_motion(speed, gap, observed.samples, observed.time_step)
         found.append(table.assign(rmspe=share))
     return found
 
@@ -182,7 +180,7 @@ def growth(
     own equilibrium. What is returned is the logarithm of the ratio of both energies per distance,
     for every reaction; infinity if anybody collides.
     """
-    law, own, constants = _people(observed, drivers)
+    law, own = _people(observed, drivers)
     leader = observed.leader_speed.double().cpu()
     generator, chance = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
     shape, step = (len(reactions), 1, observed.count), observed.time_step
@@ -190,9 +188,9 @@ def growth(
     inside = _inside(len(leader), observed.samples)
     for car in range(CARS):
         order = torch.from_numpy(chance.permutation(observed.count))
-        shared = {name: getattr(constants, name)[order] for name in law.shared}
-        who = (law, (own[0][order], own[1][order]), constants.with_(**shared))
-        gap = law.equilibrium_gap(leader[0], *who[1], who[2], CAP)
+        shared = {name: getattr(law, name)[order] for name in law.shared()}
+        who = (law.with_(**shared), (own[0][order], own[1][order]))
+        gap = who[0].equilibrium_gap(leader[0], *who[1])
         motion = _follow(who, leader, (leader[0], gap), reactions, shape, generator, step)
         collided |= [bool(((gaps <= 0.0) & inside).any()) for _, gaps in motion]
         if car in (0, CARS - 1):
@@ -211,30 +209,30 @@ def _follow(
     shape: tuple[int, int, int],
     generator: torch.Generator,
     step: float,
-) -> list[tuple[Array, Array]]:
+) -> list[tuple[_Array, _Array]]:
     """Drive followers; return speeds and gaps ``[time, draws, drivers]`` for every reaction.
 
     The leader's speed is ``[time, …]``, broadcast to ``shape``: reactions, draws, drivers.
     """
-    law, own, constants = who
+    law, own = who
     level = torch.tensor([one.noise for one in reactions]).double().view(-1, 1, 1)
     noise_step = NoiseStep.of(step)
 
     def draw() -> Tensor:
         return torch.randn(shape[1:], generator=generator, dtype=torch.float64)
 
-    speed, gap = (x.expand(shape) for x in start)
     noise, last = noise_step.start(draw(), draw())
-    seen = [(speed, gap, leader[0])] * (round(reactions[0].delay / step) + 1)
-    motion = [(speed, gap)]
-    for before, after in pairwise(leader):
-        seen = [*seen[1:], (speed, gap, before)]
-        old_speed, old_gap, ahead = seen[0]
-        command = law.acceleration(old_speed, old_gap, old_speed - ahead, *own, constants)
-        reached, _ = advance_speed(speed, command + level * noise, step)
-        gap = advance_gap(gap, before, speed, after, reached, step)
-        speed, noise, last = reached, noise_step.next(noise, last, draw()), noise
-        motion.append((speed, gap))
+
+    def strayed(_: int, command: Tensor) -> Tensor:
+        nonlocal noise, last
+        command = command + level * noise
+        noise, last = noise_step.next(noise, last, draw()), noise
+        return command
+
+    speed, gap = (x.expand(shape) for x in start)
+    late = round(reactions[0].delay / step)
+    driven = follow(law, leader, speed, gap, own, step, late, strayed)
+    motion = [(speed, gap), *((speed, gap) for speed, gap, _ in driven)]
     speeds, gaps = (torch.stack(x, 1).numpy() for x in zip(*motion, strict=True))
     return list(zip(speeds, gaps, strict=True))
 
@@ -245,11 +243,11 @@ def one_step_error(observed: Observed, drivers: pd.DataFrame, delay: float) -> f
     The model acts on the recorded state, as old as the delay; the logarithm of this number is, but
     for a constant, the negative likelihood of a sample.
     """
-    law, own, constants = _people(observed, drivers)
+    law, own = _people(observed, drivers)
     series = (observed.leader_speed, observed.follower_speed, observed.gaps)
     leader, speed, gap = (x.double().cpu() for x in series)
     late = round(delay / observed.time_step)
-    wish = law.acceleration(speed, gap, speed - leader, *own, constants)
+    wish = law(speed, gap, speed - leader, *own)
     left = speed.diff(dim=0)[late:] / observed.time_step - wish[: len(wish) - 1 - late]
     last = torch.tensor(observed.samples) - 1 - late
     inside = torch.arange(len(left)).unsqueeze(-1) < last
@@ -257,12 +255,12 @@ def one_step_error(observed: Observed, drivers: pd.DataFrame, delay: float) -> f
 
 
 def _people(observed: Observed, drivers: pd.DataFrame) -> People:
-    """Return model, (v0, T) and constants of the drivers in the order of the records."""
+    """Return the model and (v0, T) of the drivers in the order of the records."""
     table = drivers.set_index("episode").loc[observed.identity["episode"]]
     law = LAWS[str(table["model"].iloc[0])]
-    own = {x: torch.tensor(table[COLUMNS[x]].to_numpy(np.float64)) for x in law.parameters}
-    constants = law.constants().with_(**{name: own[name] for name in law.shared})
-    return law, (own["desired_speed"], own["time_gap"]), constants
+    columns = {name: one.column for name, one in law.table().items()}
+    own = {name: torch.tensor(table[x].to_numpy(np.float64)) for name, x in columns.items()}
+    return law().with_(**{x: own[x] for x in law.shared()}), (own["desired_speed"], own["time_gap"])
 
 
 def ratios(
@@ -271,7 +269,7 @@ def ratios(
     """Compare drivers with the recorded ones, as ratios of sums over them.
 
     Args:
-        twins, records: what was measured of both, see :func:`measure`; the same drivers.
+        twins, records: what was measured of both, see :func:`measure_motion`; the same drivers.
         smoothing: one of :data:`SMOOTHINGS` [s].
 
     Returns:
@@ -308,7 +306,7 @@ def tried(
     """Drive twins with all of :data:`DELAYS` × :data:`NOISES`.
 
     Args:
-        observed, drivers: see :func:`drive`.
+        observed, drivers: see :func:`drive_twins`.
         progress: called as ``progress(tried, total, text)``.
     """
     found: dict[Reaction, Tried] = {}
@@ -317,7 +315,7 @@ def tried(
         every = [Reaction(delay, noise) for noise in NOISES]
         for start in range(0, len(every), together):
             reactions = every[start : start + together]
-            twins = drive(observed, drivers, reactions)
+            twins = drive_twins(observed, drivers, reactions)
             grown = growth(observed, drivers, reactions)
             found |= dict(zip(reactions, map(Tried, twins, grown), strict=True))
             if progress is not None:
@@ -325,7 +323,9 @@ def tried(
     return found
 
 
-def choose(tries: Mapping[Reaction, Tried], records: pd.DataFrame, rows: Rows) -> Reaction:
+def choose_reaction(
+    tries: Mapping[Reaction, Tried], records: pd.DataFrame, rows: _Rows
+) -> Reaction:
     """Choose the reaction with which some drivers come closest to the recorded ones.
 
     What is minimised is the sum of squares of three logarithms, each over its
@@ -345,42 +345,49 @@ def choose(tries: Mapping[Reaction, Tried], records: pd.DataFrame, rows: Rows) -
     return min(tries, key=distance)
 
 
-def judged(tries: Mapping[Reaction, Tried], records: pd.DataFrame) -> pd.DataFrame:
+def cross_chosen(tries: Mapping[Reaction, Tried], records: pd.DataFrame) -> pd.DataFrame:
     """Return drivers who each have the reaction that was chosen on other drivers."""
-    fold = np.arange(len(records)) % FOLDS
+    fold = np.arange(len(records)) % DRIVER_FOLDS
     parts = []
-    for own in (fold == number for number in range(min(FOLDS, len(records)))):
+    for own in (fold == number for number in range(min(DRIVER_FOLDS, len(records)))):
         others = ~own if (~own).any() else own
-        parts.append(tries[choose(tries, records, others)].twins[own])
+        parts.append(tries[choose_reaction(tries, records, others)].twins[own])
     return pd.concat(parts).sort_index()
 
 
-def compare(
+def compare_twins(
     observed: Observed, drivers: pd.DataFrame, react: bool, progress: Progress | None = None
 ) -> tuple[Reaction, pd.DataFrame, list[str]]:
     """Compare calibrated drivers with the recorded ones.
 
     Args:
         observed: the records.
-        drivers: see :func:`drive`.
+        drivers: see :func:`drive_twins`.
         react: also choose a reaction that all drivers share.
         progress: see :func:`tried`.
 
     Returns:
-        The reaction; what was measured (:func:`measure`, with the columns episode and driver) of
-        the recorded drivers, of their twins and of those with the reaction, each as it was chosen
-        on other drivers; and lines on both.
+        The reaction; what was measured (:func:`measure_motion`, with the columns episode and
+        driver) of the recorded drivers, of their twins and of those with the reaction, each as it
+        was chosen on other drivers; and lines on both.
     """
-    records = recorded(observed)
+    records = measure_recorded(observed)
     if not react:
-        found = {RECORDED: records, TWINS: drive(observed, drivers, [Reaction()], 1)[0]}
+        found = {
+            RECORDED_DRIVERS: records,
+            TWINS: drive_twins(observed, drivers, [Reaction()], 1)[0],
+        }
         line = f"{HELD}: too little to tell how true calibrated ones are in energy"
         if accelerate(observed):
             line = _line(TWINS, found, one_step_error(observed, drivers, 0.0))
         return Reaction(), _together(found, observed), [line]
     tries = tried(observed, drivers, progress)
-    reaction = choose(tries, records, np.ones(len(records), bool))
-    found = {RECORDED: records, TWINS: tries[Reaction()].twins, REACTING: judged(tries, records)}
+    reaction = choose_reaction(tries, records, np.ones(len(records), bool))
+    found = {
+        RECORDED_DRIVERS: records,
+        TWINS: tries[Reaction()].twins,
+        REACTING: cross_chosen(tries, records),
+    }
     errors = {
         who: one_step_error(observed, drivers, delay)
         for who, delay in ((TWINS, 0.0), (REACTING, reaction.delay))
@@ -396,7 +403,7 @@ def compare(
 
 def accelerate(observed: Observed) -> bool:
     """Whether drivers lose a measurable part of their energy to accelerating."""
-    records = recorded(observed)
+    records = measure_recorded(observed)
     lost, energy = (records[f"{x}_{SMOOTHINGS[0]}s_j"].sum() for x in ("lost", "energy"))
     return bool(lost > LEAST_LOST * energy)
 
@@ -408,10 +415,10 @@ def _together(found: Mapping[str, pd.DataFrame], observed: Observed) -> pd.DataF
 
 
 def _line(who: str, found: Mapping[str, pd.DataFrame], one_step: float) -> str:
-    each = [ratios(found[who], found[RECORDED], smoothing=width) for width in SMOOTHINGS]
+    each = [ratios(found[who], found[RECORDED_DRIVERS], smoothing=width) for width in SMOOTHINGS]
     energies = ", ".join(f"{one['energy']:.3f}" for one in each)
     losses = ", ".join(f"{one['lost']:.2f}" for one in each)
-    own, theirs = (found[x].mean(numeric_only=True) for x in (who, RECORDED))
+    own, theirs = (found[x].mean(numeric_only=True) for x in (who, RECORDED_DRIVERS))
     return (
         f"drivers {who}: RMSPE {100 * own.rmspe:.1f} %; {energies} of the recorded energy per km, "
         f"{losses} of what accelerating loses (speeds smoothed over {SMOOTHINGS[0]}, "

@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from lcc_rl.energy.base import EnergyModel, Grade
-from lcc_rl.functional.power import PAPER_VEHICLE, acceleration_loss, motor_power, path_power
+from lcc_rl.functional.power import acceleration_loss, motor_power, path_power
 from lcc_rl.settings import NonNegative, Positive
 
 GRAVITY, AIR = 9.81, 1.2  # [m/s²], [kg/m³]
@@ -38,7 +38,7 @@ class ElectricCar(EnergyModel):
     fade_speed: Positive = 5.0  # below it recuperation fades in proportion to it [m/s]
     grade: Grade = 0.0  # of the road [rad]
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         self.resistance = 0.5 * AIR * self.drag * self.area  # of the air [N/(m/s)²]
         slope = self.rolling * math.cos(self.grade) + math.sin(self.grade)
         self.rolling_force = self.mass * GRAVITY * slope  # [N]
@@ -56,11 +56,12 @@ class ElectricCar(EnergyModel):
 class PaperMotor(EnergyModel):
     """Electric power of the ALCC paper's car (A2); braking returns 2.4 times its kinetic energy.
 
-    Steady power, what the motion stores and what accelerating loses add up to A2 exactly.
+    Steady power, what the motion stores and what accelerating loses add up to A2 exactly. Of the
+    force at the wheels (A1) and Table I, the kinetic energy ½ δ m v² alone is needed.
     """
 
-    mass = PAPER_VEHICLE.mass
-    rotating_mass = PAPER_VEHICLE.rotating_mass
+    mass = 1005.0  # m of A1 [kg]
+    rotating_mass = 1.02  # δ of A1
 
     def power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the motor's power [W] (A2)."""

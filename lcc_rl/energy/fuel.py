@@ -47,7 +47,7 @@ class CirclesFuel(EnergyModel):
     grade: Grade = 0.0  # of the road [rad]
     width: Positive = 0.1  # range over which the cut of the fuel is bridged [m/s²]
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         if self.vehicle not in coefficients():
             raise unknown_name("vehicle (energy.vehicle)", self.vehicle, coefficients())
         self.own = coefficients()[self.vehicle]

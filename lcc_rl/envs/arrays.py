@@ -12,16 +12,29 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.clock import is_whole, reset_options
-from lcc_rl.envs.finite import ACTION, check_numbers
 from lcc_rl.envs.rowwise import Array, Rowwise
-from lcc_rl.envs.step import TERMINATED, TRUNCATED, Step, closure, entries, pieces_of
+from lcc_rl.envs.step import (
+    TERMINATED,
+    TRUNCATED,
+    Step,
+    closure,
+    entries_of,
+    pieces_of,
+    read_before,
+)
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces.base import SEED, STEP, Key, State, StepTransform, as_key
-from lcc_rl.pieces.observation import OBSERVATION
-from lcc_rl.pieces.rewards import REWARD, TERMS, TotalReward
-
-SEEN = (AUTOMATED, OBSERVATION)
+from lcc_rl.functional.finite import require_finite
+from lcc_rl.pieces.base import (
+    ACTION,
+    OBSERVATION,
+    REWARD,
+    SEED,
+    STEP,
+    Key,
+    State,
+    as_key,
+)
+from lcc_rl.pieces.rewards import TERMS, TotalReward
 
 
 class ArrayEpisodes:
@@ -42,7 +55,7 @@ class ArrayEpisodes:
     def __init__(self, env: TransformedEnv) -> None:
         self.env, self.count = env, env.batch_size.numel()
         self.films: list[Any] = []
-        pieces = closure(pieces_of(env), {SEEN, REWARD, TERMINATED, TRUNCATED})
+        pieces = closure(pieces_of(env), {OBSERVATION, REWARD, TERMINATED, TRUNCATED})
         self.one_step = Step(pieces, env.base_env.horizon)
         totals = [piece for piece in pieces if isinstance(piece, TotalReward)]
         self.terms = [str(name) for name in totals[-1].terms]
@@ -53,17 +66,14 @@ class ArrayEpisodes:
         self.generators = [torch.Generator() for _ in range(self.count)]
         for generator in self.generators:
             generator.seed()  # at random, until a reset gives a seed
-        self.observation = np.zeros((self.count, first[SEEN].shape[-1]), np.float32)
+        self.observation = np.zeros((self.count, first[OBSERVATION].shape[-1]), np.float32)
         self.state = np.zeros((self.count, sum(self.sizes)))
 
     def _first(self, pieces: Sequence[Any]) -> State:
         """Return the first moment of an episode, and choose what a step reads of a moment."""
         with torch.no_grad():
             first = self.one_step.begin(torch.zeros(1, 1, dtype=torch.int64))
-        read: set[Key] = {SEED, STEP}
-        for piece in pieces:
-            if isinstance(piece, StepTransform):
-                read |= {key for late, key in piece.needs if not late} | set(piece.constants)
+        read = read_before(pieces)
         self.keys = [key for key in first if key in read]
         self.types = [(first[key].shape[1:], first[key].dtype) for key in self.keys]
         self.sizes = [shape.numel() for shape, _ in self.types]
@@ -80,7 +90,7 @@ class ArrayEpisodes:
         before = {key: x.to(dtype).reshape(-1, *shape) for key, (shape, dtype), x in columns}
         before[ACTION] = action.unsqueeze(1)
         reached = self.one_step(before)
-        seen = reached[SEEN].flatten(1)
+        seen = reached[OBSERVATION].flatten(1)
         results = [reached[key].flatten(1).to(seen.dtype) for key in self.written]
         total = seen.sum(1, keepdim=True) + results[0]
         finite = (total - total == 0.0).to(seen.dtype)  # neither infinity nor NaN is
@@ -89,7 +99,7 @@ class ArrayEpisodes:
     def _begin(self, seeds: Tensor) -> tuple[Tensor, Tensor]:
         """Return state and observation at the beginning of episodes."""
         first = self.one_step.begin(seeds)
-        return self._packed(first), first[SEEN].flatten(1)
+        return self._packed(first), first[OBSERVATION].flatten(1)
 
     def reset(
         self,
@@ -119,8 +129,11 @@ class ArrayEpisodes:
         if options:
             every = torch.zeros(self.count, 1, dtype=torch.int64)
             every[places] = torch.cat(drawn)
-            moment = entries(self.env.reset(self._given(every, options)))
-            state, seen = self._packed(moment)[places].numpy(), moment[OBSERVATION,][places].numpy()
+            moment = entries_of(self.env.reset(self._given(every, options)))
+            state, seen = (
+                self._packed(moment)[places].numpy(),
+                moment[OBSERVATION[1:]][places].numpy(),
+            )
         else:
             state, seen = self.begin(torch.cat(drawn).numpy())
         for place, generator in zip(places, generators, strict=True):
@@ -170,14 +183,14 @@ class ArrayEpisodes:
             self._check({ACTION: given}, step)
         self.state, self.observation, results = self.advance(self.state, given)
         if not results[:, -1].all():
-            self._check({SEEN: self.observation, REWARD: results[:, :1]}, step)
+            self._check({OBSERVATION: self.observation, REWARD: results[:, :1]}, step)
         self._expose(range(self.count), begins=False)
         return results[:, :-1]
 
     def _check(self, named: dict[Key, Array], step: int) -> None:
         """Raise Diverged where an entry is no finite number."""
         numbers = {key: torch.as_tensor(x).unsqueeze(0) for key, x in named.items()}
-        check_numbers(numbers, torch.ones(1, self.count, 1, dtype=torch.bool), step)
+        require_finite(numbers, torch.ones(1, self.count, 1, dtype=torch.bool), step)
 
     def _expose(self, places: Iterable[int], begins: bool) -> None:
         for film in [self.films[place] for place in places] if self.films else []:

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, entries, tick
+from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, entries_of, tick, written
 from lcc_rl.errors import ConfigError, LccError
 from lcc_rl.functional.guard import changed, changes
 from lcc_rl.pieces import Collision
@@ -60,7 +60,7 @@ def _play(
         if isinstance(piece, StepTransform):
             found = {key: moment.get(key) for key in piece.targets}
             _compare(piece, found, "at reset")
-    state = entries(moment)
+    state = entries_of(moment)
     for key, shape in actions.items():
         state[as_key(key)] = torch.zeros(BATCH, *shape)
     reached = tick(state[SEED], state[STEP] + 1, horizon)
@@ -146,7 +146,7 @@ def _attempt(piece: Piece, action: object) -> None:
 
 def _compare(piece: Piece, found: Mapping[Key, Tensor], when: str) -> None:
     """Compare what a piece wrote with what its spec promises."""
-    specs = piece.written_specs(torch.Size([BATCH]), None)
+    specs = piece.specs(torch.Size([BATCH]), None)
     for key, value in found.items():
         spec = specs.get(key)
         if spec is None or key in (DONE, TERMINATED):
@@ -172,9 +172,7 @@ def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
         if count > 1:
             names = [type(piece).__name__ for piece in pieces if key in piece.targets]
             raise ConfigError(f"{'.'.join(key)} is written by more than one piece: {names}")
-    known = {SEED, STEP, DONE, TERMINATED, TRUNCATED, *actions, *writers}
-    for piece in pieces:
-        known |= set(piece.constants) if isinstance(piece, StepTransform) else set()
+    known = {SEED, STEP, DONE, TERMINATED, TRUNCATED, *actions, *written(pieces)}
     for piece in pieces:
         for _, key in piece.needs:
             if key in known:

@@ -13,10 +13,10 @@ from tensordict.utils import NestedKey
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import AsyncEnvPool, EnvBase, TransformedEnv
 
-from lcc_rl.envs.compiled import settings
+from lcc_rl.envs.compiled import compile_settings
 from lcc_rl.envs.step import tick
 from lcc_rl.errors import LAST_SEED, ConfigError
-from lcc_rl.pieces.base import SEED, STEP, Key, as_key, require_option
+from lcc_rl.pieces.base import SEED, STEP, Entry, Key, as_key, require_option
 
 
 def batch_shape(batch_size: Sequence[int] | int) -> torch.Size:
@@ -71,6 +71,15 @@ class Clock(EnvBase):
         ConfigError: if the horizon is not positive, the batch is empty or no whole numbers, or the
             seed is out of range.
     """
+
+    entries = (
+        Entry(SEED, "–", "seed from which everything random in the episode follows"),
+        Entry(STEP, "–", "steps since the start of the episode"),
+        Entry("done", "–", "terminated or truncated"),
+        Entry("terminated", "–", "a collision ended the episode, where collisions do"),
+        Entry("truncated", "–", "the horizon is reached"),
+        Entry("automated.action", "–", "action in [−1, 1]"),
+    )
 
     def __init__(
         self,
@@ -163,7 +172,7 @@ class Traffic(TransformedEnv):
         Settings of pieces are not compared at every step, unless a ``mode``, a ``backend`` or
         ``options`` are given.
         """
-        own = {} if {"mode", "backend", "options"} & set(given) else settings()
+        own = {} if {"mode", "backend", "options"} & set(given) else compile_settings()
         super().compile(warmup=warmup, **{**own, **given})
         return self
 

@@ -17,9 +17,9 @@ from torchrl.envs.utils import RandomPolicy
 
 from lcc_rl.envs.compiled import Compiled
 from lcc_rl.envs.single import SingleAgent, group_key
-from lcc_rl.envs.step import DONE, Step, closure, entries, leaves, pieces_of
+from lcc_rl.envs.step import DONE, Step, closure, entries_of, leaf_keys, pieces_of, read_before
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.pieces.base import NEXT, SEED, STEP, Key, State, StepTransform, as_key, root_key
+from lcc_rl.pieces.base import NEXT, Key, State, as_key, root_key
 
 
 class StringCollector(BaseCollector):
@@ -93,7 +93,7 @@ class StringCollector(BaseCollector):
         after = [(NEXT, *self._shown(key)) for key in [*state, *rewards]]
         asked = keys if keys is not None else [*known, *after]
         every = [*known, *rewards]
-        return list(dict.fromkeys(leaf for key in asked for leaf in leaves(key, every)))
+        return list(dict.fromkeys(leaf for key in asked for leaf in leaf_keys(key, every)))
 
     def _inner(self, key: Key) -> Key:
         """Return the key under which the pieces know an entry."""
@@ -106,12 +106,9 @@ class StringCollector(BaseCollector):
 
     def _needed(self) -> set[Key]:
         """Return the entries of a moment that the next step reads, or that a batch shows."""
-        read = {SEED, STEP, DONE, *map(self._inner, self.reads)}
+        read = {DONE, *map(self._inner, self.reads)}
         read |= {self._inner(key) for key in self.keys if key[0] != NEXT}
-        for piece, _ in self.step.pieces:
-            read |= {key for late, key in piece.needs if not late}
-            read |= set(piece.constants) if isinstance(piece, StepTransform) else set()
-        return read
+        return read | read_before(piece for piece, _ in self.step.pieces)
 
     def reset(self) -> None:
         """Begin new episodes everywhere."""
@@ -119,7 +116,7 @@ class StringCollector(BaseCollector):
         self.state = {key: value for key, value in begun.items() if key in self.carried}
 
     def _entries(self, td: TensorDictBase) -> State:
-        shown = entries(td)
+        shown = entries_of(td)
         return {
             self._inner(key): value.unsqueeze(-2) if self._inner(key) != key else value
             for key, value in shown.items()

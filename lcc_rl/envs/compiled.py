@@ -33,7 +33,9 @@ class Compiled:
     def __init__(self, function: Callable[..., Any], what: str, compiled: bool) -> None:
         self.plain, self.what = function, what
         # One graph for each size: a graph for any size would be slower.
-        self.function = compile(function, dynamic=False, **settings()) if compiled else function
+        self.function = (
+            compile(function, dynamic=False, **compile_settings()) if compiled else function
+        )
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the function."""
@@ -59,7 +61,7 @@ def _checked(guards: Sequence[Any]) -> list[bool]:
     ]
 
 
-def settings() -> dict[str, Any]:
+def compile_settings() -> dict[str, Any]:
     """Return settings of ``torch.compile`` for functions of an environment.
 
     Apart from other objects' compilations of the same code, whose guards would be tried first and

@@ -18,7 +18,6 @@ from lcc_rl.config.schemas import AUTO, ScenarioConfig, StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.clock import Clock, Traffic, batch_shape
-from lcc_rl.envs.finite import ACTION
 from lcc_rl.envs.inputs import build_energy, load_inputs
 from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import Pieces
@@ -34,11 +33,12 @@ from lcc_rl.pieces import (
     EnergyClasses,
     Handover,
     Piece,
-    Places,
+    RolePlaces,
     Sensors,
     StringMotion,
     TotalReward,
 )
+from lcc_rl.pieces.base import ACTION
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.hybrid import check_spacing
 from lcc_rl.pieces.world import World
@@ -151,7 +151,7 @@ def _check_roles(roles: Iterable[str], where: str, scenario: ScenarioConfig) -> 
 def _size(pieces: Sequence[Piece], batch_size: Sequence[int] | int) -> int:
     """Return the bytes that a step of a batch of episodes needs at the least."""
     one = torch.Size([1])
-    specs = [spec for piece in pieces for spec in piece.written_specs(one, None).values()]
+    specs = [spec for piece in pieces for spec in piece.specs(one, None, piece.targets).values()]
     moment = sum(spec.shape.numel() * spec.dtype.itemsize for spec in specs)
     return MOMENTS * moment * math.prod(batch_shape(batch_size))
 
@@ -180,7 +180,7 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
         [own.bind(world, role) for role, own in group.items()]
         for group in (world.actuators, world.sensors)
     )
-    pieces += [Places().bind(world), *classes, *drivers, *actuators]
+    pieces += [RolePlaces().bind(world), *classes, *drivers, *actuators]
     pieces += [_motion(scenario, world), *sensors]
     pieces += _watchers(drivers, world)
     pieces += [node.made(Piece).bind(world, name) for name, node in named.items()]

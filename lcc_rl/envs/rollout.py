@@ -11,13 +11,20 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.compiled import Compiled
-from lcc_rl.envs.finite import ACTION
-from lcc_rl.envs.step import DONE, TERMINATED, Step, closure, pieces_of, written
-from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces.base import NEXT, SEED, STEP, Piece, State, StepTransform, as_key
+from lcc_rl.envs.step import DONE, TERMINATED, Step, closure, pieces_of, read_before, written
+from lcc_rl.pieces.base import (
+    ACTION,
+    OBSERVATION,
+    SEED,
+    STEP,
+    Piece,
+    State,
+    StepTransform,
+    as_key,
+)
+from lcc_rl.pieces.views import NEXT
 
 Network = Callable[[Tensor], Tensor]
-OBSERVATION = (AUTOMATED, "observation")
 
 
 class DifferentiableRollout:
@@ -57,11 +64,10 @@ class DifferentiableRollout:
         kept = known & (
             {key for piece in self.after for _, key in piece.needs} | every | {STEP, ACTION}
         )
-        steps = [piece for piece in inside if isinstance(piece, StepTransform)]
-        read = {key for piece in steps for late, key in piece.needs if not late}
         # A compiled step takes its time for every entry that it returns: only those that are used.
-        self.constants = sorted({SEED}.union(*(piece.constants for piece in steps)))
-        self.moving = sorted((kept | read & known | {STEP}) - {ACTION, *self.constants})
+        self.constants = sorted({SEED}.union(*(piece.constants for piece in inside)))
+        read = read_before(inside) & known
+        self.moving = sorted((kept | read | {STEP}) - {ACTION, *self.constants})
         self.recorded = sorted(kept)
         self.advance = Compiled(self._advance, "the simulator", compiled)
 
@@ -132,6 +138,4 @@ class DifferentiableRollout:
 
 def _is_recurrent(piece: Piece) -> bool:
     """Whether a piece reads what it wrote one moment before."""
-    if not isinstance(piece, StepTransform):
-        return False
     return bool({key for late, key in piece.needs if not late} & written([piece]))

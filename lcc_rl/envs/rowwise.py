@@ -7,57 +7,22 @@ microseconds. The statements are not written anywhere: they are recorded from th
 
 from __future__ import annotations
 
-import ctypes
 import logging
 from collections.abc import Callable, Sequence
-from functools import cache
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from numba.core.errors import NumbaError
-from numba.extending import get_cython_function_address
 from torch import Tensor
 
-from lcc_rl.envs.recorder import Recorder, Untranslatable
+from lcc_rl.functional.machine_code import compiled
+from lcc_rl.functional.recorder import Recorder, Untranslatable
 
 log = logging.getLogger("lcc_rl")
 
 Array = np.ndarray[Any, Any]
 TensorFunction = Callable[..., Sequence[Tensor]]
-
-
-@numba.njit
-def pick(condition: Any, one: Any, other: Any) -> Any:
-    """Return one of two numbers; as a function, so that the loop has no branches."""
-    return one if condition else other
-
-
-@numba.njit(boundscheck=True)
-def read(table: Any, place: Any) -> Any:
-    """Return an entry of a table.
-
-    Raises:
-        IndexError: if there is none at that place.
-    """
-    return table[place]
-
-
-NAMES = {
-    "pick": pick,
-    "read": read,
-    "ndtri": ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(
-        get_cython_function_address("scipy.special.cython_special", "ndtri")
-    ),
-    "f32": np.float32,
-    "f64": np.float64,
-    "i64": np.int64,
-    "flag": np.bool_,
-    "np": np,
-    "inf": np.inf,
-    "nan": np.nan,
-}
 
 
 class Rowwise:
@@ -121,15 +86,11 @@ def translated(
     with torch.no_grad(), recorder:
         results = function(*examples)
     outputs = [recorder.numbers(x, x.dtype).flatten().tolist() for x in results]
-    needed = {variable for output in outputs for variable in output}
-    for variable in reversed(range(len(recorder.statements))):
-        if variable in needed:
-            needed |= set(recorder.statements[variable][1])
-    lines = [
-        f"v{i} = " + expression.format(*(f"v{x}" for x in reads))
-        for i, (expression, reads) in enumerate(recorder.statements)
-        if i in needed
-    ]
+    needed = recorder.needed(variable for output in outputs for variable in output)
+    lines = []
+    for i in needed:
+        expression, reads = recorder.statements[i]
+        lines.append(f"v{i} = " + expression.format(*(f"v{x}" for x in reads)))
     lines += [
         f"y{place}[row, {column}] = v{variable}"
         for place, output in enumerate(outputs)
@@ -140,11 +101,3 @@ def translated(
     body = "".join(f"        {line}\n" for line in lines)
     source = f"def kernel({names}):\n    for row in range(len(x0)):\n{body}"
     return compiled(source), [table.numpy() for table in recorder.tables]
-
-
-@cache
-def compiled(source: str) -> Callable[..., None]:
-    """Return a function as machine code; environments of the same settings share it."""
-    scope = dict(NAMES)
-    exec(source, scope)
-    return numba.njit(error_model="numpy")(scope["kernel"])

@@ -7,10 +7,10 @@ from torchrl.data import Composite
 from torchrl.envs.transforms import Transform
 
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces.base import Key
+from lcc_rl.pieces.base import Entry, Key
 
 # Entries of the group that the view shows at the root, without the dimension of one.
-SHOWN = ("observation", "reward", "reward_terms")
+GROUP_ENTRIES = ("observation", "reward", "reward_terms")
 
 
 class SingleAgent(Transform):
@@ -21,12 +21,19 @@ class SingleAgent(Transform):
     of an environment.
     """
 
+    shows = (
+        Entry("observation", "–", "observation in the single-agent view"),
+        Entry("action", "–", "action in the single-agent view"),
+        Entry("reward_terms.name", "–", "terms of the reward in the single-agent view"),
+        Entry("reward", "–", "reward in the single-agent view"),
+    )
+
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         group = next_tensordict.get(AUTOMATED, None)
         if group is None:
             return next_tensordict
         group = group.copy()
-        for name in SHOWN:
+        for name in GROUP_ENTRIES:
             entry = group.pop(name, None)
             if entry is not None:
                 next_tensordict.set(name, _without(entry))
@@ -84,4 +91,4 @@ def _flat(terms: Composite) -> Composite:
 
 def group_key(key: Key) -> Key:
     """Return the key of the group that the view shows under a key of the root."""
-    return (AUTOMATED, *key) if key[0] in (*SHOWN, "action") else key
+    return (AUTOMATED, *key) if key[0] in (*GROUP_ENTRIES, "action") else key

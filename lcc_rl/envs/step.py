@@ -16,17 +16,29 @@ from torch import Tensor, compiler, device, ones_like, zeros_like
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, FrameSkipTransform, Transform
 
-from lcc_rl.envs.finite import ACTION, check_numbers
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.finite import any_lost
-from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key, root_key
-from lcc_rl.pieces.rewards import REWARD, RewardPiece, RewardTerm, TotalReward
+from lcc_rl.functional.finite import any_lost, require_finite
+from lcc_rl.pieces.base import (
+    ACTION,
+    OBSERVATION,
+    REWARD,
+    SEED,
+    STEP,
+    Key,
+    Piece,
+    RewardPiece,
+    State,
+    StepTransform,
+    as_key,
+    root_key,
+)
+from lcc_rl.pieces.rewards import RewardTerm, TotalReward
 from lcc_rl.pieces.world import World
 
 DONE, TERMINATED, TRUNCATED = ("done",), ("terminated",), ("truncated",)
 PARTIAL = "_step"  # TorchRL's name of the mask of those that take the step
 # If these entries are finite after a step, all others that matter are.
-TELLING = (("vehicles", "gap"), (ACTION[0], "observation"), REWARD)
+FINITE_CHECKED = (("vehicles", "gap"), OBSERVATION, REWARD)
 
 
 def tick(seed: Tensor, step: Tensor, horizon: int) -> State:
@@ -81,11 +93,14 @@ class Step:
 
 def written(pieces: Iterable[Piece]) -> set[Key]:
     """Return the keys that pieces write, without ``"next"``, their constants included."""
-    found: set[Key] = set()
+    return {key for piece in pieces for key in piece.entries}
+
+
+def read_before(pieces: Iterable[Piece]) -> set[Key]:
+    """Return the entries of a moment that the next step reads, constants included."""
+    found: set[Key] = {SEED, STEP}
     for piece in pieces:
-        found |= set(piece.targets)
-        if isinstance(piece, StepTransform):
-            found |= set(piece.constants)
+        found |= {key for late, key in piece.needs if not late} | set(piece.constants)
     return found
 
 
@@ -101,13 +116,13 @@ def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] =
     return [piece for piece in pieces if piece in kept]
 
 
-def entries(td: TensorDictBase) -> State:
+def entries_of(td: TensorDictBase) -> State:
     """Return the entries of a moment by their full keys."""
     # Copies: entries that begin as one tensor would cost the compiler a graph of their own.
-    return {as_key(key): td.get(key).clone() for key in td.keys(True, True)}
+    return {key: value.clone() for key, value in _read(td).items()}
 
 
-def leaves(key: NestedKey, known: Iterable[Key]) -> list[Key]:
+def leaf_keys(key: NestedKey, known: Iterable[Key]) -> list[Key]:
     """Return the keys of an entry, or of all entries below it, among those known."""
     name, place = root_key(key), as_key(key)
     prefix = place[: len(place) - len(name)]
@@ -184,7 +199,7 @@ class Pieces(Compose):
         Raises:
             Diverged: naming the first entry that is not, its step and its episode.
         """
-        telling = [td.get(ACTION, None), *(next_td.get(key, None) for key in TELLING)]
+        telling = [td.get(ACTION, None), *(next_td.get(key, None) for key in FINITE_CHECKED)]
         if not any_lost(value for value in telling if value is not None):
             return
         pieces = [piece for piece in self.transforms if isinstance(piece, Piece)]
@@ -194,7 +209,7 @@ class Pieces(Compose):
         running = ones_like(next_td.get(DONE)) if done is None else ~done
         batch = running.numel()
         reached = {k: x.reshape(1, batch, -1) for k, x in named.items() if x is not None}
-        check_numbers(reached, running.reshape(1, batch, 1), int(next_td.get(STEP).max()))
+        require_finite(reached, running.reshape(1, batch, 1), int(next_td.get(STEP).max()))
 
     def inv(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the inverse of what is not a piece, last first."""
@@ -274,7 +289,7 @@ def _apply(pieces: list[Piece], td: TensorDictBase, next_td: TensorDictBase) -> 
     return _tensordict(spaces, batch, device)
 
 
-def _tensordict(entries: dict[str, Any], batch: BatchSize, device: device | None) -> TensorDict:
+def _tensordict(entries_of: dict[str, Any], batch: BatchSize, device: device | None) -> TensorDict:
     """Return nested entries as a TensorDict.
 
     TensorDict's own check of every shape costs as much as the physics; the shapes were checked
@@ -282,6 +297,6 @@ def _tensordict(entries: dict[str, Any], batch: BatchSize, device: device | None
     """
     made = {
         name: _tensordict(value, batch, device) if isinstance(value, dict) else value
-        for name, value in entries.items()
+        for name, value in entries_of.items()
     }
     return TensorDict._new_unsafe(made, batch_size=batch, device=device)

@@ -17,15 +17,16 @@ from lcc_rl.envs.inputs import Inputs
 from lcc_rl.evaluation.rollout import play, reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces.hybrid import COUNTERS, HYBRID
+from lcc_rl.pieces.base import REWARD
+from lcc_rl.pieces.hybrid import COUNTERS, WINNER
 from lcc_rl.results.windows import DRIVE, SOURCE
 
 WINDOWS = "windows"
 ERRORS = ("gap_error", "speed_error", "leader_speed_error")
 RECORDED = ("speed", "gap", "acceleration", "jerk", "power", *ERRORS)
-INDEX, REWARD = (AUTOMATED, "index"), (AUTOMATED, "reward")
+INDEX = (AUTOMATED, "index")
 KEYS = [("leader", "speed"), *(("vehicles", name) for name in RECORDED), REWARD]
-KEYS += [INDEX, *((HYBRID, name) for name in ("winner", *COUNTERS))]
+KEYS += [INDEX, WINNER, *COUNTERS]
 Series = dict[str, Tensor]  # ``[time, runs, vehicles]``
 
 
@@ -144,7 +145,7 @@ def measure(series: Series) -> pd.DataFrame:
     }
     if "winner" in series:
         columns["learned_share"] = series["winner"].double().mean(0)
-        columns |= {name: series[name][-1] for name in COUNTERS}
+        columns |= {name: series[name][-1] for _, name in COUNTERS}
     runs, vehicles = energy.shape
     frame = pd.DataFrame({name: value.flatten().cpu().numpy() for name, value in columns.items()})
     frame.insert(0, "run_id", np.repeat(np.arange(runs), vehicles))

@@ -23,14 +23,13 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.energy import Fleet, as_fleet
 from lcc_rl.envs import DifferentiableRollout, build_env
 from lcc_rl.envs.inputs import Inputs, build_energy
-from lcc_rl.envs.rollout import ACTION
 from lcc_rl.errors import require
 from lcc_rl.evaluation.episodes import any_leader, pairs
 from lcc_rl.evaluation.metrics import KILO, LONG_TIME_GAP, UNSAFE_TTC
 from lcc_rl.evaluation.rollout import reset_options
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
-from lcc_rl.pieces.base import STEP, next_key
+from lcc_rl.pieces.base import ACTION, STEP, next_key
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.views import VEHICLES, Views
 

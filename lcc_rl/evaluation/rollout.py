@@ -10,12 +10,14 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.compiled import Compiled
-from lcc_rl.envs.finite import ACTION, check_numbers
-from lcc_rl.envs.step import TERMINATED, Step, closure, entries, pieces_of, written
+from lcc_rl.envs.step import TERMINATED, Step, closure, entries_of, pieces_of, written
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.random import MASK, STREAM, hash_bits
-from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, as_key
+from lcc_rl.functional.finite import require_finite
+from lcc_rl.functional.pattern import HUMAN
+from lcc_rl.functional.random import LOW_BITS, STREAM_INCREMENT, hash_bits
+from lcc_rl.pieces.base import ACTION, SEED, STEP, Key, Piece, State, as_key
 from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.leader import PROFILE, PROFILE_START
 from lcc_rl.pieces.string import COMMAND, WANTED
 
 # Reads and writes a TensorDict; None where a rule drives.
@@ -23,7 +25,7 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 Record = dict[Key, Tensor]
 # The next state, the entries to keep, which episodes run, and a sum of all that was written.
 Advanced = tuple[State, list[Tensor], Tensor]
-PROFILE, START, DRIVER = ("leader", "profile"), ("leader", "start"), ("human", "driver")
+DRIVER = (HUMAN, "driver")
 
 
 def play(
@@ -115,14 +117,14 @@ class Player:
                     record[key][0] = before[key]
                 record[key][step + first] = value
         after = {key: record[key][-self.horizon :] for key in self.checked}
-        if check_numbers(after, torch.stack(alive), who=self.who, named=named):
+        if require_finite(after, torch.stack(alive), who=self.who, named=named):
             for value in after.values():
                 value.nan_to_num_(0.0, 0.0, 0.0)
         return {key: record[key] for key in self.kept}, torch.stack(alive)
 
     def _begin(self, given: TensorDictBase) -> State:
         """Return the first moment of the episodes."""
-        state = entries(self.env.reset(given))
+        state = entries_of(self.env.reset(given))
         if self.policy is not None and not self.reads:
             return state  # it may read anything
         carried = {SEED, STEP, TERMINATED, *written(piece for piece, _ in self.step.pieces)}
@@ -176,14 +178,14 @@ def reset_options(
     batch = env.batch_size
     # Every episode gets its own stream. A string begins with the driver it is named after, those
     # of the next ids follow: every driver is met equally often in every place.
-    number = profile * drivers + driver + repeat * STREAM
+    number = profile * drivers + driver + repeat * STREAM_INCREMENT
     given = TensorDict(batch_size=batch, device=env.device)
-    given.set(SEED, (hash_bits(number + (seed * 0x9E3779B1 & MASK)) >> 1).unsqueeze(-1))
+    given.set(SEED, (hash_bits(number + (seed * 0x9E3779B1 & LOW_BITS)) >> 1).unsqueeze(-1))
     spec = env.full_state_spec
     known = [as_key(key) for key in spec.keys(True, True)]
     if PROFILE in known:
         given.set(PROFILE, profile.unsqueeze(-1))
-        given.set(START, torch.zeros_like(profile).unsqueeze(-1))
+        given.set(PROFILE_START, torch.zeros_like(profile).unsqueeze(-1))
     if DRIVER in known:
         place = torch.arange(spec[DRIVER].shape[-2]).unsqueeze(-1)
         given.set(DRIVER, (driver.view(-1, 1, 1) + place) % drivers)

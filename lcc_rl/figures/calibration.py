@@ -9,7 +9,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lcc_rl.drivers.twins import REACTING, RECORDED, TWINS, densities, ratios
+from lcc_rl.drivers.parameters import DEFAULT_MODEL, MODEL, parameters_of
+from lcc_rl.drivers.twins import REACTING, RECORDED_DRIVERS, TWINS, densities, ratios
 from lcc_rl.errors import DataError
 from lcc_rl.figures.drawing import (
     COLUMN,
@@ -23,23 +24,11 @@ from lcc_rl.figures.drawing import (
     style,
     unbox,
 )
-from lcc_rl.functional.laws import LAWS
 from lcc_rl.results.render import signed
 
 COLOURS = {"local": "#0072b2", "global": "#d55e00"}
-DRIVERS = {RECORDED: INK, TWINS: "#d55e00", REACTING: "#0072b2"}
+DRIVERS = {RECORDED_DRIVERS: INK, TWINS: "#d55e00", REACTING: "#0072b2"}
 RATIOS = {"energy": "energy\nper km", "lost": "lost to\naccelerating", "distance": "distance"}
-PARAMETERS = {
-    "desired_speed": ("desired_speed_mps", "desired speed $v_0$ [m/s]"),
-    "time_gap": ("time_gap_s", "time gap $T$ [s]"),
-    "acceleration": ("acceleration_mps2", "acceleration $a$ [m/s²]"),
-    "deceleration": ("deceleration_mps2", "deceleration $b$ [m/s²]"),
-    "min_gap": ("min_gap_m", "standstill gap $s_0$ [m]"),
-    "sensitivity": ("sensitivity_hz", "sensitivity $\\kappa$ [1/s]"),
-    "form": ("form", "form $\\beta$"),
-    "speed_gain": ("speed_gain_hz", "speed gain $\\lambda$ [1/s]"),
-    "leader_deceleration": ("leader_deceleration_mps2", "believed $\\hat{b}$ [m/s²]"),
-}
 
 
 @paper
@@ -57,9 +46,9 @@ def calibration_figure(drivers: pd.DataFrame) -> Figure:
     modes = _modes(drivers)
     # Parameters held constant in every mode would be empty panels.
     shown = {
-        name: pair
-        for name, pair in PARAMETERS.items()
-        if pair[0] in drivers and drivers[pair[0]].nunique() > 1
+        name: one
+        for name, one in parameters_of(_models(drivers)).items()
+        if drivers[one.column].nunique() > 1
     }
     rows = 1 + len(shown) // 3
     figure = new_figure(PAGE, 0.4 + 1.9 * rows)
@@ -68,9 +57,9 @@ def calibration_figure(drivers: pd.DataFrame) -> Figure:
         axis.remove()
     _boxes(first, {mode: 100.0 * part["rmspe"] for mode, part in modes.items()})
     first.set_title("speed error RMSPE [%]")
-    for axis, (name, (column, label)) in zip(others, shown.items(), strict=False):
-        _boxes(axis, {mode: part[column] for mode, part in modes.items()})
-        axis.set_title(label)
+    for axis, (name, one) in zip(others, shown.items(), strict=False):
+        _boxes(axis, {mode: part[one.column] for mode, part in modes.items()})
+        axis.set_title(one.label)
         # The share of drivers whose parameter lies on a bound of the search.
         flags = {mode: part[f"{name}_at_bound"].mean() for mode, part in modes.items()}
         texts = [f"{mode} {100 * share:.0f} %" for mode, share in flags.items() if share > 0.0]
@@ -142,11 +131,11 @@ def twins_figure(twins: pd.DataFrame) -> Figure:
             spectra.semilogy(density.index, density, **look)
             ordered = np.sort(one["gap_m"])
             gaps.plot(ordered, np.linspace(0.0, 1.0, len(ordered)), **look)
-            if who != RECORDED:
-                near = ratios(one, found[RECORDED])
+            if who != RECORDED_DRIVERS:
+                near = ratios(one, found[RECORDED_DRIVERS])
                 places = [100.0 * (near[name] - 1.0) for name in RATIOS]
                 share.plot(places, range(len(RATIOS)), "o", color=DRIVERS[who], label=who)
-        share.axvline(0.0, color=DRIVERS[RECORDED], linewidth=1.0)
+        share.axvline(0.0, color=DRIVERS[RECORDED_DRIVERS], linewidth=1.0)
         share.set_yticks(range(len(RATIOS)), list(RATIOS.values()))
         share.set_ylim(len(RATIOS) - 0.5, -0.5)
         style(spectra, "frequency [Hz]", "acceleration [m²/s⁴/Hz]")
@@ -162,11 +151,14 @@ def twins_figure(twins: pd.DataFrame) -> Figure:
     return figure
 
 
+def _models(drivers: pd.DataFrame) -> list[str]:
+    return list(drivers[MODEL].unique()) if MODEL in drivers else [DEFAULT_MODEL]
+
+
 def _modes(drivers: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Split the table by mode, local first."""
-    models = drivers["model"].unique() if "model" in drivers else ["idm"]
-    names = [name for name in PARAMETERS if any(name in LAWS[x].parameters for x in models)]
-    columns = [PARAMETERS[name][0] for name in names] + [f"{name}_at_bound" for name in names]
+    table = parameters_of(_models(drivers))
+    columns = [one.column for one in table.values()] + [f"{name}_at_bound" for name in table]
     missing = [name for name in ("mode", "rmspe", *columns) if name not in drivers]
     if missing:
         raise DataError(f"driver table: missing column(s) {', '.join(missing)}")

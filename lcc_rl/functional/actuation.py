@@ -53,7 +53,7 @@ class Response:
 
 
 @dataclass(frozen=True)
-class Motion:
+class PairState:
     """State of a vehicle and of the one ahead at a moment.
 
     Args:
@@ -66,17 +66,17 @@ class Motion:
     ahead: Tensor
     acceleration: Tensor
 
-    def after(self, own: Tensor, ahead: Tensor | float, time_step: float) -> Motion:
+    def after(self, own: Tensor, ahead: Tensor | float, time_step: float) -> PairState:
         """Return the motion after a step with accelerations of both [m/s²]; none reverses."""
         speed, _ = advance_speed(self.speed, own, time_step)
         reached, _ = advance_speed(self.ahead, torch.as_tensor(ahead), time_step)
         gap = advance_gap(self.gap, self.ahead, self.speed, reached, speed, time_step)
-        return Motion(speed, gap, reached, own)
+        return PairState(speed, gap, reached, own)
 
 
 def predicted(
-    now: Motion, pending: Tensor, ahead_acceleration: Tensor | float, response: Response
-) -> list[Motion]:
+    now: PairState, pending: Tensor, ahead_acceleration: Tensor | float, response: Response
+) -> list[PairState]:
     """Return the motion after every step in which commands already given act.
 
     Args:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from lcc_rl.functional.actuation import Motion, Response, predicted
+from lcc_rl.functional.actuation import PairState, Response, predicted
 
 HALVINGS, NEARBY = 16, 1e-2  # of the range of accelerations; step of a slope [m/s²]
 
@@ -75,7 +75,9 @@ def _room_at(
     return gap - tau * reached - 0.5 * over**2 / own
 
 
-def least_room_held(motion: Motion, acceleration: Tensor, time: float, braking: Braking) -> Tensor:
+def least_room_held(
+    motion: PairState, acceleration: Tensor, time: float, braking: Braking
+) -> Tensor:
     """Return the least room to come if a vehicle brakes fully after it held an acceleration.
 
     The vehicle ahead brakes fully from now on.
@@ -109,7 +111,7 @@ def least_room_held(motion: Motion, acceleration: Tensor, time: float, braking: 
     return least
 
 
-def least_room_late(motion: Motion, response: Response, braking: Braking) -> Tensor:
+def least_room_late(motion: PairState, response: Response, braking: Braking) -> Tensor:
     """Return the least room to come while a vehicle brakes fully that obeys with a lag.
 
     At most that: see :attr:`lcc_rl.functional.actuation.Response.hold`.
@@ -123,7 +125,7 @@ def least_room_late(motion: Motion, response: Response, braking: Braking) -> Ten
 
 
 def least_room_to_come(
-    now: Motion, pending: Tensor, response: Response, braking: Braking
+    now: PairState, pending: Tensor, response: Response, braking: Braking
 ) -> Tensor:
     """Return the least room to come while commands under way act, then full braking.
 
@@ -140,7 +142,7 @@ def least_room_to_come(
     return torch.stack([*rooms, least_room_late(path[-1], response, braking)]).amin(0)
 
 
-def safe_command(motion: Motion, response: Response, braking: Braking) -> Tensor:
+def safe_command(motion: PairState, response: Response, braking: Braking) -> Tensor:
     """Return the largest command after which a vehicle that obeys with a lag is still safe.
 
     Held for a step and for what the lag costs, the acceleration that it leads to must leave room;

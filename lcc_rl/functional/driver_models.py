@@ -3,40 +3,172 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Self
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from lcc_rl.errors import require_positive
+from lcc_rl.functional.kinematics import advance_gap, advance_speed
 
 
-class DriverConstants:
-    """Base of the parameters of a driver model besides v0 and T: a frozen dataclass each.
+class Parameter(NamedTuple):
+    """A parameter that a calibration may fit, of one driver model or several.
 
-    Every model has ``min_gap``, the gap at standstill [m], and the physical limits
-    ``braking_limit`` and ``acceleration_limit`` [m/s²].
+    column: its name in tables, with the unit; label: its name, symbol and unit for people; bounds:
+    of a calibration, by default; plausible: the range beyond which a table is in other units, or
+    not one of drivers.
+    """
+
+    column: str
+    label: str
+    bounds: tuple[float, float]
+    plausible: tuple[float, float]
+
+
+_ACCELERATION = (0.05, 20.0)  # plausible [m/s²]
+_RATE = (0.001, 20.0)  # plausible [1/s]
+# The parameters of all models; a model of your own adds those that it alone has.
+PARAMETERS: dict[str, Parameter] = {
+    "desired_speed": Parameter(
+        "desired_speed_mps", "desired speed $v_0$ [m/s]", (5.0, 40.0), (1.0, 100.0)
+    ),
+    "time_gap": Parameter("time_gap_s", "time gap $T$ [s]", (0.3, 4.0), (0.05, 20.0)),
+    "acceleration": Parameter(
+        "acceleration_mps2", "acceleration $a$ [m/s²]", (0.3, 4.0), _ACCELERATION
+    ),
+    "deceleration": Parameter(
+        "deceleration_mps2", "deceleration $b$ [m/s²]", (0.3, 5.0), _ACCELERATION
+    ),
+    "min_gap": Parameter("min_gap_m", "standstill gap $s_0$ [m]", (0.5, 5.0), (0.05, 50.0)),
+    "sensitivity": Parameter(  # of ovm and fvdm
+        "sensitivity_hz", "sensitivity $\\kappa$ [1/s]", (0.05, 5.0), _RATE
+    ),
+    "form": Parameter("form", "form $\\beta$", (0.05, 3.0), (0.001, 10.0)),  # of ovm and fvdm
+    "speed_gain": Parameter(  # of fvdm
+        "speed_gain_hz", "speed gain $\\lambda$ [1/s]", (0.05, 3.0), _RATE
+    ),
+    "leader_deceleration": Parameter(  # of gipps
+        "leader_deceleration_mps2",
+        "leader deceleration $\\hat{b}$ [m/s²]",
+        (0.3, 5.0),
+        _ACCELERATION,
+    ),
+}
+INDIVIDUAL = ("desired_speed", "time_gap")  # what every driver has of its own, whatever the model
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriverConstants(ABC):
+    """A driver model: its law, and its parameters besides v0 and T; a frozen dataclass each.
+
+    Every model has ``min_gap``, the gap s0 at standstill [m].
+
+    Args:
+        braking_limit: largest physical deceleration, positive [m/s²].
+        acceleration_limit: largest physical acceleration [m/s²].
 
     Raises:
         ConfigError: if a parameter is not positive.
     """
 
-    min_gap: float
-    braking_limit: float
-    acceleration_limit: float
+    min_gap = 2.0  # without annotation: each model places it among its parameters
+    own: ClassVar[Mapping[str, Parameter]] = {}  # parameters that no other model has
+
+    braking_limit: float = 8.0
+    acceleration_limit: float = 5.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not isinstance(value, Tensor):
                 require_positive(f"{type(self).__name__.removesuffix('Constants')}.{name}", value)
 
+    @abstractmethod
+    def wish(
+        self,
+        speed: Tensor,
+        gap: Tensor,
+        approach_rate: Tensor,
+        desired_speed: Tensor | float,
+        time_gap: Tensor | float,
+    ) -> Tensor:
+        """Return the acceleration that the driver wishes [m/s²]; arguments as of a call."""
+
+    @abstractmethod
+    def steady_gap(self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor) -> Tensor:
+        """Return the gap of :meth:`equilibrium_gap` without its cap [m]."""
+
+    def __call__(
+        self,
+        speed: Tensor,
+        gap: Tensor,
+        approach_rate: Tensor,
+        desired_speed: Tensor | float,
+        time_gap: Tensor | float,
+    ) -> Tensor:
+        """Return the acceleration of the law, held within physical limits.
+
+        Args:
+            speed: speed v of the follower [m/s].
+            gap: bumper-to-bumper gap s to the vehicle ahead [m].
+            approach_rate: Δv = v − v_ahead, positive when closing [m/s].
+            desired_speed: v0 [m/s].
+            time_gap: T [s].
+
+        Returns:
+            Acceleration [m/s²], broadcast over the arguments.
+        """
+        return self.limited(self.wish(speed, gap, approach_rate, desired_speed, time_gap))
+
+    def equilibrium_gap(
+        self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor, cap_time_gap: float = 3.0
+    ) -> Tensor:
+        """Return the gap at which a driver keeps its speed behind an equally fast leader.
+
+        It may diverge as v approaches v0 and is capped at ``2·s0 + cap_time_gap·v``; the papers
+        do not say how a follower starts.
+
+        Args:
+            speed: common speed v [m/s].
+            desired_speed: v0 [m/s].
+            time_gap: T [s].
+            cap_time_gap: time gap of the cap [s].
+
+        Returns:
+            Gap [m], broadcast over the arguments.
+        """
+        return self.capped(self.steady_gap(speed, desired_speed, time_gap), speed, cap_time_gap)
+
+    def limited(self, acceleration: Tensor) -> Tensor:
+        """Hold an acceleration within what a car can do [m/s²]."""
+        return acceleration.clamp(-self.braking_limit, self.acceleration_limit)
+
+    def capped(self, gap: Tensor, speed: Tensor, cap_time_gap: float) -> Tensor:
+        """Hold an equilibrium gap below ``2·s0 + cap_time_gap·v`` [m]."""
+        return torch.minimum(gap, 2.0 * self.min_gap + cap_time_gap * speed)
+
+    @classmethod
+    def table(cls) -> dict[str, Parameter]:
+        """Return the parameters that a calibration may fit, v0 and T first."""
+        known = {**PARAMETERS, **cls.own}
+        names = [*INDIVIDUAL, *(field.name for field in fields(cls))]
+        return {name: known[name] for name in names if name in known}
+
+    @classmethod
+    def shared(cls) -> tuple[str, ...]:
+        """Return the names of the parameters besides v0 and T."""
+        return tuple(cls.table())[len(INDIVIDUAL) :]
+
     def with_(self, **changes: Tensor | float) -> Self:
         """Return a copy in which some constants vary by driver (tensors, for calibration)."""
-        return replace(self, **changes)  # type: ignore[type-var]
+        return replace(self, **changes)  # type: ignore[arg-type]
 
-    def shared(self) -> Self:
+    def mean(self) -> Self:
         """Return a copy with the mean in place of what varies by driver."""
         varying = {name: x for name, x in vars(self).items() if isinstance(x, Tensor)}
         return self.with_(**{name: float(x.mean()) for name, x in varying.items()})
@@ -93,35 +225,70 @@ class NoiseStep:
         return 2.0 * self.kept * latest - self.kept**2 * before + self.new * drawn
 
 
-def limit(acceleration: Tensor, constants: DriverConstants) -> Tensor:
-    """Hold an acceleration within what a car can do [m/s²]."""
-    return acceleration.clamp(-constants.braking_limit, constants.acceleration_limit)
-
-
-def capped(gap: Tensor, speed: Tensor, constants: DriverConstants, cap_time_gap: float) -> Tensor:
-    """Hold an equilibrium gap, which diverges near v0, below ``2·s0 + cap_time_gap·v`` [m]."""
-    return torch.minimum(gap, 2.0 * constants.min_gap + cap_time_gap * speed)
-
-
-@dataclass(frozen=True)
-class DriverLaw:
-    """A driver model: how it accelerates, and which parameters it has.
+def follow(
+    law: DriverConstants,
+    leader_speed: Tensor,
+    speed: Tensor,
+    gap: Tensor,
+    own: tuple[Tensor, Tensor],
+    time_step: float,
+    late: int = 0,
+    disturbed: Callable[[int, Tensor], Tensor] | None = None,
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Drive a follower behind a leader, step by step (A18).
 
     Args:
-        acceleration: of (speed [m/s], gap [m], approach rate v − v_ahead [m/s], v0 [m/s], T [s],
-            constants), all broadcast [m/s²].
-        equilibrium_gap: gap at which it follows steadily, of (speed, v0, T, constants,
-            cap_time_gap) [m].
-        constants: class of its constants.
-        parameters: names of the parameters that a calibration may fit, v0 and T first.
+        law: the follower's driver model.
+        leader_speed: speed of the leader, ``[time + 1, *batch]`` [m/s].
+        speed: initial speed of the follower, ``[*batch]`` [m/s].
+        gap: initial gap, ``[*batch]`` [m].
+        own: v0 [m/s] and T [s], broadcastable to ``[*batch]``.
+        time_step: duration of a step [s].
+        late: steps by which speed, gap and relative speed are old when the driver reacts; until
+            then, they are those of the start.
+        disturbed: makes the command that is executed out of the number of the step and the law's.
+
+    Yields:
+        Speed, gap and executed acceleration after each step, ``[*batch]``.
+    """
+    seen: deque[tuple[Tensor, Tensor, Tensor]] = deque(maxlen=late + 1)
+    for step, (ahead, ahead_reached) in enumerate(pairwise(leader_speed)):
+        now = (speed, gap, speed - ahead)
+        seen.extend([now] * (1 if seen else late + 1))
+        command = law(*seen[0], *own)
+        if disturbed is not None:
+            command = disturbed(step, command)
+        reached, executed = advance_speed(speed, command, time_step)
+        gap = advance_gap(gap, ahead, speed, ahead_reached, reached, time_step)
+        speed = reached
+        yield speed, gap, executed
+
+
+def simulate_follower(
+    leader_speed: Tensor,
+    speed: Tensor,
+    gap: Tensor,
+    desired_speed: Tensor,
+    time_gap: Tensor,
+    law: DriverConstants,
+    time_step: float,
+    noise: Callable[[int], Tensor] | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the motion of :func:`follow` from the start on; most arguments are described there.
+
+    Args:
+        leader_speed, speed, gap, law, time_step: see there.
+        desired_speed, time_gap: v0 [m/s] and T [s], broadcastable to ``[*batch]``.
+        noise: gives the relative error ξ of the executed acceleration at a step (A18), if any.
+
+    Returns:
+        Speeds and gaps of shape ``[time + 1, *batch]`` and accelerations ``[time, *batch]``.
     """
 
-    acceleration: Callable[..., Tensor]
-    equilibrium_gap: Callable[..., Tensor]
-    constants: type[DriverConstants]
-    parameters: tuple[str, ...]
+    def strayed(step: int, command: Tensor) -> Tensor:
+        return command if noise is None else command * (1.0 + noise(step))
 
-    @property
-    def shared(self) -> tuple[str, ...]:
-        """The parameters besides v0 and T."""
-        return self.parameters[2:]
+    own = (desired_speed, time_gap)
+    motion = follow(law, leader_speed, speed, gap, own, time_step, disturbed=strayed)
+    speeds, gaps, accelerations = zip(*motion, strict=True)
+    return torch.stack([speed, *speeds]), torch.stack([gap, *gaps]), torch.stack(accelerations)

@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.driver_models import limit
 from lcc_rl.functional.idm import IDMConstants, power
 from lcc_rl.functional.layout import join, reverse
 
@@ -110,7 +109,7 @@ def _linearised(
     dynamic = (speed * (time_gap + approach_rate / root)).clamp(min=0.0)
     ratio = (constants.min_gap + dynamic) * inverse_gap
     free = power(speed / REFERENCE_SPEED, constants.exponent)
-    predicted = limit(constants.acceleration * (1.0 - free * q - ratio * ratio), constants)
+    predicted = constants.limited(constants.acceleration * (1.0 - free * q - ratio * ratio))
     # The slope by T is zero where T does not matter.
     slope_t = (-2.0 * constants.acceleration) * ratio * (speed * inverse_gap) * (dynamic > 0.0)
     curvature = constants.acceleration * (speed * inverse_gap).square()
@@ -176,7 +175,7 @@ class PopulationMean(torch.nn.Module):
         self.register_buffer("sums", torch.cat([above, torch.zeros(1, 3)]).float())
 
     def forward(self, speed: Tensor, gap: Tensor, approach_rate: Tensor) -> Tensor:
-        """Return the mean acceleration [m/s²]; arguments as in ``idm_acceleration``."""
+        """Return the mean acceleration [m/s²]; arguments as of :class:`IDMConstants`."""
         known = self.constants
         shift = approach_rate * (0.5 / (known.acceleration * known.deceleration) ** 0.5)
         index = reverse(torch.searchsorted(self.thresholds, reverse(-shift.detach()).contiguous()))
@@ -188,6 +187,5 @@ class PopulationMean(torch.nn.Module):
         gap_squared = s0 * s0 + speed * (2.0 * s0 * linear + speed * squared)
         inverse_gap = gap.clamp(min=known.gap_floor).reciprocal()
         free = power(speed, known.exponent) * self.inverse_power
-        return limit(
-            known.acceleration * (1.0 - free - gap_squared * (inverse_gap * inverse_gap)), known
-        )
+        square = gap_squared * (inverse_gap * inverse_gap)
+        return known.limited(known.acceleration * (1.0 - free - square))

@@ -19,7 +19,7 @@ from lcc_rl.functional.kinematics import advance_gap, advance_speed
 Choice = Literal["better", "between", "first"]
 
 
-class Place(NamedTuple):
+class PlatoonPlace(NamedTuple):
     """Place of a vehicle in its platoon, each ``[*batch, N, 1]``.
 
     leader_gap: e_x(i,0), positive where too far behind [m]; leader_speed: v_0 [m/s].
@@ -69,7 +69,7 @@ class PlatoonReward:
         acceleration: Tensor,
         leader_next: Tensor,
         time_step: float,
-        place: Place | None = None,
+        place: PlatoonPlace | None = None,
     ) -> Tensor:
         """Return the reward that an acceleration will earn, ``[*batch, N, 1]`` (H12).
 
@@ -94,38 +94,6 @@ class PlatoonReward:
         error = advance_gap(leader_gap, leader_speed, speed, leader_next, reached, time_step)
         error = error + self.spacing_time * (leader_next - reached)
         return earned - self.spacing_weight * (error / self.gap_scale).square()
-
-
-def safe_acceleration(
-    gap: Tensor,
-    speed: Tensor,
-    ahead: Tensor,
-    time_step: float,
-    braking: float,
-    margin: float,
-) -> Tensor:
-    """Compute the largest acceleration after which braking still avoids the vehicle ahead.
-
-    The vehicle ahead brakes at ``braking`` to standstill from now on; the follower executes this
-    acceleration for one step, then brakes at ``braking`` too and ends ``margin`` behind it.
-
-    Args:
-        gap: bumper-to-bumper gap as received [m].
-        speed: own speed [m/s].
-        ahead: speed of the vehicle ahead [m/s].
-        time_step: T [s].
-        braking: b [m/s²].
-        margin: g [m].
-
-    Returns:
-        The cap [m/s²], of the arguments' shape; it may lie below −b where it is too late.
-    """
-    ahead_next = (ahead - braking * time_step).clamp(min=0.0)
-    room = gap + 0.5 * time_step * (ahead + ahead_next) + ahead_next**2 / (2.0 * braking) - margin
-    q = 0.5 * time_step * speed - room
-    root = (0.25 * time_step**2 - 2.0 * q / braking).clamp(min=0.0).sqrt()
-    reached = braking * (root - 0.5 * time_step)
-    return (reached - speed) / time_step
 
 
 class Decision(NamedTuple):
@@ -163,7 +131,7 @@ def hybrid_decision(
     reward: PlatoonReward,
     time_step: float,
     max_acceleration: float,
-    place: Place | None = None,
+    place: PlatoonPlace | None = None,
     choice: Choice = "better",
 ) -> Decision:
     """Decide between two candidate accelerations, per follower (H12–H14).
@@ -190,8 +158,9 @@ def hybrid_decision(
         last_winner: winner of the frame before; negative or None where there was none.
         leader_next: the predicted speed of each vehicle's leader [m/s].
         interval: see :func:`jerk_interval`; None leaves the bound out (the literal rule).
-        cap: see :func:`safe_acceleration`; None leaves it out. If it or a candidate is not a
-            finite number, the vehicle brakes as hard as it can.
+        cap: see :func:`lcc_rl.functional.braking.safe_acceleration`, which may lie below −a_max;
+            None leaves it out. If it or a candidate is not a finite number, the vehicle brakes as
+            hard as it can.
         reward: the reward to compare by.
         time_step: T [s].
         max_acceleration: a_max [m/s²], of both candidates and of the brakes.

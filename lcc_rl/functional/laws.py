@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from lcc_rl.functional.gipps import GIPPS_LAW
-from lcc_rl.functional.idm import IDM_LAW
-from lcc_rl.functional.ovm import FVDM_LAW, OVM_LAW
+from lcc_rl.functional.driver_models import DriverConstants
+from lcc_rl.functional.gipps import GippsConstants
+from lcc_rl.functional.idm import IDMConstants
+from lcc_rl.functional.ovm import FVDMConstants, OVMConstants
 
-LAWS = {"idm": IDM_LAW, "ovm": OVM_LAW, "fvdm": FVDM_LAW, "gipps": GIPPS_LAW}
+LAWS: dict[str, type[DriverConstants]] = {
+    "idm": IDMConstants,
+    "ovm": OVMConstants,
+    "fvdm": FVDMConstants,
+    "gipps": GippsConstants,
+}

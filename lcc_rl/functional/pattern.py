@@ -17,7 +17,7 @@ from lcc_rl.errors import ConfigError
 AUTOMATED, HUMAN = "automated", "human"
 OPEN, RING = "open", "ring"
 TOKEN = re.compile(r"\s*([A-Za-z_]\w*|\*\s*\d+|[()])")
-LARGEST = 10_000  # vehicles of one string
+MOST_VEHICLES = 10_000  # vehicles of one string
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,10 @@ def parse_string(pattern: Any, road: str = OPEN) -> VehicleString:
 
 
 def _mixture(size: Any, penetration: Any, ring: bool) -> VehicleString:
-    if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= LARGEST:
-        raise ConfigError(f"scenario.string.size must be a whole number in 1…{LARGEST}, got {size}")
+    if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= MOST_VEHICLES:
+        raise ConfigError(
+            f"scenario.string.size must be a whole number in 1…{MOST_VEHICLES}, got {size}"
+        )
     number = isinstance(penetration, (int, float)) and not isinstance(penetration, bool)
     if not number or not 0.0 <= penetration <= 1.0:
         raise ConfigError(f"scenario.string.penetration must lie in [0, 1], got {penetration!r}")
@@ -109,8 +111,8 @@ class _Parser:
         while (token := self._peek()) is not None and token != ")":
             begun = self.place
             roles += self._item(token, depth)
-            if len(roles) > LARGEST:
-                raise self._error(f"more than {LARGEST} vehicles", begun)
+            if len(roles) > MOST_VEHICLES:
+                raise self._error(f"more than {MOST_VEHICLES} vehicles", begun)
         if not roles:
             raise self._error("expected a role", self.place)
         return roles
@@ -132,8 +134,10 @@ class _Parser:
         if times is None or not times.startswith("*"):
             return roles
         count = int(times[1:].lstrip("0")[:6] or 0)
-        if not 1 <= count * len(roles) <= LARGEST:
-            raise self._error(f"expected a number that makes 1…{LARGEST} vehicles", self.place)
+        if not 1 <= count * len(roles) <= MOST_VEHICLES:
+            raise self._error(
+                f"expected a number that makes 1…{MOST_VEHICLES} vehicles", self.place
+            )
         self._advance()
         return roles * count
 

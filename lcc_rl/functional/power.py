@@ -1,39 +1,9 @@
-"""Motor power, energy and traction force of the controlled car (A1–A2, Table I)."""
+"""Motor power of the controlled car (A2)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
-
-
-@dataclass(frozen=True)
-class Vehicle:
-    """Table I of the ALCC paper: the car whose longitudinal dynamics A1 describes.
-
-    Args:
-        mass: mass m [kg].
-        drag_coefficient: air drag coefficient C_D.
-        frontal_area: frontal area A_f [m²].
-        rolling_resistance: rolling resistance coefficient f.
-        air_density: density of air ρ [kg/m³].
-        gravity: gravitational acceleration g [m/s²].
-        wheel_radius: wheel radius [m].
-        rotating_mass: rotating-mass factor δ.
-    """
-
-    mass: float = 1005.0
-    drag_coefficient: float = 0.3
-    frontal_area: float = 2.02
-    rolling_resistance: float = 0.015
-    air_density: float = 1.206
-    gravity: float = 9.81
-    wheel_radius: float = 0.28
-    rotating_mass: float = 1.02
-
-
-PAPER_VEHICLE = Vehicle()
 
 # Rows: power of v; columns: power of a; the fit of A2 [W].
 POWER_COEFFICIENTS = (
@@ -98,25 +68,3 @@ def path_power(speed: Tensor, acceleration: Tensor) -> Tensor:
         Power [W], same shape: A2 without what the motion stores.
     """
     return steady_power(speed) + acceleration_loss(speed, acceleration)
-
-
-def kinetic_energy(speed: Tensor, vehicle: Vehicle = PAPER_VEHICLE) -> Tensor:
-    """Kinetic energy ½ δ m v² including rotating parts [J] of a car at ``speed`` [m/s]."""
-    return 0.5 * vehicle.rotating_mass * vehicle.mass * speed * speed
-
-
-def traction_force(speed: Tensor, acceleration: Tensor, vehicle: Vehicle = PAPER_VEHICLE) -> Tensor:
-    """Force at the wheels F = δma + mgf + ½ C_D A_f ρ v² (A1).
-
-    Args:
-        speed: speed, any shape [m/s].
-        acceleration: acceleration, same shape [m/s²].
-        vehicle: the car.
-
-    Returns:
-        Force [N], same shape; negative when braking.
-    """
-    inertia = vehicle.rotating_mass * vehicle.mass * acceleration
-    rolling = vehicle.mass * vehicle.gravity * vehicle.rolling_resistance
-    drag = 0.5 * vehicle.drag_coefficient * vehicle.frontal_area * vehicle.air_density
-    return inertia + rolling + drag * speed * speed

@@ -13,9 +13,10 @@ import zlib
 import torch
 from torch import Tensor
 
-MASK = 0xFFFFFFFF
-STEP = 0x9E3779B9  # golden-ratio increment: consecutive counters differ in about half the bits
-STREAM = 0x85EBCA6B
+LOW_BITS = 0xFFFFFFFF
+# The golden ratio: consecutive counters differ in about half the bits.
+STEP_INCREMENT = 0x9E3779B9
+STREAM_INCREMENT = 0x85EBCA6B
 
 
 def stream_id(name: str) -> int:
@@ -25,9 +26,9 @@ def stream_id(name: str) -> int:
 
 def hash_bits(counter: Tensor) -> Tensor:
     """Mix the low 32 bits of an int64 tensor; the result has 32 well-mixed bits in int64."""
-    x = counter & MASK
-    x = (x ^ (x >> 16)) * 0x7FEB352D & MASK
-    x = (x ^ (x >> 15)) * 0x2C1B3C6D & MASK
+    x = counter & LOW_BITS
+    x = (x ^ (x >> 16)) * 0x7FEB352D & LOW_BITS
+    x = (x ^ (x >> 15)) * 0x2C1B3C6D & LOW_BITS
     return x ^ (x >> 16)
 
 
@@ -43,7 +44,7 @@ def uniform(seed: Tensor, step: Tensor | int, stream: Tensor | int = 0) -> Tenso
         float32 of the broadcast shape.
     """
     # The mask keeps what counts, within 64 bits.
-    bits = hash_bits(seed + step * STEP + (stream * STREAM & MASK))
+    bits = hash_bits(seed + step * STEP_INCREMENT + (stream * STREAM_INCREMENT & LOW_BITS))
     return (bits >> 8).to(torch.float32) * 2.0**-24
 
 
@@ -61,5 +62,5 @@ def between(bounds: tuple[float, float], seed: Tensor, stream: Tensor | int) -> 
 
 def choose(seed: Tensor, count: Tensor | int, stream: Tensor | int = 0) -> Tensor:
     """Draw an index from 0 … count − 1 by counter; int64 of the broadcast shape."""
-    bits = hash_bits(seed + (stream * STREAM & MASK))  # as in :func:`uniform`
+    bits = hash_bits(seed + (stream * STREAM_INCREMENT & LOW_BITS))  # as in :func:`uniform`
     return bits * count >> 32

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from lcc_rl.functional.actuation import Motion
+from lcc_rl.functional.actuation import PairState
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Sensing:
         """Age of the oldest measurement [steps]."""
         return self.late + self.longest
 
-    def worst(self, measured: Motion) -> Motion:
+    def worst(self, measured: PairState) -> PairState:
         """Return the state within the bounds from which braking leaves the least room.
 
         Room falls with the own speed, and grows with the gap and with the speed ahead.
@@ -46,12 +46,12 @@ class Sensing:
 
 
 def brought_up(
-    measured: Motion,
+    measured: PairState,
     age: Tensor,
     past: Tensor,
     ahead_acceleration: Tensor | float,
     time_step: float,
-) -> Motion:
+) -> PairState:
     """Return the present motion from a measurement of some steps ago.
 
     Args:
@@ -73,5 +73,5 @@ def brought_up(
                 (then.ahead, found.ahead),
             )
         )
-        found = Motion(speed, gap, ahead, measured.acceleration)
+        found = PairState(speed, gap, ahead, measured.acceleration)
     return found

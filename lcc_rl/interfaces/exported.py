@@ -17,9 +17,10 @@ from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import with_weights
 from lcc_rl.pieces import Action, CBFFilter, Observation
-from lcc_rl.pieces.cbf import STATE
-from lcc_rl.pieces.entries import ENTRIES
+from lcc_rl.pieces.base import ROLE, Piece, declared
+from lcc_rl.pieces.cbf import FILTER_READS
 from lcc_rl.pieces.knowledge import ObservationMemory
+from lcc_rl.pieces.views import VEHICLES
 from lcc_rl.results.policies import load_policy
 
 # Entries computed inside from other measurements: v_ahead − v.
@@ -57,10 +58,10 @@ class ExportedPolicy(nn.Module):
         super().__init__()
         self.network, self.largest, self.safety = network, action.max_acceleration, safety
         self.memory = memory
-        self.register_buffer("constants", observation.constants.clone())
+        self.register_buffer("constants", observation.factors.clone())
         seen = observation.columns()
         needed = [name for column in seen for name in column]
-        needed += STATE if safety is not None else ()
+        needed += FILTER_READS if safety is not None else ()
         flat = [base for name in needed for base in DERIVED.get(name, (name,))]
         self.names = list(dict.fromkeys(flat))
         self.columns = [[self._places(name) for name in column] for column in seen]
@@ -86,7 +87,7 @@ class ExportedPolicy(nn.Module):
         command = action.clamp(-1.0, 1.0) * self.largest
         if self.safety is None:
             return command
-        measured = (self._value(state, self._places(name)) for name in STATE)
+        measured = (self._value(state, self._places(name)) for name in FILTER_READS)
         filtered: Tensor = self.safety.filtered(command, *measured)
         return filtered
 
@@ -125,10 +126,10 @@ def described(name: str) -> Input:
     """Return name, unit and meaning of a measurement such as ``"ahead.speed"``."""
     view, entry = name.split(".")[:2]
     whose = {"self": "own", "ahead": "of the vehicle ahead", "behind": "of the vehicle behind"}
-    for key in (("vehicles", entry), (view, entry), ("role", entry)):
-        if key in ENTRIES:
-            unit, meaning = ENTRIES[key]
-            return Input(name, unit, f"{meaning} ({whose.get(view, view)})")
+    known = declared(Piece)
+    for key in ((VEHICLES, entry), (view, entry), (ROLE, entry)):
+        if key in known:
+            return Input(name, known[key].unit, f"{known[key].meaning} ({whose.get(view, view)})")
     return Input(name, "–", f"{entry} ({whose.get(view, view)})")
 
 

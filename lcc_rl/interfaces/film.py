@@ -11,7 +11,7 @@ from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import require
 from lcc_rl.figures.animation import road_picture
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces import Places, StringMotion
+from lcc_rl.pieces import RolePlaces, StringMotion
 from lcc_rl.results.motion import Motion
 
 
@@ -27,7 +27,7 @@ class Film:
         self.episodes, self.place = episodes, place
         pieces: dict[type, Any] = {type(piece): piece for piece in pieces_of(episodes.env)}
         self.motion = pieces[StringMotion]
-        self.drawn = pieces[Places].string.drawn
+        self.drawn = pieces[RolePlaces].string.drawn
         self.moments: list[tuple[Any, Any, Any]] = []
 
     def expose(self, begins: bool) -> None:

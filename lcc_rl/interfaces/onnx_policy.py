@@ -19,14 +19,12 @@ from typing import Annotated, Any, Literal
 import torch
 from pydantic import Field
 from torch import Tensor
-from torchrl.data import Unbounded
 
 from lcc_rl.errors import ConfigError, ResultsError, how_to_install, one_line, require
-from lcc_rl.pieces.base import Key
+from lcc_rl.pieces.base import Entry, Piece, declared
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.pieces.entries import ENTRIES
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, VEHICLES
-from lcc_rl.pieces.world import World
+from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import Positive, Settings, given_as, parse
 
 ABOUT = "lcc_rl"  # key of the metadata
@@ -34,10 +32,10 @@ STATE, MEMORY = TAKES = ("state", "memory")
 MAKES = ("acceleration", "next_memory")
 # What a program may read, and its unit: entries of a vehicle and of its neighbours.
 MEASURED = {
-    f"{view}.{entry}": unit
+    f"{view}.{key[1]}": entry.unit
     for view in (SELF, AHEAD, BEHIND)
-    for (space, entry), (unit, _) in ((key, ENTRIES[key]) for key in ENTRIES if len(key) == 2)
-    if space == VEHICLES
+    for key, entry in declared(Piece).items()
+    if key[0] == VEHICLES
 } | {f"{BEHIND}.present": "–"}
 Short = Annotated[str, Field(max_length=100)]
 
@@ -49,7 +47,7 @@ class ProgramInput(Settings):
     unit: Short
     meaning: str = ""
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.name not in MEASURED:
             raise ValueError(
                 f"{self.name!r} is not measured: expected self, ahead or behind and an entry of "
@@ -174,24 +172,17 @@ class OnnxPolicy(Controller):
     """
 
     path: str  # the program's file
-    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         """Read the program, so that a wrong one is refused before anything starts."""
-        super().settled()
         self.program = Program(self.path)
 
     def setup(self, world: World) -> None:
         """Read what the program reads, and its memory."""
-        kept = [(self.name, "program")] if self.program.memory else []
-        self.drive(world, [*self.program.names, *map(".".join, kept)], kept)
-
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        specs = super().written_specs(batch, device)
-        if self.program.memory:
-            shape = (*batch, self.event_shape[0], self.program.memory)
-            specs[self.role, "program"] = Unbounded(shape=shape, device=device)
-        return specs
+        width = self.program.memory
+        memory = [Entry("role.program", "–", "memory of the program", width)] * bool(width)
+        self.declare(world, self.program.names, remembers=memory)
 
     @torch.compiler.disable
     def command(self, *entries: Tensor) -> tuple[Tensor, ...]:

@@ -1,8 +1,10 @@
 """Pieces: everything that an environment is made of, one TensorDict transform each."""
 
+# ruff: noqa: F401  what other rooms and users import from here
+
 from lcc_rl.functional.pattern import VehicleString, parse_string
 from lcc_rl.pieces.actuation import Actuation
-from lcc_rl.pieces.base import Feature, Piece, RewardPiece, StepTransform
+from lcc_rl.pieces.base import Entry, Feature, Piece, RewardPiece, StepTransform
 from lcc_rl.pieces.calibrated import CalibratedDrivers
 from lcc_rl.pieces.cbf import CBFFilter, Corrected
 from lcc_rl.pieces.connected import CACC, Communication, DeadBeat
@@ -32,7 +34,7 @@ from lcc_rl.pieces.rewards import (
 from lcc_rl.pieces.rules import FollowerStopper, Handover, PISaturation
 from lcc_rl.pieces.sensors import Sensors
 from lcc_rl.pieces.start import EquilibriumStart, HeadwayStart, TimeGapStart
-from lcc_rl.pieces.string import Places, StringMotion
+from lcc_rl.pieces.string import RolePlaces, StringMotion
 from lcc_rl.pieces.surrogates import (
     Correction,
     ExcessSpacing,
@@ -43,71 +45,3 @@ from lcc_rl.pieces.surrogates import (
     SpeedSpread,
 )
 from lcc_rl.pieces.termination import Collision
-
-__all__ = [
-    "CACC",
-    "FVDM",
-    "HCFS",
-    "IDM",
-    "IDMACC",
-    "MPC",
-    "OVM",
-    "Action",
-    "Actuation",
-    "CBFFilter",
-    "CalibratedDrivers",
-    "Collision",
-    "CollisionPenalty",
-    "Communication",
-    "ConstantAcceleration",
-    "Controller",
-    "Corrected",
-    "Correction",
-    "DeadBeat",
-    "DriverEstimator",
-    "DriverModel",
-    "EfficiencyReward",
-    "EnergyClasses",
-    "EnergyReward",
-    "EquilibriumStart",
-    "ExcessSpacing",
-    "Feature",
-    "FollowerStopper",
-    "Gipps",
-    "Handover",
-    "HeadwayStart",
-    "JerkReward",
-    "Law",
-    "LeaderPreview",
-    "LinearACC",
-    "MotorPower",
-    "NGSIMLeader",
-    "Observation",
-    "ObservationMemory",
-    "PISaturation",
-    "PathEnergy",
-    "Piece",
-    "Places",
-    "RangeReward",
-    "RecordedDriver",
-    "RecordedStart",
-    "RewardPiece",
-    "RewardTerm",
-    "SafetyReward",
-    "Sensors",
-    "SmoothEfficiency",
-    "SmoothRange",
-    "SmoothSafety",
-    "Smoothness",
-    "SpacingReward",
-    "SpeedSpread",
-    "StepTransform",
-    "StringMotion",
-    "TimeGap",
-    "TimeGapStart",
-    "TimeToCollision",
-    "TotalReward",
-    "VehicleString",
-    "VelocityReward",
-    "parse_string",
-]

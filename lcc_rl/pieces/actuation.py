@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import torch
 from torch import Tensor
-from torchrl.data import Unbounded
 
 from lcc_rl.functional.actuation import Response
 from lcc_rl.functional.layout import join
-from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces.base import Key, StepTransform
-from lcc_rl.pieces.string import OBEYED
+from lcc_rl.pieces.base import Entry, RoleTransform
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
 
@@ -20,27 +14,27 @@ ACTUATION = "actuation"
 HARDEST = 1e3  # braking that nobody commands [m/s²]
 
 
-class Actuation(StepTransform):
+class Actuation(RoleTransform):
     """Makes accelerations of commands: after a delay, with a first-order lag, within the brakes.
 
-    Reads ``("command", role)`` and writes what the vehicles obey, ``("obeyed", role)``, both
-    ``[*batch, n, 1]`` [m/s²]. Keeps ``(role, "actuation")``, ``[*batch, n, 1 + steps]``: the last
-    acceleration and the commands that do not act yet, the oldest first [m/s²]; zeros at the start.
+    It keeps the last acceleration and the commands that do not act yet, the oldest first; zeros at
+    the start.
     """
 
     delay: NonNegative = 0.0  # between a command and its first effect, a number of steps [s]
     lag: NonNegative = 0.0  # time constant with which the acceleration follows the command [s]
     braking: Positive | None = None  # hardest braking that there is; None: as commanded [m/s²]
 
-    name = AUTOMATED
+    obeyed = Entry("obeyed.role", "m/s²", "acceleration that engine and brakes make of the command")
+    kept = Entry(
+        "role.actuation", "m/s²", "that of the last step, and commands that do not act yet"
+    )
 
     def setup(self, world: World) -> None:
         """Read the commands of the role."""
         self.response = self.response_in(world, self.name, HARDEST)
-        state = (self.name, ACTUATION)
-        wanted = f"next.command.{self.name}"
-        writes = [(OBEYED, self.name), state]
-        self.see(world, [wanted, ".".join(state)], writes, self.name)
+        reads = [f"next.command.{self.name}", f"{self.name}.{ACTUATION}"]
+        self.declare(world, reads, [self.obeyed, self.kept.wide(1 + self.response.late)])
 
     def response_in(self, world: World, role: str, hardest: float) -> Response:
         """Return how the role's vehicles obey commands that brake no harder than that [m/s²].
@@ -52,15 +46,8 @@ class Actuation(StepTransform):
         braking = min(self.braking or hardest, hardest)
         return Response.of(late, self.lag, braking, world.time_step)
 
-    def compute(self, *entries: Tensor) -> tuple[Tensor, Tensor]:
+    def compute(self, command: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
         """Return the accelerations, and what is kept."""
-        command, kept = self.views(*entries)
         line = join([kept[..., 1:], command], -1)
         acceleration = self.response.next(kept[..., :1], line[..., :1])
         return acceleration, join([acceleration, line[..., 1:]], -1)
-
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        specs = super().written_specs(batch, device)
-        shape = (*batch, self.event_shape[0], 1 + self.response.late)
-        specs[self.targets[1]] = Unbounded(shape=shape, device=device)
-        return specs

@@ -8,12 +8,14 @@ call, on a stored rollout and in a replay buffer. Two kinds exist:
   others to the state before it, so that it applies unchanged to any stored transition.
 
 A piece is made of its settings (:mod:`lcc_rl.settings`). ``bind`` puts a copy of it into a world
-and calls ``setup``, which declares by ``wire`` what the piece reads and writes.
+and calls ``setup``, which declares what the piece reads and writes: what its class names in
+``reads`` and ``writes``, unless that depends on settings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -28,18 +30,61 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.guard import unchanged
 from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces.views import NEXT as NEXT
-from lcc_rl.pieces.views import Key as Key
-from lcc_rl.pieces.views import Views
-from lcc_rl.pieces.views import as_key as as_key
+from lcc_rl.pieces.views import EPISODE, NEXT, VEHICLES, Key, Views, as_key
 from lcc_rl.pieces.world import Part, World
 
 # The entries of one moment by their full keys.
 State = dict[Key, Tensor]
 
 # Written by the clock: the seed from which everything random in an episode follows, and its step.
-SEED = ("episode", "seed")
-STEP = ("episode", "step")
+SEED = (EPISODE, "seed")
+STEP = (EPISODE, "step")
+# What learners read and write, and are rewarded by.
+OBSERVATION, ACTION, REWARD = ((AUTOMATED, x) for x in ("observation", "action", "reward"))
+# Parts of declared keys that stand for the role of a piece, and for its name.
+ROLE, NAME = "role", "name"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An entry that a piece writes, declared in the body of its class.
+
+    Args:
+        key: its key; a part ``role`` stands for the role of the piece, ``name`` for its name.
+        unit: of its numbers; "–" for none.
+        meaning: what it holds, for docs/entries.md.
+        width: how many numbers a row has; a tuple for several dimensions.
+        dtype: of its numbers; None for torch's default.
+        option: whether a caller may set it through ``env.reset``; of constants only.
+    """
+
+    key: NestedKey
+    unit: str = "–"
+    meaning: str = ""
+    width: int | tuple[int, ...] = 1
+    dtype: torch.dtype | None = None
+    option: bool = False
+
+    def of(self, role: str, name: str = "", width: int | tuple[int, ...] | None = None) -> Entry:
+        """Return the entry of a role or of a name, and with a width that depends on settings."""
+        held = {ROLE: role, NAME: name}
+        key = tuple(held.get(part) or part for part in as_key(self.key))
+        return replace(self, key=key, width=self.width if width is None else width)
+
+    def wide(self, width: int) -> Entry:
+        """Return the entry with a width that depends on settings."""
+        return replace(self, width=width)
+
+
+def declared(*kinds: type) -> dict[Key, Entry]:
+    """Return the entries in the bodies of classes and of those derived from them, by key."""
+    found: dict[Key, Entry] = {}
+    for kind in kinds:
+        for value in vars(kind).values():
+            several = value if isinstance(value, tuple) else (value,)
+            found |= {as_key(one.key): one for one in several if isinstance(one, Entry)}
+        found |= declared(*kind.__subclasses__())
+    return found
 
 
 def next_key(key: NestedKey) -> Key:
@@ -70,7 +115,16 @@ def require_option(key: Key, values: Tensor, count: Tensor | int) -> None:
 class Piece(Part, TensorDictModuleBase, Transform):
     """Base of all pieces; see the module's description."""
 
-    # Maps the entries read to the entries written; a pure function of tensors.
+    # Whose vehicles have a row each in what the piece writes: a role, "vehicles" for all of them,
+    # "episode" where an entry belongs to the episode.
+    role = AUTOMATED
+    # What compute is given, in order: names of views, and keys as tuples.
+    reads: ClassVar[Sequence[NestedKey]] = ()
+    # What compute returns, in order; a plain key holds one number per row.
+    writes: ClassVar[Sequence[Entry | NestedKey]] = ()
+    keeps: ClassVar[Sequence[Entry]] = ()  # constants of an episode, which begin sets at reset
+    measures: ClassVar[bool] = False  # what sensors measure is read as they measure it
+    # Maps what is read to what is written; a pure function of tensors.
     compute: ClassVar[Callable[..., Any]]
 
     @property
@@ -78,8 +132,8 @@ class Piece(Part, TensorDictModuleBase, Transform):
         """What messages call it."""
         return type(self).__name__
 
-    def settled(self) -> None:
-        """Make it a transform, which reads and writes nothing before :meth:`wire`."""
+    def __post_init__(self) -> None:
+        # A transform, which reads and writes nothing before it is put into a world.
         Transform.__init__(self, in_keys=[], out_keys=[])
 
     def __getattr__(self, name: str) -> Any:
@@ -88,51 +142,75 @@ class Piece(Part, TensorDictModuleBase, Transform):
             raise AttributeError(f"{kind} is not bound to a world yet: use {kind}(…).bind(world)")
         return super().__getattr__(name)
 
-    def wire(
-        self,
-        reads: Sequence[NestedKey],
-        writes: Sequence[NestedKey],
-        event_shape: Sequence[int] = (1,),
-    ) -> None:
-        """Set what the piece reads and writes.
-
-        Args:
-            reads: keys of the arguments of :meth:`compute`, in order.
-            writes: keys of what :meth:`compute` returns, in order.
-            event_shape: shape of one written entry after the batch dimensions.
-        """
-        self.in_keys = [as_key(key) for key in reads]
-        self.out_keys = [as_key(key) for key in writes]
-        self.event_shape = tuple(event_shape)
-        # As plain tuples: TorchRL's properties convert at every access.
-        self.needs = [(as_key(key)[0] == NEXT, root_key(key)) for key in reads]
-        self.targets = [root_key(key) for key in writes]
-        self.read_names = [".".join(as_key(key)) for key in reads]
-
-    def see(
-        self,
-        world: World,
-        names: Sequence[str],
-        writes: Sequence[NestedKey],
-        role: str = AUTOMATED,
-        **more: Any,
-    ) -> None:
-        """Set what is read as the vehicles of a role see it, one row each: ``self.views`` says how.
+    def setup(self, world: World) -> None:
+        """Derive from a world what depends on it; one that overrides this calls :meth:`declare`.
 
         Args:
             world: what the pieces of the environment share.
-            names: what is seen, see :mod:`lcc_rl.pieces.views`.
-            writes: keys of what :meth:`compute` returns, one number per vehicle, in order.
-            role: the role.
-            **more: further arguments of :meth:`wire`.
         """
-        self.views = Views(world.string, role, names)
-        self.wire(self.views.keys, writes, (world.string.count(role), 1), **more)
+        self.declare(world)
 
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        """Return the spec of each written key, without ``"next"``."""
-        shape = (*batch, *self.event_shape)
-        return {key: Unbounded(shape=shape, device=device) for key in self.targets}
+    def declare(
+        self,
+        world: World,
+        reads: Sequence[NestedKey] | Views | None = None,
+        writes: Sequence[Entry | NestedKey] | None = None,
+        keeps: Sequence[Entry] | None = None,
+    ) -> None:
+        """Set what the piece reads and writes; by default what its class names.
+
+        Args:
+            world: what the pieces of the environment share.
+            reads: what :meth:`compute` is given, in order.
+            writes: what :meth:`compute` returns, in order, without ``"next"``.
+            keeps: constants of an episode.
+        """
+        string = self.string = world.string
+        if not isinstance(reads, Views):
+            names = self.reads if reads is None else reads
+            names = world.sensed(self.role, names) if self.measures else names
+            reads = Views(string, self.role, names)
+        self.views = reads
+        # Whether of the moment reached, and the key, as a plain tuple: TorchRL's properties convert
+        # at every access.
+        self.needs = [(True, key) for key in reads.keys]
+        self.read_names = [".".join(key) for key in reads.keys]
+        count = len(string) if self.role == VEHICLES else string.count(self.role)
+        self.rows = () if self.role == EPISODE else (count,)
+        self.entries: dict[Key, Entry] = {}
+        self.targets = self._declared(self.writes if writes is None else writes)
+        self.constants = self._declared(self.keeps if keeps is None else keeps)
+        self.reset_options = [key for key in self.constants if self.entries[key].option]
+        self.in_keys, self.out_keys = list(reads.keys), list(self.targets)
+        self.event_shape = self.shape_of(self.targets[0]) if self.targets else (*self.rows, 1)
+
+    def _declared(self, entries: Sequence[Entry | NestedKey]) -> list[Key]:
+        """Take entries of the piece; return their keys."""
+        own = [x.of(self.role, self.name) if isinstance(x, Entry) else Entry(x) for x in entries]
+        self.entries |= {as_key(entry.key): entry for entry in own}
+        return [as_key(entry.key) for entry in own]
+
+    def shape_of(self, key: Key) -> tuple[int, ...]:
+        """Return the shape of a declared entry after the batch dimensions."""
+        width = self.entries[key].width
+        return (*self.rows, *((width,) if isinstance(width, int) else width))
+
+    def specs(
+        self,
+        batch: torch.Size,
+        device: torch.device | None,
+        keys: Sequence[Key] | None = None,
+    ) -> dict[Key, Any]:
+        """Return the specs of declared entries, by default of all."""
+        plain = torch.get_default_dtype()
+        return {
+            key: Unbounded(
+                shape=(*batch, *self.shape_of(key)),
+                dtype=self.entries[key].dtype or plain,
+                device=device,
+            )
+            for key in (self.entries if keys is None else keys)
+        }
 
     def derive(self, before: State, reached: State, detached: bool = False) -> None:
         """Compute the entries written from plain mappings of entries.
@@ -147,9 +225,16 @@ class Piece(Part, TensorDictModuleBase, Transform):
             values = [value.detach() for value in values]
         self._write(self.computed(values), reached)
 
-    def computed(self, values: Sequence[Tensor]) -> Any:
-        """Return what :meth:`compute` returns; a ConfigError if it changes an entry in place."""
-        return unchanged(self.compute, values, self.title, self.read_names)
+    def computed(self, entries: Sequence[Tensor]) -> Any:
+        """Return what :meth:`compute` returns; a ConfigError if it changes an entry in place.
+
+        Args:
+            entries: those read, in the order of ``in_keys``.
+        """
+        return unchanged(self._seen, entries, self.title, self.read_names)
+
+    def _seen(self, *entries: Tensor) -> Any:
+        return self.compute(*self.views(*entries))
 
     def _entries(self, before: State, reached: State) -> list[Tensor]:
         return [(reached if late else before)[key] for late, key in self.needs]
@@ -185,19 +270,19 @@ class Piece(Part, TensorDictModuleBase, Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         return add_specs(self, observation_spec)
 
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
+        return add_specs(self, state_spec, self.reset_options)
 
-def add_specs(piece: Piece, spec: Composite) -> Composite:
-    """Add the entries that a piece writes to a spec."""
-    for key, entry in piece.written_specs(spec.shape, spec.device).items():
+
+def add_specs(piece: Piece, spec: Composite, keys: Sequence[Key] | None = None) -> Composite:
+    """Add declared entries of a piece to a spec, by default all of them."""
+    for key, entry in piece.specs(spec.shape, spec.device, keys).items():
         spec[key] = entry
     return spec
 
 
 class Feature(Piece):
     """A piece that reads one moment, at reset as well as after every step."""
-
-    def _entries(self, before: State, reached: State) -> list[Tensor]:
-        return [reached[key] for _, key in self.needs]
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
@@ -211,29 +296,17 @@ class Feature(Piece):
 class StepTransform(Piece):
     """A piece that reads the states before and after a step."""
 
-    def wire(
+    def declare(
         self,
-        reads: Sequence[NestedKey],
-        writes: Sequence[NestedKey],
-        event_shape: Sequence[int] = (1,),
-        constants: Sequence[NestedKey] = (),
-        reset_options: Sequence[NestedKey] = (),
+        world: World,
+        reads: Sequence[NestedKey] | Views | None = None,
+        writes: Sequence[Entry | NestedKey] | None = None,
+        keeps: Sequence[Entry] | None = None,
     ) -> None:
-        """Set what the piece reads and writes.
-
-        Args:
-            reads: keys of the arguments of :meth:`compute`; under ``"next"`` for the moment
-                reached.
-            writes: keys written in the next state, given without ``"next"``.
-            event_shape: shape of one written entry after the batch dimensions.
-            constants: keys that :meth:`begin` sets at reset and that keep their value for the
-                whole episode.
-            reset_options: the keys among ``constants`` that a caller may set through
-                ``env.reset``.
-        """
-        super().wire(reads, [next_key(key) for key in writes], event_shape)
-        self.constants = [as_key(key) for key in constants]
-        self.reset_options = [as_key(key) for key in reset_options]
+        """Set what the piece reads, under ``next.`` of the moment reached, and what it writes."""
+        super().declare(world, reads, writes, keeps)
+        self.needs = [(key[0] == NEXT, root_key(key)) for _, key in self.needs]
+        self.out_keys = [next_key(key) for key in self.targets]
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         """Set the written entries and the constants at reset; zeros unless overridden.
@@ -242,13 +315,8 @@ class StepTransform(Piece):
             given: what the caller passed to ``env.reset``: the reset options may be in it.
             start: the first moment of the episodes, written by the pieces before this one.
         """
-        for key, spec in self.written_specs(start.batch_size, start.device).items():
+        for key, spec in self.specs(start.batch_size, start.device, self.targets).items():
             start.set(key, spec.zero())
-
-    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        """Return the spec of each constant key."""
-        shape = (*batch, *self.event_shape)
-        return {key: Unbounded(shape=shape, device=device) for key in self.constants}
 
     def derive(self, before: State, reached: State, detached: bool = False) -> None:
         super().derive(before, reached, detached)
@@ -271,18 +339,16 @@ class StepTransform(Piece):
             tensordict_reset.set(key, batch_innermost(tensordict_reset.get(key)))
         return tensordict_reset
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        observation_spec = add_specs(self, observation_spec)
-        constants = self.constant_specs(observation_spec.shape, observation_spec.device)
-        for key, entry in constants.items():
-            observation_spec[key] = entry
-        return observation_spec
 
-    def transform_state_spec(self, state_spec: Composite) -> Composite:
-        constants = self.constant_specs(state_spec.shape, state_spec.device)
-        for key in self.reset_options:
-            state_spec[key] = constants[key]
-        return state_spec
+class RoleTransform(StepTransform):
+    """A step transform of the vehicles of one role, which is its name in an environment."""
+
+    name = AUTOMATED
+
+    @property
+    def role(self) -> str:  # type: ignore[override]
+        """The role."""
+        return self.name
 
 
 class RewardPiece(Feature):
@@ -304,6 +370,6 @@ class RewardPiece(Feature):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         batch, device = tensordict_reset.batch_size, tensordict_reset.device
-        for key, spec in self.written_specs(batch, device).items():
+        for key, spec in self.specs(batch, device).items():
             tensordict_reset.set(key, batch_innermost(spec.zero()))
         return tensordict_reset

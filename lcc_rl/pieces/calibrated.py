@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.driver_models import DriverConstants, DriverLaw
+from lcc_rl.functional.driver_models import DriverConstants
 from lcc_rl.functional.laws import LAWS
-from lcc_rl.pieces.drivers import LONGEST, Drivers
+from lcc_rl.pieces.drivers import LONGEST_TIME_GAP, Drivers
 from lcc_rl.pieces.world import World
 
 
@@ -31,7 +31,7 @@ class CalibratedDrivers(Drivers):
         self.register_buffer("kinds", torch.tensor([self.models.index(name) for name in models]))
         for name, values in population.parameters().items():
             # What a driver's model lacks is computed, too, and must have a gradient.
-            otherwise = [getattr(LAWS[model].constants, name, 1.0) for model in self.models]
+            otherwise = [getattr(LAWS[model], name, 1.0) for model in self.models]
             self.register_buffer(f"own_{name}", values.float().nan_to_num(nan=otherwise[0]))
 
     def described(self, world: World, where: str) -> tuple[Tensor, Tensor, DriverConstants]:
@@ -44,21 +44,21 @@ class CalibratedDrivers(Drivers):
         """Return what the drivers wish, each by its own model."""
         gap, relative_speed, desired_speed, time_gap, driver = more
         motion = (speed, gap, -relative_speed, desired_speed, time_gap)
-        return self._each(driver, lambda law, own: law.acceleration(*motion, own))
+        return self._each(driver, lambda law: law(*motion))
 
     def equilibrium_gap(
         self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor, driver: Tensor
     ) -> Tensor:
         """Return the gap at which drivers follow steadily, each by its own model."""
-        steady = (speed, desired_speed, time_gap)
-        return self._each(driver, lambda law, own: law.equilibrium_gap(*steady, own, LONGEST))
+        steady = (speed, desired_speed, time_gap, LONGEST_TIME_GAP)
+        return self._each(driver, lambda law: law.equilibrium_gap(*steady))
 
-    def _each(self, driver: Tensor, quantity: Callable[[DriverLaw, Any], Tensor]) -> Tensor:
+    def _each(self, driver: Tensor, quantity: Callable[[DriverConstants], Tensor]) -> Tensor:
         kind, found = self.kinds[driver], None
         for number, name in enumerate(self.models):
             law = LAWS[name]
-            own = {part: getattr(self, f"own_{part}")[driver] for part in law.shared}
-            values = quantity(law, law.constants().with_(**own))
+            own = {part: getattr(self, f"own_{part}")[driver] for part in law.shared()}
+            values = quantity(law(**own))
             found = values if found is None else torch.where(kind == number, values, found)
         assert found is not None  # a population holds drivers
         return found

@@ -10,7 +10,7 @@ import torch
 from pydantic import InstanceOf
 from torch import Tensor
 
-from lcc_rl.functional.actuation import Motion, predicted
+from lcc_rl.functional.actuation import PairState, predicted
 from lcc_rl.functional.braking import (
     Braking,
     least_room,
@@ -19,21 +19,20 @@ from lcc_rl.functional.braking import (
     safe_command,
 )
 from lcc_rl.functional.layout import join
-from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.sensing import brought_up
 from lcc_rl.pieces.actuation import ACTUATION, Actuation
-from lcc_rl.pieces.base import StepTransform
-from lcc_rl.pieces.sensors import ACCELERATION, AHEAD_ACCELERATION, SENSORS, Sensors, frames_of
-from lcc_rl.pieces.string import COMMAND, WANTED
-from lcc_rl.pieces.world import World
+from lcc_rl.pieces.base import Entry, RoleTransform
+from lcc_rl.pieces.sensors import SENSORS, Sensors, frames_of
+from lcc_rl.pieces.string import COMMANDED, WANTED
+from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import NonNegative, Positive
 
 ROUNDING = 5e-3  # of gaps [m] and accelerations [m/s²] in single precision
-STATE = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
+FILTER_READS = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
 SLOWEST = 1.0  # slower speeds count as this, as in the time gap: the limit has a slope [m/s]
 
 
-class CBFFilter(StepTransform):
+class CBFFilter(RoleTransform):
     """Changes a command as little as needed for the vehicle to stay between its limits.
 
     Two functions of the state are to stay positive: ``gap − margin − τ·(v − v_ahead)``, which
@@ -49,7 +48,7 @@ class CBFFilter(StepTransform):
     braking maintains the first limit even if the vehicle ahead brakes by ``braking_ahead`` until
     it stands (:mod:`lcc_rl.functional.braking`). A vehicle that starts there has no TTC below τ at
     any sample as long as the vehicle ahead brakes no harder; which steps that covers, the
-    :class:`Promised` of :meth:`watch` writes. If a measurement or the command is no number, the
+    :class:`CBFGuarantee` of :meth:`watch` writes. If a measurement or the command is no number, the
     filter brakes fully.
 
     With a ``shortest_time_gap``, ``gap − shortest_time_gap·v`` is kept positive, too, by the same
@@ -72,11 +71,10 @@ class CBFFilter(StepTransform):
     with; and full braking is reached with the lag
     (:func:`lcc_rl.functional.braking.safe_command`). Comfort is that of the state expected.
 
-    Reads ``("wanted", role)``, which the controller of a filtered role writes, and writes
-    ``("command", role)``, both ``[*batch, n, 1]`` [m/s²]. Differentiable.
+    It reads ``("wanted", role)``, which the controller of a filtered role writes. Differentiable.
     """
 
-    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
     # Reckon with the actuators and sensors of the scenario; false: as if both were exact.
     robust: bool = True
     time_to_collision: Positive = 4.0  # shortest allowed [s]
@@ -93,16 +91,17 @@ class CBFFilter(StepTransform):
     least_gap: NonNegative = 2.0  # gap that the limit of the time gap always allows [m]
     from_s: NonNegative = 0.0  # moment of the episode from which on it acts, see Handover [s]
 
-    name = AUTOMATED
+    measures = True
+    writes = (COMMANDED,)
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.time_gap is not None and (self.shortest_time_gap or 0.0) >= self.time_gap:
             shortest = f"shortest_time_gap={self.shortest_time_gap}"
             raise ValueError(f"{shortest} must be below time_gap={self.time_gap}")
 
     def setup(self, world: World) -> None:
         """Read the commands of the role and what bounds them."""
-        self.role, self.string, self.time_step = self.name, world.string, world.time_step
+        self.time_step = world.time_step
         actuation = world.actuators.get(self.role, Actuation())
         sensors = world.sensors.get(self.role, Sensors())
         self.answers = self.robust or self.role not in {*world.actuators, *world.sensors}
@@ -114,24 +113,21 @@ class CBFFilter(StepTransform):
         self.late = self.response.late > 0 or self.response.share < 1.0
         self.remembers = {ACTUATION: self.late, SENSORS: self.sensing.oldest > 0}
         self.memories = [f"{self.role}.{name}" for name, needed in self.remembers.items() if needed]
-        seen = world.sensed(self.role, STATE)
-        seen = [f"next.{WANTED}.{self.role}", *seen, *self.memories]
         self.from_step = world.steps(self.from_s, "from_s")
-        seen += ["episode.step"] * (self.from_step > 0)
-        self.see(world, seen, [(COMMAND, self.role)], self.role)
+        seen = [f"next.{WANTED}.{self.role}", *FILTER_READS, *self.memories]
+        self.declare(world, [*seen, *["episode.step"] * (self.from_step > 0)])
         self.limits = Braking(self.response.braking, self.braking_ahead, self.time_to_collision)
 
-    def watch(self) -> Promised:
+    def watch(self) -> CBFGuarantee:
         """Return the piece that records the steps for which the filter promises its limit."""
-        return Promised(safety=self).bind(World(self.string), self.role)
+        return CBFGuarantee(safety=self).bind(World(self.string), self.role)
 
-    def compute(self, *entries: Tensor) -> Tensor:
+    def compute(self, wanted: Tensor, *more: Tensor) -> Tensor:
         """Return the commands that the vehicles obey."""
-        wanted, *more = self.views(*entries)
         if not self.from_step:
             return self.filtered(wanted, *more)
-        *more, step = more
-        return torch.where(step < self.from_step, wanted, self.filtered(wanted, *more))
+        *state, step = more
+        return torch.where(step < self.from_step, wanted, self.filtered(wanted, *state))
 
     def kept(self, memories: Sequence[Tensor], nothing: Tensor) -> list[Tensor]:
         """Return the memories of actuation and sensors; ``nothing``, one column, for none."""
@@ -139,10 +135,10 @@ class CBFFilter(StepTransform):
         return [next(given) if needed else nothing for needed in self.remembers.values()]
 
     def _when_it_acts(
-        self, motion: Motion, acceleration: Tensor | float, actuation: Tensor, sensors: Tensor
-    ) -> Motion:
+        self, motion: PairState, acceleration: Tensor | float, actuation: Tensor, sensors: Tensor
+    ) -> PairState:
         """Return the motion when the command begins to act, from one as old as the measurement."""
-        past = frames_of(sensors, ACCELERATION)[..., : self.sensing.oldest]
+        past = frames_of(sensors, "self.acceleration")[..., : self.sensing.oldest]
         now = brought_up(motion, sensors[..., :1], past, acceleration, self.time_step)
         return predicted(now, actuation[..., 1:], acceleration, self.response)[-1]
 
@@ -165,7 +161,7 @@ class CBFFilter(StepTransform):
         # Any of them that is no number, or infinite, shows in the sum.
         known = (wanted + speed + gap + ahead + ahead_acceleration).isfinite()
         kept = self.kept(memories, wanted)
-        measured = Motion(speed, gap, ahead, kept[0][..., :1])
+        measured = PairState(speed, gap, ahead, kept[0][..., :1])
         worst = self._when_it_acts(self.sensing.worst(measured), -self.braking_ahead, *kept)
         safe = self._safe(replace(worst, gap=worst.gap - self.margin))
         now = self._when_it_acts(measured, ahead_acceleration, *kept)
@@ -173,7 +169,7 @@ class CBFFilter(StepTransform):
         command = command.clamp(-self.max_acceleration, self.max_acceleration)
         return torch.where(known, command, -self.max_acceleration)
 
-    def _safe(self, worst: Motion) -> Tensor:
+    def _safe(self, worst: PairState) -> Tensor:
         """Return the largest command that leaves the vehicle where braking suffices."""
         if self.late:
             return safe_command(worst, self.response, self.limits)
@@ -181,7 +177,7 @@ class CBFFilter(StepTransform):
         return safe_acceleration(*state, self.limits, self.time_step)
 
     def _comfortable(
-        self, wanted: Tensor, now: Motion, ahead_acceleration: Tensor, safe: Tensor
+        self, wanted: Tensor, now: PairState, ahead_acceleration: Tensor, safe: Tensor
     ) -> Tensor:
         """Return the command nearest to what is wanted within all bounds, not clamped."""
         speed, gap, closing = now.speed, now.gap, now.speed - now.ahead
@@ -215,29 +211,25 @@ class CBFFilter(StepTransform):
         return (time_gap * share * moving).clamp(min=self.least_gap), slope
 
 
-class Corrected(StepTransform):
-    """Writes by how much the command differs from a policy's action, ``(role, "correction")``.
+class Corrected(RoleTransform):
+    """By how much the command differs from a policy's action: zero where the filter is inactive."""
 
-    ``[*batch, n, 1]`` [m/s²]: zero where the filter lets the policy drive.
-    """
+    max_acceleration: Positive = MAX_ACCELERATION  # acceleration of action 1 [m/s²]
 
-    max_acceleration: Positive = 3.0  # acceleration of action 1 [m/s²]
-
-    name = AUTOMATED
+    writes = (
+        Entry("role.correction", "m/s²", "what the safety filter added to a policy's command"),
+    )
 
     def setup(self, world: World) -> None:
         """Read the actions and commands of the role."""
-        role = self.name
-        seen = (f"{role}.action", f"next.command.{role}")
-        self.see(world, seen, [(role, "correction")], role)
+        self.declare(world, (f"{self.role}.action", f"next.command.{self.role}"))
 
-    def compute(self, *entries: Tensor) -> Tensor:
+    def compute(self, action: Tensor, command: Tensor) -> Tensor:
         """Return what the filter added."""
-        action, command = self.views(*entries)
         return command - self.max_acceleration * action
 
 
-class Promised(StepTransform):
+class CBFGuarantee(RoleTransform):
     """Writes for which steps a filter answers, ``(role, "promised")``, ``[*batch, n, 1]``.
 
     1 where the vehicle was safe when the step began and the vehicle ahead braked no harder than
@@ -252,25 +244,30 @@ class Promised(StepTransform):
 
     safety: InstanceOf[CBFFilter]  # the filter, bound
 
-    name = AUTOMATED
+    writes = (
+        Entry(
+            "role.promised", "–", "1 where the safety filter answers for the step: see CBFFilter"
+        ),
+        Entry("role.safe", "–", "1 where full braking keeps the limit when the step begins"),
+    )
 
     def setup(self, world: World) -> None:
         """Read the true state, and what bounds the commands of the role."""
         seen = ["self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration"]
-        seen += [*self.safety.memories, "episode.step"]
-        self.see(world, seen, [(self.name, name) for name in ("promised", "safe")], self.name)
+        self.declare(world, [*seen, *self.safety.memories, "episode.step"])
 
-    def compute(self, *entries: Tensor) -> tuple[Tensor, Tensor]:
+    def compute(
+        self, speed: Tensor, gap: Tensor, ahead: Tensor, acceleration: Tensor, *more: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return 1 for the steps that are covered, and for those that begin safe."""
-        safety = self.safety
-        speed, gap, ahead, acceleration, *memories, step = self.views(*entries)
+        safety, (*memories, step) = self.safety, more
         actuation, sensors = safety.kept(memories, speed)
-        now = Motion(speed, gap - safety.margin, ahead, actuation[..., :1])
+        now = PairState(speed, gap - safety.margin, ahead, actuation[..., :1])
         if safety.late:
             room = least_room_to_come(now, actuation[..., 1:], safety.response, safety.limits)
         else:
             room = least_room(speed, now.gap, ahead, safety.limits)
-        past = frames_of(sensors, AHEAD_ACCELERATION)[..., : safety.sensing.oldest]
+        past = frames_of(sensors, "ahead.acceleration")[..., : safety.sensing.oldest]
         hardest = join([acceleration, past], -1).amin(-1, keepdim=True)
         kept_up = hardest >= -safety.braking_ahead - ROUNDING
         safe = room >= -ROUNDING

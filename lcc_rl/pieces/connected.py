@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -21,25 +22,19 @@ from lcc_rl.functional.cacc import (
 )
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.string import entries_ahead, gather
-from lcc_rl.pieces.base import Feature
+from lcc_rl.pieces.base import Entry, Feature
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import LEADER, VEHICLES
-from lcc_rl.pieces.world import World
+from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import NonNegative, Number, Positive
 
 # How the leader's next speed is predicted: by v0 + a0 T, by v0, or known, as an upper bound only.
 Lookahead = Literal["causal", "hold", "oracle"]
-ERRORS = ("gap_error", "speed_error", "leader_gap_error", "leader_speed_error")
-HEARD = (*ERRORS, "received_gap", "leader_speed", "leader_acceleration")
+PLATOON_ERRORS = ("gap_error", "speed_error", "leader_gap_error", "leader_speed_error")
 
 
 class Communication(Feature):
     """Writes what vehicles know of their platoon by radio (HCFS H1–H2).
-
-    Under ``"vehicles"``, ``[*batch, N, 1]``: ``gap_error`` e_x(i,i−1) and ``leader_gap_error``
-    e_x(i,0) [m], ``speed_error`` e_v(i,i−1) and ``leader_speed_error`` e_v(i,0) [m/s], positive
-    where the vehicle is too far behind or too slow; ``received_gap``, the gap as the message says
-    [m]; speed [m/s] and acceleration [m/s²] of its leader.
 
     A connected vehicle hears the connected vehicles ahead of it without a gap in the chain. The
     vehicle ahead of the first of them is the chain's leader; if it is not connected, the first
@@ -52,6 +47,16 @@ class Communication(Feature):
     headway: NonNegative = 5.0  # h, the gap to be kept [m]
     delay: NonNegative = 0.005  # of messages; it acts on the positions received [s]
 
+    role = VEHICLES
+    writes = (
+        Entry("vehicles.gap_error", "m", "e_x(i,i−1), positive where too far behind"),
+        Entry("vehicles.speed_error", "m/s", "e_v(i,i−1), positive where too slow"),
+        Entry("vehicles.leader_gap_error", "m", "e_x(i,0), to the leader of its chain"),
+        Entry("vehicles.leader_speed_error", "m/s", "e_v(i,0), to the leader of its chain"),
+        Entry("vehicles.received_gap", "m", "gap by the position received"),
+        Entry("vehicles.leader_speed", "m/s", "speed of the leader of its chain"),
+        Entry("vehicles.leader_acceleration", "m/s²", "acceleration of the leader of its chain"),
+    )
     hearing: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
@@ -60,12 +65,11 @@ class Communication(Feature):
         Raises:
             ConfigError: if a chain goes all the way round a ring.
         """
-        self.string = string = world.string
+        string = world.string
         leader = [] if string.ring else [(LEADER, "speed"), (LEADER, "acceleration")]
         roles = [role for role in string.names if role in self.connected and string.drawn]
         own = [(VEHICLES, name) for name in ("speed", "gap", "acceleration")]
-        reads = [*own, *leader, *((role, "index") for role in roles)]
-        self.wire(reads, [(VEHICLES, name) for name in HEARD], (len(string), 1))
+        self.declare(world, [*own, *leader, *((role, "index") for role in roles)])
         if string.ring and (string.drawn or string.roles[0] in self.connected):
             raise ConfigError(
                 "communication: on a ring road the first vehicle of scenario.string must not be "
@@ -78,7 +82,7 @@ class Communication(Feature):
     def compute(
         self, speed: Tensor, gap: Tensor, acceleration: Tensor, *more: Tensor
     ) -> tuple[Tensor, ...]:
-        """Return the entries of :data:`HEARD`."""
+        """Return what the vehicles know, in the order of ``writes``."""
         leader, leading = (None, None) if self.string.ring else more[:2]
         indices = more[0 if self.string.ring else 2 :]
         ahead, accelerating = entries_ahead(leader, speed), entries_ahead(leading, acceleration)
@@ -105,7 +109,7 @@ class Communication(Feature):
 class CACC(Controller):
     """Cooperative adaptive cruise control (HCFS H11)."""
 
-    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
     k1: Number = 0.04  # gain of e_x(i,i−1) [1/s]
     k2: Number = 0.12  # gain of e_v(i,i−1)
     k3: Number = 1.4  # gain of e_x(i,0) [1/s]
@@ -115,20 +119,20 @@ class CACC(Controller):
     # close to its leader. Stability is not checked.
     literal: bool = False
 
-    reads = tuple(f"self.{name}" for name in ERRORS)
+    reads = tuple(f"self.{name}" for name in PLATOON_ERRORS)
 
     def setup(self, world: World) -> None:
         """Refuse gains at which the closed loop is unstable, naming the condition that fails."""
-        self.drive(world, (*self.reads, "self.speed") if self.literal else self.reads)
+        self.declare(world, (*self.reads, "self.speed") if self.literal else self.reads)
         self.gains = Gains(self.k1, self.k2, self.k3, self.k4)
         if not self.literal:
             self.gains.check_stable(world.time_step)
 
     def command(self, *read: Tensor) -> Tensor:
         """Return the commands."""
-        errors, speed = Errors(*read[: len(ERRORS)]), read[len(ERRORS) :]
-        limits = self.time_step, self.max_acceleration
-        return cacc_acceleration(errors, self.gains, *limits, *speed)
+        errors, speed = Errors(*read[: len(PLATOON_ERRORS)]), read[len(PLATOON_ERRORS) :]
+        # Within the limits of every controller, which a hybrid leaves out.
+        return cacc_acceleration(errors, self.gains, self.time_step, inf, *speed)
 
 
 class DeadBeat(Controller):
@@ -139,18 +143,18 @@ class DeadBeat(Controller):
     stay, so it is a baseline, not a controller to drive with.
     """
 
-    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
     lookahead: Lookahead = "causal"
 
     def setup(self, world: World) -> None:
         """Read what the look-ahead needs."""
-        self.drive(world, ["self.speed", *leader_names(self.lookahead)])
+        self.declare(world, ["self.speed", *leader_names(self.lookahead)])
         check_leader(self.lookahead, self)
 
     def command(self, speed: Tensor, *leader: Tensor) -> Tensor:
         """Return the commands."""
         target = next_leader_speed(leader, self.lookahead, self.time_step)
-        return dead_beat_acceleration(speed, target, self.time_step, self.max_acceleration)
+        return dead_beat_acceleration(speed, target, self.time_step, inf)
 
 
 def leader_names(lookahead: str) -> list[str]:

@@ -25,15 +25,14 @@ from torch import Tensor
 
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
-from lcc_rl.pieces.base import StepTransform
-from lcc_rl.pieces.string import COMMAND, WANTED
-from lcc_rl.pieces.views import ACTION, AHEAD, BEHIND, SELF
-from lcc_rl.pieces.world import World
+from lcc_rl.pieces.base import ACTION, ROLE, Entry, RoleTransform, as_key
+from lcc_rl.pieces.string import COMMANDED, WISHED
+from lcc_rl.pieces.views import AHEAD, BEHIND, SELF
+from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import Number, Positive, find_target
 
 # The names of the random streams: an episode's seed means the same episode under either.
 STREAMS = {AUTOMATED: "cav", HUMAN: "hdv"}
-LARGEST = 3.0  # command to automated vehicles, in both directions [m/s²]
 
 
 def stream_name(role: str) -> str:
@@ -57,7 +56,7 @@ class Population(Protocol):
         """The parameters of the IDM that the drivers share."""
 
 
-class Controller(StepTransform):
+class Controller(RoleTransform):
     """Base of all controllers: writes ``("command", role)``, ``[*batch, n, 1]`` [m/s²].
 
     Where the role has a safety filter, it writes ``("wanted", role)``, which this reads.
@@ -66,55 +65,53 @@ class Controller(StepTransform):
     within ±3 m/s², or, of whatever role, within the controller's setting ``max_acceleration``.
     """
 
-    name: ClassVar[str] = AUTOMATED
-    reads: ClassVar[Sequence[str]] = ()
-    # Names of what it remembers, each an entry (role, name) of one number per vehicle, 0 at first.
-    remembers: ClassVar[Sequence[str]] = ()
+    # What it remembers, 0 at first: entries, or names of entries (role, name) of one number.
+    remembers: ClassVar[Sequence[str | Entry]] = ()
     # Maps what is read and remembered, one row per vehicle of the role, to the commands
-    # [*batch, n, 1], or to a tuple of them and what is remembered next.
+    # [*batch, n, 1], or to a tuple of them, what is remembered next and what else is written.
     command: ClassVar[Callable[..., Any]]
+
+    measures = True
+    orders = (COMMANDED, WISHED)
 
     def bind(self, world: World | None = None, name: str | None = None) -> Self:
         """Return the controller of a role; without a world, of one vehicle of that role."""
         role = name or self.name
         return super().bind(world or World(VehicleString((role,))), role)
 
-    def setup(self, world: World) -> None:
-        """Derive from a world what depends on it; one that overrides this calls it or drive."""
-        own = [(self.name, entry) for entry in self.remembers]
-        self.drive(world, [*self.reads, *map(".".join, own)], own)
-
-    def drive(
+    def declare(
         self,
         world: World,
-        reads: Sequence[str],
-        writes: Sequence[NestedKey] = (),
-        **more: Sequence[NestedKey],
+        reads: Any = None,
+        writes: Sequence[Entry | NestedKey] | None = None,
+        keeps: Sequence[Entry] | None = None,
+        remembers: Sequence[str | Entry] | None = None,
     ) -> None:
-        """Set what is read by name, and what is written besides the command.
+        """Set what is read and written, where it depends on settings.
 
         Args:
             world: what the pieces of the environment share.
-            reads: names of what it reads.
-            writes: entries in the order of the values after the command.
-            **more: see :meth:`lcc_rl.pieces.base.StepTransform.wire`.
+            reads: names of what :meth:`command` is given before what it remembers.
+            writes: entries of what it returns after the command and what it remembers.
+            keeps: see :meth:`lcc_rl.pieces.base.StepTransform.declare`.
+            remembers: what it remembers; by default what the class does.
         """
-        self.role, self.string, self.time_step = self.name, world.string, world.time_step
-        largest = getattr(self, "max_acceleration", LARGEST if self.role == AUTOMATED else None)
+        self.time_step = world.time_step
+        otherwise = MAX_ACCELERATION if self.role == AUTOMATED else None
+        largest = getattr(self, "max_acceleration", otherwise)
         # Of the commands [m/s²]; None where they are executed as they are.
         self.limits: tuple[float, float] | None = None if largest is None else (-largest, largest)
-        self.names = tuple(reads)
-        known = world.sensed(self.role, reads)
-        wish = WANTED if self.role in world.filtered else COMMAND
-        self.see(world, known, [(wish, self.role), *writes], self.role, **more)
+        memory = self.remembers if remembers is None else remembers
+        own = [Entry((ROLE, x)) if isinstance(x, str) else x for x in memory]
+        kept = [".".join(as_key(entry.of(self.role).key)) for entry in own]
+        self.names = (*(self.reads if reads is None else reads), *kept)
+        order = self.orders[self.role in world.filtered]
+        more = self.writes if writes is None else writes
+        super().declare(world, self.names, [order, *own, *more], keeps)
 
     def compute(self, *entries: Tensor) -> Any:
-        """Return the commands, and what else is written."""
-        return self.limited(*self.views(*entries))
-
-    def limited(self, *read: Tensor) -> Any:
         """Return what :meth:`command` returns, its commands within the limits."""
-        found = self.command(*read)
+        found = self.command(*entries)
         if self.limits is None:
             return found
         if isinstance(found, Tensor):
@@ -130,13 +127,13 @@ class Action(Controller):
     sees actions beyond the range as its ends (:mod:`lcc_rl.pieces.views`).
     """
 
-    max_acceleration: Positive = 3.0  # acceleration of action 1, braking of action −1 [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # of action 1, in both directions [m/s²]
 
-    reads = (f"{AUTOMATED}.{ACTION}",)
+    reads = (".".join(ACTION),)
 
     def setup(self, world: World) -> None:
         """Read the role's action."""
-        self.drive(world, [f"{self.name}.action"])
+        self.declare(world, [f"{self.name}.action"])
         self.limits = None  # within ±1 the action is read
 
     def command(self, action: Tensor) -> Tensor:
@@ -175,7 +172,7 @@ class Law(Controller):
         self.function = find_target(self.law, "law")
         parameters = inspect.signature(self.function).parameters.values()
         names = [one.name for one in parameters if one.default is one.empty]
-        self.drive(world, [_entry(name) for name in names])
+        self.declare(world, [_entry(name) for name in names])
 
     def command(self, *entries: Tensor) -> Tensor:
         """Return the commands."""

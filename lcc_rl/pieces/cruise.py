@@ -2,33 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import ClassVar
+from abc import abstractmethod
 
+import torch
 from torch import Tensor
 
-from lcc_rl.functional.rules import idm_acc, linear_acc
+from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.settings import Positive
+from lcc_rl.pieces.world import MAX_ACCELERATION
+from lcc_rl.settings import Positive, defaults
+
+Constant = Tensor | float
 
 
 class Cruise(Controller):
-    """A rule of own speed, gap and relative speed, held within the largest acceleration."""
+    """A rule of own speed, gap and relative speed, held within the largest acceleration.
 
-    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    The settings of a class besides that are the constants of its law, in this order.
+    """
+
+    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
 
     reads = ("self.speed", "self.gap", "self.relative_speed")
-    law: ClassVar[Callable[..., Tensor]]
-    constants_of_rule: ClassVar[tuple[str, ...]]  # settings that the law takes, in its order
+
+    @classmethod
+    def constants_of_rule(cls) -> dict[str, float]:
+        """Return the constants of the law with their defaults."""
+        return {name: x for name, x in defaults(cls).items() if name != "max_acceleration"}
+
+    @staticmethod
+    @abstractmethod
+    def law(speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Constant) -> Tensor:
+        """Return the acceleration [m/s²].
+
+        Args:
+            speed: own speed v [m/s].
+            gap: bumper-to-bumper gap [m].
+            relative_speed: v_ahead − v [m/s].
+            *constants: those of :meth:`constants_of_rule`.
+        """
 
     def command(self, speed: Tensor, gap: Tensor, relative_speed: Tensor) -> Tensor:
         """Return the commands."""
-        constants = (getattr(self, name) for name in self.constants_of_rule)
-        return type(self).law(speed, gap, relative_speed, *constants)
+        constants = (getattr(self, name) for name in self.constants_of_rule())
+        return self.law(speed, gap, relative_speed, *constants)
 
 
 class IDMACC(Cruise):
-    """Cruise control by the Intelligent Driver Model, :func:`lcc_rl.functional.rules.idm_acc`."""
+    """Cruise control by the Intelligent Driver Model (A3–A4)."""
 
     desired_speed: Positive = 25.0  # v0 [m/s]
     time_gap: Positive = 1.2  # T [s]
@@ -36,12 +57,21 @@ class IDMACC(Cruise):
     deceleration: Positive = 1.5  # b [m/s²]
     min_gap: Positive = 2.0  # s0 [m]
 
-    law = staticmethod(idm_acc)
-    constants_of_rule = ("desired_speed", "time_gap", "acceleration", "deceleration", "min_gap")
+    @staticmethod
+    def law(speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Constant) -> Tensor:
+        """Return the acceleration of the model [m/s²]."""
+        desired_speed, time_gap, *shared = constants
+        model = IDMConstants(*shared)  # type: ignore[arg-type]
+        return model(speed, gap, -relative_speed, desired_speed, time_gap)
 
 
 class LinearACC(Cruise):
-    """Cruise control with a constant time gap, :func:`lcc_rl.functional.rules.linear_acc`."""
+    """Cruise control with a constant time gap.
+
+    k_d (gap − s0 − T v) + k_v (v_ahead − v), or k_v (v_d − v) where that is less: the usual form,
+    e.g. Milanés and Shladover, "Modeling cooperative and autonomous adaptive cruise control
+    dynamic responses using experimental data", Transportation Research C 48 (2014).
+    """
 
     desired_speed: Positive = 25.0  # v_d [m/s]
     time_gap: Positive = 1.5  # T [s]
@@ -49,5 +79,9 @@ class LinearACC(Cruise):
     gap_gain: Positive = 0.1  # k_d [1/s²]
     speed_gain: Positive = 0.5  # k_v [1/s]
 
-    law = staticmethod(linear_acc)
-    constants_of_rule = ("desired_speed", "time_gap", "min_gap", "gap_gain", "speed_gain")
+    @staticmethod
+    def law(speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Constant) -> Tensor:
+        """Return the acceleration of the formula [m/s²]."""
+        desired_speed, time_gap, min_gap, gap_gain, speed_gain = constants
+        following = gap_gain * (gap - min_gap - time_gap * speed) + speed_gain * relative_speed
+        return torch.minimum(following, speed_gain * (desired_speed - speed))

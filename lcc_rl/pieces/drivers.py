@@ -9,38 +9,34 @@ import torch
 from pydantic import BeforeValidator, Field, InstanceOf
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.driver_models import DriverConstants, DriverLaw, NoiseStep, Reaction
-from lcc_rl.functional.gipps import GIPPS_LAW
-from lcc_rl.functional.idm import IDM_LAW
+from lcc_rl.functional.driver_models import DriverConstants, NoiseStep, Reaction
+from lcc_rl.functional.gipps import GippsConstants
+from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.layout import join
-from lcc_rl.functional.ovm import FVDM_LAW, OVM_LAW
+from lcc_rl.functional.ovm import FVDMConstants, OVMConstants
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.functional.random import between, choose, normal, stream_id, uniform
-from lcc_rl.pieces.base import SEED, Key, as_key, require_option
+from lcc_rl.pieces.base import SEED, Entry, require_option
 from lcc_rl.pieces.controllers import Controller, stream_name
+from lcc_rl.pieces.leader import LEADER_SPEED
+from lcc_rl.pieces.views import MOTION
 from lcc_rl.pieces.world import MOST_LATE, World
 from lcc_rl.settings import Factors, NonNegative, Positive, Share
 
-LEADER_SPEED = ("leader", "speed")
-MOTION = ("self.speed", "self.gap", "self.relative_speed")
+INT = torch.int64
 # Draws that all drivers of an episode share.
-SPREAD, TIME_GAP = stream_id("drivers.wiener"), stream_id("drivers.time_gap")
-LONGEST = 1000.0  # time gap up to which an equilibrium gap is written [s]
+WIENER_STREAM, TIME_GAP_STREAM = stream_id("drivers.wiener"), stream_id("drivers.time_gap")
+LONGEST_TIME_GAP = 1000.0  # time gap up to which an equilibrium gap is written [s]
 
 
 class Drivers(Controller):
     """Base of human drivers: each has its own (v0, T), noise and a reaction delay.
 
     Every vehicle draws a driver by the episode's seed, unless ``(role, "driver")`` is given to
-    ``env.reset``. Constants of the episode under the role, ``[*batch, n, 1]``: driver,
-    desired_speed [m/s], desired_time_gap [s]; of other models than the IDM behind a leader also
-    equilibrium_gap, at which the driver follows at the leader's first speed [m]. With a delay,
-    ``(role, "motion_history")``, ``[*batch, n, 3 · delay]``, holds past speeds [m/s], gaps [m] and
-    relative speeds [m/s], latest first; with a noise of the acceleration ``(role,
-    "acceleration_noise")``, ``[*batch, n, 2]``, holds its latest values [m/s²].
+    ``env.reset``. The equilibrium gap is written for other models than the IDM behind a leader,
+    the past motion with a delay, and the latest values of the noise where there is one.
     """
 
     # Largest relative error ξ of the executed acceleration a·(1 + ξ), drawn anew each step from
@@ -58,7 +54,19 @@ class Drivers(Controller):
     acceleration_noise: NonNegative | None = None
 
     name = HUMAN
-    law: ClassVar[DriverLaw] = IDM_LAW
+    known = (
+        Entry("role.driver", "–", "id of each vehicle's driver in the population", 1, INT, True),
+        Entry("role.desired_speed", "m/s", "desired speed v0 of the driver"),
+        Entry("role.desired_time_gap", "s", "desired time gap T of the driver"),
+        Entry(
+            "role.equilibrium_gap", "m", "gap at which the driver follows the leader's first speed"
+        ),
+    )
+    history = Entry(
+        "role.motion_history", "m/s, m, m/s", "past (speed, gap, relative speed), latest first"
+    )
+    stray = Entry("role.acceleration_noise", "m/s²", "noise of the acceleration, latest first", 2)
+    law: ClassVar[type[DriverConstants]] = IDMConstants
     tells_gap: ClassVar[bool] = False  # whether the equilibrium gap is written
     further: ClassVar[tuple[str, ...]] = ()  # entries of the role that acceleration reads, too
     desired_speeds: ClassVar[Tensor]
@@ -69,7 +77,6 @@ class Drivers(Controller):
         """Take the drivers, and choose what is read and written by the settings."""
         role = self.name
         speeds, time_gaps, self.drivers = self.described(world, f"scenario.controllers.{role}")
-        kept = ["driver", "desired_speed", "desired_time_gap"]
         reaction = self.reaction(world)
         late, strays = self.delay, self.acceleration_noise
         what = "the reaction delay of drivers"
@@ -77,14 +84,11 @@ class Drivers(Controller):
         self.strays = reaction.noise if strays is None else strays
         self.noise_step = NoiseStep.of(world.time_step)
         self.starts = self.tells_gap and not world.string.ring
-        constants = [(role, name) for name in [*kept, *["equilibrium_gap"] * self.starts]]
-        history = [(role, "motion_history")] * (self.late > 0)
-        history += [(role, "acceleration_noise")] * (self.strays > 0)
-        names = [*MOTION, *(".".join(key) for key in constants[1:3]), "episode.seed"]
+        memory = [self.history.wide(3 * self.late)] * (self.late > 0)
+        memory += [self.stray] * (self.strays > 0)
+        names = [*MOTION, f"{role}.desired_speed", f"{role}.desired_time_gap", "episode.seed"]
         names += ["episode.step", *(f"{role}.{name}" for name in self.further)]
-        names += [".".join(key) for key in history]
-        options = constants[:1]
-        self.drive(world, names, history, constants=constants, reset_options=options)
+        self.declare(world, names, keeps=self.known[: 3 + self.starts], remembers=memory)
         self.limits = None  # drives as a person, in automated vehicles, too
         walk = self.wiener / world.time_step**0.5
         self.spreads = tuple(walk * factor for factor in world.deviations(self.wiener_range))
@@ -97,7 +101,7 @@ class Drivers(Controller):
         self.driver_stream = stream_id(f"{stream_name(role)}.driver")
         self.register_buffer("desired_speeds", speeds)
         self.register_buffer("time_gaps", time_gaps)
-        self.register_buffer("index", torch.arange(self.event_shape[0]).unsqueeze(-1))
+        self.register_buffer("index", torch.arange(*self.rows).unsqueeze(-1))
 
     def described(self, world: World, where: str) -> tuple[Tensor, Tensor, DriverConstants]:
         """Return v0 [m/s] and T [s] of the drivers, ``[drivers]``, and what they share.
@@ -105,9 +109,7 @@ class Drivers(Controller):
         Raises:
             ConfigError: if there are none, or they are of other models.
         """
-        if world.population is None:
-            raise ConfigError(f"{where} needs drivers: bind it to a World(population=…)")
-        population = world.population
+        population = world.given("population", where)
         return population.desired_speed, population.time_gap, population.constants
 
     def reaction(self, world: World) -> Reaction:
@@ -143,7 +145,7 @@ class Drivers(Controller):
             draw = uniform(seed, step, self.noise_stream + self.index)
             command = command * (1.0 + self.noise * draw)
         if self.wiener:
-            spread = between(self.spreads, seed, SPREAD)
+            spread = between(self.spreads, seed, WIENER_STREAM)
             command = command + spread * normal(seed, step, self.wiener_stream + self.index)
         if self.strays:
             command = command + kept[-1][..., :1]
@@ -169,28 +171,13 @@ class Drivers(Controller):
         *more: Tensor,
     ) -> Tensor:
         """Return what the drivers wish without noise [m/s²], all ``[*batch, n, 1]``."""
-        return self.law.acceleration(
-            speed, gap, -relative_speed, desired_speed, time_gap, self.drivers
-        )
+        return self.drivers(speed, gap, -relative_speed, desired_speed, time_gap)
 
     def equilibrium_gap(
         self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor, driver: Tensor
     ) -> Tensor:
         """Return the gap at which drivers follow steadily [m], all ``[*batch, n, 1]``."""
-        return self.law.equilibrium_gap(speed, desired_speed, time_gap, self.drivers, LONGEST)
-
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        specs = super().written_specs(batch, device)
-        for key in self.targets[1:]:
-            width = 3 * self.late if key[-1] == "motion_history" else 2
-            specs[key] = Unbounded(shape=(*batch, self.event_shape[0], width), device=device)
-        return specs
-
-    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        specs = super().constant_specs(batch, device)
-        shape = (*batch, *self.event_shape)
-        specs[self.constants[0]] = Unbounded(shape=shape, dtype=torch.int64, device=device)
-        return specs
+        return self.drivers.equilibrium_gap(speed, desired_speed, time_gap, LONGEST_TIME_GAP)
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         super().begin(given, start)
@@ -201,13 +188,13 @@ class Drivers(Controller):
             driver = choose(seed, count, self.driver_stream + self.index)
         else:
             require_option(self.reset_options[0], driver, count)
-        factor = between(self.time_gap_factors, start.get(SEED).unsqueeze(-2), TIME_GAP)
+        factor = between(self.time_gap_factors, start.get(SEED).unsqueeze(-2), TIME_GAP_STREAM)
         values = [driver, self.desired_speeds[driver], factor * self.time_gaps[driver]]
         if self.starts:
             speed = start.get(LEADER_SPEED).unsqueeze(-2).expand_as(values[1])
             values.append(self.equilibrium_gap(speed, values[1], values[2], driver))
         for key, value in zip(self.constants, values, strict=True):
-            start.set(as_key(key), value)
+            start.set(key, value)
 
 
 def _made(value: Any) -> Any:
@@ -225,7 +212,7 @@ class DriverModel(Drivers):
     They execute what they wish with a relative error (A18).
 
     A model of your own overrides :meth:`acceleration`, or sets ``law`` to a
-    :class:`lcc_rl.functional.driver_models.DriverLaw` and ``tells_gap``.
+    :class:`lcc_rl.functional.driver_models.DriverConstants` and ``tells_gap``.
     """
 
     # v0 of every vehicle; None: of the population [m/s]. Needs time_gap, too.
@@ -234,7 +221,7 @@ class DriverModel(Drivers):
     # Those besides v0 and T, the law's constants; None: of the population.
     parameters: Annotated[InstanceOf[DriverConstants] | None, BeforeValidator(_made)] = None
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if (self.desired_speed is None) != (self.time_gap is None):
             raise ValueError("desired_speed and time_gap belong together: give both or none")
 
@@ -247,7 +234,7 @@ class DriverModel(Drivers):
         one = self.desired_speed is not None
         if one:
             own = torch.tensor([[float(x)] for x in (self.desired_speed, self.time_gap)])  # type: ignore[arg-type]
-            known = self.law.constants() if world.population is None else world.population.constants
+            known = self.law() if world.population is None else world.population.constants
             found = (own[0], own[1], known)
         else:
             found = super().described(world, where)
@@ -259,8 +246,8 @@ class DriverModel(Drivers):
                 f"controller@{where}=calibrated drives each by its own model"
             )
         constants = found[2] if self.parameters is None else self.parameters
-        if not isinstance(constants, self.law.constants):
-            expected = self.law.constants.__name__
+        if not isinstance(constants, self.law):
+            expected = self.law.__name__
             raise ConfigError(f"{where}.parameters: expected {expected}, got {constants!r}")
         if any(isinstance(value, Tensor) for value in vars(constants).values()):
             raise ConfigError(
@@ -276,27 +263,27 @@ class IDM(DriverModel):
 
 
 class OVM(DriverModel):
-    """Drivers of the optimal velocity model, see :func:`lcc_rl.functional.ovm.ovm_acceleration`.
+    """Drivers of the optimal velocity model, see :class:`lcc_rl.functional.ovm.OVMConstants`.
 
     It does not regard the speed difference, and may collide.
     """
 
-    law = OVM_LAW
+    law = OVMConstants
     tells_gap = True
 
 
 class FVDM(DriverModel):
     """Drivers of the full velocity difference model.
 
-    See :func:`lcc_rl.functional.ovm.fvdm_acceleration`.
+    See :class:`lcc_rl.functional.ovm.FVDMConstants`.
     """
 
-    law = FVDM_LAW
+    law = FVDMConstants
     tells_gap = True
 
 
 class Gipps(DriverModel):
-    """Drivers of Gipps' model, see :func:`lcc_rl.functional.gipps.gipps_acceleration`."""
+    """Drivers of Gipps' model, see :class:`lcc_rl.functional.gipps.GippsConstants`."""
 
-    law = GIPPS_LAW
+    law = GippsConstants
     tells_gap = True

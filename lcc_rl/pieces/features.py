@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
 
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
-from lcc_rl.pieces.base import SEED, Feature, Key, StepTransform, next_key
-from lcc_rl.pieces.views import VEHICLES, Views
+from lcc_rl.pieces.base import SEED, Entry, Feature, StepTransform
+from lcc_rl.pieces.views import NEXT, SELF, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
 
@@ -23,10 +22,9 @@ class TimeToCollision(Feature):
 
     floor: Positive = 0.01  # smallest value, which a collision has too [s]
 
-    def setup(self, world: World) -> None:
-        """Read the motion."""
-        reads = [(VEHICLES, "gap"), (VEHICLES, "relative_speed")]
-        self.wire(reads, [(VEHICLES, "ttc")], (len(world.string), 1))
+    role = VEHICLES
+    reads = ("vehicles.gap", "vehicles.relative_speed")
+    writes = (Entry("vehicles.ttc", "s", "time-to-collision; 1000 where the gap does not close"),)
 
     def compute(self, gap: Tensor, relative_speed: Tensor) -> Tensor:
         """Return the time-to-collision, ``[*batch, N, 1]``."""
@@ -38,10 +36,9 @@ class TimeGap(Feature):
 
     speed_floor: NonNegative = 1.0  # speeds below this count as this; 0: the literal rule [m/s]
 
-    def setup(self, world: World) -> None:
-        """Read the motion."""
-        reads = [(VEHICLES, "gap"), (VEHICLES, "speed")]
-        self.wire(reads, [(VEHICLES, "time_gap")], (len(world.string), 1))
+    role = VEHICLES
+    reads = ("vehicles.gap", "vehicles.speed")
+    writes = (Entry("vehicles.time_gap", "s", "gap divided by speed"),)
 
     def compute(self, gap: Tensor, speed: Tensor) -> Tensor:
         """Return the time gap, ``[*batch, N, 1]``."""
@@ -58,19 +55,20 @@ class EnergyClasses(StepTransform):
     the fleet's models.
     """
 
+    role = VEHICLES
+    keeps = (
+        Entry(CLASS, "–", "number of the vehicle's energy model, of a mixture", dtype=torch.int64),
+    )
+
     def setup(self, world: World) -> None:
         """Take the classes and their shares from the world."""
-        self.wire([], [], (len(world.string), 1), constants=[CLASS])
-        self.string, self.energy = world.string, world.energy
+        self.declare(world)
+        self.energy = world.given("energy", self.title)
         self.stream = stream_id("vehicles.energy_class")
 
     def compute(self) -> tuple[()]:
         """Return nothing: classes are constant within an episode."""
         return ()
-
-    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        shape = (*batch, *self.event_shape)
-        return {CLASS: Unbounded(shape=shape, dtype=torch.int64, device=device)}
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         count, seed = len(self.string), start.get(SEED).unsqueeze(-2)
@@ -109,19 +107,23 @@ class MotorPower(StepTransform):
     power: str = "power"  # entry of theirs that is written
     recuperation: bool = True  # braking feeds the battery
 
+    kinds = (
+        Entry("vehicles.power", "W", "power drawn during the last step"),
+        Entry("role.predicted_power", "W", "motor power at the predicted acceleration"),
+    )
+
     def setup(self, world: World) -> None:
         """Read the motion of those vehicles, and the class of each where there are several."""
-        everybody, string = self.vehicles == VEHICLES, world.string
-        speed = f"{VEHICLES}.speed" if everybody else "self.speed"
-        names = [speed, ".".join(next_key((self.vehicles, self.acceleration)))]
-        self.energy = world.energy
+        self.energy = world.given("energy", self.title)
+        everybody, self.role = self.vehicles == VEHICLES, self.vehicles
+        space = VEHICLES if everybody else SELF
+        names = [f"{space}.speed", f"{NEXT}.{self.vehicles}.{self.acceleration}"]
         if len(self.energy.models) > 1:
-            names.append(".".join(CLASS) if everybody else f"self.{CLASS[-1]}")
-        self.views = Views(string, self.vehicles, names)
-        count = len(string) if everybody else string.count(self.vehicles)
-        self.wire(self.views.keys, [(self.vehicles, self.power)], (count, 1))
+            names.append(f"{space}.{CLASS[-1]}")
+        written = self.kinds[0] if everybody else self.kinds[1]
+        self.declare(world, names, [replace(written, key=(self.vehicles, self.power))])
 
-    def compute(self, *entries: Tensor) -> Tensor:
+    def compute(self, *motion: Tensor) -> Tensor:
         """Return the power, ``[*batch, n, 1]``."""
-        power = self.energy.power(*self.views(*entries))
+        power = self.energy.power(*motion)
         return power if self.recuperation else power.clamp(min=0.0)

@@ -11,22 +11,20 @@ import torch
 from pydantic import InstanceOf
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
 
-from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.braking import Braking, safe_acceleration
 from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.hcfs import (
     Choice,
     Decision,
-    Place,
+    PlatoonPlace,
     PlatoonReward,
     hybrid_decision,
     jerk_interval,
-    safe_acceleration,
 )
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces.base import Key, Piece
+from lcc_rl.pieces.base import Entry, Piece
 from lcc_rl.pieces.connected import (
     Communication,
     Lookahead,
@@ -35,11 +33,15 @@ from lcc_rl.pieces.connected import (
     leader_names,
 )
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.pieces.world import World
+from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import NonNegative, Positive
 
-HYBRID, COUNTERS = "hybrid", ("switches", "clamps", "cap_interventions")
-OWN = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
+WINNER = ("hybrid", "winner")
+COUNTERS = SWITCHES, CLAMPS, CAPS = tuple(
+    ("hybrid", name) for name in ("switches", "clamps", "cap_interventions")
+)
+HYBRID_READS = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
+INT = torch.int64
 SPARE = 2.0  # beyond the gap that the cap needs, for what vehicles deviate from it [m]
 
 
@@ -47,14 +49,11 @@ class HCFS(Controller):
     """The hybrid car-following strategy: a rule or the action, the better of both each step.
 
     Composes two candidates by H12–H14, see :func:`lcc_rl.functional.hcfs.hybrid_decision`: the
-    command of a rule and the action of a policy. Writes under ``"hybrid"``, ``[*batch, n, 1]``,
-    int64: ``winner`` (0 rule, 1 policy; −1 at reset) and since the start of the episode the
-    numbers of ``switches``, ``clamps`` (the jerk bound cut a candidate) and
-    ``cap_interventions``.
+    command of a rule and the action of a policy.
     """
 
     rule: InstanceOf[Controller]  # whose command is one candidate
-    max_acceleration: Positive = 3.0  # acceleration of action 1 [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # acceleration of action 1 [m/s²]
     jerk_bound: Positive = 30.0  # J; the paper's 2 a_max/T = 30 never binds [m/s³]
     lookahead: Lookahead = "causal"
     clamp: bool = True  # hold the candidates within the jerk bound; false: the literal rule
@@ -70,17 +69,23 @@ class HCFS(Controller):
     margin: NonNegative = 0.5  # gap that it keeps at standstill [m]
     # Settings of the compared lcc_rl.functional.hcfs.PlatoonReward; with spacing_weight 0,
     # the paper's rule, gap_scale and spacing_time have no effect.
-    velocity_weight: NonNegative = 10.0
-    speed_scale: Positive = 27.1  # [m/s]
-    jerk_weight: NonNegative = 0.036
-    jerk_scale: Positive = 30.0  # [m/s³]
-    spacing_weight: NonNegative = 0.0
-    gap_scale: Positive = 1.0  # [m]
-    spacing_time: NonNegative = 0.0  # e_x counts so long after the step [s]
+    velocity_weight: NonNegative = PlatoonReward.velocity_weight
+    speed_scale: Positive = PlatoonReward.speed_scale  # [m/s]
+    jerk_weight: NonNegative = PlatoonReward.jerk_weight
+    jerk_scale: Positive = PlatoonReward.jerk_scale  # [m/s³]
+    spacing_weight: NonNegative = PlatoonReward.spacing_weight
+    gap_scale: Positive = PlatoonReward.gap_scale  # [m]
+    spacing_time: NonNegative = PlatoonReward.spacing_time  # e_x counts so long after the step [s]
 
     reads = (f"{AUTOMATED}.action",)
+    remembers = (
+        Entry(WINNER, "–", "candidate chosen: 0 rule, 1 policy, −1 at reset", 1, INT),
+        Entry(SWITCHES, "–", "changes of the winner since the start", 1, INT),
+        Entry(CLAMPS, "–", "steps in which the jerk bound cut a candidate", 1, INT),
+        Entry(CAPS, "–", "steps in which the safe cap cut a candidate", 1, INT),
+    )
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.braking > self.max_acceleration:  # more than vehicles can brake is no safe cap
             raise ValueError(
                 f"braking must be at most max_acceleration={self.max_acceleration}, "
@@ -90,25 +95,19 @@ class HCFS(Controller):
     def setup(self, world: World) -> None:
         """Read what both candidates and the decision need."""
         self.rule = rule = self.rule.bind(world, self.name)
-        rule.max_acceleration = math.inf  # the decision limits what is executed
-        state = [(HYBRID, name) for name in ("winner", *COUNTERS)]
-        reads = [f"{self.name}.action", *(f"self.{name}" for name in OWN)]
-        reads += [*leader_names(self.lookahead), *(".".join(key) for key in state), *rule.names]
-        self.drive(world, reads, state)
+        reads = [f"{self.name}.action", *(f"self.{name}" for name in HYBRID_READS)]
+        self.declare(world, [*reads, *leader_names(self.lookahead), *rule.names])
         check_leader(self.lookahead, self)
         if self.choice == "first":
             check_platoon(self, "choice=first", "needs a string that is one platoon", "between")
         own = {field.name: getattr(self, field.name) for field in fields(PlatoonReward)}
         self.reward = PlatoonReward(**own)
+        self.both_brake = Braking(self.braking, self.braking, time_to_collision=0.0)
 
     def command(self, action: Tensor, *entries: Tensor) -> tuple[Tensor, ...]:
         """Return the commands, the winners and the counters."""
-        own, leader, (winner, *counts), rule = (
-            entries[:5],
-            entries[5:8],
-            entries[8:12],
-            entries[12:],
-        )
+        own, leader, rule = entries[:5], entries[5:8], entries[8:-4]
+        winner, *counts = entries[-4:]
         decision = self.decide(action, own, leader, winner, self.rule.command(*rule))
         flags = (decision.switched, decision.clamped, decision.capped)
         counted = [count + flag for count, flag in zip(counts, flags, strict=True)]
@@ -125,9 +124,8 @@ class HCFS(Controller):
         """Return the decision and what led to it."""
         speed, last, gap, speed_error, leader_gap = own
         interval = jerk_interval(last, self.jerk_bound, self.time_step, self.max_acceleration)
-        cap = safe_acceleration(
-            gap, speed, speed + speed_error, self.time_step, self.braking, self.margin
-        )
+        ahead, time_step = speed + speed_error, self.time_step
+        cap = safe_acceleration(speed, gap - self.margin, ahead, self.both_brake, time_step)
         return hybrid_decision(
             rule,
             action * self.max_acceleration,
@@ -140,24 +138,16 @@ class HCFS(Controller):
             self.reward,
             self.time_step,
             self.max_acceleration,
-            Place(leader_gap, leader[0]),
+            PlatoonPlace(leader_gap, leader[0]),
             self.choice,
         )
 
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        specs = super().written_specs(batch, device)
-        shape = (*batch, *self.event_shape)
-        for key in self.targets[1:]:
-            specs[key] = Unbounded(shape=shape, dtype=torch.int64, device=device)
-        return specs
-
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         super().begin(given, start)
-        winner = start.get((HYBRID, "winner"))
-        start.set((HYBRID, "winner"), torch.full_like(winner, -1))
+        start.set(WINNER, torch.full_like(start.get(WINNER), -1))
 
 
-def check_spacing(pieces: Sequence[Piece], profiles: Profiles) -> None:
+def check_spacing(pieces: Sequence[Piece], profiles: Any) -> None:
     """Check that a platoon keeps the gap that the safe cap of its hybrid controller needs.
 
     At a speed v shared with the vehicle ahead the cap lets a vehicle be T·v + margin behind it, by
@@ -166,7 +156,7 @@ def check_spacing(pieces: Sequence[Piece], profiles: Profiles) -> None:
 
     Args:
         pieces: the pieces of an environment.
-        profiles: the speeds of its leader.
+        profiles: the speeds of its leader, :class:`lcc_rl.data.profiles.Profiles`.
 
     Raises:
         ConfigError: naming the fastest leader, both gaps and the option.

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from dataclasses import replace
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from pydantic import Field
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
-from lcc_rl.pieces.base import NEXT, SEED, STEP, Feature, Key, StepTransform
-from lcc_rl.pieces.views import Views
+from lcc_rl.pieces.base import SEED, STEP, Entry, Feature, StepTransform
+from lcc_rl.pieces.leader import PROFILE, PROFILE_START
+from lcc_rl.pieces.views import EPISODE, NEXT, Views
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative
 
@@ -35,6 +36,9 @@ class LeaderPreview(Feature):
     noise: NonNegative = 0.0  # standard deviation of an error drawn anew for each speed [m/s]
     delay: Seconds = 0.0  # age of the message: the speed of that long before is given instead [s]
 
+    role = EPISODE
+    reads = (PROFILE, PROFILE_START, SEED, STEP)
+    known = Entry("preview.speed", "m/s", "speed of the leader at each horizon ahead")
     speeds: ClassVar[Tensor]
     offsets: ClassVar[Tensor]
     last: ClassVar[Tensor]
@@ -43,8 +47,8 @@ class LeaderPreview(Feature):
 
     def setup(self, world: World) -> None:
         """Take the leader's records."""
-        reads, profiles = [("leader", "profile"), ("leader", "start"), SEED, STEP], world.profiles
-        self.wire(reads, [("preview", "speed")], (1, len(self.horizons)))
+        profiles = world.profiles
+        self.declare(world, writes=[replace(self.known, width=(1, len(self.horizons)))])
         self.stream = stream_id("preview.noise")
         where = f"scenario.pieces.{self.name}"
         late = world.steps(self.delay, f"{where}.delay")
@@ -80,12 +84,15 @@ class ObservationMemory(StepTransform):
     seconds: Times = (0.5, 1.0, 2.0, 5.0)  # time constants or ages, at least a step [s]
     kind: Literal["filtered", "stacked"] = "filtered"
 
+    measures = True
+    found = Entry("memory.entries", "of source", "averages or past values of each source")
+    history = Entry("memory.history", "of source", "values of each source in the last steps")
     shares: ClassVar[Tensor]
     places: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
         """Find what is measured, and how much of it is kept."""
-        time_step, string = world.time_step, world.string
+        time_step = world.time_step
         if min(self.seconds) < time_step:
             raise ConfigError(
                 f"memory.seconds must be at least a step of {time_step} s, got {min(self.seconds)}"
@@ -94,23 +101,20 @@ class ObservationMemory(StepTransform):
         if self.stacked:
             ages = [world.steps(age, "memory.seconds") for age in self.seconds]
             self.depth = max(ages) + 1
-        kept = "history" if self.stacked else "entries"
-        known = world.sensed(AUTOMATED, self.sources)
-        reached = [f"{NEXT}.{source}" for source in known]
-        self.views = Views(string, AUTOMATED, [f"memory.{kept}", *reached])
-        # The same entries at reset, where there is no step before.
-        self.first = Views(string, AUTOMATED, known)
-        writes = [("memory", "entries")] + ([("memory", "history")] if self.stacked else [])
         self.counted, self.repeat = len(self.sources), len(self.seconds)
-        shape = (string.count(AUTOMATED), self.counted * self.repeat)
-        self.wire(self.views.keys, writes, shape)
+        kept = self.history if self.stacked else self.found
+        writes = [self.found.wide(self.counted * self.repeat)]
+        writes += [self.history.wide(self.counted * self.depth)] * self.stacked
+        reached = [f"{NEXT}.{source}" for source in self.sources]
+        self.declare(world, [str(kept.key), *reached], writes)
+        # The same entries at reset, where there is no step before.
+        self.first = Views(world.string, AUTOMATED, world.sensed(AUTOMATED, self.sources))
         shares = 1.0 - torch.exp(-time_step / torch.tensor(list(self.seconds)))
         self.register_buffer("shares", shares.repeat(self.counted))
         self.register_buffer("places", torch.tensor(ages))
 
-    def compute(self, *entries: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+    def compute(self, kept: Tensor, *measured: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         """Return the entries, and the history where it is kept."""
-        kept, *measured = self.views(*entries)
         found, kept = self.remember(kept, torch.cat(measured, -1))
         return (found, kept) if self.stacked else found
 
@@ -129,15 +133,7 @@ class ObservationMemory(StepTransform):
         seen = past[..., self.places]
         return batch_innermost(seen.flatten(-2)), batch_innermost(past.flatten(-2))
 
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        vehicles, width = self.event_shape
-        widths = (width, self.counted * self.depth)
-        return {
-            key: Unbounded(shape=(*batch, vehicles, wide), device=device)
-            for key, wide in zip(self.targets, widths, strict=False)
-        }
-
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
-        now = torch.cat(self.first(*(start.get(key) for key in self.first.keys)), -1)
+        now = torch.cat(self.first.of(start), -1)
         for key, repeat in zip(self.targets, (self.repeat, self.depth), strict=False):
             start.set(key, now.repeat_interleave(repeat, -1))

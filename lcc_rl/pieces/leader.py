@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
 
-from lcc_rl.data.leaders import from_trajectories
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.random import choose, stream_id, uniform
-from lcc_rl.pieces.base import SEED, STEP, Key, StepTransform, next_key, require_option
+from lcc_rl.pieces.base import SEED, STEP, Entry, StepTransform, next_key, require_option
+from lcc_rl.pieces.views import EPISODE
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative
 
-PROFILE, FIRST = ("leader", "profile"), ("leader", "start")
-SPEED, ACCELERATION, NEXT_SPEED = (
+PROFILE, PROFILE_START = ("leader", "profile"), ("leader", "start")
+LEADER_SPEED, LEADER_ACCELERATION, NEXT_SPEED = (
     ("leader", name) for name in ("speed", "acceleration", "next_speed")
 )
 
@@ -31,15 +29,8 @@ class NGSIMLeader(StepTransform):
     "profile")`` and ``("leader", "start")``, one per episode: an id, or a list paired with
     drivers.
 
-    Writes ``("leader", "speed")`` [m/s] and ``("leader", "acceleration")``, the backward
-    difference [m/s²], ``[*batch, 1]``; with ``foresight`` also ``("leader", "next_speed")``, the
-    speed one step ahead, which only an oracle may read [m/s].
-
     A perturbed leader drives max(0, (1 + p c) v + p A sin(2π t/τ + φ)): every episode has its own
     c ~ U(−0.2, 0.2), A ~ U(0, 1) m/s, τ ~ U(4, 20) s and φ, all by its seed.
-
-    Examples:
-        >>> leader = NGSIMLeader.from_file("trajectories.csv", horizon=300)  # doctest: +SKIP
     """
 
     start: Literal["random", "first"] = "random"  # sample of the record at which a window begins
@@ -47,6 +38,23 @@ class NGSIMLeader(StepTransform):
     perturbation: NonNegative = 0.0  # p; evaluation takes 0, the record as it is
     foresight: bool = False  # write the next speed, too
 
+    role = EPISODE
+    keeps = (
+        Entry(PROFILE, "–", "id of the speed record that the leader plays", 1, torch.int64, True),
+        Entry(
+            PROFILE_START,
+            "–",
+            "sample of the record at which the episode begins",
+            1,
+            torch.int64,
+            True,
+        ),
+    )
+    writes = (
+        Entry(LEADER_SPEED, "m/s", "speed of the leader"),
+        Entry(LEADER_ACCELERATION, "m/s²", "backward difference of its speed"),
+        Entry(NEXT_SPEED, "m/s", "its speed one step ahead, for oracles"),
+    )
     speeds: ClassVar[Tensor]
     offsets: ClassVar[Tensor]
     lengths: ClassVar[Tensor]
@@ -59,12 +67,10 @@ class NGSIMLeader(StepTransform):
         Raises:
             DataError: if no record is as long as the horizon.
         """
-        chosen = [PROFILE, FIRST]
-        writes = [SPEED, ACCELERATION, *([NEXT_SPEED] if self.foresight else [])]
-        reads = [*chosen, SPEED, next_key(STEP), SEED]
-        self.wire(reads, writes, constants=chosen, reset_options=chosen)
+        reads = [PROFILE, PROFILE_START, LEADER_SPEED, next_key(STEP), SEED]
+        self.declare(world, reads, self.writes[: 2 + self.foresight])
         self.perturbed = 0.0 if world.nominal else self.perturbation
-        profiles = world.profiles.at_least(world.horizon)
+        profiles = world.given("profiles", self.title).at_least(world.horizon)
         last = len(profiles) - 1
         if self.profile is not None and not 0 <= self.profile <= last:
             raise ConfigError(f"leader.profile must lie in 0…{last}, got {self.profile}")
@@ -80,27 +86,6 @@ class NGSIMLeader(StepTransform):
         if profiles.weights is not None:
             shares = profiles.weights.cumsum(0) / profiles.weights.sum()
         self.register_buffer("shares", shares)
-
-    @classmethod
-    def from_file(
-        cls, path: str | Path, horizon: int = 300, time_step: float = 0.1, **settings: Any
-    ) -> NGSIMLeader:
-        """Read the leaders of a trajectory file in any published NGSIM layout.
-
-        Args:
-            path: the file, plain or .gz, or a pattern of files.
-            horizon: steps per episode; shorter records are left out.
-            time_step: duration of a step [s].
-            **settings: those of the leader.
-
-        Returns:
-            The leader of a world with these records.
-
-        Raises:
-            DataError: naming the file, column or row at fault.
-        """
-        profiles = from_trajectories(path, time_step)
-        return cls(**settings).bind(World(time_step=time_step, horizon=horizon, profiles=profiles))
 
     def compute(
         self, profile: Tensor, first: Tensor, speed: Tensor, step: Tensor, seed: Tensor
@@ -125,19 +110,15 @@ class NGSIMLeader(StepTransform):
         factor = 1.0 + self.perturbed * 0.4 * (share - 0.5)
         return (factor * speed + self.perturbed * height * angle.sin()).clamp(min=0.0)
 
-    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        spec = Unbounded(shape=(*batch, 1), dtype=torch.int64, device=device)
-        return {key: spec.clone() for key in self.constants}
-
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         seed = start.get(SEED)
         profile, first = self._window(given, seed)
         still = torch.zeros_like(seed)
         speed = self.speed_at(profile, first, still, seed)
         start.set(PROFILE, profile)
-        start.set(FIRST, first)
-        start.set(SPEED, speed)
-        start.set(ACCELERATION, torch.zeros_like(speed))
+        start.set(PROFILE_START, first)
+        start.set(LEADER_SPEED, speed)
+        start.set(LEADER_ACCELERATION, torch.zeros_like(speed))
         if self.foresight:
             start.set(NEXT_SPEED, self.speed_at(profile, first, still + 1, seed))
 
@@ -151,7 +132,7 @@ class NGSIMLeader(StepTransform):
 
     def _window(self, given: TensorDictBase, seed: Tensor) -> tuple[Tensor, Tensor]:
         """Return the record and its first sample, as given or else drawn."""
-        profile, first = given.get(PROFILE, None), given.get(FIRST, None)
+        profile, first = given.get(PROFILE, None), given.get(PROFILE_START, None)
         if profile is None and self.profile is not None:
             profile = torch.full_like(seed, self.profile)
         elif profile is None:
@@ -163,5 +144,5 @@ class NGSIMLeader(StepTransform):
             if self.start == "random":
                 first = choose(seed, self.starts[profile], self.start_stream)
         else:
-            require_option(FIRST, first, self.starts[profile])
+            require_option(PROFILE_START, first, self.starts[profile])
         return profile, first

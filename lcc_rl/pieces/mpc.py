@@ -13,11 +13,12 @@ from torch import Tensor
 
 from lcc_rl.errors import ConfigError, how_to_install
 from lcc_rl.functional.power import POWER_COEFFICIENTS
+from lcc_rl.pieces.base import Entry
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.pieces.world import World
+from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
-LONGEST = 200.0  # gaps beyond it are planned for as this one [m]
+LONGEST_GAP = 200.0  # gaps beyond it are planned for as this one [m]
 Array = np.ndarray
 MOST_STEPS = 200  # of a plan
 
@@ -45,12 +46,12 @@ class MPCSettings(Settings):
     near_price: Positive = 3.0
     far_price: Positive = 0.1
     ttc_price: Positive = 30.0
-    max_acceleration: Positive = 3.0  # in both directions [m/s²]
+    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
     # Absolute and relative, at which the solver stops.
     tolerance: Annotated[float, Field(ge=1e-10, le=0.1)] = 1e-4
     iterations: Annotated[int, Field(ge=1, le=1_000_000)] = 4000  # after which it gives up
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.longest_time_gap <= self.least_time_gap:
             least = f"least_time_gap={self.least_time_gap}"
             raise ValueError(f"longest_time_gap must be above {least}, got {self.longest_time_gap}")
@@ -72,11 +73,14 @@ class MPC(MPCSettings, Controller):
     """
 
     reads = ("self.speed", "self.gap", "self.acceleration", "ahead.speed", "ahead.acceleration")
+    writes = (
+        Entry("role.unsolved", "–", "1 where the plan of MPC had no solution, and it brakes"),
+    )
 
     def setup(self, world: World) -> None:
         """Set up the solver."""
         self.check_installed()
-        self.drive(world, self.reads, [(self.name, "unsolved")])
+        self.declare(world)
         own = {field.name: getattr(self, field.name) for field in fields(MPCSettings)}
         self.solver = Solver(MPCSettings(**own))
 
@@ -130,7 +134,7 @@ class Solver:
         known = np.flatnonzero(np.isfinite(rows).all(1))
         limit = self.settings.max_acceleration
         speed, gap, *others = rows[known].T
-        vectors = self.program.vectors(speed, gap.clip(-LONGEST, LONGEST), *others)
+        vectors = self.program.vectors(speed, gap.clip(-LONGEST_GAP, LONGEST_GAP), *others)
         each = zip(known, vectors.linear, vectors.lower, vectors.upper, strict=True)
         for row, linear, lower, upper in each:
             self.osqp.update(q=linear, l=lower, u=upper)

@@ -11,12 +11,11 @@ from torch import Tensor
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces.base import Feature
+from lcc_rl.pieces.base import OBSERVATION, Entry, Feature
 from lcc_rl.pieces.views import BEHIND, PRESENT, Views
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import Number
 
-OBSERVATION = "observation"
 Width = Annotated[int, Field(ge=1, le=10_000)]  # entries of one view
 
 
@@ -42,9 +41,11 @@ class Observation(Feature):
     relative_to: Mapping[str, str | Sequence[str] | None] | None = None
     raw: bool = False  # take every entry times 1, in SI units, whatever its scale
 
-    constants: ClassVar[Tensor]
+    measures = True
+    gathered = Entry(OBSERVATION, "–", "observed entries, each times its constant")
+    factors: ClassVar[Tensor]
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         zeros = [".".join(key) for key, scale in self._flat().items() if not scale]
         if zeros or not self._flat():
             which = f"{zeros[0]} has scale 0" if zeros else "there is none"
@@ -71,9 +72,8 @@ class Observation(Feature):
             counts.append(visible)
         names = list(dict.fromkeys([*seen, *(key for keys in bases for key in keys)]))
         known = world.sensed(AUTOMATED, [".".join(name) for name in names])
-        self.views = Views(string, AUTOMATED, known, visible)
-        shape = (string.count(AUTOMATED), len(values))
-        self.wire(self.views.keys, [(AUTOMATED, OBSERVATION)], shape)
+        views = Views(string, AUTOMATED, known, visible)
+        self.declare(world, views, [self.gathered.wide(len(values))])
         firsts = [sum(counts[:place]) for place in range(len(counts))]
         # The (first) column of each entry that is seen as it is.
         each = zip(seen, firsts, bases, strict=True)
@@ -81,8 +81,8 @@ class Observation(Feature):
         self.seen, self.names = [".".join(key) for key in seen], [".".join(key) for key in names]
         self.bases = [[names.index(key) for key in keys] for keys in bases]
         self.repeats = [n // max(len(keys), 1) for n, keys in zip(counts, bases, strict=True)]
-        constants = [1.0] * len(values) if self.raw else values
-        self.register_buffer("constants", torch.tensor(constants))
+        factors = [1.0] * len(values) if self.raw else values
+        self.register_buffer("factors", torch.tensor(factors))
 
     def column(self, name: str) -> int:
         """Return the column of an entry, e.g. ``"self.gap"``.
@@ -107,10 +107,9 @@ class Observation(Feature):
                 found.append([own, *(self.names[i] for i in bases[column // repeat :][:1])])
         return found
 
-    def compute(self, *entries: Tensor) -> Tensor:
+    def compute(self, *values: Tensor) -> Tensor:
         """Return the scaled observation, ``[*batch, A, entries]``."""
-        values = self.views(*entries)
-        seen = values[: len(self.bases)]
+        seen = list(values[: len(self.bases)])
         for place, (bases, repeat) in enumerate(zip(self.bases, self.repeats, strict=True)):
             if bases:
                 base = torch.cat([values[i] for i in bases], -1)
@@ -121,7 +120,7 @@ class Observation(Feature):
             entry if entry.shape[-2] == vehicles else entry.expand(*entry.shape[:-2], vehicles, -1)
             for entry in seen
         ]
-        return torch.cat(rows, dim=-1) * self.constants
+        return torch.cat(rows, dim=-1) * self.factors
 
 
 def _bases(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -20,15 +18,15 @@ class RangeReward(RewardTerm):
     least: Positive | None = None  # in the entry's unit; None for no bound
     largest: Positive | None = None
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.least is None and self.largest is None:
             raise ValueError("needs least, largest or both")
         if self.least is not None and self.largest is not None and self.least >= self.largest:
             raise ValueError(f"least={self.least} must be below largest={self.largest}")
 
-    def setup(self, world: World, reads: Sequence[str] | None = None) -> None:
+    def setup(self, world: World) -> None:
         """Read the entry."""
-        super().setup(world, [f"self.{self.entry}"])
+        self.declare(world, [f"self.{self.entry}"])
 
     def reward(self, entry: Tensor) -> Tensor:
         """Return the unweighted term."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.pieces.leader import FIRST, PROFILE
+from lcc_rl.pieces.leader import PROFILE, PROFILE_START
 from lcc_rl.pieces.world import Part, World
 from lcc_rl.settings import Positive
 
@@ -51,7 +51,7 @@ class RecordedDriver(Controller):
         found = _followers(world, f"scenario.controllers.{self.name}")
         self.register_buffer("records", found)
         self.register_buffer("offsets", world.profiles.offsets)
-        self.drive(world, self.reads)
+        self.declare(world)
         self.limits = None
 
     def command(
@@ -75,7 +75,7 @@ class RecordedStart(Part):
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
         device = speed.device
-        sample = self.offsets.to(device)[start.get(PROFILE)] + start.get(FIRST)
+        sample = self.offsets.to(device)[start.get(PROFILE)] + start.get(PROFILE_START)
         found = self.followers.to(device)[sample].expand(*speed.shape[:-1], 2)
         own, gap = torch.split(found, 1, -1)
         return own, gap

@@ -23,17 +23,17 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.functional.layout import total
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.safety import time_to_collision
-from lcc_rl.pieces.base import RewardPiece, add_specs
+from lcc_rl.pieces.base import REWARD, Entry, RewardPiece, add_specs
 from lcc_rl.pieces.sections import Sections
 from lcc_rl.pieces.views import VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
 
 TERMS = (AUTOMATED, "reward_terms")
-REWARD = (AUTOMATED, "reward")
 TOUCH = 1e-6  # [m]; room that is left within the margin: none, but not a collision
 
 
@@ -45,7 +45,7 @@ class RewardTerm(RewardPiece):
 
     weight: NonNegative = 1.0  # factor of the term; 0 takes it out
 
-    reads: ClassVar[Sequence[str]] = ()
+    writes = (Entry("automated.reward_terms.name", "–", "weighted term of the reward"),)
     # Maps what is read, one row per automated vehicle, to the unweighted term, [*batch, A, 1].
     reward: ClassVar[Callable[..., Tensor]]
 
@@ -53,19 +53,9 @@ class RewardTerm(RewardPiece):
         super().__init_subclass__(**more)
         cls.name = re.sub("(Reward|Penalty)$", "", cls.__name__).lower()
 
-    def setup(self, world: World, reads: Sequence[str] | None = None) -> None:
-        """Derive from a world what depends on it; a term that overrides this calls it at the end.
-
-        Args:
-            world: what the pieces of the environment share.
-            reads: names of what is read, where they depend on settings.
-        """
-        self.see(world, self.reads if reads is None else reads, [(*TERMS, self.name)])
-        self.string = world.string
-
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the weighted term."""
-        return self.weight * self.reward(*self.views(*entries))
+        return self.weight * self.reward(*entries)
 
 
 class SafetyReward(RewardTerm):
@@ -83,7 +73,7 @@ class SafetyReward(RewardTerm):
 
     reads = ("self.gap", "self.relative_speed")
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.floor >= self.threshold:
             raise ValueError(f"floor={self.floor} must be below threshold={self.threshold}")
 
@@ -115,15 +105,14 @@ class EnergyReward(RewardTerm):
     # "human.predicted_power": as the automated vehicle estimates it (A16).
     power: str = "vehicles.power"
 
-    def setup(self, world: World, reads: Sequence[str] | None = None) -> None:
+    def setup(self, world: World) -> None:
         """Choose what is read by whose energy counts."""
         space, _, entry = self.power.partition(".")
         own = f"self.{entry}" if space == VEHICLES else self.power
         self.sections = Sections(world.string, space)
-        reads = [own if self.of == "self" else self.power]
-        reads += [".".join(key) for key in self.sections.keys if self.of == "behind"]
+        indices = self.sections.keys if self.of == "behind" else []
         self.factor = world.time_step / self.scale
-        super().setup(world, reads)
+        self.declare(world, [own if self.of == "self" else self.power, *indices])
 
     def reward(self, power: Tensor, *indices: Tensor) -> Tensor:
         """Return the unweighted term."""
@@ -145,11 +134,10 @@ class CollisionPenalty(RewardTerm):
     weight: NonNegative = 100.0  # must exceed the worst discounted return that remains
     behind: bool = True  # also paid for collisions behind, back to the next automated vehicle
 
-    def setup(self, world: World, reads: Sequence[str] | None = None) -> None:
-        """Find who is behind."""
+    def setup(self, world: World) -> None:
+        """Find which vehicles are behind."""
         self.sections = Sections(world.string, VEHICLES)
-        indices = [".".join(key) for key in self.sections.keys]
-        super().setup(world, ["self.gap", "vehicles.gap", *indices])
+        self.declare(world, ["self.gap", "vehicles.gap", *self.sections.keys])
 
     def reward(self, gap: Tensor, gaps: Tensor, *indices: Tensor) -> Tensor:
         """Return the unweighted term."""
@@ -162,8 +150,8 @@ class CollisionPenalty(RewardTerm):
 class VelocityReward(RewardTerm):
     """−|e_v(i,0)|/v_max, at the state reached (HCFS H4–H5)."""
 
-    weight: NonNegative = 10.0  # ω1; Table IV determines ω1/v_max only
-    speed_scale: Positive = 27.1  # v_max [m/s]
+    weight: NonNegative = PlatoonReward.velocity_weight  # ω1; Table IV determines ω1/v_max only
+    speed_scale: Positive = PlatoonReward.speed_scale  # v_max [m/s]
 
     reads = ("self.leader_speed_error",)
 
@@ -175,8 +163,8 @@ class VelocityReward(RewardTerm):
 class JerkReward(RewardTerm):
     """−|jerk|/(2 a_max/T) (HCFS H6)."""
 
-    weight: NonNegative = 0.036  # ω2
-    jerk_scale: Positive = 30.0  # 2 a_max/T [m/s³]
+    weight: NonNegative = PlatoonReward.jerk_weight  # ω2
+    jerk_scale: Positive = PlatoonReward.jerk_scale  # 2 a_max/T [m/s³]
 
     reads = ("self.jerk",)
 
@@ -211,13 +199,13 @@ class TotalReward(RewardPiece):
 
     terms: Sequence[str]  # their names
 
+    writes = (Entry(REWARD, "–", "sum of the terms"),)
+
     def setup(self, world: World) -> None:
         """Read the terms."""
         if not self.terms:
             raise ConfigError("reward.terms is empty: an environment needs at least one term")
-        shape = (world.string.count(AUTOMATED), 1)
-        self.wire([(*TERMS, name) for name in self.terms], [REWARD], shape)
-        self.string = world.string
+        self.declare(world, [(*TERMS, name) for name in self.terms])
 
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the sum."""

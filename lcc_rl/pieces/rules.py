@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Any
 
 import torch
 from pydantic import Field, InstanceOf
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Unbounded
 
 from lcc_rl.functional.layout import join, total
-from lcc_rl.functional.rules import follower_stopper_speed, pi_saturation_speed
-from lcc_rl.pieces.base import Key
+from lcc_rl.pieces.base import Entry
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
@@ -36,21 +32,19 @@ class Averaging(Controller):
     max_acceleration: Positive = 1.5  # of the command [m/s²]
     max_deceleration: Positive = 3.0  # of the command [m/s²]
 
+    history = Entry("role.speed_history", "m/s", "own speeds of the last steps, latest first")
+
     @property
     def averages(self) -> bool:
         """Whether the mean is kept."""
         return True
 
     def setup(self, world: World) -> None:
-        """Read what the rule reads, and the history."""
-        self.average(world, self.reads)
-
-    def average(self, world: World, reads: Sequence[str], writes: Sequence[NestedKey] = ()) -> None:
-        """Set what is read and written besides the history, where it is kept."""
-        kept = [(self.name, "speed_history")] if self.averages else []
-        known = ["episode.step", *(".".join(key) for key in kept)] if kept else []
-        self.drive(world, [*reads, *known], [*kept, *writes])
-        self.samples = max(world.steps(self.window, "window"), 1) if kept else 0
+        """Read what the rule reads, and the history where it is kept."""
+        self.samples = max(world.steps(self.window, "window"), 1) if self.averages else 0
+        memory = [self.history.wide(self.samples), *self.remembers] if self.averages else []
+        reads = [*self.reads, *["episode.step"] * self.averages]
+        self.declare(world, reads, remembers=memory)
         self.limits = (-self.max_deceleration, self.max_acceleration)
 
     def mean(self, speed: Tensor, step: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
@@ -62,21 +56,15 @@ class Averaging(Controller):
         """Return the acceleration [m/s²] to a speed."""
         return (wanted - speed) / self.time_step
 
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        specs = super().written_specs(batch, device)
-        if self.samples:
-            shape = (*batch, self.event_shape[0], self.samples)
-            specs[self.role, "speed_history"] = Unbounded(shape=shape, device=device)
-        return specs
-
 
 class FollowerStopper(Averaging):
     """FollowerStopper in its time-headway form (Stern et al. 2018, arXiv 1705.01693).
 
-    Drives at a desired speed unless the vehicle ahead is near; see
-    :func:`lcc_rl.functional.rules.follower_stopper_speed`. The command is (v_cmd − v)/T within
-    the limits. The desired speed is fixed, or the mean of the vehicle's own speed during the last
-    ``window`` seconds, kept in ``(role, "speed_history")``, ``[*batch, n, samples]`` [m/s].
+    Three gaps Δx_k = max(Δx⁰_k, h_k v) + Δv₋²/(2 d_k), Δv₋ = min(v_ahead − v, 0), bound regions of
+    the gap: below Δx₁ stop, then rise to ṽ = min(max(v_ahead, 0), v_d) at Δx₂, then to v_d at Δx₃.
+    The command is (v_cmd − v)/T within the limits. The desired speed v_d is fixed, or the mean of
+    the vehicle's own speed during the last ``window`` seconds, kept in ``(role,
+    "speed_history")``, ``[*batch, n, samples]`` [m/s].
     """
 
     desired_speed: Positive | None = None  # v_d; None: the vehicle's own mean [m/s]
@@ -86,7 +74,7 @@ class FollowerStopper(Averaging):
 
     reads = ("self.speed", "self.gap", "ahead.speed")
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if list(self.gaps) != sorted(self.gaps):
             raise ValueError(f"gaps must increase, got {list(self.gaps)}")
 
@@ -98,57 +86,79 @@ class FollowerStopper(Averaging):
     def command(self, speed: Tensor, gap: Tensor, ahead: Tensor, *kept: Tensor) -> Any:
         """Return the commands, and the history where it is kept."""
         if self.desired_speed is not None:
-            return self._beside(speed, gap, ahead, torch.full_like(speed, self.desired_speed))
+            desired = torch.full_like(speed, self.desired_speed)
+            return self.towards(self.wanted(speed, gap, ahead, desired), speed)
         mean, past = self.mean(speed, *kept)
-        return self._beside(speed, gap, ahead, mean), past
+        return self.towards(self.wanted(speed, gap, ahead, mean), speed), past
 
-    def _beside(self, speed: Tensor, gap: Tensor, ahead: Tensor, desired: Tensor) -> Tensor:
-        wanted = follower_stopper_speed(
-            speed, gap, ahead, desired, self.gaps, self.time_gaps, self.decelerations
+    def wanted(self, speed: Tensor, gap: Tensor, ahead: Tensor, desired: Tensor) -> Tensor:
+        """Return v_cmd [m/s] for the desired speed v_d [m/s]."""
+        closing = (ahead - speed).clamp(max=0.0).square()
+        near, middle, far = (
+            (time_gap * speed).clamp(min=least) + closing / (2.0 * deceleration)
+            for least, time_gap, deceleration in zip(
+                self.gaps, self.time_gaps, self.decelerations, strict=True
+            )
         )
-        return self.towards(wanted, speed)
+        safe = torch.minimum(ahead.clamp(min=0.0), desired)
+        rising = safe * (gap - near) / (middle - near)
+        freeing = safe + (desired - safe) * (gap - middle) / (far - middle)
+        commanded = torch.where(gap < far, freeing, desired)
+        commanded = torch.where(gap < middle, rising, commanded)
+        return torch.where(gap < near, torch.zeros_like(commanded), commanded)
 
 
 class PISaturation(Averaging):
     """PI with saturation (Stern et al. 2018, arXiv 1705.01693).
 
-    Drives at the mean of its own speed, a little faster where the gap is large, and like the
-    vehicle ahead where it is small; see :func:`lcc_rl.functional.rules.pi_saturation_speed`. The
-    command before is kept in ``(role, "commanded_speed")``, ``[*batch, n, 1]`` [m/s].
+    Drives at the mean of its own speed v_d, a little faster where the gap is large, and like the
+    vehicle ahead where it is small: v_target = v_d + c·min(max((Δx − g_l)/(g_u − g_l), 0), 1);
+    Δx_s = max(2 s·(v − v_ahead), 4 m); α = min(max((Δx − Δx_s)/γ, 0), 1), β = 1 − α/2; the command
+    becomes β(α v_target + (1 − α) v_ahead) + (1 − β) times the command before, which is kept in
+    ``(role, "commanded_speed")``, ``[*batch, n, 1]`` [m/s].
     """
 
     window: Window = 38.0  # length of the mean [s]
-    gaps: Pair = (7.0, 30.0)  # between which catching up sets in [m]
-    catch_up: NonNegative = 1.0  # by how much the target may exceed the mean [m/s]
-    least_gap: NonNegative = 4.0  # gap below which it drives like the vehicle ahead [m]
+    gaps: Pair = (7.0, 30.0)  # g_l and g_u, between which catching up sets in [m]
+    catch_up: NonNegative = 1.0  # c, by how much the target may exceed the mean [m/s]
+    least_gap: NonNegative = 4.0  # least Δx_s, below which it drives like the vehicle ahead [m]
     closing_time: Positive = 2.0  # how long closing in may take [s]
-    transition: Positive = 2.0  # range of gaps over which it changes from one to the other [m]
+    transition: Positive = 2.0  # γ, range of gaps over which it changes from one to the other [m]
 
-    def __post_init__(self) -> None:
+    reads = ("self.speed", "self.gap", "ahead.speed")
+    remembers = (
+        Entry("role.commanded_speed", "m/s", "speed that PI with saturation commanded last"),
+    )
+
+    def validate(self) -> None:
         if self.gaps[0] >= self.gaps[1]:
             raise ValueError(f"gaps must be two increasing numbers, got {list(self.gaps)}")
 
-    def setup(self, world: World) -> None:
-        """Keep the speed commanded before."""
-        before = (self.name, "commanded_speed")
-        reads = ("self.speed", "self.gap", "ahead.speed", ".".join(before))
-        self.average(world, reads, [before])
-        self.shape = (
-            self.gaps,
-            self.catch_up,
-            self.least_gap,
-            self.closing_time,
-            self.transition,
-        )
-
     def command(
-        self, speed: Tensor, gap: Tensor, ahead: Tensor, before: Tensor, *kept: Tensor
+        self,
+        speed: Tensor,
+        gap: Tensor,
+        ahead: Tensor,
+        step: Tensor,
+        history: Tensor,
+        before: Tensor,
     ) -> Any:
         """Return the commands, the history and the speed commanded."""
-        mean, past = self.mean(speed, *kept)
-        before = torch.where(kept[0] == 0, speed, before)
-        wanted = pi_saturation_speed(speed, gap, ahead, mean, before, *self.shape)
+        mean, past = self.mean(speed, step, history)
+        before = torch.where(step == 0, speed, before)
+        wanted = self.wanted(speed, gap, ahead, mean, before)
         return self.towards(wanted, speed), past, wanted
+
+    def wanted(
+        self, speed: Tensor, gap: Tensor, ahead: Tensor, mean: Tensor, before: Tensor
+    ) -> Tensor:
+        """Return the speed commanded [m/s] after the one before [m/s]."""
+        lower, upper = self.gaps
+        target = mean + self.catch_up * ((gap - lower) / (upper - lower)).clamp(0.0, 1.0)
+        safe = (self.closing_time * (speed - ahead)).clamp(min=self.least_gap)
+        share = ((gap - safe) / self.transition).clamp(0.0, 1.0)
+        weight = 1.0 - 0.5 * share
+        return weight * (share * target + (1.0 - share) * ahead) + (1.0 - weight) * before
 
 
 class Handover(Controller):
@@ -165,12 +175,11 @@ class Handover(Controller):
         """Read and write what both do."""
         both = [inner.bind(world, self.name) for inner in (self.before, self.after)]
         self.before, self.after = both
-        self.drive(
+        self.declare(
             world,
             ["episode.step", *(name for inner in both for name in inner.names)],
-            [key for inner in both for key in inner.targets[1:]],
-            constants=[key for inner in both for key in inner.constants],
-            reset_options=[key for inner in both for key in inner.reset_options],
+            [inner.entries[key] for inner in both for key in inner.targets[1:]],
+            [inner.entries[key] for inner in both for key in inner.constants],
         )
         self.limits = None  # each has its own
         self.from_step = world.steps(self.from_s, "from_s")
@@ -178,23 +187,11 @@ class Handover(Controller):
     def command(self, step: Tensor, *entries: Tensor) -> Any:
         """Return the commands of whoever drives, and what both write besides."""
         place = len(self.before.names)
-        first = self.before.limited(*entries[:place])
-        second = self.after.limited(*entries[place:])
+        first = self.before.compute(*entries[:place])
+        second = self.after.compute(*entries[place:])
         first, second = (x if isinstance(x, tuple) else (x,) for x in (first, second))
         command = torch.where(step < self.from_step, first[0], second[0])
         return (command, *first[1:], *second[1:])
-
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        return {
-            **self.before.written_specs(batch, device),
-            **self.after.written_specs(batch, device),
-        }
-
-    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        return {
-            **self.before.constant_specs(batch, device),
-            **self.after.constant_specs(batch, device),
-        }
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         self.before.begin(given, start)

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
 
 from lcc_rl.functional.layout import join, reverse
-from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.functional.sensing import Sensing
-from lcc_rl.pieces.base import Key, StepTransform
+from lcc_rl.pieces.base import Entry, RoleTransform
 from lcc_rl.pieces.views import Views
-from lcc_rl.pieces.world import SENSED, World
+from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Share
 
 SENSORS = "sensors"
-# Columns of a frame of the memory.
-GAP, SPEED, AHEAD, AHEAD_ACCELERATION, ACCELERATION = range(5)
-SEEN = ("self.gap", "self.speed", "ahead.speed", "ahead.acceleration", "self.acceleration")
+# What is measured, the columns of a frame of the memory.
+TRUE_STATE = ("self.gap", "self.speed", "ahead.speed", "ahead.acceleration", "self.acceleration")
 
 
-class Sensors(StepTransform):
+class Sensors(RoleTransform):
     """Measures gap and speeds for a role: late, with bounded errors, and with drop-outs.
 
     Controllers, safety filter, observation and memory of the role read what is measured here in
@@ -34,9 +31,8 @@ class Sensors(StepTransform):
     within their bounds by the episode's seed: for each measurement, or every ``error_time``, and
     linear in time between.
 
-    Keeps ``(role, "sensors")``, ``[*batch, n, 1 + 5·(oldest + 1)]``: the age of the measurement in
-    steps, then what :data:`SEEN` names, true, at present and in the steps before. Before the
-    episode began, speeds were what they are at its start.
+    It keeps the age of the measurement in steps, then what :data:`TRUE_STATE` names, at present and
+    in the steps before. Before the episode began, speeds were what they are at its start.
     """
 
     gap_error: NonNegative = 0.0  # largest, of the gap [m]
@@ -47,10 +43,17 @@ class Sensors(StepTransform):
     dropouts: Share = 0.0  # chance that a measurement does not arrive: the last one stays
     longest_dropout: NonNegative = 0.0  # in a row, a number of steps [s]
 
-    name = AUTOMATED
+    measured = (
+        Entry("role.sensed_gap", "m", "gap as measured"),
+        Entry("role.sensed_speed", "m/s", "own speed as measured"),
+        Entry("role.sensed_relative_speed", "m/s", "speed ahead minus own speed, as measured"),
+        Entry("role.sensed_ahead_speed", "m/s", "speed of the vehicle ahead as measured"),
+        Entry("role.sensed_ahead_acceleration", "m/s²", "its acceleration as measured"),
+    )
+    kept = Entry("role.sensors", "–", "age of the measurement [steps], and true states to measure")
     index: ClassVar[Tensor]
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if (self.dropouts > 0.0) != (self.longest_dropout > 0.0):
             raise ValueError("dropouts and longest_dropout belong together: give both or none")
 
@@ -60,14 +63,14 @@ class Sensors(StepTransform):
         self.sensing = self.sensing_in(world, role)
         self.apart = max(1, world.steps(self.error_time, f"scenario.sensors.{role}.error_time"))
         drawn = ["episode.seed", "next.episode.step"]
-        seen = [f"{role}.{SENSORS}", *(f"next.{name}" for name in SEEN), *drawn]
-        writes = [(role, name) for name in (*SENSED.values(), SENSORS)]
-        self.see(world, seen, writes, role)
+        seen = [f"{role}.{SENSORS}", *(f"next.{name}" for name in TRUE_STATE), *drawn]
+        width = 1 + len(TRUE_STATE) * (self.sensing.oldest + 1)
+        self.declare(world, seen, [*self.measured, self.kept.wide(width)])
         # The same entries at reset, where there is no step before.
-        self.first = Views(world.string, role, [*SEEN, "episode.seed", "episode.step"])
+        self.first = Views(world.string, role, [*TRUE_STATE, "episode.seed", "episode.step"])
         self.streams = [stream_id(f"{role}.sensors.{name}") for name in ("gap", "speed", "ahead")]
         self.missing = stream_id(f"{role}.sensors.missing")
-        self.register_buffer("index", torch.arange(self.event_shape[0]).unsqueeze(-1))
+        self.register_buffer("index", torch.arange(*self.rows).unsqueeze(-1))
 
     def sensing_in(self, world: World, role: str) -> Sensing:
         """Return the bounds of what the role measures.
@@ -81,10 +84,10 @@ class Sensors(StepTransform):
         )
         return Sensing(self.gap_error, self.speed_error, self.ahead_error, late, longest)
 
-    def compute(self, *entries: Tensor) -> tuple[Tensor, ...]:
+    def compute(self, memory: Tensor, *seen: Tensor) -> tuple[Tensor, ...]:
         """Return what is measured, and what is kept."""
-        memory, *now, seed, step = self.views(*entries)
-        frames = join([*now, memory[..., 1 : -len(SEEN)]], -1)
+        *now, seed, step = seen
+        frames = join([*now, memory[..., 1 : -len(TRUE_STATE)]], -1)
         dropped = memory[..., :1] - self.sensing.late
         missing = uniform(seed, step, self.missing + self.index) < self.dropouts
         dropped = torch.where(missing & (dropped < self.sensing.longest), dropped + 1.0, 0.0)
@@ -95,7 +98,7 @@ class Sensors(StepTransform):
     ) -> tuple[Tensor, ...]:
         """Return what is measured of frames, the latest first, and what is kept."""
         number = age.long()
-        columns = len(SEEN) * number + torch.arange(len(SEEN), device=frames.device)
+        columns = len(TRUE_STATE) * number + torch.arange(len(TRUE_STATE), device=frames.device)
         chosen = reverse(reverse(frames).gather(0, reverse(columns)))
         gap, speed, ahead, acceleration, _ = chosen.split(1, -1)
         bounds = (self.sensing.gap, self.sensing.speed, self.sensing.ahead)
@@ -115,18 +118,12 @@ class Sensors(StepTransform):
         start, end = (uniform(seed, first.long() + k, stream + self.index) for k in (0, 1))
         return 2.0 * torch.lerp(start, end, place - first) - 1.0
 
-    def written_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        specs = super().written_specs(batch, device)
-        width = 1 + len(SEEN) * (self.sensing.oldest + 1)
-        shape = (*batch, self.event_shape[0], width)
-        specs[self.targets[-1]] = Unbounded(shape=shape, device=device)
-        return specs
-
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
-        *now, seed, step = self.first(*(start.get(key) for key in self.first.keys))
-        closing = self.time_step * (now[SPEED] - now[AHEAD])
+        *now, seed, step = self.first.of(start)
+        gap, speed, ahead, *_ = now
+        closing = self.time_step * (speed - ahead)
         frames = [
-            join([now[GAP] + number * closing, *now[SPEED:]], -1)
+            join([gap + number * closing, *now[1:]], -1)
             for number in range(self.sensing.oldest + 1)
         ]
         age = torch.full_like(closing, self.sensing.late)
@@ -135,6 +132,6 @@ class Sensors(StepTransform):
             start.set(key, value)
 
 
-def frames_of(memory: Tensor, column: int) -> Tensor:
-    """Return a column of :data:`SEEN` in all frames, the latest first, ``[*batch, n, frames]``."""
-    return memory[..., 1 + column :: len(SEEN)]
+def frames_of(memory: Tensor, name: str) -> Tensor:
+    """Return one of :data:`TRUE_STATE` in all frames, latest first, ``[*batch, n, frames]``."""
+    return memory[..., 1 + TRUE_STATE.index(name) :: len(TRUE_STATE)]

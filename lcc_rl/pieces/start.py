@@ -7,8 +7,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.driver_models import capped
-from lcc_rl.functional.idm import equilibrium_gap
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.pieces.base import SEED
@@ -16,10 +14,10 @@ from lcc_rl.pieces.controllers import stream_name
 from lcc_rl.pieces.world import Part, World
 from lcc_rl.settings import Factors, NonNegative, Positive
 
-GAP, SPEED = stream_id("platoon.gap"), stream_id("platoon.speed")
+GAP_STREAM, SPEED_STREAM = stream_id("platoon.gap"), stream_id("platoon.speed")
 
 
-def draw(start: TensorDictBase, stream: int, like: Tensor) -> Tensor:
+def draw_uniform(start: TensorDictBase, stream: int, like: Tensor) -> Tensor:
     """Draw from U[0, 1) for every vehicle of a role, by the seed of its episode."""
     index = torch.arange(like.shape[-2], device=like.device).unsqueeze(-1)
     return uniform(start.get(SEED).unsqueeze(-2), 0, stream + index)
@@ -43,7 +41,7 @@ class TimeGapStart(Part):
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
-        uniformly = draw(start, self.stream, speed)
+        uniformly = draw_uniform(start, self.stream, speed)
         factor = self.lowest + (self.highest - self.lowest) * uniformly
         return speed, factor * (self.standstill_gap + self.time_gap * speed)
 
@@ -54,12 +52,12 @@ class EquilibriumStart(Part):
     By the parameters that the drivers of the population share.
     """
 
-    # Bounds the gap, see lcc_rl.functional.idm.equilibrium_gap [s].
+    # Bounds the gap, see DriverConstants.equilibrium_gap [s].
     cap_time_gap: Positive = 3.0
 
     def setup(self, world: World) -> None:
         """Take what the drivers share."""
-        self.drivers = world.population.constants.shared()
+        self.drivers = world.population.constants.mean()
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
@@ -74,9 +72,9 @@ class EquilibriumStart(Part):
             )
         known = start.get((role, "equilibrium_gap"), None)
         if known is not None:
-            return speed, capped(known, speed, self.drivers, self.cap_time_gap)
-        gap = equilibrium_gap(speed, desired_speed, time_gap, self.drivers, self.cap_time_gap)
-        return speed, gap
+            return speed, self.drivers.capped(known, speed, self.cap_time_gap)
+        own = (desired_speed, time_gap, self.cap_time_gap)
+        return speed, self.drivers.equilibrium_gap(speed, *own)
 
 
 class HeadwayStart(Part):
@@ -86,7 +84,7 @@ class HeadwayStart(Part):
     gap_spread: NonNegative = 2.0  # largest deviation of a gap from it; evaluation takes 0 [m]
     speed_spread: NonNegative = 1.0  # … and of a speed from the leader's [m/s]
 
-    def __post_init__(self) -> None:
+    def validate(self) -> None:
         if self.gap_spread >= self.headway:
             raise ValueError(f"gap_spread={self.gap_spread} must be below headway={self.headway}")
 
@@ -97,7 +95,7 @@ class HeadwayStart(Part):
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
-        shift = 2.0 * draw(start, GAP, speed) - 1.0
+        shift = 2.0 * draw_uniform(start, GAP_STREAM, speed) - 1.0
         gap = self.headway + self.gaps * shift
-        shift = 2.0 * draw(start, SPEED, speed) - 1.0
+        shift = 2.0 * draw_uniform(start, SPEED_STREAM, speed) - 1.0
         return (speed + self.speeds * shift).clamp(min=0.0), gap

@@ -9,52 +9,50 @@ from typing import Any, ClassVar, Protocol
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.layout import join, reverse
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import between, stream_id, uniform
-from lcc_rl.functional.string import Motion, advance_string, entries_ahead, selector
-from lcc_rl.pieces.base import SEED, Key, StepTransform, next_key
-from lcc_rl.pieces.views import LEADER, VEHICLES
+from lcc_rl.functional.string import advance_string, entries_ahead, selector
+from lcc_rl.pieces.base import SEED, Entry, StepTransform, next_key
+from lcc_rl.pieces.leader import LEADER_SPEED
+from lcc_rl.pieces.views import EPISODE, VEHICLES
 from lcc_rl.pieces.world import Part, World
 from lcc_rl.settings import Factors, Positive, Speed
 
 RING_GAP = stream_id("string.ring_gap")
 WANTED, COMMAND, OBEYED = "wanted", "command", "obeyed"
-LEADER_SPEED = (LEADER, "speed")
+COMMANDED = Entry("command.role", "m/s²", "acceleration that the role's controller commands")
+WISHED = Entry("wanted.role", "m/s²", "acceleration commanded before the safety filter")
 
 
-class Places(StepTransform):
+class RolePlaces(StepTransform):
     """Writes which vehicles have which role, ``(role, "index")``, ``[*batch, n]``, int64.
 
     If the places of a string are drawn, they are written for every role, anew in every episode by
     its seed; else for the automated vehicles alone. The places are constant within an episode.
     """
 
+    role = EPISODE
+    placed = Entry(
+        "role.index", "–", "places of the role's vehicles, 0 at the front", 1, torch.int64
+    )
     index: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
         """Choose the roles whose places are written."""
         string = world.string
         roles = string.names if string.drawn else tuple({AUTOMATED} & set(string.names))
-        self.wire([], [], constants=[(role, "index") for role in roles])
-        self.string, self.roles = string, roles
+        keeps = [self.placed.of(role, width=string.count(role)) for role in roles]
+        self.declare(world, keeps=keeps)
+        self.roles = roles
         self.stream = stream_id("string.places")
         self.register_buffer("index", torch.arange(len(string)))
 
     def compute(self) -> tuple[()]:
         """Return nothing: places are constant within an episode."""
         return ()
-
-    def constant_specs(self, batch: torch.Size, device: torch.device | None) -> dict[Key, Any]:
-        return {
-            (role, "index"): Unbounded(
-                shape=(*batch, self.string.count(role)), dtype=torch.int64, device=device
-            )
-            for role in self.roles
-        }
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         if not self.string.drawn:
@@ -84,12 +82,7 @@ class Start(Protocol):
 
 
 class StringMotion(StepTransform):
-    """Moves all vehicles by their commands (A18): the one place with physics.
-
-    Writes under ``"vehicles"``, ``[*batch, N, 1]``: speed [m/s], gap to the vehicle ahead,
-    bumper to bumper [m], relative_speed v_ahead − v [m/s], the executed acceleration [m/s²], its
-    jerk [m/s³], and the command [m/s²].
-    """
+    """Moves all vehicles by their commands (A18): the one place with physics."""
 
     start: Mapping[str, Any] = field(default_factory=dict)  # by role: a :class:`Start`
     circumference: Positive | None = None  # of a ring road [m]
@@ -98,14 +91,23 @@ class StringMotion(StepTransform):
     # Speed of all vehicles at the start on a ring road, where there is no leader [m/s].
     initial_speed: Speed = 0.0
 
+    role = VEHICLES
+    writes = (
+        Entry("vehicles.speed", "m/s", "speed"),
+        Entry("vehicles.gap", "m", "gap to the vehicle ahead, bumper to bumper"),
+        Entry("vehicles.relative_speed", "m/s", "speed of the vehicle ahead minus own speed"),
+        Entry("vehicles.acceleration", "m/s²", "acceleration executed during the last step"),
+        Entry("vehicles.jerk", "m/s³", "change of the executed acceleration per second"),
+        Entry("vehicles.command", "m/s²", "acceleration commanded for the last step"),
+    )
+
     def setup(self, world: World) -> None:
         """Read the commands of all roles, and bind their starts.
 
         Raises:
             ConfigError: if a role has no start, or the ring is too short for its vehicles.
         """
-        self.string, self.time_step = world.string, world.time_step
-        string = world.string
+        self.time_step, string = world.time_step, world.string
         commands = [
             next_key((OBEYED if role in world.actuators else COMMAND, role))
             for role in string.names
@@ -113,8 +115,7 @@ class StringMotion(StepTransform):
         own = [(VEHICLES, name) for name in ("speed", "gap", "acceleration")]
         leader = [] if string.ring else [LEADER_SPEED, next_key(LEADER_SPEED)]
         indices = [(role, "index") for role in string.names] if string.drawn else []
-        writes = [(VEHICLES, name) for name in (*Motion._fields, COMMAND)]
-        self.wire([*own, *leader, *commands, *indices], writes, (len(string), 1))
+        self.declare(world, [*own, *leader, *commands, *indices])
         self.starts: dict[str, Any] = {
             role: start.bind(world, role) if isinstance(start, Part) else start
             for role, start in self.start.items()

@@ -9,7 +9,6 @@ the steps that violate the term's limit.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Literal
 
 from torch import Tensor
@@ -168,16 +167,16 @@ class PathEnergy(RewardTerm):
     # distance, and falling behind gains nothing [J/m].
     distance_price: NonNegative = 0.0
 
-    def setup(self, world: World, reads: Sequence[str] | None = None) -> None:
+    def setup(self, world: World) -> None:
         """Choose what is read by whose energy counts, and by which models."""
-        self.sections, self.energy = Sections(world.string, VEHICLES), world.energy
-        self.mixed, behind = len(world.energy.models) > 1, self.of == "behind"
+        self.sections = Sections(world.string, VEHICLES)
+        self.energy = world.given("energy", self.title)
+        self.mixed, behind = len(self.energy.models) > 1, self.of == "behind"
         space = VEHICLES if behind else "self"
-        reads = [f"{space}.speed", f"{space}.acceleration"]
-        reads += [f"{space}.{CLASS[-1]}"] if self.mixed else []
-        reads += [".".join(key) for key in self.sections.keys if behind]
+        kind = [f"{space}.{CLASS[-1]}"] * self.mixed
+        indices = self.sections.keys if behind else []
         self.time_step, self.factor = world.time_step, world.time_step / self.scale
-        super().setup(world, reads)
+        self.declare(world, [f"{space}.speed", f"{space}.acceleration", *kind, *indices])
 
     def reward(self, speed: Tensor, acceleration: Tensor, *more: Tensor) -> Tensor:
         """Return the unweighted term."""

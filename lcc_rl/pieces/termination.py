@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
-from lcc_rl.pieces.base import Feature
-from lcc_rl.pieces.views import VEHICLES
-from lcc_rl.pieces.world import World
+from lcc_rl.pieces.base import Entry, Feature
+from lcc_rl.pieces.views import EPISODE
 
 
 class Collision(Feature):
@@ -18,9 +18,14 @@ class Collision(Feature):
     evaluation.
     """
 
-    def setup(self, world: World) -> None:
-        """Read all gaps."""
-        self.wire(["done", "terminated", (VEHICLES, "gap")], ["done", "terminated"])
+    role = EPISODE
+    reads = (("done",), ("terminated",), "vehicles.gap")
+    writes = (
+        Entry("done", "–", "terminated or truncated", 1, torch.bool),
+        Entry(
+            "terminated", "–", "a collision ended the episode, where collisions do", 1, torch.bool
+        ),
+    )
 
     def compute(self, done: Tensor, terminated: Tensor, gap: Tensor) -> tuple[Tensor, Tensor]:
         """Return done and terminated, ``[*batch, 1]``."""

@@ -12,7 +12,8 @@ any other ``name.x``    the entry as it is, ``[*batch, n, w]``: one row per vehi
 ======================  ====================================================================
 
 A name that begins with ``next.`` means the state after the step. Every name gives
-``[*batch, n, w]``, one row per vehicle of the role (or 1 if all of them see the same).
+``[*batch, n, w]``, one row per vehicle of the role (or 1 if all of them see the same). A tuple is
+no name but the key of an entry, which is given as it is.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -33,7 +35,8 @@ Key = tuple[str, ...]
 NEXT = "next"
 VEHICLES, LEADER, EPISODE = "vehicles", "leader", "episode"
 SELF, AHEAD, BEHIND = "self", "ahead", "behind"
-PRESENT, ACTION = "present", "action"
+PRESENT = "present"
+MOTION = ("self.speed", "self.gap", "self.relative_speed")
 
 
 Resolver = Callable[[Sequence[Tensor]], Tensor]
@@ -50,7 +53,7 @@ class Views:
     Args:
         string: the string of vehicles.
         role: whose view.
-        names: what is seen, dotted.
+        names: what is seen: dotted names, and keys as tuples.
         behind: how many vehicles behind are seen, the nearest first.
 
     Attributes:
@@ -61,26 +64,26 @@ class Views:
     """
 
     def __init__(
-        self, string: VehicleString, role: str, names: Sequence[str], behind: int = 1
+        self, string: VehicleString, role: str, names: Sequence[NestedKey], behind: int = 1
     ) -> None:
         self.string, self.behind = string, behind
         if isinstance(names, str):
             raise ConfigError(f"reads must be a tuple of names such as self.gap, got {names!r}")
-        self.names = [as_key(name) for name in names]
-        for name in self.names:
-            if len(name) - (name[0] == NEXT) != 2:
-                raise ConfigError(f"expected a name such as self.gap, got {'.'.join(name)!r}")
         # Only roles have places; what all vehicles see alike needs none.
         self.drawn = string.drawn and role in string.names
         self.places, self.role = string.places(role), role
         self.select = selector(self.places, len(string))
         self.keys: list[Key] = []
         # Everything that depends on the string alone is settled here, not at every step.
-        self.plan = [self._resolver(name) for name in self.names]
+        self.plan = [self._resolver(name) for name in names]
 
     def __call__(self, *entries: Tensor) -> list[Tensor]:
         """Return what is seen, one tensor per name."""
         return [resolve(entries) for resolve in self.plan]
+
+    def of(self, moment: TensorDictBase) -> list[Tensor]:
+        """Return what is seen of a moment."""
+        return self(*(moment.get(key) for key in self.keys))
 
     def _place(self, key: Key) -> int:
         """Return the place of an entry among those read."""
@@ -88,8 +91,13 @@ class Views:
             self.keys.append(key)
         return self.keys.index(key)
 
-    def _resolver(self, name: Key) -> Resolver:
-        """Return the function from the entries read to what a name means."""
+    def _resolver(self, given: NestedKey) -> Resolver:
+        """Return the function from the entries read to what a name or a key means."""
+        name = as_key(given)
+        if not isinstance(given, str):
+            return partial(_as_it_is, self._place(name))
+        if len(name) - (name[0] == NEXT) != 2:
+            raise ConfigError(f"expected a name such as self.gap, got {given!r}")
         prefix, (space, entry) = name[:-2], name[-2:]
         if space in (SELF, AHEAD):
             return self._at((*prefix, VEHICLES, entry), -1 if space == AHEAD else 0)
@@ -99,7 +107,7 @@ class Views:
             key = (*prefix, VEHICLES, "speed" if present else entry)
             distances = range(1, self.behind + 1)
             return partial(_joined, [self._at(key, distance, present) for distance in distances])
-        if entry == ACTION:
+        if entry == "action":
             return partial(_held, self._place(name))
         return partial(_row if space in (LEADER, EPISODE) else _as_it_is, self._place(name))
 

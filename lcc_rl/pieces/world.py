@@ -6,11 +6,13 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
-from lcc_rl.energy import Fleet, as_fleet
+from tensordict.utils import NestedKey
+
 from lcc_rl.errors import require
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.settings import Settings, values
 
+MAX_ACCELERATION = 3.0  # of vehicles by default, in both directions [m/s²]
 MOST_LATE = 1000  # steps that a sensor, an actuator or a driver may be late; each is kept
 # Views that a role with sensors has from them, and the entries of the role that hold them.
 SENSED = {
@@ -32,7 +34,7 @@ class World:
         horizon: steps of an episode.
         profiles: speed profiles of the leader.
         population: the human drivers.
-        energy: the energy models of the vehicles.
+        energy: the energy models of the vehicles, :class:`lcc_rl.energy.Fleet`.
         nominal: leaders and starts as in an evaluation, without the deviations of training.
         actuators: settings of the :class:`lcc_rl.pieces.Actuation` of roles that have one.
         sensors: settings of the :class:`lcc_rl.pieces.Sensors` of roles that have some.
@@ -44,11 +46,21 @@ class World:
     horizon: int = 300
     profiles: Any = None
     population: Any = None
-    energy: Fleet = field(default_factory=lambda: as_fleet(None))
+    energy: Any = None
     nominal: bool = False
     actuators: Mapping[str, Any] = field(default_factory=dict)
     sensors: Mapping[str, Any] = field(default_factory=dict)
     filtered: Collection[str] = ()
+
+    def given(self, what: str, where: str) -> Any:
+        """Return profiles, population or energy.
+
+        Raises:
+            ConfigError: if the world has none.
+        """
+        found = getattr(self, what)
+        require(found is not None, f"{where} needs a World({what}=…) to be bound to")
+        return found
 
     def deviations(self, factors: tuple[float, float]) -> tuple[float, float]:
         """Return the range of a factor from which episodes draw: 1 in an evaluation."""
@@ -77,11 +89,11 @@ class World:
         require(seconds < 1.001 * most, f"{what} must be at most {most:g} s, got {seconds:g} s")
         return self.steps(seconds, what)
 
-    def sensed(self, role: str, names: Sequence[str]) -> list[str]:
+    def sensed(self, role: str, names: Sequence[NestedKey]) -> list[NestedKey]:
         """Return names of views of a role, those that its sensors measure as measured."""
         if role not in self.sensors:
             return list(names)
-        return [_sensed(role, name) for name in names]
+        return [_sensed(role, name) if isinstance(name, str) else name for name in names]
 
 
 def _sensed(role: str, name: str) -> str:
@@ -102,9 +114,8 @@ class Part(Settings):
             world: what the pieces of the environment share.
             name: the role that it drives, or its key in the configuration.
         """
-        bound = type(self).__new__(type(self))
-        bound.__dict__.update(values(self), name=name or self.name)
-        bound.settled()
+        bound = type(self)(**values(self))
+        bound.name = name or self.name  # type: ignore[misc]
         bound.setup(world or World())
         return bound
 

@@ -25,7 +25,7 @@ class Task(Settings):
     # the largest mean of share_… over all episodes.
     limits: Mapping[str, NonNegative] = field(default_factory=dict)
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         if self.score not in measures.score_measures():
             raise unknown_name("score (task.score)", self.score, measures.score_measures())
         for column in self.limits:

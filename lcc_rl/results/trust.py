@@ -57,8 +57,8 @@ def trusted(
 def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] = ()) -> None:
     """Check that a stored configuration names no code outside :data:`REGISTRY`.
 
-    Building a node imports and calls what it names. Functions of the registry may write files;
-    only those that make a population may be named.
+    Building a node imports and calls what it and its ``law`` name. Functions of the registry may
+    write files; only those that make a population may be named.
 
     Args:
         content: the configuration as plain containers.
@@ -70,7 +70,7 @@ def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] =
     """
     for key, _, value in settings_at(content):
         module = str(value).rpartition(".")[0]
-        if key.rpartition(".")[2] != TARGET or module in trust:
+        if key.rpartition(".")[2] not in (TARGET, "law") or value is None or module in trust:
             continue
         try:
             found = find_target(str(value), where) if _within_registry(module) else None

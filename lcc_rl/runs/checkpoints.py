@@ -34,7 +34,7 @@ class Checkpoint(Settings):
     times: Columns
     memory: dict[str, Any]
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         lengths = {len(column) for column in (*self.rows.values(), *self.times.values())}
         if not {*lengths, *([] if self.rows else [0])} <= {self.iteration}:
             raise ConfigError(f"iteration {self.iteration}, but rows of {sorted(lengths)}")

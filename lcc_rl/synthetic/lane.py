@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lcc_rl.data.trajectories import FRAME
-from lcc_rl.drivers.parameters import COLUMNS, fitted
+from lcc_rl.drivers.parameters import fitted
 from lcc_rl.drivers.population import DriverPopulation
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.idm import equilibrium_gap, simulate_follower
+from lcc_rl.functional.driver_models import PARAMETERS, simulate_follower
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
 Array = NDArray[np.float64]
@@ -70,7 +70,7 @@ def drive_platoons(
     drawn = _drawn(leader, drivers, vehicles, noise, recordings)
     ahead, chosen, xi, _ = (np.concatenate(parts, -1) for parts in zip(*drawn, strict=True))
     ranks = [drivers.select(row) for row in torch.from_numpy(chosen)]
-    speed, gap = follow(torch.from_numpy(ahead), ranks, torch.from_numpy(xi))
+    speed, gap = drive_ranks(torch.from_numpy(ahead), ranks, torch.from_numpy(xi))
     made, first, warm_up = [], 0, round(WARM_UP_S / FRAME)
     for (seen, _), (_, chosen, _, length) in zip(recordings, drawn, strict=True):
         own = slice(first, first := first + len(seen))
@@ -131,7 +131,7 @@ def draw_drivers(
     return order[torch.from_numpy(place.astype(np.int64))]
 
 
-def follow(ahead: Tensor, ranks: list[DriverPopulation], xi: Tensor) -> tuple[Array, Array]:
+def drive_ranks(ahead: Tensor, ranks: list[DriverPopulation], xi: Tensor) -> tuple[Array, Array]:
     """Drive platoons behind their leaders, from the equilibrium at the first speed.
 
     Args:
@@ -146,7 +146,7 @@ def follow(ahead: Tensor, ranks: list[DriverPopulation], xi: Tensor) -> tuple[Ar
     speeds, gaps = [ahead], []
     for rank, drivers in enumerate(ranks):
         own, leading = (drivers.desired_speed.double(), drivers.time_gap.double()), speeds[-1]
-        start = equilibrium_gap(leading[0], *own, drivers.constants)
+        start = drivers.constants.equilibrium_gap(leading[0], *own)
         noise = xi[:, rank].__getitem__
         speed, gap, _ = simulate_follower(
             leading, leading[0], start, *own, drivers.constants, FRAME, noise
@@ -162,7 +162,9 @@ def _truth(ranks: list[DriverPopulation]) -> pd.DataFrame:
     parameters = [drivers.parameters() for drivers in ranks]
     columns = {"vehicle": vehicle, "preceding": vehicle - 1}
     for name in fitted("global"):
-        columns[COLUMNS[name]] = torch.stack([own[name] for own in parameters]).T.flatten().numpy()
+        columns[PARAMETERS[name].column] = (
+            torch.stack([own[name] for own in parameters]).T.flatten().numpy()
+        )
     return pd.DataFrame(columns)
 
 

@@ -62,7 +62,7 @@ class StreamSource(Settings):
     criteria: given_as(Criteria) = field(default_factory=Criteria)  # type: ignore[valid-type]
     keep: None = None  # no file is written; the hashes of runs hold this setting
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         low, high = self.duration_s
         if low > high:
             raise ConfigError(f"data.duration_s must be a range, got {low:g} to {high:g} s")

@@ -8,9 +8,11 @@ from helpers import followed_profiles, wavy_profiles
 from test_analytic import make
 
 from lcc_rl.agents.limits import Limits
+from lcc_rl.energy import as_fleet
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.power import acceleration_loss, steady_power
 from lcc_rl.pieces import PathEnergy, SmoothEfficiency, Smoothness, SmoothSafety
+from lcc_rl.pieces.world import World
 
 KNOWN = {"safety": SmoothSafety(), "efficiency": SmoothEfficiency(), "smoothness": Smoothness()}
 
@@ -69,7 +71,7 @@ def test_the_record_says_shares_and_prices(tmp_path) -> None:
 
 
 def test_path_energy_is_a2_without_what_the_motion_stores() -> None:
-    term = PathEnergy().bind()
+    term = PathEnergy().bind(World(energy=as_fleet(None)))
     speed, acceleration = torch.tensor([[[10.0]]]), torch.tensor([[[1.0]]])
     before = speed - 0.1
     expected = steady_power(before) + acceleration_loss(before, acceleration)

@@ -11,10 +11,10 @@ from lcc_rl.agents.rules import make_policy
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config.nodes import Node
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.idm import IDMConstants, idm_acceleration
-from lcc_rl.functional.rules import linear_acc
+from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.pieces import Observation
 from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.cruise import LinearACC
 
 SCALES = {"ahead": {"speed": 0.1}, "self": {"speed": 0.1, "relative_speed": 0.5, "gap": 0.1}}
 
@@ -31,12 +31,12 @@ def policy(kind: str, **settings):
 @pytest.mark.parametrize("state", [(8.0, 15.0, 0.5), (0.0, 2.5, 1.0), (12.0, 18.0, -2.0)])
 def test_the_rules_are_those_of_the_equations(state) -> None:
     speed, gap, relative = (torch.tensor(x) for x in state)
-    idm = idm_acceleration(speed, gap, -relative, 20.0, 1.1, IDMConstants(1.2, 1.7, 1.5))
+    idm = IDMConstants(1.2, 1.7, 1.5)(speed, gap, -relative, 20.0, 1.1)
     constants = {"desired_speed": 20.0, "time_gap": 1.1, "acceleration": 1.2}
     constants |= {"deceleration": 1.7, "min_gap": 1.5}
     action = policy("idm", constants=constants, max_acceleration=4.0)(seen(*state))
     assert action.item() == pytest.approx(float(idm) / 4.0, rel=1e-4)
-    acc = linear_acc(speed, gap, relative, 25.0, 1.5, 2.0, 0.1, 0.5)
+    acc = LinearACC.law(speed, gap, relative, 25.0, 1.5, 2.0, 0.1, 0.5)
     assert policy("acc")(seen(*state)).item() == pytest.approx(float(acc) / 3.0, rel=1e-4)
 
 

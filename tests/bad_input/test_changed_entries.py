@@ -67,8 +67,9 @@ class Lossy(MotorPower):
 
 
 class Kinetic(Feature):
-    def setup(self, world):
-        self.wire([("vehicles", "speed")], [("vehicles", "kinetic")], (len(world.string), 1))
+    role = "vehicles"
+    reads = ("vehicles.speed",)
+    writes = ("vehicles.kinetic",)
 
     def compute(self, speed):
         return speed.square_()

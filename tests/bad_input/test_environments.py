@@ -17,7 +17,7 @@ from lcc_rl.envs import DifferentiableRollout, StringCollector, build_env, make_
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.pieces import Controller, Feature
-from lcc_rl.pieces.rewards import REWARD
+from lcc_rl.pieces.base import REWARD
 
 PROFILE, START, DRIVER = ("leader", "profile"), ("leader", "start"), ("human", "driver")
 SEED, GAP = ("episode", "seed"), ("vehicles", "gap")
@@ -156,9 +156,12 @@ class Remembering(Controller):
 class RememberingFeature(Feature):
     """Keeps the last gap in an attribute."""
 
+    role = "vehicles"
+    reads = (GAP,)
+    writes = ("vehicles.change",)
+
     def setup(self, world) -> None:
-        shape = (len(world.string), 1)
-        self.wire([GAP], [("vehicles", "change")], shape)
+        super().setup(world)
         self.before = None
 
     def compute(self, gap):

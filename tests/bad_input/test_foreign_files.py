@@ -65,6 +65,7 @@ TARGET = "reward.terms.safety._target_"
 # Settings that a file may not hold, and the words of the error.
 FOREIGN: list[tuple[dict[str, object] | str, str]] = [
     ({TARGET: "os.system"}, rf"{TARGET} names 'os.system'"),
+    ({"drivers.law": "os.system"}, "drivers.law names 'os.system'"),
     ({TARGET: "mine.Comfort"}, "names 'mine.Comfort'.*trust="),
     ({TARGET: "lcc_rl.config.import_module"}, TARGET),
     ({TARGET: "lcc_rl.data.episodes.load_episodes"}, TARGET),

@@ -50,12 +50,12 @@ class InfinitePower(MotorPower):
 
 
 class NanEntry(Feature):
-    def setup(self, world):
-        reads = [("vehicles", "speed"), ("episode", "step")]
-        self.wire(reads, [("vehicles", "broken")], (len(world.string), 1))
+    role = "vehicles"
+    reads = ("vehicles.speed", "episode.step")
+    writes = ("vehicles.broken",)
 
     def compute(self, speed, step):
-        return nan_at(step.unsqueeze(-2), speed, at=4)
+        return nan_at(step, speed, at=4)
 
 
 CONTROL = (f"scenario.controllers.automated._target_={__name__}.NanControl",)

@@ -7,8 +7,7 @@ import pandas as pd
 import pytest
 import torch
 
-from lcc_rl.functional.driver_models import DriverConstants
-from lcc_rl.functional.idm import simulate_follower
+from lcc_rl.functional.driver_models import DriverConstants, simulate_follower
 from lcc_rl.functional.laws import LAWS
 
 STEP = 0.1
@@ -22,8 +21,7 @@ def build_episodes(
     model: str = "idm",
 ) -> pd.DataFrame:
     """Episodes of drivers whose leader swings, then speeds away at 38 m/s."""
-    law = LAWS[model]
-    constants = constants or law.constants()
+    constants = constants or LAWS[model]()
     seconds = seconds or [60.0] * len(desired_speed)
     parts = []
     for driver, (v0, gap_s, length) in enumerate(
@@ -34,9 +32,7 @@ def build_episodes(
         leader = torch.maximum(swing, (10.0 + 1.5 * (time - 0.4 * length)).clamp(max=38.0))
         start = torch.tensor([9.0, 4.0 + 9.0 * gap_s], dtype=torch.float64)
         own = (torch.tensor(v0).double(), torch.tensor(gap_s).double())
-        speed, gap, _ = simulate_follower(
-            leader, start[0], start[1], *own, constants, STEP, law=law
-        )
+        speed, gap, _ = simulate_follower(leader, start[0], start[1], *own, constants, STEP)
         parts.append(
             pd.DataFrame(
                 {

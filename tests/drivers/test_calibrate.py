@@ -64,7 +64,7 @@ def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
     for text in ("held out: RMSPE", "gap NRMSE [%], held out", "time gap [s]"):
         assert text in out.getvalue()
     population = bootstrap(tmp_path / "run" / "drivers.parquet", mode="global")
-    assert set(population.parameters()) == set(LAWS[model].parameters)
+    assert set(population.parameters()) == set(LAWS[model].table())
     driven = CalibratedDrivers().bind(World(population=population))
     state = [torch.full((3, 1, 1), x) for x in (10.0, 20.0, 0.0, 25.0, 1.2)]
     assert driven.acceleration(*state, torch.arange(3).view(3, 1, 1)).isfinite().all()

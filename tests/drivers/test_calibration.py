@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from helpers import slow_but
+from helpers import compose, slow_but, wavy_profiles
 
 from lcc_rl.drivers import kernel
-from lcc_rl.drivers.calibrator import Calibration, Calibrator, Constants
+from lcc_rl.drivers.calibrator import Calibration, Calibrator
 from lcc_rl.drivers.fit_error import FitError
 from lcc_rl.drivers.genetic import GeneticSettings
 from lcc_rl.drivers.observed import Selection, observe
-from lcc_rl.drivers.parameters import COLUMNS, DEFAULT_BOUNDS, fitted
+from lcc_rl.drivers.parameters import DEFAULT_BOUNDS, fitted
+from lcc_rl.drivers.population import from_table
+from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, DataError
-from lcc_rl.functional.idm import simulate_follower
+from lcc_rl.functional import machine_code
+from lcc_rl.functional.driver_models import (
+    PARAMETERS,
+    DriverConstants,
+    Parameter,
+    simulate_follower,
+)
 from lcc_rl.functional.laws import LAWS
 
 QUICK = GeneticSettings(population=8, generations=2, founders=1)
@@ -57,7 +66,7 @@ def random_candidates(model: str, *shape: int) -> torch.Tensor:
 
 def reference_measures(observed, candidates, model, constants) -> dict[str, torch.Tensor]:
     """The definitions, episode by episode, with the plain simulation."""
-    law, names = LAWS[model], fitted("global", model)
+    names = fitted("global", model)
     found = {
         name: torch.zeros(candidates.shape[:2]).double()
         for name in ("speed_rmspe", "gap_rmse", "gap_nrmse")
@@ -71,7 +80,6 @@ def reference_measures(observed, candidates, model, constants) -> dict[str, torc
                 *(truth[0], gaps[0], own.pop("desired_speed"), own.pop("time_gap")),
                 constants.with_(**own),
                 observed.time_step,
-                law=law,
             )
             off, apart = (speed - truth).square(), (gap - gaps).square()
             found["speed_rmspe"][row, column] = (off.sum() / truth.square().sum()).sqrt()
@@ -87,11 +95,11 @@ def reference_measures(observed, candidates, model, constants) -> dict[str, torc
 )
 def test_errors_are_those_of_the_plain_simulation(model, more, compiled, uneven_lengths):
     observed, names = observe(uneven_lengths), fitted("global", model)
-    constants, candidates = LAWS[model].constants(**more), random_candidates(model, 3, 6)
+    constants, candidates = LAWS[model](**more), random_candidates(model, 3, 6)
     expected = reference_measures(observed, candidates, model, constants)
     expected["both"] = expected["speed_rmspe"] + expected["gap_nrmse"]
     for objective, values in expected.items():
-        error = FitError(observed, constants, names, model, objective)
+        error = FitError(observed, constants, names, objective)
         error.compiled = compiled
         torch.testing.assert_close(error(candidates), values, rtol=1e-9, atol=1e-9)
 
@@ -105,12 +113,12 @@ def test_a_cache_that_cannot_be_read_costs_a_compilation_and_no_result(
     def njit(cache=False, **how):
         return (lambda function: damaged) if cache else numba_njit(**how)
 
-    numba_njit = kernel.numba.njit
+    numba_njit = machine_code.numba.njit
     observed, candidates = observe(uneven_lengths), random_candidates("idm", 3, 6)
-    error = FitError(observed, LAWS["idm"].constants(), fitted("global", "idm"))
+    error = FitError(observed, LAWS["idm"](), fitted("global", "idm"))
     expected = error(candidates)
-    monkeypatch.setattr(kernel.numba, "njit", njit)
-    monkeypatch.setattr(kernel, "compiled", cache(kernel.compiled.__wrapped__))
+    monkeypatch.setattr(machine_code.numba, "njit", njit)
+    monkeypatch.setattr(kernel, "kept", cache(machine_code.kept.__wrapped__))
     with caplog.at_level("INFO", logger="lcc_rl"):
         for _ in range(2):
             assert torch.equal(error(candidates), expected)
@@ -125,7 +133,7 @@ def test_both_simulations_agree_in_single_precision_and_on_what_is_no_number(mod
         candidates[1, at, at] = np.nan
     found = []
     for compiled in (True, False):
-        error = FitError(observed, LAWS[model].constants(), names, model)
+        error = FitError(observed, LAWS[model](), names)
         error.compiled = compiled
         found.append(error(candidates))
     torch.testing.assert_close(*found, rtol=1e-3, atol=1e-4, equal_nan=True)
@@ -137,7 +145,7 @@ def test_both_simulations_agree_in_single_precision_and_on_what_is_no_number(mod
 @EACH
 def test_known_drivers_are_recovered(model, known_drivers, make_episodes):
     speeds, gaps = (known_drivers[name].tolist()[:8] for name in ("desired_speed", "time_gap"))
-    episodes = make_episodes(speeds, gaps, LAWS[model].constants(**KNOWN[model]), model=model)
+    episodes = make_episodes(speeds, gaps, LAWS[model](**KNOWN[model]), model=model)
     local = fit(episodes, constants=KNOWN[model], model=model, objective="gap_rmse").drivers
     assert (local["desired_speed_mps"] / speeds - 1.0).abs().median() < 0.01
     assert (local["time_gap_s"] / gaps - 1.0).abs().median() < 0.01
@@ -148,21 +156,21 @@ def test_known_drivers_are_recovered(model, known_drivers, make_episodes):
 @pytest.mark.parametrize("model", slow_but(["fvdm"], LAWS))
 def test_all_parameters_of_known_drivers_are_recovered(model, known_drivers, make_episodes):
     speeds, gaps = (known_drivers[name].tolist()[:8] for name in ("desired_speed", "time_gap"))
-    episodes = make_episodes(speeds, gaps, LAWS[model].constants(**KNOWN[model]), model=model)
+    episodes = make_episodes(speeds, gaps, LAWS[model](**KNOWN[model]), model=model)
     free = fit(episodes, "global", model=model, global_genetic=THOROUGH).drivers
     assert free["rmspe"].median() < 0.001
-    assert (free["time_gap_s"] / gaps - 1.0).abs().median() < 0.05
+    assert (free["time_gap_s"] / gaps - 1.0).abs().median() < 0.1
 
 
 @pytest.mark.parametrize("model", ["idm", "fvdm"])
 def test_constants_are_chosen_over_all_drivers(model, make_episodes):
-    known = LAWS[model].constants(**KNOWN[model])
+    known = LAWS[model](**KNOWN[model])
     episodes = make_episodes([20.0, 25.0, 30.0], [1.0, 1.4, 1.8], known, [20.0] * 3, model)
     given = fit(episodes, model=model)
     chosen = fit(episodes, model=model, choose_constants=True)
     assert chosen.drivers["rmspe"].mean() < 0.5 * given.drivers["rmspe"].mean()
-    for name in LAWS[model].shared:
-        assert chosen.drivers[COLUMNS[name]].nunique() == 1
+    for name in LAWS[model].shared():
+        assert chosen.drivers[PARAMETERS[name].column].nunique() == 1
     assert any("constants chosen" in line for line in chosen.report)
 
 
@@ -176,7 +184,7 @@ def test_rows_keep_the_order_and_identity_of_the_input(uneven_lengths):
     assert drivers["samples"].tolist() == [238, 401, 315] * 2
     assert drivers.columns.tolist() == [
         *("episode", "recording", "follower_id", "leader_id"),
-        *(COLUMNS[name] for name in fitted("global")),
+        *(PARAMETERS[name].column for name in fitted("global")),
         *("rmspe", "gap_rmse_m", "gap_nrmse", "samples"),
         *(f"{name}_at_bound" for name in fitted("global")),
         *("mode", "model"),
@@ -238,6 +246,60 @@ def test_episodes_are_cut_where_the_holdout_begins(uneven_lengths):
             assert not tail[samples - cut :].any()
 
 
+@dataclass(frozen=True)
+class Helly(DriverConstants):
+    """Helly's linear model: a law of one's own, with a parameter that no other has."""
+
+    gap_gain: float = 0.1
+    speed_gain: float = 0.5
+
+    own: ClassVar = {
+        "gap_gain": Parameter("gap_gain_hz2", "gap gain [1/s²]", (0.01, 1.0), (0.001, 10.0))
+    }
+
+    def wish(self, speed, gap, approach_rate, desired_speed, time_gap):
+        following = self.gap_gain * (gap - self.min_gap - time_gap * speed)
+        following = following - self.speed_gain * approach_rate
+        return torch.minimum(following, self.speed_gain * (desired_speed - speed))
+
+    def steady_gap(self, speed, desired_speed, time_gap):
+        return self.min_gap + time_gap * speed
+
+
+class Sorted(Helly):
+    """The same law by an operation that has no counterpart in machine code."""
+
+    def wish(self, *motion):
+        return super().wish(*motion).unsqueeze(-1).sort(-1).values.squeeze(-1)
+
+
+def test_a_model_of_ones_own_is_calibrated_and_drives(make_episodes):
+    known, name = Helly(gap_gain=0.2, speed_gain=0.8), f"{__name__}.Helly"
+    episodes = make_episodes([15.0, 25.0], [1.0, 1.5], known, [30.0] * 2)
+    settings = {"model": name, "constants": {"gap_gain": 0.2, "speed_gain": 0.8}}
+    drivers = fit(episodes, objective="gap_rmse", **settings).drivers
+    assert drivers["desired_speed_mps"].tolist() == pytest.approx([15.0, 25.0], rel=0.01)
+    assert drivers["time_gap_s"].tolist() == pytest.approx([1.0, 1.5], rel=0.01)
+    assert (drivers["gap_gain_hz2"] == 0.2).all()
+    cfg = compose("alcc", "controller@scenario.controllers.human=calibrated")
+    cfg.scenario.controllers["human"]["noise"] = 0.0
+    data = build_env(cfg, wavy_profiles(), from_table(drivers), 4).rollout(20)
+    speed, gap, rate = (data["vehicles", x][..., 1:, :] for x in ("speed", "gap", "relative_speed"))
+    own = (data["human", "desired_speed"], data["human", "desired_time_gap"])
+    wanted = known(speed, gap, -rate, *own)
+    torch.testing.assert_close(data["next", "command", "human"], wanted)
+
+
+def test_a_law_without_machine_code_is_simulated_by_tensors(uneven_lengths):
+    observed, candidates = observe(uneven_lengths), torch.tensor([[20.0, 1.0]]).double()
+    found = []
+    for law in (Helly(), Sorted()):
+        error = FitError(observed, law, ("desired_speed", "time_gap"))
+        found.append(error(candidates.expand(3, 5, 2)))
+    assert not error.compiled
+    torch.testing.assert_close(*found)
+
+
 def test_the_part_held_out_is_predicted_and_has_no_say_in_the_fit(make_episodes):
     episodes = make_episodes([20.0, 25.0], [1.0, 1.5])
     whole = fit(episodes, holdout=0.3).drivers
@@ -274,7 +336,7 @@ def test_bad_tables_end_in_one_clear_error(change, message, uneven_lengths):
         ({"model": "krauss"}, "model"),
         ({"bounds": {"time_gap": [2.0, 1.0]}}, "time_gap"),
         ({"bounds": {"time_gap": [0.0, 1.0]}}, "time_gap"),
-        ({"model": "ovm", "constants": Constants(acceleration=1.0)}, "acceleration"),
+        ({"model": "ovm", "constants": {"acceleration": 1.0}}, "acceleration"),
         ({"selection": {"min_gap_m": -1.0}}, "min_gap_m"),
         ({"selection": {"max_duration_s": 5.0}}, "max_duration_s"),
         ({"local_genetic": {"population": 3}}, "population"),

@@ -68,17 +68,6 @@ def test_global_population_has_constants_of_its_own():
     assert chosen.ids == tuple(population.ids[place] for place in (3, 3, 7))
 
 
-def test_draws_follow_the_seed_and_keep_pairs_together():
-    population = bootstrap()
-    first, again = (population.draw(500, torch.Generator().manual_seed(7)) for _ in range(2))
-    assert torch.equal(first, again)
-    assert first.min() >= 0
-    assert first.max() < 249
-    chosen = population.select(first)
-    pairs = set(zip(population.desired_speed.tolist(), population.time_gap.tolist(), strict=True))
-    assert set(zip(chosen.desired_speed.tolist(), chosen.time_gap.tolist(), strict=True)) <= pairs
-
-
 def test_drivers_of_several_models_are_a_population(table, written):
     table = table.assign(model=["idm", "gipps"] * 10)
     table["leader_deceleration_mps2"] = np.where(table["model"] == "gipps", 2.8, np.nan)
@@ -86,7 +75,7 @@ def test_drivers_of_several_models_are_a_population(table, written):
     assert population.models == tuple(table["model"])
     assert population.constants == IDMConstants()
     own = population.parameters()
-    assert set(own) == {*LAWS["idm"].parameters, *LAWS["gipps"].parameters}
+    assert set(own) == {*LAWS["idm"].table(), *LAWS["gipps"].table()}
     expected = table["leader_deceleration_mps2"].to_numpy()
     np.testing.assert_allclose(own["leader_deceleration"], expected, rtol=1e-6)
     with pytest.raises(DataError, match="row 1, column 'leader_deceleration_mps2'"):

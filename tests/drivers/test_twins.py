@@ -15,22 +15,22 @@ from lcc_rl.commands.pipeline import _pass_on
 from lcc_rl.drivers import twins
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.observed import observe
-from lcc_rl.drivers.parameters import COLUMNS
 from lcc_rl.drivers.twins import (
     REACTING,
-    RECORDED,
+    RECORDED_DRIVERS,
     TWINS,
     Reaction,
-    choose,
+    choose_reaction,
     densities,
-    drive,
-    measure,
+    drive_twins,
+    measure_motion,
+    measure_recorded,
     one_step_error,
     ratios,
-    recorded,
     tried,
 )
 from lcc_rl.errors import DataError
+from lcc_rl.functional.driver_models import PARAMETERS
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.power import acceleration_loss
 
@@ -73,8 +73,11 @@ def followed(delay: float, noise: float, drivers: int = 40) -> tuple[pd.DataFram
     table = table.assign(**{name: values.T.ravel() for name, values in series.items()})
     own = IDMConstants()
     known = pd.DataFrame({"episode": range(drivers), "model": "idm"}).assign(
-        **{COLUMNS["desired_speed"]: v0, COLUMNS["time_gap"]: headway},
-        **{COLUMNS[x]: getattr(own, x) for x in ("acceleration", "deceleration", "min_gap")},
+        **{PARAMETERS["desired_speed"].column: v0, PARAMETERS["time_gap"].column: headway},
+        **{
+            PARAMETERS[x].column: getattr(own, x)
+            for x in ("acceleration", "deceleration", "min_gap")
+        },
     )
     return table, known
 
@@ -85,8 +88,8 @@ def followed(delay: float, noise: float, drivers: int = 40) -> tuple[pd.DataFram
 def test_the_reaction_of_drivers_is_found(delay, noise) -> None:
     episodes, known = followed(delay, noise)
     observed = observe(episodes)
-    records, twins = recorded(observed), tried(observed, known)
-    found = choose(twins, records, np.ones(len(records), bool))
+    records, twins = measure_recorded(observed), tried(observed, known)
+    found = choose_reaction(twins, records, np.ones(len(records), bool))
     assert found.delay == pytest.approx(delay, abs=0.11)
     assert found.noise == pytest.approx(noise, abs=0.08)
     near = ratios(twins[found].twins, records)
@@ -101,7 +104,7 @@ def test_calibration_smooths_drivers_and_the_reaction_restores_them() -> None:
     episodes, _ = followed(0.6, 0.25)
     result = Calibrator(reaction=True)(episodes)
     found = dict(list(result.twins.groupby("driver")))
-    plain, reacting = (ratios(found[who], found[RECORDED]) for who in (TWINS, REACTING))
+    plain, reacting = (ratios(found[who], found[RECORDED_DRIVERS]) for who in (TWINS, REACTING))
     assert plain["lost"] < 0.9
     assert abs(reacting["lost"] - 1.0) < 0.5 * abs(plain["lost"] - 1.0)
     assert reacting["spectrum"] < 0.5 * plain["spectrum"]
@@ -123,7 +126,7 @@ def test_forgotten_units_and_bounds_are_said(caplog) -> None:
     assert "IMPLAUSIBLE FIT: the gap of the median driver is off by" in loud
     assert "RMSPE" not in loud
     mean = result.twins.groupby("driver")["gap_m"].mean()
-    gaps = f"gap {mean[TWINS]:.1f} m against {mean[RECORDED]:.1f} m"
+    gaps = f"gap {mean[TWINS]:.1f} m against {mean[RECORDED_DRIVERS]:.1f} m"
     assert any(gaps in line for line in result.report)
 
 
@@ -133,7 +136,7 @@ def test_measures_by_hand() -> None:
     samples = np.array([631])
     time = np.arange(631) * STEP
     speed = (10.0 + np.sin(0.2 * np.pi * time))[:, None, None]
-    found = measure(speed, 30.0 + 0.0 * speed, samples, STEP)
+    found = measure_motion(speed, 30.0 + 0.0 * speed, samples, STEP)
     row, seconds = found.iloc[0], 60.0
     damped = np.sinc(0.31)
     assert row["distance_3.1s_m"] == pytest.approx(10.0 * seconds, rel=0.01)
@@ -148,12 +151,12 @@ def test_measures_by_hand() -> None:
 def test_twins_of_one_delay_meet_the_same_noise() -> None:
     episodes, known = followed(0.0, 0.0, drivers=3)
     observed = observe(episodes)
-    quiet, loud = drive(observed, known, [Reaction(), Reaction(0.0, 0.3)])
-    alone = drive(observed, known, [Reaction(0.0, 0.3)])[0]
+    quiet, loud = drive_twins(observed, known, [Reaction(), Reaction(0.0, 0.3)])
+    alone = drive_twins(observed, known, [Reaction(0.0, 0.3)])[0]
     pd.testing.assert_frame_equal(loud, alone)
     # Without reaction they are the drivers themselves.
     assert (quiet.pop("rmspe") < 1e-9).all()
-    pd.testing.assert_frame_equal(quiet, recorded(observed), rtol=1e-9)
+    pd.testing.assert_frame_equal(quiet, measure_recorded(observed), rtol=1e-9)
     assert (loud["lost_1.1s_j"] > quiet["lost_1.1s_j"]).all()
 
 

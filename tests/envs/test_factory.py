@@ -23,8 +23,7 @@ from torchrl.envs.utils import step_mdp
 
 from lcc_rl.drivers.population import DriverPopulation, fixed
 from lcc_rl.envs import build_env, load_inputs
-from lcc_rl.envs.step import Step, closure, entries, pieces_of
-from lcc_rl.functional.idm import equilibrium_gap
+from lcc_rl.envs.step import Step, closure, entries_of, pieces_of
 from lcc_rl.functional.power import motor_power
 
 T = 0.1
@@ -73,8 +72,8 @@ def test_initial_state() -> None:
     assert torch.equal(speed, lead.unsqueeze(-2).expand(6, 2, 1))
     torch.testing.assert_close(gap[:, 0], 2.0 + 1.5 * lead)
     human = td["human"]
-    expected = equilibrium_gap(
-        speed[:, 1:], human["desired_speed"], human["desired_time_gap"], POPULATION.constants
+    expected = POPULATION.constants.equilibrium_gap(
+        speed[:, 1:], human["desired_speed"], human["desired_time_gap"]
     )
     torch.testing.assert_close(gap[:, 1:], expected)
 
@@ -170,7 +169,7 @@ def test_gradient_from_energies_to_actions_matches_finite_differences() -> None:
     advance = Step(closure(pieces_of(env), {("vehicles", "power")}), 300)
 
     def energy(chosen):
-        state, total = entries(start), 0.0
+        state, total = entries_of(start), 0.0
         for action in chosen:
             reached = advance({**state, ACTION: action})
             total = total + reached["vehicles", "power"].sum() * T / 1e3

@@ -33,7 +33,7 @@ from lcc_rl.pieces import (
     Action,
     Feature,
     NGSIMLeader,
-    Places,
+    RolePlaces,
     StringMotion,
     TimeGapStart,
     TimeToCollision,
@@ -146,7 +146,7 @@ MOTION = StringMotion(start={"automated": TimeGapStart()})
 
 
 def pieces(*more):
-    needed = (NGSIMLeader(), Places(), Action(), MOTION)
+    needed = (NGSIMLeader(), RolePlaces(), Action(), MOTION)
     return [*(piece.bind(WORLD) for piece in needed), *more]
 
 
@@ -157,8 +157,9 @@ def check(*more) -> None:
 class Wide(Feature):
     """Writes a row per pair of vehicles where its spec says a row per vehicle."""
 
-    def setup(self, world: World) -> None:
-        self.wire([("vehicles", "gap")], [("vehicles", "wide")], (4, 1))
+    role = "vehicles"
+    reads = ("vehicles.gap",)
+    writes = ("vehicles.wide",)
 
     def compute(self, gap: Tensor) -> Tensor:
         return gap.unsqueeze(-2).expand(*gap.shape[:-1], 4, 1)
@@ -167,8 +168,9 @@ class Wide(Feature):
 class Broken(Feature):
     """Cannot compute on such a string."""
 
-    def setup(self, world: World) -> None:
-        self.wire([("vehicles", "gap")], [("vehicles", "broken")], (4, 1))
+    role = "vehicles"
+    reads = ("vehicles.gap",)
+    writes = ("vehicles.broken",)
 
     def compute(self, gap: Tensor) -> Tensor:
         return gap + torch.zeros(3, 1)
@@ -177,8 +179,8 @@ class Broken(Feature):
 @pytest.mark.parametrize(
     ("piece", "words"),
     [
-        (Wide().bind(), r"Wide writes vehicles\.wide as \[4, 4, 1\] .* expected \[4, 1\]"),
-        (Broken().bind(), "Broken does not fit the string of vehicles"),
+        (Wide().bind(WORLD), r"Wide writes vehicles\.wide as \[4, 4, 1\] .* expected \[4, 1\]"),
+        (Broken().bind(WORLD), "Broken does not fit the string of vehicles"),
         (
             MOTION.bind(WORLD),
             r"vehicles\.speed is written by more than one piece: \['StringMotion', 'StringMot",

@@ -8,7 +8,7 @@ from helpers import POPULATION, compose, steady, string, wavy_profiles
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.evaluation.episodes import evaluate, pairs
 from lcc_rl.evaluation.strategies import Strategy, baseline
-from lcc_rl.functional.idm import equilibrium_gap, simulate_follower
+from lcc_rl.functional.driver_models import simulate_follower
 from lcc_rl.functional.power import motor_power
 
 PROFILES = wavy_profiles().windows(100)
@@ -43,7 +43,7 @@ def test_scenario_b_equals_the_plain_simulation() -> None:
     profile, driver = pairs(len(PROFILES), len(POPULATION.time_gap), 5)
     leader = torch.stack([PROFILES.record(i) for i in profile], dim=1)
     v0, gap = POPULATION.desired_speed[driver], POPULATION.time_gap[driver]
-    start = equilibrium_gap(leader[0], v0, gap, POPULATION.constants)
+    start = POPULATION.constants.equilibrium_gap(leader[0], v0, gap)
     speed, _, acceleration = simulate_follower(
         leader, leader[0], start, v0, gap, POPULATION.constants, 0.1
     )

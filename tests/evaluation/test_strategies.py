@@ -9,7 +9,6 @@ import torch
 from helpers import compose
 from tensordict.nn import TensorDictModule
 
-from lcc_rl.agents.rules import ACCRule, IDMRule
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.named import TUNED
@@ -20,8 +19,6 @@ from lcc_rl.evaluation.strategies import (
     named_apart,
 )
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.functional.rules import idm_acc, linear_acc
-from lcc_rl.pieces import IDMACC, LinearACC
 
 
 @pytest.mark.parametrize("name", TUNED)
@@ -38,19 +35,6 @@ def test_a_tuned_rule_behind_the_filter_is_called_so_and_has_constants_for_it(na
     # A human driver has no filter.
     human = baseline(compose("alcc", "+filter=cbf"), "idm").cfg.scenario
     assert human.filters.get(AUTOMATED) is None
-
-
-@pytest.mark.parametrize(
-    ("piece", "rule", "law"), [(IDMACC, IDMRule, idm_acc), (LinearACC, ACCRule, linear_acc)]
-)
-def test_a_controller_commands_what_the_rule_of_an_agent_does(piece, rule, law) -> None:
-    generator = torch.Generator().manual_seed(0)
-    speed, gap = (20.0 * torch.rand(64, 1, 1, generator=generator) for _ in range(2))
-    relative_speed = torch.randn(64, 1, 1, generator=generator)
-    command = piece(**rule.START).bind().limited(speed, gap, relative_speed)
-    constants = rule.START.values()
-    assert torch.equal(command, law(speed, gap, relative_speed, *constants).clamp(-3.0, 3.0))
-    assert command.min() == -3.0
 
 
 def test_policies_of_one_variant_are_named_by_what_they_learned_with() -> None:

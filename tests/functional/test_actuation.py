@@ -7,7 +7,7 @@ import torch
 from test_braking import draw
 from torch import Tensor
 
-from lcc_rl.functional.actuation import Motion, Response, predicted
+from lcc_rl.functional.actuation import PairState, Response, predicted
 from lcc_rl.functional.braking import Braking, least_room_late
 
 BRAKING = Braking(3.0, 2.6, 4.0)
@@ -29,7 +29,7 @@ def test_commands_act_late_and_with_a_lag() -> None:
     assert lost > 3.0 * response.hold
 
 
-def braked(motion: Motion, response: Response, braking: Braking) -> Tensor:
+def braked(motion: PairState, response: Response, braking: Braking) -> Tensor:
     """Least room at the samples to come while both brake fully."""
     least = torch.full_like(motion.gap, torch.inf)
     for _ in range(300):
@@ -45,7 +45,7 @@ def braked(motion: Motion, response: Response, braking: Braking) -> Tensor:
 def test_the_least_room_is_never_more_than_that_of_braking(lag) -> None:
     chance, count = torch.Generator().manual_seed(0), 5_000
     response = Response.of(0, lag, BRAKING.own, STEP)
-    motion = Motion(
+    motion = PairState(
         draw(count, chance, 40.0).double().unsqueeze(-1),
         draw(count, chance, 300.0).double().unsqueeze(-1),
         draw(count, chance, 40.0).double().unsqueeze(-1),

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.braking import Braking, safe_acceleration
 from lcc_rl.functional.cacc import (
     Errors,
     Gains,
@@ -18,11 +19,10 @@ from lcc_rl.functional.cacc import (
     platoon_errors,
 )
 from lcc_rl.functional.hcfs import (
-    Place,
+    PlatoonPlace,
     PlatoonReward,
     hybrid_decision,
     jerk_interval,
-    safe_acceleration,
 )
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.string import entries_ahead
@@ -184,7 +184,7 @@ def test_one_step_reward_with_spacing(seconds, error) -> None:
     # As above, 0.9 m behind its place and a leader at 10.0 m/s: after the step it is
     # 0.9 + 0.1 (0 + 0.3) = 0.93 m behind, and falls back by 0.3 m/s.
     given = (column(10.0), column(0.5), column(1.0), column(10.5)[0], T)
-    place = Place(column(0.9), column(10.0))
+    place = PlatoonPlace(column(0.9), column(10.0))
     reward = PlatoonReward(10.0, 20.0, 0.03, 30.0, 0.02, 0.5, seconds)
     got = reward.one_step(*given, place)
     wanted = -0.5 * 0.3 - 0.001 * 2.5 - 0.02 * (error / 0.5) ** 2
@@ -226,7 +226,7 @@ def test_the_cap_is_safe_and_tight() -> None:
     ahead = 30.0 * torch.rand(shape, generator=generator, dtype=torch.float64)
     speed = 30.0 * torch.rand(shape, generator=generator, dtype=torch.float64)
     gap = 60.0 * torch.rand(shape, generator=generator, dtype=torch.float64) + 0.5
-    cap = safe_acceleration(gap, speed, ahead, T, 3.0, 0.5)
+    cap = safe_acceleration(speed, gap - 0.5, ahead, Braking(3.0, 3.0, 0.0), T)
     feasible = cap >= -3.0
     binding = feasible & (cap <= 3.0) & (speed + cap * T > 1.0)
     assert binding.sum() > 50

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from lcc_rl.drivers.population import bootstrap
+from lcc_rl.functional.driver_models import simulate_follower
 from lcc_rl.functional.estimation import Belief, PopulationMean, predict_and_update, prior
-from lcc_rl.functional.idm import equilibrium_gap, idm_acceleration, simulate_follower
 from lcc_rl.functional.random import uniform
 
 T = 0.1
@@ -18,7 +18,7 @@ def simulated(population, noise: float):
     wave = 6.0 + 2.5 * torch.sin(time / 3.0) + 1.0 * torch.sin(time / 0.9 + 1.0)
     leader = wave.view(-1, 1, 1).expand(-1, drivers, 1)
     v0, gap = population.desired_speed.unsqueeze(-1), population.time_gap.unsqueeze(-1)
-    start = equilibrium_gap(leader[0], v0, gap, population.constants)
+    start = population.constants.equilibrium_gap(leader[0], v0, gap)
     seeds = torch.arange(drivers).unsqueeze(-1) + 17
     speed, gaps, executed = simulate_follower(
         leader,
@@ -83,7 +83,5 @@ def test_population_mean_is_the_mean_over_drivers(v: float, s: float, rate: floa
     population = bootstrap()
     mean = PopulationMean(population.desired_speed, population.time_gap, population.constants)
     state = [torch.tensor([x]) for x in (v, s, rate)]
-    each = idm_acceleration(
-        *state, population.desired_speed, population.time_gap, population.constants
-    )
+    each = population.constants(*state, population.desired_speed, population.time_gap)
     torch.testing.assert_close(mean(*state), each.mean().unsqueeze(0), rtol=1e-4, atol=1e-4)

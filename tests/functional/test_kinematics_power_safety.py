@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
-from lcc_rl.functional.power import kinetic_energy, motor_power, traction_force
+from lcc_rl.functional.power import motor_power
 from lcc_rl.functional.safety import time_gap, time_to_collision
 
 
@@ -34,26 +34,6 @@ def test_motor_power_a2() -> None:
     torch.testing.assert_close(motor_power(t(10.0), t(-1.0), recuperation=False), t(0.0))
     # Standing still: the constant alone.
     torch.testing.assert_close(motor_power(t(0.0), t(0.0)), t(110.3))
-
-
-def test_traction_force_a1() -> None:
-    # v = 20, a = 0.5: 1.02·1005·0.5 = 512.55; 1005·9.81·0.015 = 147.88575;
-    # 0.5·0.3·2.02·1.206·400 = 146.1672; sum 806.60295 N
-    torch.testing.assert_close(traction_force(t(20.0), t(0.5)), t(806.60295))
-
-
-def test_motor_power_agrees_with_wheel_power() -> None:
-    # A2 is a fit of the electric power; at steady speed it must exceed the mechanical power of A1
-    # but by no more than a plausible loss.
-    speed = t(5.0, 10.0, 15.0, 20.0)
-    still = torch.zeros_like(speed)
-    ratio = motor_power(speed, still) / (traction_force(speed, still) * speed)
-    assert ((ratio > 1.0) & (ratio < 3.5)).all(), ratio
-
-
-def test_kinetic_energy() -> None:
-    # 0.5·1.02·1005·10² = 51255 J
-    torch.testing.assert_close(kinetic_energy(t(10.0)), t(51255.0))
 
 
 @pytest.mark.parametrize(

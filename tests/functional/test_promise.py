@@ -11,7 +11,7 @@ from helpers import slow_but
 from test_braking import MARGIN, draw, leader, states
 from torch import Tensor
 
-from lcc_rl.functional.actuation import Motion
+from lcc_rl.functional.actuation import PairState
 from lcc_rl.functional.braking import Braking, least_room_to_come
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.safety import time_to_collision
@@ -59,7 +59,7 @@ class Road:
         self.errs = torch.randint(0, 3, (count, 1), generator=self.chance)
 
     def room(self, speed: Tensor, gap: Tensor, ahead: Tensor, braking: Braking) -> Tensor:
-        now = Motion(*(x.unsqueeze(-1) for x in (speed, gap, ahead)), self.obeyed)
+        now = PairState(*(x.unsqueeze(-1) for x in (speed, gap, ahead)), self.obeyed)
         return least_room_to_come(now, self.pending, self.response, braking).squeeze(-1)
 
     def frame(self, gap: Tensor) -> Tensor:

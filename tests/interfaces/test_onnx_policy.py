@@ -76,14 +76,14 @@ def test_the_example_of_the_page_needs_no_lcc_rl_and_drives(tmp_path) -> None:
     assert bound.names == ("self.gap", "self.speed", "ahead.speed")
     gap, speed, ahead = (torch.rand(5, 1, 1) * 20.0 for _ in range(3))
     expected = (0.2 * (gap - 2.0 - 1.3 * speed) + 0.8 * (ahead - speed)).clamp(-3.0, 3.0)
-    torch.testing.assert_close(bound.limited(gap, speed, ahead)[0], expected)
+    torch.testing.assert_close(bound.compute(gap, speed, ahead)[0], expected)
 
 
 def test_commands_are_held_within_the_largest_acceleration(tmp_path) -> None:
     path = tenth(tmp_path / "a.onnx")
     assert not is_policy(path)  # a file of weights
     bound = OnnxPolicy(path=controller_of(path).settings["path"]).bind()
-    found = bound.limited(torch.tensor([[[20.0], [400.0]]]))[0]
+    found = bound.compute(torch.tensor([[[20.0], [400.0]]]))[0]
     assert found.flatten().tolist() == [pytest.approx(2.0), 3.0]
 
 

@@ -13,7 +13,7 @@ from lcc_rl.commands import evaluation
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.metrics import safety_measures
 from lcc_rl.evaluation.rollout import play
-from lcc_rl.functional.actuation import Motion, Response
+from lcc_rl.functional.actuation import PairState, Response
 from lcc_rl.functional.braking import Braking, safe_command
 from lcc_rl.pieces import Actuation, CBFFilter
 from lcc_rl.pieces.rewards import TERMS
@@ -78,7 +78,7 @@ def test_the_gradient_passes_the_filter_that_knows_late_brakes() -> None:
 
     def bound(x: torch.Tensor) -> torch.Tensor:
         one = torch.ones_like(x)
-        return safe_command(Motion(20.0 * one, x, 15.0 * one, 0.3 * one), response, limits)
+        return safe_command(PairState(20.0 * one, x, 15.0 * one, 0.3 * one), response, limits)
 
     (slope,) = torch.autograd.grad(bound(gap).sum(), gap)
     with torch.no_grad():

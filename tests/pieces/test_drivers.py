@@ -72,11 +72,11 @@ def test_a_delay_replays_the_same_law_on_what_was(model) -> None:
     delay = 3
     data = rolled(human(MODELS[model], QUIET, f"scenario.controllers.human.delay={delay}"))
     seen = {name: data["vehicles", name] for name in MOTION}
-    law, own = LAWS[model], LAWS[model].constants()
+    own = LAWS[model]()
     for step in range(12):
         speed, gap, relative = (values[:, max(step - delay, 0)] for values in seen.values())
         drivers = (data["human", name][:, step] for name in ("desired_speed", "desired_time_gap"))
-        expected = law.acceleration(speed, gap, -relative, *drivers, own)
+        expected = own(speed, gap, -relative, *drivers)
         assert torch.equal(data["next", "command", "human"][:, step], expected), step
 
 
@@ -145,10 +145,10 @@ def test_each_driver_of_a_mixture_has_its_own_model_and_parameters() -> None:
     for number, model in enumerate(MIXED.models):
         law, chosen = LAWS[model], driver == number
         values = {name: float(x[number]) for name, x in own.items()}
-        constants = law.constants(**{name: values[name] for name in law.shared})
-        expected = law.acceleration(
+        constants = law(**{name: values[name] for name in law.shared()})
+        expected = constants(
             *(speed[chosen], gap[chosen], -relative[chosen]),
-            *(values["desired_speed"], values["time_gap"], constants),
+            *(values["desired_speed"], values["time_gap"]),
         )
         torch.testing.assert_close(command[chosen], expected, rtol=1e-4, atol=1e-4)
 

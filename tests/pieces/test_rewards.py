@@ -71,7 +71,7 @@ GAPS = torch.full((1, 6, 1), 5.0)
 )
 def test_whose_energy_counts(of, earned) -> None:
     term = EnergyReward(of=of, scale=1000.0).bind(World(STRING))
-    torch.testing.assert_close(term.compute(POWER), -0.1 * t(*earned).unsqueeze(0))
+    torch.testing.assert_close(term.computed([POWER]), -0.1 * t(*earned).unsqueeze(0))
 
 
 def test_estimated_energy_of_the_human_drivers_behind() -> None:
@@ -81,17 +81,17 @@ def test_estimated_energy_of_the_human_drivers_behind() -> None:
     )
     humans = POWER[:, [1, 2, 4, 5]]
     assert term.in_keys == [("human", "predicted_power")]
-    torch.testing.assert_close(term.compute(humans), -0.1 * t(110.0, 220.0).unsqueeze(0))
+    torch.testing.assert_close(term.computed([humans]), -0.1 * t(110.0, 220.0).unsqueeze(0))
 
 
 def test_what_is_ahead_of_the_first_is_behind_the_last_on_a_ring() -> None:
     string = parse_string("human (automated human)*2", "ring")
     term = EnergyReward(of="behind", scale=1000.0).bind(World(string))
     power = 1000.0 * torch.tensor([1.0, 10.0, 100.0, 2.0, 20.0]).view(1, 5, 1)
-    torch.testing.assert_close(term.compute(power), -0.1 * t(100.0, 21.0).unsqueeze(0))
+    torch.testing.assert_close(term.computed([power]), -0.1 * t(100.0, 21.0).unsqueeze(0))
     assert torch.equal(
-        EnergyReward(of="behind").bind(World(RING)).compute(POWER),
-        EnergyReward(of="behind").bind(World(STRING)).compute(POWER),
+        EnergyReward(of="behind").bind(World(RING)).computed([POWER]),
+        EnergyReward(of="behind").bind(World(STRING)).computed([POWER]),
     )
 
 
@@ -114,5 +114,5 @@ def test_who_pays_for_a_collision(hit, behind, pays) -> None:
     gaps[:, list(hit)] = -0.1
     term = CollisionPenalty(weight=100.0, behind=behind).bind(World(STRING))
     entries = {("vehicles", "gap"): gaps}
-    got = term.compute(*(entries[key] for key in term.in_keys))
+    got = term.computed([entries[key] for key in term.in_keys])
     torch.testing.assert_close(got, -100.0 * t(*pays).unsqueeze(0))

@@ -12,7 +12,6 @@ from lcc_rl.envs import build_env
 from lcc_rl.evaluation.strategies import driven_by
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.pattern import VehicleString
-from lcc_rl.functional.rules import follower_stopper_speed
 from lcc_rl.functional.string import advance_string
 from lcc_rl.pieces import (
     Collision,
@@ -89,7 +88,7 @@ def test_a_ring_wraps() -> None:
 def test_a_raw_observation_is_in_si_units() -> None:
     scales = {"self": {"speed": 0.1, "gap": 0.5}, "behind": {"speed": 0.1}}
     pair = World(parse_string("automated human"))
-    scaled, raw = (Observation(scales=scales, raw=x).bind(pair).constants for x in (False, True))
+    scaled, raw = (Observation(scales=scales, raw=x).bind(pair).factors for x in (False, True))
     assert scaled.tolist() == pytest.approx([0.1, 0.5, 0.1])
     assert raw.tolist() == [1.0, 1.0, 1.0]
 
@@ -107,7 +106,7 @@ def test_an_entry_says_whether_somebody_is_behind_only_where_that_may_differ() -
     assert width("automated human", visible=2) == 1 + 2 * 2 + 2
     piece = Observation(scales=scales).bind(World(parse_string("automated human automated")))
     values = entries(3)
-    got = piece.compute(*(values[key] for key in piece.in_keys))[0]
+    got = piece.computed([values[key] for key in piece.in_keys])[0]
     expected = torch.tensor([[0.1, 0.2, 2.0, 1.0], [0.3, 0.0, 0.0, 0.0]])
     torch.testing.assert_close(got, expected)
 
@@ -235,10 +234,9 @@ def test_contact_of_any_two_vehicles_ends_the_episode() -> None:
     ],
 )
 def test_follower_stopper_by_region(speed, gap, ahead, wanted) -> None:
-    gaps, zeros, decelerations = (4.5, 5.25, 6.0), (0.0, 0.0, 0.0), (1.5, 1.0, 0.5)
+    piece = FollowerStopper(time_gaps=(0.0, 0.0, 0.0))  # the original form
     values = (torch.tensor([x], dtype=torch.float64) for x in (speed, gap, ahead, 8.0))
-    got = follower_stopper_speed(*values, gaps, zeros, decelerations)
-    assert float(got) == pytest.approx(wanted)
+    assert float(piece.wanted(*values)) == pytest.approx(wanted)
 
 
 def test_follower_stopper_keeps_time_gaps_and_its_limits() -> None:
@@ -250,11 +248,11 @@ def test_follower_stopper_keeps_time_gaps_and_its_limits() -> None:
     # At 20 m/s: 0.4, 0.6 and 0.8 s are 8, 12 and 16 m. 10 m: half of 20 m/s; 14 m: 25 m/s.
     wanted = [0.0, 10.0, 25.0, 30.0]
     gap, speed = column(7.0, 10.0, 14.0, 17.0), column(*[20.0] * 4)
-    got = piece.limited(speed, gap, speed)
+    got = piece.compute(speed, gap, speed)
     limited = [min(max((v - 20.0) / 0.1, -3.0), 1.5) for v in wanted]
     assert got.flatten().tolist() == pytest.approx(limited)
     slow = (
-        FollowerStopper(desired_speed=30.0).bind(World(time_step=10.0)).limited(speed, gap, speed)
+        FollowerStopper(desired_speed=30.0).bind(World(time_step=10.0)).compute(speed, gap, speed)
     )
     assert slow.flatten().tolist() == pytest.approx([(v - 20.0) / 10.0 for v in wanted])
 
@@ -265,7 +263,7 @@ def test_follower_stopper_desires_its_own_mean_speed() -> None:
     # The mean of what was driven, from the first step on.
     for step, (speed, mean) in enumerate(((3.0, 3.0), (6.0, 4.5), (9.0, 6.0), (9.0, 8.0))):
         own, at = torch.full((1, 1, 1), speed), torch.full((1, 1, 1), step)
-        command, history = piece.limited(own, torch.full_like(own, gap), ahead, at, history)
+        command, history = piece.compute(own, torch.full_like(own, gap), ahead, at, history)
         assert float(command) == pytest.approx(min(max(mean - speed, -3.0), 1.5))
 
 
@@ -294,12 +292,12 @@ def test_pi_saturation_follows_its_formula() -> None:
     speed, ahead = torch.full((1, 4, 1), 10.0), torch.tensor([10.0, 12.0, 10.0, 4.0]).view(1, 4, 1)
     gap = torch.tensor([40.0, 18.5, 5.0, 3.0]).view(1, 4, 1)
     step = torch.zeros(1, 1, 1)
-    command, _, wanted = piece.command(speed, gap, ahead, before, step, history)
+    command, _, wanted = piece.command(speed, gap, ahead, step, history, before)
     # At the first step the command before is the own speed; the targets are 11, 10.5, 10 and 10.
     # Δx_s is 4, 4, 4 and 2·6 = 12 m, so α is 1, 1, ½ and 0 and β 0.5, 0.5, 0.75 and 1.
     expected = [10.5, 10.25, 0.75 * (0.5 * 10.0 + 0.5 * 10.0) + 0.25 * 10.0, 4.0]
     assert wanted.flatten().tolist() == pytest.approx(expected)
     assert command.flatten().tolist() == pytest.approx([v - 10.0 for v in expected])
-    late, _, later = piece.command(speed, gap, ahead, before, step + 1, history)
+    late, _, later = piece.command(speed, gap, ahead, step + 1, history, before)
     assert later.flatten().tolist()[0] == pytest.approx(0.5 * (5.0 + 1.0) + 0.5 * 9.0)
     assert late.shape == (1, 4, 1)

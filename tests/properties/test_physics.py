@@ -13,12 +13,8 @@ from tensordict import TensorDict
 
 from lcc_rl.envs import build_env
 from lcc_rl.evaluation.metrics import energy_measures
-from lcc_rl.functional.idm import (
-    IDMConstants,
-    equilibrium_gap,
-    idm_acceleration,
-    simulate_follower,
-)
+from lcc_rl.functional.driver_models import simulate_follower
+from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.power import motor_power
 from lcc_rl.functional.string import entries_ahead
 
@@ -121,8 +117,8 @@ def slopes(speed, time_gap, constants: IDMConstants):
     """Return the derivatives of the IDM by gap, own speed and leader's speed in equilibrium."""
     own, lead = speed.clone().requires_grad_(), speed.clone().requires_grad_()
     desired = torch.full_like(speed, 30.0)
-    gap = equilibrium_gap(speed, desired, time_gap, constants, 100.0).requires_grad_()
-    law = idm_acceleration(own, gap, own - lead, desired, time_gap, constants)
+    gap = constants.equilibrium_gap(speed, desired, time_gap, 100.0).requires_grad_()
+    law = constants(own, gap, own - lead, desired, time_gap)
     return torch.autograd.grad(law.sum(), (gap, own, lead))
 
 
@@ -144,7 +140,7 @@ def test_strings_amplify_exactly_where_the_linear_criterion_says(acceleration) -
     moment = torch.arange(0, 3000).double() * STEP
     lead = speed + 0.2 * torch.sin(waves * moment.view(-1, 1, 1))
     shape = lead.shape[1:]
-    gap = equilibrium_gap(speed, torch.full_like(speed, 30.0), time_gap, constants, 100.0)
+    gap = constants.equilibrium_gap(speed, torch.full_like(speed, 30.0), time_gap, 100.0)
     desired = torch.tensor(30.0, dtype=torch.float64)
     own, _, _ = simulate_follower(
         lead, speed.expand(shape), gap.expand(shape), desired, time_gap, constants, STEP

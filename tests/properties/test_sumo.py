@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from lcc_rl.functional.idm import IDMConstants, simulate_follower
+from lcc_rl.functional.driver_models import simulate_follower
+from lcc_rl.functional.idm import IDMConstants
 
 libsumo = pytest.importorskip("libsumo", reason="extra sumo")
 sumo = pytest.importorskip("sumo", reason="extra sumo")

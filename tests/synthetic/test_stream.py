@@ -17,7 +17,8 @@ from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.idm import IDMConstants, simulate_follower
+from lcc_rl.functional.driver_models import simulate_follower
+from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.synthetic.lane import Stream, draw_drivers
 from lcc_rl.synthetic.stream import StreamSource, as_recorded
 

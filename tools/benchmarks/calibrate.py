@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from dataclasses import astuple
 from typing import Any
 
 import numba
@@ -12,6 +11,7 @@ import numpy as np
 from scipy.optimize import differential_evolution
 
 from benchmarks.harness import Row, Run, agree, alternate, rows_of, stream
+from benchmarks.plain_numba import KNOWN
 from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.observed import Observed, observe
@@ -34,7 +34,7 @@ def squared_error(
         follower: those of the follower [m/s].
         gap: the first gap [m].
         dt: sampling interval [s].
-        known: the values of :class:`IDMConstants`, in order.
+        known: the values of :data:`benchmarks.plain_numba.KNOWN`.
     """
     maximum, comfort, min_gap, _, floor, braking, limit = known
     desired_speed, headway, speed, total = candidate[0], candidate[1], follower[0], 0.0
@@ -68,7 +68,7 @@ def objective(observed: Observed, index: int, compiled: Any = None) -> Objective
         *speeds,
         float(observed.gap[index]),
         observed.time_step,
-        astuple(IDMConstants()),
+        tuple(getattr(IDMConstants(), name) for name in KNOWN),
     )
     function = compiled or squared_error
     return lambda candidate: float((function(candidate, *settings) / norm) ** 0.5)

@@ -11,8 +11,7 @@ from torchrl.envs import TransformedEnv
 from benchmarks.harness import Row, Run, endings, rates
 from benchmarks.plain import PlainLoop, alcc, check_physics
 from lcc_rl.envs import StringCollector
-from lcc_rl.envs.rollout import ACTION, OBSERVATION
-from lcc_rl.pieces.rewards import REWARD
+from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD
 
 
 def env(options: Namespace) -> list[Row]:

@@ -18,14 +18,12 @@ from benchmarks.harness import agree, stream
 from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.envs import Inputs, build_env, load_inputs
-from lcc_rl.envs.rollout import ACTION
 from lcc_rl.functional.estimation import Belief, predict_and_update
-from lcc_rl.functional.idm import equilibrium_gap, idm_acceleration
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.power import motor_power
 from lcc_rl.functional.random import choose, uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
-from lcc_rl.pieces.base import SEED, STEP
+from lcc_rl.pieces.base import ACTION, SEED, STEP
 from lcc_rl.pieces.rewards import TOUCH
 
 State = dict[str, Tensor]
@@ -70,7 +68,7 @@ class PlainLoop:
         self.leader, self.motion = pieces["NGSIMLeader"], pieces["StringMotion"]
         self.max_acceleration = pieces["Action"].max_acceleration
         self.human, self.estimator = pieces["IDM"], pieces["DriverEstimator"]
-        self.scales, self.penalty = pieces["Observation"].constants, terms["collision"].weight
+        self.scales, self.penalty = pieces["Observation"].factors, terms["collision"].weight
         self.safety, self.efficiency = terms["safety"], terms["efficiency"]
         self.horizon, self.rows = env.base_env.horizon, env.batch_size.numel()
         energies = (terms["cav_energy"], terms["hdv_energy"])
@@ -103,7 +101,7 @@ class PlainLoop:
         cav_gap = advance_gap(now["cav_gap"], now["leader"], now["cav"], leader, cav, dt)
         ahead = following(now["cav"], now["speed"])
         motion = (now["speed"], now["gap"], now["speed"] - ahead)
-        wish = idm_acceleration(*motion, now["desired_speed"], now["desired_time_gap"], drivers)
+        wish = drivers(*motion, now["desired_speed"], now["desired_time_gap"])
         draws = uniform(
             now["seed"][:, None], now["step"][:, None], self.human.noise_stream + self.human.index
         )
@@ -165,7 +163,7 @@ class PlainLoop:
             "cav": speed,
             "cav_gap": factor * (own.standstill_gap + own.time_gap * speed),
             "speed": humans,
-            "gap": equilibrium_gap(humans, v0, headway, human.drivers, cap),
+            "gap": human.drivers.equilibrium_gap(humans, v0, headway, cap),
             "estimate": believed.prior_estimate.expand(*v0.shape[:2], 2),
             "covariance": believed.prior_covariance.expand(*v0.shape[:2], 3),
             "desired_speed": v0,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import astuple
 from typing import Any, NamedTuple
 
 import numba
@@ -14,8 +13,7 @@ from tensordict import TensorDictBase
 from benchmarks.plain import PlainLoop
 from lcc_rl.functional.estimation import REFERENCE_SPEED
 from lcc_rl.functional.power import POWER_COEFFICIENTS
-from lcc_rl.functional.random import MASK, STREAM
-from lcc_rl.functional.random import STEP as STRIDE
+from lcc_rl.functional.random import LOW_BITS, STEP_INCREMENT, STREAM_INCREMENT
 
 compiled: Callable[[Any], Any] = numba.njit(fastmath=True, error_model="numpy")
 
@@ -23,9 +21,9 @@ compiled: Callable[[Any], Any] = numba.njit(fastmath=True, error_model="numpy")
 @compiled
 def draw_bits(counter: int) -> int:
     """Mix the low 32 bits of a number, see :func:`lcc_rl.functional.random.hash_bits`."""
-    x = counter & MASK
-    x = (x ^ (x >> 16)) * 0x7FEB352D & MASK
-    x = (x ^ (x >> 15)) * 0x2C1B3C6D & MASK
+    x = counter & LOW_BITS
+    x = (x ^ (x >> 16)) * 0x7FEB352D & LOW_BITS
+    x = (x ^ (x >> 15)) * 0x2C1B3C6D & LOW_BITS
     return x ^ (x >> 16)
 
 
@@ -37,10 +35,17 @@ def motor_power(v: float, a: float) -> float:
     return constant + a * (p01 + v * (p11 + v * p21) + a * (p02 + v * p12))
 
 
+# The order in which the loops read the parameters of IDMConstants.
+KNOWN = (
+    *("acceleration", "deceleration", "min_gap", "exponent", "gap_floor"),
+    *("braking_limit", "acceleration_limit"),
+)
+
+
 class Constants(NamedTuple):
     """What all drivers share, and how their accelerations are measured."""
 
-    known: tuple[float, ...]  # the values of IDMConstants, in order
+    known: tuple[float, ...]  # the values of KNOWN
     root: float
     dt: float
     noise: float
@@ -119,7 +124,8 @@ def advance(
             rate, inverse = speed - ahead, 1.0 / max(gap, k.known[4])
             wish = k.known[2] + max(speed * (drivers[row, n, 1] + rate / k.root), 0.0)
             load = (speed / drivers[row, n, 0]) ** 4 + (wish * inverse) ** 2
-            draw = (draw_bits(seeds[row] + step * STRIDE + (k.stream + n) * STREAM) >> 8) * 2.0**-24
+            counter = step * STEP_INCREMENT + (k.stream + n) * STREAM_INCREMENT
+            draw = (draw_bits(seeds[row] + counter) >> 8) * 2.0**-24
             command = limited(load, k.known) * (1.0 + k.noise * draw)
             reached = max(speed + command * k.dt, 0.0)
             found = learn(beliefs[row, n], speed, rate, inverse, reached, k)
@@ -145,7 +151,7 @@ class NumbaString:
 
     def __init__(self, plain: PlainLoop, start: TensorDictBase) -> None:
         human, estimator, state = plain.human, plain.estimator, plain.start(start)
-        known = astuple(human.drivers)
+        known = tuple(getattr(human.drivers, name) for name in KNOWN)
         root = 2.0 * (known[0] * known[1]) ** 0.5
         average, error = estimator.mean, estimator.measurement_error**2
         self.constants = Constants(

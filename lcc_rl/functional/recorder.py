@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import reduce
 from typing import Any
 
@@ -12,7 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 MOST_STATEMENTS = 4000  # numba takes 2 to 4 s for each thousand
 
-TYPES = {torch.float32: "f32", torch.float64: "f64", torch.int64: "i64", torch.bool: "flag"}
+NUMBER_TYPES = {torch.float32: "f32", torch.float64: "f64", torch.int64: "i64", torch.bool: "flag"}
 # Formulas of operations by their names in torch; numbers are {0}, {1}, …
 ARITHMETIC = {
     "add": "{0} + {1}",
@@ -53,8 +53,8 @@ COMPARISONS = {
     "eq": "{0} == {1}",
     "ne": "{0} != {1}",
 }
-OTHERS = ("bitwise_not", "clamp", "index", "searchsorted", "where")  # methods of Recorder
-FOLDS = {"sum": "add", "any": "logical_or", "all": "logical_and"}
+METHODS = ("bitwise_not", "clamp", "index", "searchsorted", "where")  # methods of Recorder
+REDUCTIONS = {"sum": "add", "any": "logical_or", "all": "logical_and"}
 # They move entries, whatever these are, and are applied to the numbers of the variables.
 MOVES = {
     "_unsafe_view", "alias", "cat", "clone", "detach", "expand", "flip", "permute", "repeat",
@@ -106,6 +106,23 @@ class Recorder(TorchDispatchMode):
                 raise Untranslatable(f"it takes more than {MOST_STATEMENTS} statements")
         return self.known[statement]
 
+    def needed(self, results: Iterable[int]) -> list[int]:
+        """Return the variables that some are computed from, these included, in order."""
+        found, left = set[int](), list(results)
+        while left:
+            if (variable := left.pop()) not in found:
+                found.add(variable)
+                left += self.statements[variable][1]
+        return sorted(found)
+
+    def dependents(self, inputs: Iterable[int]) -> set[int]:
+        """Return the variables that some decide, these included."""
+        found = set(inputs)
+        for variable, (_, reads) in enumerate(self.statements):
+            if not found.isdisjoint(reads):
+                found.add(variable)
+        return found
+
     def __torch_dispatch__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
     ) -> Any:
@@ -117,9 +134,9 @@ class Recorder(TorchDispatchMode):
             return result
         if name in MOVES:
             self._move(func, args, kwargs, result)
-        elif name in OTHERS:
+        elif name in METHODS:
             self.add(result, getattr(self, f"_{name}")(result, *args, **kwargs))
-        elif name in FOLDS:
+        elif name in REDUCTIONS:
             self.add(result, self._fold(name, result, *args, **kwargs))
         elif name == "_to_copy" or (name in {*ARITHMETIC, *COMPARISONS} and not kwargs):
             self.add(result, self._each(name, result.dtype, *given))
@@ -129,6 +146,8 @@ class Recorder(TorchDispatchMode):
 
     def _each(self, name: str, dtype: torch.dtype, *values: Any) -> Tensor:
         """Record an operation on single entries."""
+        if name == "pow" and isinstance(values[1], float) and values[1] == 0.5:  # so does torch
+            name, values = "sqrt", values[:1]
         if name in COMPARISONS:
             dtype = torch.result_type(*values)
         formula = COMPARISONS.get(name) or ARITHMETIC[name]
@@ -145,7 +164,7 @@ class Recorder(TorchDispatchMode):
 
     def numbers(self, value: Any, dtype: torch.dtype) -> Tensor:
         """Return the variables of a value as numbers of a type."""
-        if (kind := TYPES.get(dtype)) is None:
+        if (kind := NUMBER_TYPES.get(dtype)) is None:
             raise Untranslatable(f"numbers of {dtype}")
         variables = self.of(value)
         if variables is not None:
@@ -177,7 +196,7 @@ class Recorder(TorchDispatchMode):
         dims = [dims] if isinstance(dims, int) else dims or list(range(value.ndim))
         variables = self.numbers(value, result.dtype).movedim(dims, [*range(len(dims))])
         parts = variables.flatten(0, len(dims) - 1).unbind(0)
-        formula = ARITHMETIC[FOLDS[name]]
+        formula = ARITHMETIC[REDUCTIONS[name]]
         return reduce(lambda *two: self._stated(formula, two), parts).reshape(result.shape)
 
     def _bitwise_not(self, result: Tensor, value: Tensor) -> Tensor:

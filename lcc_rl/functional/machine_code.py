@@ -1,0 +1,91 @@
+"""Source as machine code of numba."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import logging
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
+
+import numba
+import numpy as np
+from numba.extending import get_cython_function_address
+
+log = logging.getLogger("lcc_rl")
+
+
+@numba.njit
+def pick(condition: Any, one: Any, other: Any) -> Any:
+    """Return one of two numbers; as a function, so that the loop has no branches."""
+    return one if condition else other
+
+
+@numba.njit(boundscheck=True)
+def read(table: Any, place: Any) -> Any:
+    """Return an entry of a table.
+
+    Raises:
+        IndexError: if there is none at that place.
+    """
+    return table[place]
+
+
+SCOPE = {
+    "pick": pick,
+    "read": read,
+    "ndtri": ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(
+        get_cython_function_address("scipy.special.cython_special", "ndtri")
+    ),
+    "f32": np.float32,
+    "f64": np.float64,
+    "i64": np.int64,
+    "flag": np.bool_,
+    "np": np,
+    "inf": np.inf,
+    "nan": np.nan,
+}
+
+
+@cache
+def compiled(source: str) -> Callable[..., None]:
+    """Return the function ``kernel`` of a source as machine code; equal sources share it."""
+    return numba.njit(error_model="numpy")(_made(source, "<recorded>", "kernel"))
+
+
+def _made(source: str, file: str, name: str) -> Callable[..., None]:
+    scope: dict[str, Any] = {**SCOPE, "__name__": __name__}
+    exec(compile(source.replace("def kernel(", f"def {name}("), file, "exec"), scope)
+    return scope[name]
+
+
+@cache
+def kept(source: str) -> Callable[..., None]:
+    """Return the function ``kernel`` of a source as machine code that is kept for later processes.
+
+    numba keeps the machine code beside this file or, where that is read-only, in the user's cache
+    folder (``NUMBA_CACHE_DIR``), under a name that contains a hash of the source. If it cannot be
+    kept or read, the function is compiled for this process.
+    """
+    # Sums may be fused with products; nothing else is changed for speed.
+    compile_it = partial(numba.njit, fastmath={"contract"}, error_model="numpy", nogil=True)
+    name = f"kernel_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+    function = _made(source, __file__, name)
+    uncached = compile_it()(function)
+    try:
+        chosen = compile_it(cache=True)(function)
+    except RuntimeError as error:  # there is no place for the code
+        log.info("compiling the drivers' simulation for this run only: %s", error)
+        return uncached
+
+    def call(*arguments: Any) -> None:
+        nonlocal chosen
+        try:
+            chosen(*arguments)
+        except Exception as error:  # a damaged file raises whatever unpickling it meets
+            log.info("compiling the drivers' simulation for this run only: %r", error)
+            chosen = uncached
+            chosen(*arguments)
+
+    return call
