@@ -92,7 +92,7 @@ class RewardConfig(Settings):
 
     terms: Nodes
 
-    def settled(self) -> None:
+    def validate(self) -> None:
         for name in (name for name, node in self.terms.items() if node is None):
             raise ConfigError(f"reward.terms.{name} is null; ~reward.terms.{name} leaves it out")
 
