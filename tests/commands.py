@@ -29,7 +29,7 @@ from hydra.core.hydra_config import HydraConfig
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.config import load
 from lcc_rl.io.files import read_parquet
-from lcc_rl.runs.interrupts import SIGNALS
+from lcc_rl.runs.interrupts import ENDING_SIGNALS
 
 # The baselines of an evaluation by default, in their order.
 UNTRAINED = ("direct", "idm", "human", "idm_acc", "acc")
@@ -142,7 +142,7 @@ def process_state(
         stack.enter_context(patch.dict(os.environ))
         stack.enter_context(chdir(cwd))
         stack.enter_context(kept_logging())
-        handlers = {kind: signal.getsignal(kind) for kind in SIGNALS}
+        handlers = {kind: signal.getsignal(kind) for kind in ENDING_SIGNALS}
         stack.enter_context(redirect_stdout(out))
         stack.enter_context(redirect_stderr(err))
         try:

@@ -14,9 +14,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from lcc_rl.data.leaders import Case, RecordLeaders, stretch
-from lcc_rl.data.profiles import Profiles, from_records, join
+from lcc_rl.data.profiles import Profiles, from_records, joined
 from lcc_rl.envs import Inputs, build_env
-from lcc_rl.evaluation.cases import drive
+from lcc_rl.evaluation.cases import drive_runs
 from lcc_rl.evaluation.strategies import Strategy, deployed
 from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.random import uniform
@@ -53,7 +53,7 @@ def windows(limit: int | None = None) -> Profiles:
 
 def whole(*records: tuple[str, float]) -> Profiles:
     """Whole records at a scale, side by side; a record that is over keeps its last speed."""
-    profiles = join([stretch(path, T, scale) for path, scale in records])
+    profiles = joined([stretch(path, T, scale) for path, scale in records])
     longest = int(profiles.lengths.max())
     padded = []
     for index in range(len(profiles)):
@@ -109,7 +109,7 @@ def play(profiles: Profiles, driver: Driver, vehicles: int = 6) -> dict[str, Ten
     cfg = deployed(composed(*driver.overrides))
     inputs = Inputs(profiles, profiles, POPULATION)
     case = Case("whole", profiles, vehicles)
-    return drive(Strategy("tested", cfg, driver.policy), case, inputs)
+    return drive_runs(Strategy("tested", cfg, driver.policy), case, inputs)
 
 
 class Actor(TensorDictModuleBase):

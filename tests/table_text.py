@@ -12,7 +12,7 @@ from lcc_rl.data.leaders import RecordLeaders
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.sources import EpisodesSource, NgsimSource
-from lcc_rl.data.speed_records import COLUMNS, read_drives, read_speed_record
+from lcc_rl.data.speed_records import DRIVE_COLUMNS, read_drives, read_speed_record
 from lcc_rl.data.table_source import TableSource
 
 PREAMBLE = (
@@ -29,7 +29,7 @@ READERS: dict[str, Callable[[str], object]] = {
     "table": lambda path: TableSource(path=path, columns={**BY_GAP, "position": "x"}).load(),
     "episodes": lambda path: EpisodesSource(path=path).load(),
     "openacc": lambda path: OpenAccSource(path=path).load(),
-    "drives": lambda path: read_drives(path, COLUMNS, 0.1),
+    "drives": lambda path: read_drives(path, DRIVE_COLUMNS, 0.1),
     "record": lambda path: read_speed_record(path),
     "leaders": lambda path: RecordLeaders(path=path, training=STRETCH, held_out=STRETCH).load(
         0.1, 9

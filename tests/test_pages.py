@@ -132,7 +132,7 @@ class Reader:
     def command(self, words: list[str], error: str | None) -> None:
         """Compose one command, which may end with an error, without running it."""
         program, name, *rest = [*(PLACEHOLDER.sub("a_name", word) for word in words), "", ""]
-        if program != "lcc-rl" or name not in console.HYDRA:
+        if program != "lcc-rl" or name not in console.HYDRA_COMMANDS:
             return
         settings = settings_of([word for word in rest if word], self.folder)
         with suppress(ConfigError) if error else nullcontext():
@@ -182,7 +182,7 @@ class Runner(Reader):
         if name == "clairvoyant":
             data = [] if any(word.startswith("leader=") for word in words) else DATA
             return ["--iterations", "2", "--no-compile", LENGTH, *WINDOWS, *data]
-        if name not in console.HYDRA or any(word.startswith("resume=") for word in words):
+        if name not in console.HYDRA_COMMANDS or any(word.startswith("resume=") for word in words):
             return []
         self.count += 1
         place = [] if "-m" in words else [f"hydra.run.dir=outputs/{name}/{self.count}"]

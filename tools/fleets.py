@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from lcc_rl.figures.drawing import INK, PAGE, footnote, new_figure, paper, style
+from lcc_rl.figures.drawing import INK, PAGE_WIDTH, footnote, new_figure, paper, style
 from lcc_rl.results.bootstrap import Estimate
 from lcc_rl.results.fronts import (
     DISTANCE,
@@ -17,8 +17,8 @@ from lcc_rl.results.fronts import (
     NET,
     Statistic,
     compare_fronts,
+    fleet_saved,
     flow_gained,
-    saved,
     saved_at_flow,
 )
 from lcc_rl.results.render import markdown_row
@@ -61,7 +61,7 @@ def fronts(rows: pd.DataFrame) -> str:
         saving, flow = curve(part, RULE)
         own, best = curve(part, LEARNED)[1].iloc[0], saving.index.to_numpy(float)[saving.argmax()]
         gap = np.interp(own, flow.to_numpy()[::-1], flow.index.to_numpy()[::-1])
-        cells = [setting, f"{share:.0f} %", percent(against(part, HUMAN, saved))]
+        cells = [setting, f"{share:.0f} %", percent(against(part, HUMAN, fleet_saved))]
         cells.append(f"{own:,.0f}: {percent(against(part, HUMAN, flow_gained))}")
         cells.append(f"{percent(against(part, RULE, saved_at_flow))}; T = {gap:.2f} s")
         cells.append(f"{saving[best]:.1f} %; T = {best:.1f} s, {flow[best]:,.0f}")
@@ -99,7 +99,7 @@ def percent(found: Estimate) -> str:
 @paper
 def drawn_fronts(rows: pd.DataFrame) -> Figure:
     """Draw, for each setting, the learned fleets beside the rule's fronts, a colour per share."""
-    figure = new_figure(PAGE, 5.4)
+    figure = new_figure(PAGE_WIDTH, 5.4)
     titles = [setting for setting in SETTINGS.values() if TAUGHT not in setting]
     axes = dict(zip(titles, figure.subplots(2, 2).flat, strict=True))
     shares = 100.0 * np.sort(rows[SHARE].unique())
@@ -110,7 +110,7 @@ def drawn_fronts(rows: pd.DataFrame) -> Figure:
         people = curve(part, HUMAN)[1].iloc[0]
         (saving, flow), (own, point) = curve(part, RULE), curve(part, LEARNED)
         axis.plot(100.0 * (flow / people - 1.0), saving, ".-", color=hue, lw=1.0, ms=4)
-        x, found = 100.0 * (point / people - 1.0), against(part, HUMAN, saved)
+        x, found = 100.0 * (point / people - 1.0), against(part, HUMAN, fleet_saved)
         axis.vlines(x, 100.0 * found.low, 100.0 * found.high, color=hue, lw=2.5, alpha=0.5)
         axis.plot(x, own, **{"marker": "o"} | look, ls="", color=hue, mec=INK, ms=7, zorder=5)
     for setting, axis in axes.items():
@@ -131,7 +131,7 @@ def drawn_fronts(rows: pd.DataFrame) -> Figure:
 @paper
 def drawn_ring(table: pd.DataFrame) -> Figure:
     """Draw what the ring shows over the share; hollow where a limit is missed."""
-    figure = new_figure(PAGE, 3.2)
+    figure = new_figure(PAGE_WIDTH, 3.2)
     axes = figure.subplots(1, len(SHOWN))
     humans = table[table["strategy"] == HUMAN]
     for axis, (column, label) in zip(axes, SHOWN.items(), strict=True):

@@ -30,7 +30,7 @@ import torch
 from matplotlib.image import imread
 
 from lcc_rl.cli import calibrate, console, evaluate, pipeline, train
-from lcc_rl.commands.pipeline import COMMAND
+from lcc_rl.commands.pipeline import COMMAND_FILE
 from lcc_rl.config import load
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
@@ -38,7 +38,7 @@ from lcc_rl.io.settings import read_json
 from lcc_rl.io.tensors import read_torch
 from lcc_rl.results.runs import read_settings
 from lcc_rl.runs.interrupts import INTERRUPTED
-from lcc_rl.runs.states import LOCK, RESULTS, read_progress
+from lcc_rl.runs.states import LOCK, RESULT_TABLES, read_progress
 
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 WAITED = os.WEXITED | os.WNOHANG | os.WNOWAIT
@@ -97,7 +97,7 @@ class Job:
         # A shell that starts this in the background makes it, and all below it, deaf to SIGINT.
         signal.signal(signal.SIGINT, signal.default_int_handler)
         words = [*self.words, f"{self.where}={folder}"]
-        if (folder / COMMAND).exists():
+        if (folder / COMMAND_FILE).exists():
             words = [f"resume={folder}"]
         sys.argv = [self.main.__module__, *words]
         code = 0
@@ -195,7 +195,7 @@ def unreadable(root: Path) -> list[str]:
 
 def finished(root: Path) -> dict[str, str]:
     """Return the tables of finished runs, with the hash of each."""
-    tables = [path for name in RESULTS for path in root.rglob(name)]
+    tables = [path for name in RESULT_TABLES for path in root.rglob(name)]
     return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in tables}
 
 

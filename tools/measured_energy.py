@@ -22,7 +22,16 @@ from numpy.typing import NDArray
 
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.energy import CirclesFuel, ElectricCar, EnergyModel
-from lcc_rl.figures.drawing import INK, PAGE, grid, legend_above, new_figure, paper, save, style
+from lcc_rl.figures.drawing import (
+    INK,
+    PAGE_WIDTH,
+    grid,
+    legend_above,
+    new_figure,
+    paper,
+    save,
+    style,
+)
 from lcc_rl.io.files import read_parquet, write_parquet
 
 KEPT, DRAWN = Path("outputs/reference/measured_energy.parquet"), Path("docs/figures/measured.png")
@@ -113,7 +122,7 @@ def along(bench: pd.DataFrame, column: str) -> float:
 def figure_of(table: pd.DataFrame) -> Figure:
     """Draw modelled over measured energy per km, a dot for each run."""
     bench, trips = (table[table["kind"] == kind] for kind in ("bench", "battery"))
-    figure = new_figure(PAGE, 3.4)
+    figure = new_figure(PAGE_WIDTH, 3.4)
     left, right = figure.subplots(1, 2)
     for model, colour in FUELS.items():
         _dots(left, bench, model, colour, 1e3)

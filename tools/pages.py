@@ -28,22 +28,22 @@ from lcc_rl.config.nodes import as_plain
 from lcc_rl.data.leaders import stretch
 from lcc_rl.errors import require
 from lcc_rl.figures.calibration import twins_figure
-from lcc_rl.figures.drawing import COLUMN, footnote, new_figure, paper, save, style
+from lcc_rl.figures.drawing import COLUMN_WIDTH, footnote, new_figure, paper, save, style
 from lcc_rl.figures.platoon import record_figure
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import read_parquet
 from lcc_rl.io.settings import read_json
 from lcc_rl.results import board
-from lcc_rl.results.fronts import ENERGY, KINDS, SHARE, points
-from lcc_rl.results.measures import FLOW, LEAST, Measure
+from lcc_rl.results.fronts import ENERGY, FRONT_KINDS, LONG_SHARE, points
+from lcc_rl.results.measures import AT_LEAST, FLOW, Measure
 from lcc_rl.results.measures import SHARE as IS_SHARE
 from lcc_rl.results.names import in_words, worded
-from lcc_rl.results.render import as_markdown, markdown_row, saved, signed
-from lcc_rl.results.runs import reading
+from lcc_rl.results.render import as_markdown, markdown_row, saved_text, signed
+from lcc_rl.results.runs import naming_run
 from lcc_rl.results.task import Task
 from lcc_rl.studies.alcc.results import narrow
-from lcc_rl.studies.reproduce import RESULTS
+from lcc_rl.studies.reproduce import STUDY_RESULTS
 
 REFERENCE, DOCS = Path("outputs/reference"), Path("docs")
 MARKED = re.compile(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", re.DOTALL)
@@ -90,7 +90,7 @@ def study(name: str, reference: Path, docs: Path) -> None:
     """Write the tables of a study's page, and the figures that it shows."""
     with TemporaryDirectory() as place:
         kept = shutil.copytree(reference / name, Path(place) / name)
-        found = RESULTS[name](kept).tables
+        found = STUDY_RESULTS[name](kept).tables
         found |= narrow(found) if name == "alcc" else {}
         fill(docs / f"{name}.md", {x: as_markdown(worded(table)) for x, table in found.items()})
         for figure in SHOWN_OF[name]:
@@ -106,7 +106,7 @@ def tasks(reference: Path, docs: Path) -> None:
     fill(docs / "tasks.md", {"fleets": fronts, "tasks": "\n\n".join(parts)})
     files = sorted((reference / "scores").glob("*.json"))
     documents = {path.name: read_json(path) for path in files}
-    with reading(reference / "scores"):
+    with naming_run(reference / "scores"):
         table = board.leaderboard(documents)
     fill(docs / "leaderboard.md", {"board": table})
 
@@ -125,7 +125,7 @@ def task_table(name: str, table: pd.DataFrame) -> str:
         cells = [
             in_words(str(row["strategy"])),
             f"{row['score']:.2f}",
-            saved(*share),
+            saved_text(*share),
             signed(-100.0 * row["distance_lost"]),
             f"{row[FLOW]:,.0f} ({signed(100.0 * (row[FLOW] / whole - 1.0))})",
             "kept" if row["kept"] else broken(task, row),
@@ -141,7 +141,7 @@ def task_table(name: str, table: pd.DataFrame) -> str:
 
 def bounded(measure: Measure, bound: float) -> str:
     """Return a measure and its limit in words."""
-    sign = LEAST if LEAST in measure.limit else "≤"
+    sign = AT_LEAST if AT_LEAST in measure.limit else "≤"
     return f"{measure.limited} {sign} {measured(measure, bound)}"
 
 
@@ -178,15 +178,15 @@ def figure_of_limits(windows: pd.DataFrame) -> Figure:
     Args:
         windows: one row per training and held-out window.
     """
-    figure = new_figure(COLUMN, 3.2)
+    figure = new_figure(COLUMN_WIDTH, 3.2)
     axes = figure.subplots()
-    kinds = dict(list(windows.groupby(KINDS)))
+    kinds = dict(list(windows.groupby(FRONT_KINDS)))
     for kind, (label, hue, filled) in KINDS_SHOWN.items():
-        line = points(kinds[kind]).sort_values(SHARE)
+        line = points(kinds[kind]).sort_values(LONG_SHARE)
         look: dict[str, Any] = {"color": hue, "mfc": hue if filled else "white", "ms": 3.0}
-        axes.plot(100.0 * line[SHARE], line[ENERGY], "-" if filled else "--", color=hue)
-        each = kinds[kind].groupby(["limit", "training_seed"])[[ENERGY, SHARE]].mean()
-        axes.plot(100.0 * each[SHARE], each[ENERGY], "o", **look)
+        axes.plot(100.0 * line[LONG_SHARE], line[ENERGY], "-" if filled else "--", color=hue)
+        each = kinds[kind].groupby(["limit", "training_seed"])[[ENERGY, LONG_SHARE]].mean()
+        axes.plot(100.0 * each[LONG_SHARE], each[ENERGY], "o", **look)
         axes.plot([], [], "o-" if filled else "o--", label=label, **look)
     figure.legend(loc="outside upper left", ncols=2, frameon=False)
     style(axes, "time gap > 2.5 s above 1 m/s [% of the time]", "path energy [kJ per episode]")

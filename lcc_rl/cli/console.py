@@ -13,7 +13,7 @@ from lcc_rl.version import __version__
 
 # Name, module and what it does. Each module has a main: of the first four, which Hydra reads,
 # without arguments.
-HYDRA = {
+HYDRA_COMMANDS = {
     "run": ("lcc_rl.cli.pipeline", "the main job: data, drivers, policies, results, one page"),
     "train": ("lcc_rl.cli.train", "train a variant and evaluate it; -m for a sweep"),
     "evaluate": ("lcc_rl.cli.evaluate", "compare policies, controllers and baselines"),
@@ -28,7 +28,7 @@ TOOLS = {
     "clairvoyant": ("lcc_rl.commands.clairvoyant", "what could be saved at most"),
     "export": ("lcc_rl.interfaces.export", "a trained policy as ONNX, PyTorch program or page"),
 }
-COMMANDS = {**HYDRA, **TOOLS}
+COMMANDS = {**HYDRA_COMMANDS, **TOOLS}
 
 
 @main_guard
@@ -70,7 +70,7 @@ def _run(name: str, words: list[str]) -> None:
     sys.argv = [f"lcc-rl {name}", *words]
     with ending_quietly():
         module = import_module(COMMANDS[name][0])
-    if name in HYDRA:
+    if name in HYDRA_COMMANDS:
         module.main()
     else:
         sys.exit(module.main(words))

@@ -73,7 +73,7 @@ def entry_point(
         def job(config: DictConfig) -> Any:
             if is_sweep():
                 return run_job(checked, config, run_folder())
-            return main_guard(explaining(recorded(checked)))(config)
+            return main_guard(explaining(recording_errors(checked)))(config)
 
         command = hydra.main(
             version_base="1.3", config_path="pkg://lcc_rl.conf", config_name=config_name
@@ -88,7 +88,7 @@ def entry_point(
             try:
                 if SWEEP.intersection(sys.argv):
                     import_module(work)
-                start(command)
+                start_command(command)
             finally:
                 gc.enable()
 
@@ -97,7 +97,7 @@ def entry_point(
     return decorate
 
 
-def start(command: Callable[[], Any]) -> None:
+def start_command(command: Callable[[], Any]) -> None:
     """Run a Hydra command with this package's error messages and signal handlers."""
     wanted = TRACEBACK in os.environ
     # Hydra raises errors instead of printing them.
@@ -182,7 +182,7 @@ def explaining(function: Callable[..., Any]) -> Callable[..., Any]:
     return explained_function
 
 
-def recorded(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
+def recording_errors(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
     """Leave nothing of a command that was refused, and ``error.txt`` of one that failed at work.
 
     One that was interrupted at work names the command that goes on. A command that names another

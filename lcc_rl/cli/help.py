@@ -12,12 +12,12 @@ from typing import Any
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from lcc_rl.cli.console import HYDRA
+from lcc_rl.cli.console import HYDRA_COMMANDS
 from lcc_rl.config import as_meant, choices
 from lcc_rl.config.compose import CONF
 
 HELP, FULL_HELP = {"-h", "--help"}, "--help-all"
-NAMES = {"pipeline": "run"}  # of commands that are not called as their configuration
+ENTRY_COMMANDS = {"pipeline": "run"}  # of commands that are not called as their configuration
 EXAMPLES = {
     "pipeline": (
         ("lcc-rl run", "on data in the package: minutes"),
@@ -40,23 +40,30 @@ EXAMPLES = {
         ("lcc-rl train drivers=calibrated drivers.path=drivers.parquet", "then"),
     ),
 }
-TRAFFIC = ("data", "data.path", "drivers", "scenario.string", "scenario.horizon")
+TRAFFIC_OPTIONS = ("data", "data.path", "drivers", "scenario.string", "scenario.horizon")
 OPTIONS = {
     "pipeline": (
-        *("experiment", "agent", *TRAFFIC[:2], "calibration", "variants", "scenario.string"),
+        *(
+            "experiment",
+            "agent",
+            *TRAFFIC_OPTIONS[:2],
+            "calibration",
+            "variants",
+            "scenario.string",
+        ),
         *("evaluation.drivers", "seed", "jobs", "figure_formats", "resume"),
     ),
     "train": (
-        *("variant", "task", "experiment", "agent", *TRAFFIC),
+        *("variant", "task", "experiment", "agent", *TRAFFIC_OPTIONS),
         *("training.episodes", "seed", "resume"),
     ),
     "evaluate": (
-        *("variant", "task", "policy", "compare", "filter", *TRAFFIC),
+        *("variant", "task", "policy", "compare", "filter", *TRAFFIC_OPTIONS),
         *("evaluation.drivers", "table"),
     ),
-    "calibrate": ("calibration", *TRAFFIC[:2], "seed", "threads", "figure_formats"),
+    "calibrate": ("calibration", *TRAFFIC_OPTIONS[:2], "seed", "threads", "figure_formats"),
 }
-WIDTH, NAME, DEFAULT = 80, 21, 16
+TOTAL_WIDTH, NAME_WIDTH, DEFAULT_WIDTH = 80, 21, 16
 
 
 def text(entry: str, overrides: Sequence[str] = ()) -> str:
@@ -66,14 +73,14 @@ def text(entry: str, overrides: Sequence[str] = ()) -> str:
         entry: ``"train"``, ``"evaluate"``, ``"calibrate"`` or ``"pipeline"``.
         overrides: what was typed; the defaults show the effect of the settings among it.
     """
-    name = NAMES.get(entry, entry)
+    name = ENTRY_COMMANDS.get(entry, entry)
     typed = [word for word in overrides if word[:1] != "-" and "=" in word]
     with initialize_config_module(CONF, version_base="1.3"):
         cfg = compose(entry, overrides=as_meant(typed), return_hydra_config=True)
     wide = max(len(command) for command, _ in EXAMPLES[entry])
-    lines = [f"lcc-rl {name}: {HYDRA[name][1]}", ""]
+    lines = [f"lcc-rl {name}: {HYDRA_COMMANDS[name][1]}", ""]
     lines += [f"  {command:<{wide}}  # {what}" for command, what in EXAMPLES[entry]]
-    lines += ["", f"{'option=…':<{NAME}}{'default':<{DEFAULT}}choices or meaning"]
+    lines += ["", f"{'option=…':<{NAME_WIDTH}}{'default':<{DEFAULT_WIDTH}}choices or meaning"]
     for key in OPTIONS[entry]:
         lines += _option(entry, key, cfg)
     return "\n".join(
@@ -96,9 +103,9 @@ def _option(entry: str, key: str, cfg: Any) -> Iterator[str]:
         found = OmegaConf.select(cfg, key)
         value = "–" if found is None else str(found)
         what = meaning(entry, key)
-    first, *rest = wrap(what, WIDTH - NAME - DEFAULT) or [""]
-    yield f"{key:<{NAME - 1}} {value:<{DEFAULT - 1}} {first}".rstrip()
-    yield from (" " * (NAME + DEFAULT) + line for line in rest)
+    first, *rest = wrap(what, TOTAL_WIDTH - NAME_WIDTH - DEFAULT_WIDTH) or [""]
+    yield f"{key:<{NAME_WIDTH - 1}} {value:<{DEFAULT_WIDTH - 1}} {first}".rstrip()
+    yield from (" " * (NAME_WIDTH + DEFAULT_WIDTH) + line for line in rest)
 
 
 def meaning(entry: str, key: str) -> str:

@@ -11,24 +11,24 @@ from rich.console import Console
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.errors import ConfigError
 from lcc_rl.runs.arguments import Arguments
-from lcc_rl.runs.overview import counts, draw, headline, left, live, progress
+from lcc_rl.runs.overview import counts, left, live, overview_line, progress, states_table
 from lcc_rl.runs.states import clean, survey
 from lcc_rl.runs.sweeps import read_plan
 
 
-def show(root: Path, console: Console) -> None:
+def show_states(root: Path, console: Console) -> None:
     """Print the state of the runs: a table on a terminal, otherwise one line per run."""
     states, planned = survey(root), read_plan(root).runs
     if console.is_terminal:
-        console.print(draw(root, states, planned))
+        console.print(states_table(root, states, planned))
         return
     for state in states:
         line = f"{state.state:<9}{progress(state):>12}  {state.name}  {left(state) or state.error}"
         console.print(line.rstrip(), markup=False, soft_wrap=True)
-    console.print(headline(root, states, planned), markup=False, soft_wrap=True)
+    console.print(overview_line(root, states, planned), markup=False, soft_wrap=True)
 
 
-def watch(root: Path, console: Console, every: float = 2.0) -> None:
+def watch_folder(root: Path, console: Console, every: float = 2.0) -> None:
     """Update the table until no run is running or waiting."""
 
     def planned() -> int:
@@ -48,9 +48,9 @@ def look(folder: str, console: Console, watching: bool) -> None:
     if not folder:
         raise ConfigError("the name of the folder is empty; say, e.g., outputs")
     if watching and console.is_terminal:
-        watch(Path(folder), console)
+        watch_folder(Path(folder), console)
     else:
-        show(Path(folder), console)
+        show_states(Path(folder), console)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

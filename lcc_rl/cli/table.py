@@ -21,10 +21,10 @@ from lcc_rl.io.files import as_rows, read_parquet
 from lcc_rl.results.names import worded
 from lcc_rl.results.render import as_latex, as_markdown, chosen, for_print
 from lcc_rl.results.report import together
-from lcc_rl.results.runs import EPISODES, FINAL, PARTS, load_config, reading
+from lcc_rl.results.runs import EPISODES, FINAL, PARTS, load_config, naming_run
 from lcc_rl.runs.arguments import Arguments
 
-FORMATS: dict[str, Callable[[pd.DataFrame], str]] = {
+TABLE_FORMATS: dict[str, Callable[[pd.DataFrame], str]] = {
     "text": as_markdown,
     "markdown": as_markdown,
     "latex": as_latex,
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     what = "folder of an evaluation, a training or a job; or a parquet file"
     parser.add_argument("run", type=Path, help=what)
     form = "text is that of the run; of --columns and parquet files it is markdown"
-    parser.add_argument("--format", choices=FORMATS, default="text", help=form)
+    parser.add_argument("--format", choices=TABLE_FORMATS, default="text", help=form)
     parser.add_argument("--all", action="store_true", help="every measure, as table=all shows")
     parser.add_argument("--columns", help="which, by the names of --format csv, with commas")
     parser.add_argument("--against", help="strategy that savings are against")
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         table = chosen(worded(read_parquet(options.run)), names or [])
     else:
         run = read_run(options.run, options.trust)
-        with reading(run.folder / EPISODES):
+        with naming_run(run.folder / EPISODES):
             if options.format == "text" and not names:
                 print(run.printed(options.all, options.against))
                 return
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         else:
             note = report.note
             table = report.short if numbers else for_print(report, names or [])
-    print(FORMATS[options.format](table))
+    print(TABLE_FORMATS[options.format](table))
     if note and options.format != "csv":
         print(f"% {note}" if options.format == "latex" else f"\n{note}")
 
@@ -69,7 +69,7 @@ def read_run(folder: Path, trust: Sequence[str]) -> Run:
     """Return a run as its folder holds it; of a job its last part."""
     folder = folder / FINAL if (folder / PARTS).is_dir() else folder
     cfg = load_config(folder, trust)
-    with reading(folder / EPISODES):
+    with naming_run(folder / EPISODES):
         return Run(folder, as_rows(folder / EPISODES), cfg)
 
 

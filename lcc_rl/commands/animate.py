@@ -14,18 +14,18 @@ from pathlib import Path
 import pandas as pd
 
 from lcc_rl.errors import ConfigError, ResultsError, unknown_name
-from lcc_rl.figures.animation import FORMS, animate, check_ending
+from lcc_rl.figures.animation import ANIMATION_FORMATS, animate, check_ending
 from lcc_rl.figures.drawing import in_file
 from lcc_rl.io.atomic import new_file
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.motion import Motion, motion_of, sample_episodes
+from lcc_rl.results.motion import SampleMotion, motion_of, sample_episodes
 from lcc_rl.results.names import in_words
-from lcc_rl.results.runs import CONFIG, STEPS, reading, stored_config
+from lcc_rl.results.runs import CONFIG, STEPS, naming_run, stored_config
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.states import no_run
 from lcc_rl.settings import NonNegative, Whole
 
-KEPT = "evaluation.sample_episodes=4"
+SAMPLES_KEPT = "evaluation.sample_episodes=4"
 
 
 def run(
@@ -61,9 +61,9 @@ def run(
         check_ending(new_file(out, "--out"), len(strategies))
     steps = read_parquet(folder / STEPS)
     if steps.empty:
-        raise ConfigError(f"{folder}: holds no sample episode; evaluate with {KEPT}")
+        raise ConfigError(f"{folder}: holds no sample episode; evaluate with {SAMPLES_KEPT}")
     motions = {}
-    with reading(folder):
+    with naming_run(folder):
         known = list(dict.fromkeys(map(str, steps["strategy"])))
         named = [name.partition(": ")[::2] for name in strategies or known[-1:]]
         stored = {in_words(name): name for name in known} | {name: name for name in known}
@@ -89,7 +89,7 @@ def _episode(steps: pd.DataFrame, strategy: str, episode: int) -> tuple[str, pd.
     return found[episode]
 
 
-def _cut(motion: Motion, start: float, duration: float | None) -> Motion:
+def _cut(motion: SampleMotion, start: float, duration: float | None) -> SampleMotion:
     """Return the part of an episode that is shown."""
     end = float("inf") if duration is None else start + duration
     inside = ((motion.time >= start) & (motion.time <= end)).nonzero()[0]
@@ -125,7 +125,7 @@ def main(words: Sequence[str] | None = None) -> int:
         default=0,
         help="which sample episode, from 0",
     )
-    parser.add_argument("--out", type=Path, help=f"file to write, {', '.join(FORMS)}")
+    parser.add_argument("--out", type=Path, help=f"file to write, {', '.join(ANIMATION_FORMATS)}")
     parser.add_argument("--start", type=number, default=0.0, help="first moment [s]")
     parser.add_argument("--duration", type=number, help="by default to the end [s]")
     given = parser.parse_args(words)

@@ -26,14 +26,14 @@ from lcc_rl.envs.inputs import load_episodes
 from lcc_rl.figures.calibration import calibration_figure, joint_figure, twins_figure
 from lcc_rl.figures.drawing import save
 from lcc_rl.io.files import write_parquet
-from lcc_rl.results.render import MISSING
+from lcc_rl.results.render import DASH
 from lcc_rl.results.runs import check_folder, save_config
 from lcc_rl.runs.output import PLAIN
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import Phases
 from lcc_rl.runs.states import claim
 
-ERRORS = (
+ERROR_COLUMNS = (
     *(("rmspe", "RMSPE [%]"), ("gap_rmse_m", "gap RMSE [m]")),
     ("gap_nrmse", "gap NRMSE [%]"),
 )
@@ -124,8 +124,8 @@ def _summary(drivers: pd.DataFrame) -> Table:
     table = Table("", *modes, title="calibrated drivers, mean ± standard deviation", **PLAIN)
     parts = {mode: drivers[drivers["mode"] == mode] for mode in modes}
     table.add_row("fitted", *map(count_records, parts.values()))
-    errors = [(column, column, label) for column, label in ERRORS]
-    errors += [(column + OUT, column, f"{label}, held out") for column, label in ERRORS]
+    errors = [(column, column, label) for column, label in ERROR_COLUMNS]
+    errors += [(column + OUT, column, f"{label}, held out") for column, label in ERROR_COLUMNS]
     for column, kind, label in errors:
         if column in drivers:
             scale = 1.0 if kind.endswith("_m") else 100.0
@@ -135,7 +135,7 @@ def _summary(drivers: pd.DataFrame) -> Table:
         table.add_row(escape(re.sub(r" \$.*\$", "", one.label)), *row)
     populations = [from_table(part).summary() for part in parts.values()]
     correlations = (row["correlation"] for row in populations)
-    shown = (f"{value:.2f}" if math.isfinite(value) else MISSING for value in correlations)
+    shown = (f"{value:.2f}" if math.isfinite(value) else DASH for value in correlations)
     table.add_row("correlation of (v0, T)", *shown)
     shares = (f"{100 * row['share_at_bound']:.0f} %" for row in populations)
     table.add_row("v0 on a bound", *shares)

@@ -32,7 +32,7 @@ from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.envs import load_inputs
 from lcc_rl.envs.inputs import Inputs
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.evaluation.clairvoyant import BOTH, OWN, clairvoyant
+from lcc_rl.evaluation.clairvoyant import BOUND_BOTH, BOUND_OWN, clairvoyant
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import Strategy, baseline, check_distinct, trained
 from lcc_rl.functional.pattern import HUMAN
@@ -47,16 +47,25 @@ from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import PROGRESS, claim
 from lcc_rl.settings import Million
 
-DRIVERS = 12
+DRIVER_COUNT = 12
 BLOCK = 1_000_000  # vehicles × steps planned side by side: some GiB
-GIVEN = ("variant", "policy", "compare", "seed", "knowledge", "agent", "observation", "reward")
-PATH = {BOTH: "total_path_energy_kj", OWN: "cav_path_energy_kj"}
+SET_BY_BOUND = (
+    "variant",
+    "policy",
+    "compare",
+    "seed",
+    "knowledge",
+    "agent",
+    "observation",
+    "reward",
+)
+PATH_ENERGY = {BOUND_BOTH: "total_path_energy_kj", BOUND_OWN: "cav_path_energy_kj"}
 KEYS = ["profile_id", "driver_id"]
 
 
 def plan(options: Namespace, cfg: EvaluateConfig, inputs: Inputs, folder: Path) -> pd.DataFrame:
     """Evaluate human driver, policies and plans; write and return the rows of episodes.parquet."""
-    learned = [start(cfg, path, inputs) for path in options.policy or ["pretrained"]]
+    learned = [initial_strategy(cfg, path, inputs) for path in options.policy or ["pretrained"]]
     check_distinct(learned)
     parts = list(blocks(inputs, cfg))
     work = len(parts) * len(learned) * (1 + options.regard) * options.iterations
@@ -78,7 +87,7 @@ def _tell(
     progress.update(next(done), values)
 
 
-def start(cfg: EvaluateConfig, path: str, inputs: Inputs) -> Strategy:
+def initial_strategy(cfg: EvaluateConfig, path: str, inputs: Inputs) -> Strategy:
     """Read a policy to start from."""
     policy = load_policy(path, cfg.variant, tuple(cfg.trust))
     if HUMAN not in policy[1].scenario.vehicles.names:
@@ -138,15 +147,15 @@ def block_rows(
 def best(plans: list[pd.DataFrame]) -> pd.DataFrame:
     """Return, of every episode, the plan that takes the least of what it minimises."""
     together = pd.concat(plans, ignore_index=True)
-    energy = PATH[str(together["strategy"].iloc[0])]
+    energy = PATH_ENERGY[str(together["strategy"].iloc[0])]
     return together.loc[together.groupby(KEYS)[energy].idxmin()].reset_index(drop=True)
 
 
 def regard(episodes: pd.DataFrame) -> str:
     """Say what regard for the drivers behind saves at most."""
-    found = savings(episodes, PATH[BOTH], BOTH, OWN)
-    energy = episodes.groupby("strategy")[PATH[BOTH]].mean()
-    share = (energy[OWN] - energy[BOTH]) / energy["idm"]
+    found = savings(episodes, PATH_ENERGY[BOUND_BOTH], BOUND_BOTH, BOUND_OWN)
+    energy = episodes.groupby("strategy")[PATH_ENERGY[BOUND_BOTH]].mean()
+    share = (energy[BOUND_OWN] - energy[BOUND_BOTH]) / energy["idm"]
     return (
         f"Planned for all, all vehicles' paths take {100 * found.value:.2f} % less than planned "
         f"for the car alone (95 % over windows: {100 * found.low:.2f} … {100 * found.high:.2f}); "
@@ -164,10 +173,12 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--no-compile", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("outputs/clairvoyant"))
     options, overrides = parser.parse_known_args(arguments)
-    check_overrides(overrides, GIVEN, "the controller is that of --policy, as it was trained")
+    check_overrides(
+        overrides, SET_BY_BOUND, "the controller is that of --policy, as it was trained"
+    )
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     cfg = load("evaluate", ["variant=alcc", *overrides])
-    cfg.evaluation.drivers = cfg.evaluation.drivers or DRIVERS
+    cfg.evaluation.drivers = cfg.evaluation.drivers or DRIVER_COUNT
     require(cfg.device == "cpu", "lcc-rl clairvoyant runs on device=cpu")
     folder = own_folder(options.out, "--out", {PROGRESS}.issuperset)
     prepare_torch(cfg)

@@ -48,10 +48,10 @@ from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results.names import in_words
 from lcc_rl.results.platoons import case_report
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
-from lcc_rl.results.render import show, terminal
+from lcc_rl.results.render import print_table, terminal
 from lcc_rl.results.report import (
     Report,
-    counted,
+    counted_windows,
     few_windows,
     leader_too_fast,
     remarks,
@@ -335,7 +335,7 @@ def evaluate_and_write(
     """
     metadata = {IDENTITY: identity(cfg)}
     if cfg.evaluation.rows == "vehicles":
-        results = [cases.evaluate(strategy, cfg, inputs) for strategy in strategies]
+        results = [cases.evaluate_cases(strategy, cfg, inputs) for strategy in strategies]
         rows: Rows = pd.concat([table for table, _ in results], ignore_index=True)
         steps = pd.concat([trace for _, trace in results], ignore_index=True)
         check_present(folder)
@@ -426,10 +426,10 @@ def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
         title = one.of
         if one.of in counts:
             of = [x for x in (_task_name(cfg), one.of) if x]
-            windows = counted(counts[one.of], "held-out " * bool(len(inputs.training)))
+            windows = counted_windows(counts[one.of], "held-out " * bool(len(inputs.training)))
             size = f"{windows} × {drivers}, {cfg.scenario.horizon} steps"
             title = ": ".join([*of, size])
-        show(terminal(one, title, cfg.table == "all"))
+        print_table(terminal(one, title, cfg.table == "all"))
     seconds = cfg.scenario.horizon * cfg.scenario.time_step
     if words := few_windows(plan.profiles, seconds):
         log.info(words)

@@ -43,7 +43,7 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows, write_parquet
 from lcc_rl.io.settings import read_text
-from lcc_rl.results.render import show, terminal
+from lcc_rl.results.render import print_table, terminal
 from lcc_rl.results.report import RULE, report, sample_of, windows_for
 from lcc_rl.results.runs import (
     EPISODES,
@@ -57,7 +57,7 @@ from lcc_rl.results.runs import (
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import tell
 from lcc_rl.runs.precision import prepare_torch
-from lcc_rl.runs.progress import watch
+from lcc_rl.runs.progress import watch_jobs
 from lcc_rl.runs.states import claim
 from lcc_rl.settings import TARGET, path_of
 from lcc_rl.version import __version__
@@ -66,8 +66,8 @@ log = logging.getLogger("lcc_rl")
 
 # Settings that only the pipeline has, and data, which a variant with other leaders would refuse;
 # all others are passed on to calibration and trainings.
-OWN = ("calibration", "variants", "jobs", "variant", "resume", "hydra", "data")
-COMMAND, TRAJECTORIES = "command.txt", "trajectories.parquet"
+JOB_OPTIONS = ("calibration", "variants", "jobs", "variant", "resume", "hydra", "data")
+COMMAND_FILE, TRAJECTORIES = "command.txt", "trajectories.parquet"
 NETWORKS = ("reference", "alcc")  # trained by default, and the rule by the gradient
 
 
@@ -91,18 +91,18 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
     folder = Path(folder)
     with claim(folder):
         if cfg.resume is None:
-            trainings, final = composed(cfg, overrides)
+            trainings, final = composed_part(cfg, overrides)
             cfg.variants = list(trainings)
             check_folder(cfg, folder)
             command = shlex.join(["lcc-rl", "run", *overrides])
-        elif (folder / COMMAND).is_file():
+        elif (folder / COMMAND_FILE).is_file():
             read = (folder / TRAJECTORIES).exists()  # then nothing else is
             cfg = (load_config if read else resumed_config)(folder, cfg.trust)
             trainings = {x: load_config(folder / PARTS / x, cfg.trust) for x in cfg.variants or ()}
             final = load_config(folder / PARTS / FINAL, cfg.trust)
-            command = read_text(folder / COMMAND)
+            command = read_text(folder / COMMAND_FILE)
         else:
-            raise ConfigError(f"{folder}: not the folder of a pipeline: it has no {COMMAND}")
+            raise ConfigError(f"{folder}: not the folder of a pipeline: it has no {COMMAND_FILE}")
         prepare_torch(cfg)
         for name, part in trainings.items():
             check_settings(part, folder / name)
@@ -110,12 +110,12 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
         save_config(cfg, folder)
         for name, own in {**trainings, FINAL: final}.items():
             save_config(own, folder / PARTS / name)
-        with atomic_path(folder / COMMAND) as temporary:
+        with atomic_path(folder / COMMAND_FILE) as temporary:
             temporary.write_text(command, encoding="utf-8")
         return _run(cfg, trainings, final, folder, command)
 
 
-def composed(
+def composed_part(
     cfg: PipelineConfig, overrides: list[str]
 ) -> tuple[dict[str, TrainConfig], EvaluateConfig]:
     """Compose every part of a job: its trainings by variant, and the evaluation."""
@@ -124,7 +124,7 @@ def composed(
             raise ConfigError(
                 f"{item} has no effect on lcc-rl run, which trains several: use variants=[…]"
             )
-    shared = [item for item in overrides if root_key(item) not in OWN]
+    shared = [item for item in overrides if root_key(item) not in JOB_OPTIONS]
     names = cfg.variants or NETWORKS
     trainings = {name: load("train", [*shared, f"variant={name}"]) for name in names}
     if cfg.variants is None and trainings[names[-1]].agent.kind is Analytic:
@@ -171,7 +171,7 @@ def _run(
         one = replace(one, remarks=[*filter(None, [held_to(trainings.values())]), *one.remarks])
         write_figures(folder / FINAL, reports=[one])
         page = write_page(folder, [command], one, size)
-        show(terminal(one, f"Leader, car, human behind it: {size}"))
+        print_table(terminal(one, f"Leader, car, human behind it: {size}"))
         tell(f"rows, figures and policies: {folder}")
         tell(f"page: {page}")
     return rows
@@ -238,7 +238,7 @@ def train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
             name: pool.submit(_train_one, cfg, str(folder / name)) for name, cfg in todo.items()
         }
         try:
-            watch({name: (folder / name, future) for name, future in futures.items()})
+            watch_jobs({name: (folder / name, future) for name, future in futures.items()})
             for future in futures.values():
                 future.result()
         except (KeyboardInterrupt, BrokenProcessPool):

@@ -55,7 +55,7 @@ from lcc_rl.io.files import read_parquet
 from lcc_rl.results.board import row_of, score_table
 from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import load_policy, policy_file
-from lcc_rl.results.render import show
+from lcc_rl.results.render import print_table
 from lcc_rl.results.report import summary, windows_for
 from lcc_rl.results.runs import EPISODES, save_config
 from lcc_rl.runs.arguments import Arguments
@@ -64,15 +64,24 @@ from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import ERROR, LOCK, claim, forget, record
 
 # Where leaders come from, and human drivers who keep up with them.
-SOURCES: dict[str, tuple[str, ...]] = {
+LEADER_SOURCES: dict[str, tuple[str, ...]] = {
     "stream": ("data=stream", "drivers=i80"),
     "highway": ("data=highway", "drivers=highway"),
     "platoons": ("data=platoons", "drivers=highway"),
     "everyday": ("leader=everyday", "drivers=highway"),
 }
 OF_A_SOURCE = ("data", "split", "leader", "drivers")
-GIVEN = (*OF_A_SOURCE, "task", "variant", "policy", "compare", "agent", "observation", "reward")
-PACKAGES = ("torch", "torchrl", "tensordict", "numpy", "onnxruntime")
+SET_BY_SCORE = (
+    *OF_A_SOURCE,
+    "task",
+    "variant",
+    "policy",
+    "compare",
+    "agent",
+    "observation",
+    "reward",
+)
+SCORED_WITH = ("torch", "torchrl", "tensordict", "numpy", "onnxruntime")
 FILE = "score.json"
 
 
@@ -153,7 +162,7 @@ def roads(
     }
 
 
-def play(who: Scored, source: str, cfg: EvaluateConfig, folder: Path) -> dict[str, Any]:
+def play_source(who: Scored, source: str, cfg: EvaluateConfig, folder: Path) -> dict[str, Any]:
     """Play a task behind the leaders of a source; return its row.
 
     Raises:
@@ -190,7 +199,7 @@ def about(who: Scored) -> dict[str, Any]:
     """Return the hash of the files of who is scored, and versions."""
     contents = [file.read_bytes() for file in who.files()]
     found: dict[str, str | None] = {}
-    for name in ("lcc_rl", *PACKAGES):
+    for name in ("lcc_rl", *SCORED_WITH):
         try:
             found[name] = version(name)
         except PackageNotFoundError:
@@ -222,7 +231,7 @@ def _run(
     who: Scored, name: str, folder: Path, options: Namespace, further: Sequence[str]
 ) -> dict[str, Any]:
     own = dict(map(_source, options.source))
-    given, wanted = {**SOURCES, **own}, {*options.on, *own} if options.on else None
+    given, wanted = {**LEADER_SOURCES, **own}, {*options.on, *own} if options.on else None
     found: list[dict[str, Any]] = []
     left_out: list[str] = []
     for task in options.task or choices("task"):
@@ -234,7 +243,7 @@ def _run(
             left_out.append(f"{task}: no such source, only {', '.join(sources)}")
         for source in chosen:
             with leaving_out(f"{task}, {source}", left_out):
-                found.append(play(who, source, sources[source], folder / task / source))
+                found.append(play_source(who, source, sources[source], folder / task / source))
     why = "; ".join(left_out) or f"no such source, only {', '.join(given)}"
     require(bool(found), f"nothing could be played: {why}")
     document = {"name": name, **about(who), "results": found, "left_out": left_out}
@@ -273,7 +282,7 @@ def _source(given: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     """Return name and settings of a source that the command line names."""
     name, *words = given
     require(
-        re.fullmatch(r"\w[\w-]*", name) is not None and name not in SOURCES,
+        re.fullmatch(r"\w[\w-]*", name) is not None and name not in LEADER_SOURCES,
         f"--source {name}: expected a new name of letters, digits, - and _",
     )
     for word in words:
@@ -304,10 +313,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="folder, by default below outputs/score")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
     options, further = parser.parse_known_args(arguments)
-    check_overrides(further, GIVEN, "each task has its own; --task and --source choose")
+    check_overrides(further, SET_BY_SCORE, "each task has its own; --task and --source choose")
     logging.basicConfig(level=HEADLINE, format="%(message)s")  # no detail of every task
     document = run(options, further)
-    show(score_table(document["name"], document["results"]))
+    print_table(score_table(document["name"], document["results"]))
     for line in document["left_out"]:
         Console().print(f"left out: {line}", highlight=False, markup=False)
     return 0

@@ -18,7 +18,7 @@ from lcc_rl.config import NOT_IDENTITY, identity, with_inputs
 from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
-from lcc_rl.evaluation.cases import WINDOWS, check_cases
+from lcc_rl.evaluation.cases import WINDOW_CASES, check_cases
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.io.files import Rows, as_rows
@@ -175,5 +175,5 @@ def measured(rows: Rows) -> dict[str, Any]:
     """Return the last row of the summary, that of the strategy trained."""
     # By its rows: a resumed run is not of the variant that the command line composed.
     vehicles = isinstance(rows, pd.DataFrame) and "follower" in rows
-    table = case_table(rows, WINDOWS) if vehicles else summary(windows_for(rows))
+    table = case_table(rows, WINDOW_CASES) if vehicles else summary(windows_for(rows))
     return {str(key): value for key, value in table.iloc[-1].items()}

@@ -11,23 +11,34 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from lcc_rl.arrays import Floats
 from lcc_rl.data.grid import Place
 from lcc_rl.data.tables import SI, SPEEDS, UNITS
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.errors import Concern, DataError
 
 OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
-SIGNALS = {"gap": "gap_m", "leader": "leader_speed_mps", "follower": "follower_speed_mps"}
-WINDOW, EVERY, REACH = 2.0, 1.0, 3.0  # changes compared, time between them, longest lag [s]
+PAIR_SIGNALS = {"gap": "gap_m", "leader": "leader_speed_mps", "follower": "follower_speed_mps"}
+CHANGE_S, EVERY_S, LONGEST_LAG = (
+    2.0,
+    1.0,
+    3.0,
+)  # changes compared, time between them, longest lag [s]
 # Of changes [s], share explained, relative motion in a window [m]: less is too little to tell.
 LEAST_S, LEAST_FIT, LEAST_MOTION, LEAST_ALL_S = 6.0, 0.9, 0.15, 100.0
 GAIN, FLOOR = 6.0, 2e-4  # a lag leaves so much less unexplained; what exact data leave
 RIDGE = np.diag([1e-6, 1e-6, 0.1])  # [m²]: of a bias of speeds, which steady traffic leaves open
 LEAST_WAY = 50.0  # a shorter way says nothing of the unit of a speed [m]
-NEAR, ALIKE = 1.25, 1.05  # a mistake is so near to the coefficients, or as near as another one
+NEAR_MISTAKE, ALIKE = (
+    1.25,
+    1.05,
+)  # a mistake is so near to the coefficients, or as near as another one
 LOUD = 0.3  # lag that is reported [s]
-STANDING, LEAST_STANDING, FAR = 0.5, 300, 15.0  # speed [m/s], samples; gap that may be in feet [m]
-Floats = NDArray[np.float64]
+STANDING, LEAST_STANDING, FAR_STANDING = (
+    0.5,
+    300,
+    15.0,
+)  # speed [m/s], samples; gap that may be in feet [m]
 
 
 def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
@@ -52,10 +63,10 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     keys = [name for name in ("recording", "follower_id", "leader_id") if name in episodes]
     pair = episodes.groupby(keys or ["episode"], sort=False).ngroup().to_numpy()
     number, pairs = episodes["episode"].to_numpy(), int(pair.max(initial=-1)) + 1
-    width, every, reach = (round(seconds / FRAME) for seconds in (WINDOW, EVERY, REACH))
+    width, every, reach = (round(seconds / FRAME) for seconds in (CHANGE_S, EVERY_S, LONGEST_LAG))
     whole = width + 2 * reach
     rows = np.flatnonzero(number[whole:] == number[:-whole])[::every] + reach
-    gap, *speeds = (episodes[name].to_numpy(np.float64) for name in SIGNALS.values())
+    gap, *speeds = (episodes[name].to_numpy(np.float64) for name in PAIR_SIGNALS.values())
     series = [gap, *(np.cumsum((v + np.append(0.0, v[:-1])) * FRAME / 2) for v in speeds)]
 
     fit = partial(_fit, series, pair, pairs, width)
@@ -69,15 +80,15 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     best = np.where(rest[0] >= GAIN * rest.min(axis=0), rest.argmin(axis=0), 0)
     best[-1] = 0
     each, count = np.arange(pairs + 1), sums[2, 2]
-    ahead, own, grown = sums[[0, 1, 3], 2] * [[1], [-1], [1]] * EVERY / WINDOW
+    ahead, own, grown = sums[[0, 1, 3], 2] * [[1], [-1], [1]] * EVERY_S / CHANGE_S
     names = ["leader", "follower", "slope"]
     return pd.DataFrame(found[best, :, each], columns=names).assign(
         row=np.append(np.unique(pair, return_index=True)[1], 0),
-        seconds=EVERY * count,
+        seconds=EVERY_S * count,
         fit=1 - rest[best, each],
         motion=np.sqrt(sums[:2, :2].sum(axis=(0, 1)).clip(0.0) / count.clip(1.0)),
         late=FRAME * lags[best].sum(axis=1),
-        signal=np.array([*SIGNALS])[np.abs(lags[best]).argmax(axis=1)],
+        signal=np.array([*PAIR_SIGNALS])[np.abs(lags[best]).argmax(axis=1)],
         ahead=ahead,
         own=own,
         grown=grown,
@@ -168,7 +179,7 @@ def check_pairs(
         """A line on the case in the middle of several, if there is one."""
         for row, signal, words in cases[len(cases) // 2 :][:1]:
             count = f"; {len(cases):,} of {len(pairs):,} pairs" if len(pairs) > 1 else ""
-            yield f"{place(row, SIGNALS[signal])}: {words}{count}"
+            yield f"{place(row, PAIR_SIGNALS[signal])}: {words}{count}"
 
     wrong = [
         fit
@@ -177,7 +188,7 @@ def check_pairs(
     ]
     late, too_late = [], []
     for pair in pairs[right & (pairs["late"].abs() > LOUD - FRAME / 2)].to_dict("records"):
-        most = " or more" * (abs(pair["late"]) > REACH - FRAME / 2)
+        most = " or more" * (abs(pair["late"]) > LONGEST_LAG - FRAME / 2)
         lag = f"{abs(pair['late']):.1f} s{most} {'late' if pair['late'] > 0 else 'early'}"
         late.append((pair["row"], pair["signal"], f"{pair['signal']} {lag}; are clocks apart?"))
         too_late += late[-1:] * (abs(pair["late"]) > max_lag)
@@ -223,7 +234,7 @@ def _mistaken(
         off = max(abs(log(ratio)) for ratio in ratios) if min(ratios) > 0 else inf
         near.append((off, default, signal, question))
     least = min(near)[0]
-    if least >= log(NEAR):  # of what the gap tells, or, in the end, of the ways
+    if least >= log(NEAR_MISTAKE):  # of what the gap tells, or, in the end, of the ways
         return _mistaken({**pair, "told": False}, units, max_mismatch) if pair["told"] else []
     near = [x for x in sorted(near, key=lambda x: x[1:2]) if x[0] < least + log(ALIKE)]
     questions = " or ".join(x[3] for x in near)
@@ -248,6 +259,6 @@ def medians(
         f"{behind:.2g} s above 1 m/s; {', '.join(said)}"
     )
     stand = gap[episodes[["follower_speed_mps", "leader_speed_mps"]].max(axis=1) < STANDING]
-    if len(stand) < LEAST_STANDING or stand.median() < FAR or "ft" in units.values():
+    if len(stand) < LEAST_STANDING or stand.median() < FAR_STANDING or "ft" in units.values():
         return line
     return Concern(f"{line}; cars stand {stand.median():.3g} m apart: are all columns in feet?")

@@ -16,17 +16,17 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
+from lcc_rl.arrays import Mask
 from lcc_rl.data.grid import ORIGIN, Place, Places, places
 from lcc_rl.data.trajectories import FRAME, Trajectories, find_leaders
 from lcc_rl.errors import LARGEST, ConfigError, DataError
 from lcc_rl.settings import NonNegative, Number, Settings
 
 PASSENGER_CAR = 2
-COLUMNS = (
+SAMPLE_COLUMNS = (
     *("vehicle", "frame", "segment", "time_s", "position_m", "lane", "length_m", "vehicle_class"),
     *("speed_mps", "preceding", "space_headway_m"),
 )
-Mask = NDArray[np.bool_]
 
 
 class Criteria(Settings):
@@ -123,7 +123,7 @@ def extract(
             names the criterion.
     """
     table = trajectories.samples
-    known = [*COLUMNS, *(name for name in ORIGIN if name in table)]
+    known = [*SAMPLE_COLUMNS, *(name for name in ORIGIN if name in table)]
     samples = {str(name): table[name].to_numpy() for name in known}
     recording = table["recording"].cat
 

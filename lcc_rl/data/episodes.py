@@ -29,7 +29,7 @@ SCHEMA: dict[str, str] = {
     "gap_m": "float32",
 }
 # What a table of pairs may tell; a configuration names the columns by these keys.
-FIELDS = (
+PAIR_FIELDS = (
     Column("episode", "text", required=False),
     Column("recording", "text", required=False),
     Column("follower_id", least=-LARGEST_ID, most=LARGEST_ID, whole=True, required=False),
@@ -42,15 +42,16 @@ FIELDS = (
     Column("leader_length", "length", least=0.0, required=False),
     Column("gap", "length", blank=True),
 )
-MEASURED = [column.key for column in FIELDS if column.blank]  # a blank cell costs the row
-COLUMNS = tuple(SCHEMA)
-OWN = dict(zip((column.key for column in FIELDS), COLUMNS, strict=True))  # names by default
-ALIASES = {"event": "episode", "period": "recording"}
-DERIVED = "no positions given: those of leaders are the integral of their speeds"
-MOTION = [name for name in COLUMNS if name.endswith(("_position_m", "_speed_mps", "gap_m"))]
+PAIR_MEASURED = [column.key for column in PAIR_FIELDS if column.blank]  # a blank cell costs the row
+EPISODE_NAMES = dict(
+    zip((column.key for column in PAIR_FIELDS), SCHEMA, strict=True)
+)  # names by default
+EPISODE_ALIASES = {"event": "episode", "period": "recording"}
+DERIVED_POSITIONS = "no positions given: those of leaders are the integral of their speeds"
+MOTION_COLUMNS = [name for name in SCHEMA if name.endswith(("_position_m", "_speed_mps", "gap_m"))]
 
 
-def load_episodes(
+def read_episodes(
     paths: Sequence[str],
     columns: Mapping[str, str | None] | None = None,
     units: Mapping[str, str] | None = None,
@@ -106,13 +107,13 @@ def _table(
     report = ReadReport([path])
     table = continuous(table, "episode", place, report)
     start = table.groupby("episode")["time_s"].transform("min").to_numpy()
-    table, _ = on_grid(table, start, MOTION, place, report)
+    table, _ = on_grid(table, start, MOTION_COLUMNS, place, report)
     table["time_s"] = table["time_s"].round(6)
     table["episode"] = _numbered(table["episode"].to_numpy(), numbers)
-    table = table[[*COLUMNS, "file", "row", "label"]].astype({**SCHEMA, "recording": str})
+    table = table[[*SCHEMA, "file", "row", "label"]].astype({**SCHEMA, "recording": str})
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
-        notes.append(DERIVED)
+        notes.append(DERIVED_POSITIONS)
     return table, [*notes, *(f"{path}: {line}" for line in (*report.left_out(), *report.notes))]
 
 
@@ -120,7 +121,7 @@ def _rows(
     file: TableFile, number: int, names: Mapping[str, str | None], units: Mapping[str, str]
 ) -> tuple[pd.DataFrame, NDArray[np.int64]]:
     """Rows of a file with episodes counted from 0, and the file's numbers of these."""
-    read = file.read(FIELDS, names, units, "data.columns", MEASURED)
+    read = file.read(PAIR_FIELDS, names, units, "data.columns", PAIR_MEASURED)
     if not len(read["time"]):
         raise DataError(f"{file.path}: has no episodes; expected at least one row")
     kept = read.pop("row")
@@ -132,9 +133,9 @@ def _rows(
         numbers = np.arange(len(found))
     follower = 2 * codes + 2
     values = {
-        **dict.fromkeys(COLUMNS, np.zeros(rows)),
+        **dict.fromkeys(SCHEMA, np.zeros(rows)),
         "recording": np.full(rows, stem(str(file.path))),
-        **{OWN[key]: cells for key, cells in read.items()},
+        **{EPISODE_NAMES[key]: cells for key, cells in read.items()},
         "follower_id": read.get("follower_id", follower),
         "leader_id": read.get("leader_id", follower - 1),
     }
@@ -152,10 +153,14 @@ def _numbered(episode: NDArray, numbers: NDArray[np.int64]) -> NDArray[np.int64]
 
 def _names(file: TableFile, columns: Mapping[str, str | None]) -> dict[str, str | None]:
     """What a file calls the columns, by the keys of ``FIELDS``."""
-    names: dict[str, str | None] = {key: own for key, own in OWN.items() if own in file.header}
-    names |= {new: old for old, new in ALIASES.items() if old in file.header and new not in names}
+    names: dict[str, str | None] = {
+        key: own for key, own in EPISODE_NAMES.items() if own in file.header
+    }
+    names |= {
+        new: old for old, new in EPISODE_ALIASES.items() if old in file.header and new not in names
+    }
     names |= columns
-    missing = [OWN[x.key] for x in FIELDS if x.required and x.key not in names]
+    missing = [EPISODE_NAMES[x.key] for x in PAIR_FIELDS if x.required and x.key not in names]
     if missing:
         raise lacking(str(file.path), missing, file.header, "data.columns")
     return names

@@ -14,22 +14,20 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from lcc_rl.arrays import Floats, Integers, Mask
 from lcc_rl.data.trajectories import FRAME, ReadReport, starts_of
 from lcc_rl.errors import DataError
 
 HOLE = 1.75  # of the usual step; a longer one is a missing sample
-HOLE_S, MANY = 2.0, 0.1  # least hole [s] where more than this share of steps would be one
+HOLE_S, MANY_HOLES = 2.0, 0.1  # least hole [s] where more than this share of steps would be one
 UNEVEN = 0.1  # of a step; one that is further off is irregular
 REGULAR = 0.01  # of 0.1 s, by which samples may be off the grid: times in float32 are by 10 µs
-SHORTEST, LONGEST = 0.002, 10.0  # s; samples so near, or so far apart, are not in seconds
+SHORTEST_STEP, LONGEST_STEP = 0.002, 10.0  # s; samples so near, or so far apart, are not in seconds
 MOST_TWICE = 0.1  # of the rows may be second ones of their moment that say something else
-LAST = 2**31 - 1  # frame
+LAST_FRAME = 2**31 - 1  # frame
 ORIGIN = ["file", "row", "leader_row", "label"]  # columns that only describe where a row is from
 Place = Callable[[int, str], str]  # describes the sample of a row, and a column, to the user
 Places = Callable[[pd.DataFrame], Place]
-Floats = NDArray[np.float64]
-Whole = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 def places(
@@ -154,23 +152,23 @@ def _usual_steps(samples: pd.DataFrame, same: Mask, what: str, source: str) -> F
     """Usual time between samples of each row's record [s]; ``same``: as that of the row before."""
     steps = samples["time_s"].diff().where(same)
     step = float(steps.median())
-    if not SHORTEST <= step < LONGEST:
-        unit, node = "s" if step < SHORTEST else "ms", "leader" if what == "drive" else "data"
+    if not SHORTEST_STEP <= step < LONGEST_STEP:
+        unit, node = "s" if step < SHORTEST_STEP else "ms", "leader" if what == "drive" else "data"
         raise DataError(
-            f"{source}: samples of a {what} are {step:g} s apart; expected {SHORTEST:g} to "
-            f"{LONGEST:g} s; is the time in {unit} ({node}.units.time={unit})?"
+            f"{source}: samples of a {what} are {step:g} s apart; expected {SHORTEST_STEP:g} to "
+            f"{LONGEST_STEP:g} s; is the time in {unit} ({node}.units.time={unit})?"
         )
     if not ((steps - step).abs() > UNEVEN * step).any():
         return np.full(len(samples), step)
     own = steps.groupby(samples["episode"]).transform("median")
-    many = samples.groupby("episode")["time_s"].transform("size") > round(1 / MANY)
+    many = samples.groupby("episode")["time_s"].transform("size") > round(1 / MANY_HOLES)
     return own.where(many, step).to_numpy()
 
 
 def is_hole(steps: Floats, usual: Floats) -> Mask:
     """Return which steps [s] are holes, which divide a record; irregular sampling has few."""
     long = steps > HOLE * usual
-    return long & (steps > HOLE_S) if long.mean() > MANY else long
+    return long & (steps > HOLE_S) if long.mean() > MANY_HOLES else long
 
 
 def divided(table: pd.DataFrame, wrong: Mask, begins: Mask, shortest: float) -> pd.DataFrame:
@@ -217,7 +215,7 @@ def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 def on_grid(
     samples: pd.DataFrame, origin: Floats, smooth: Sequence[str], place: Places, report: ReadReport
-) -> tuple[pd.DataFrame, Whole]:
+) -> tuple[pd.DataFrame, Integers]:
     """Bring continuous records to samples 0.1 s apart.
 
     Columns of motion are interpolated monotonically (PCHIP), ``gap`` linearly and only where both
@@ -235,8 +233,8 @@ def on_grid(
         The samples, their ``time_s`` that of a frame, and the frame of each.
     """
     at = ((samples["time_s"] - origin) / FRAME).to_numpy()
-    if at.max() > LAST:
-        row = int(np.argmax(at > LAST))
+    if at.max() > LAST_FRAME:
+        row = int(np.argmax(at > LAST_FRAME))
         raise DataError(
             f"{place(samples)(row, '')} is {FRAME * at[row]:g} s after the first; is the time in "
             "another unit?"
@@ -258,7 +256,7 @@ def on_grid(
 
 def _interpolated(
     samples: pd.DataFrame, at: Floats, smooth: list[str], report: ReadReport
-) -> tuple[pd.DataFrame, Whole]:
+) -> tuple[pd.DataFrame, Integers]:
     """Samples at the whole frames within each record; ``at`` are the frames of the samples."""
     from scipy.interpolate import PchipInterpolator  # here: it loads for a second
 

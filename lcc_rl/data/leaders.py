@@ -19,22 +19,22 @@ from lcc_rl.data.profiles import (
     EvaluationShare,
     Profiles,
     at_step,
-    described,
+    described_records,
     from_records,
-    join,
+    joined,
     leader_profiles,
     nothing,
     resample,
 )
 from lcc_rl.data.sources import NgsimSource, find_files
-from lcc_rl.data.speed_records import COLUMNS, FIELDS, read_drives, read_speed_record
+from lcc_rl.data.speed_records import DRIVE_COLUMNS, DRIVE_FIELDS, read_drives, read_speed_record
 from lcc_rl.data.tables import check_map
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.errors import ConfigError, DataError, require_positive, unknown_name
 from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, checked, parse
 
 LISTED = 8  # names in a line
-WHOLE = "full length"  # a case that is a whole record, before the record's name
+WHOLE_RECORD = "full length"  # a case that is a whole record, before the record's name
 Nodes = Mapping[str, Mapping[str, Any] | None]
 
 
@@ -165,11 +165,13 @@ class RecordLeaders(Settings):
             parts[group] = self._stretches(group, getattr(self, group), time_step)
             if not parts[group]:
                 raise ConfigError(f"leader.{group} names no record")
-        windows = varying(join(parts["held_out"]).windows(horizon), self.least_variation)
+        windows = varying(joined(parts["held_out"]).windows(horizon), self.least_variation)
         report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s"] + [
-            f"{group}: {line}" for group, x in parts.items() for line in described(join(x))
+            f"{group}: {line}"
+            for group, x in parts.items()
+            for line in described_records(joined(x))
         ]
-        leaders = Leaders(join(parts["training"]), windows, report=tuple(report))
+        leaders = Leaders(joined(parts["training"]), windows, report=tuple(report))
         if followers is None:
             return leaders
         cases = []
@@ -181,7 +183,7 @@ class RecordLeaders(Settings):
         wholes = self.full_length or {}
         whole = self._stretches("full_length", wholes, time_step)
         full_length = (
-            Case(f"{WHOLE} {name}", profile, followers)
+            Case(f"{WHOLE_RECORD} {name}", profile, followers)
             for name, profile in zip(wholes, whole, strict=True)
         )
         return replace(leaders, cases=tuple(cases), full_length=tuple(full_length))
@@ -231,7 +233,7 @@ class TrajectoryLeaders(Settings):
         profiles = at_step(leader_profiles(loaded.episodes, FRAME), time_step)
         training, held_out = self.split(profiles.at_least(horizon))
         windows = varying(held_out.windows(horizon), self.least_variation)
-        lines = described(profiles), apart(training, held_out, loaded.vehicles)
+        lines = described_records(profiles), apart(training, held_out, loaded.vehicles)
         report = (*loaded.report, *lines[0], *lines[1])
         return Leaders(training, windows, report=report)
 
@@ -274,7 +276,7 @@ class DriveLeaders(Settings):
     path: str | Sequence[str]
     # What its columns are called: ``drive``, the name of the record, null for a table that holds
     # one record; ``time``, even in a record; ``speed``.
-    columns: Mapping[str, str | None] = Field(default_factory=lambda: dict(COLUMNS))
+    columns: Mapping[str, str | None] = Field(default_factory=lambda: dict(DRIVE_COLUMNS))
     units: Mapping[str, str] = Field(default_factory=dict)  # such as {speed: km/h}; else SI
     evaluation_share: EvaluationShare = 1 / 3  # of the names, or of the single record
     # Regular expression; drives whose names begin with the same match are on the same side.
@@ -285,8 +287,8 @@ class DriveLeaders(Settings):
     plausible: Plausible | None = None  # None for the defaults
 
     def validate(self) -> None:
-        self.columns = {**COLUMNS, **self.columns}
-        check_map(FIELDS, self.columns, self.units, "leader")
+        self.columns = {**DRIVE_COLUMNS, **self.columns}
+        check_map(DRIVE_FIELDS, self.columns, self.units, "leader")
         if self.tuning and self.evaluation_share == 1:
             raise ConfigError("leader.tuning=true leaves nothing to tune on: evaluation_share is 1")
         if self.together and self.columns["drive"] is None:
@@ -321,7 +323,7 @@ class DriveLeaders(Settings):
         by = "at the end" if single else f"by name (a hash, {self.evaluation_share:.2g} each)"
         count = f"{len(held_out)} of {len(profiles)} record(s) for evaluation, {by}: "
         line = f"{self.path}: {count}{', '.join(held_out.names)}"
-        return Leaders(training, windows, report=(*report, *described(profiles), line))
+        return Leaders(training, windows, report=(*report, *described_records(profiles), line))
 
     def _by_name(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
         """Divide drives by a hash of their names; once more for tuning."""
@@ -442,12 +444,12 @@ class Mixture:
         # A source that is for evaluation only has nothing to draw from.
         learned = {name: one for name, one in found.items() if len(one.training)}
         parts = [one.training.at_least(horizon) for one in learned.values()]
-        training = join(parts) if parts else next(iter(found.values())).training
+        training = joined(parts) if parts else next(iter(found.values())).training
         each = []
         for name, part in zip(learned, parts, strict=True):
             even = torch.ones(len(part), dtype=torch.float64) / len(part)
             each.append(self.weights.get(name, 1.0) * even)
-        windows = join([one.windows for one in found.values()])
+        windows = joined([one.windows for one in found.values()])
         names = tuple(name for name, one in found.items() for _ in range(len(one.windows)))
         return Leaders(
             replace(training, weights=torch.cat(each) if each else None),

@@ -23,7 +23,7 @@ from lcc_rl.data.ngsim_recordings import Group, name_recordings
 from lcc_rl.data.tables import LARGEST_ID, Block, Column, TableFile, lacking
 from lcc_rl.data.trajectories import (
     FOOT,
-    TYPES,
+    SAMPLE_TYPES,
     ReadReport,
     RowIndex,
     Trajectories,
@@ -37,7 +37,7 @@ HEADER = (
 )
 OFFICIAL = HEADER.split(",")
 # Other spellings in the documents of the four sites, in lower case without separators.
-ALIASES = {
+HEADER_ALIASES = {
     "spacehdwy": "Space_Headway",
     "spacing": "Space_Headway",
     "preceeding": "Preceding",
@@ -56,7 +56,7 @@ def _column(name: str, least: float = -1e9, most: float = 1e9, **more: Any) -> C
 
 
 # Columns of the files by what they are in the samples.
-FIELDS = {
+NGSIM_FIELDS = {
     "vehicle": _column("Vehicle_ID", 1, LARGEST_ID, whole=True),
     "frame": _column("Frame_ID", 0, 2**31 - 1, whole=True),
     "position_m": _column("Local_Y"),
@@ -69,9 +69,9 @@ FIELDS = {
     "space_headway_m": _column("Space_Headway", blank=True, required=False),
     "clock": _column("Global_Time", -1e300, 1e300, blank=True, required=False),
 }
-NAMES = {own: column.key for own, column in FIELDS.items()}
-KNOWN = [*NAMES.values(), "Location"]
-SPELLED = {name.replace("_", "").lower(): name for name in KNOWN} | ALIASES
+NGSIM_NAMES = {own: column.key for own, column in NGSIM_FIELDS.items()}
+KNOWN = [*NGSIM_NAMES.values(), "Location"]
+SPELLED = {name.replace("_", "").lower(): name for name in KNOWN} | HEADER_ALIASES
 # What follows from a column that is all zero or blank.
 CONSEQUENCES = {
     "Global_Time": "recordings are told apart by file",
@@ -84,11 +84,11 @@ CONSEQUENCES = {
     "Space_Headway": "space headways are derived from positions",
 }
 METRES = {"feet": FOOT, "metres": 1.0}
-CAR = (2.0, 12.0)  # m; between them lies the median length of vehicles on any road
+CAR_LENGTH = (2.0, 12.0)  # m; between them lies the median length of vehicles on any road
 JAM = 3.0  # m; front to front, no two cars are closer in a queue
-EXACT = "exact duplicate (vehicle, frame)"
-CONFLICTING = "conflicting duplicate (vehicle, frame)"
-Columns = dict[str, NDArray]
+EXACT_DUPLICATE = "exact duplicate (vehicle, frame)"
+CONFLICTING_DUPLICATE = "conflicting duplicate (vehicle, frame)"
+NgsimColumns = dict[str, NDArray]
 
 
 def read_ngsim(
@@ -123,7 +123,7 @@ def read_ngsim(
     wanted = None if location is None else location.strip().lower()
     for name in rows.report.files:
         file = TableFile(name, _official, OFFICIAL)
-        missing = [x.key for x in FIELDS.values() if x.required and x.key not in file.header]
+        missing = [x.key for x in NGSIM_FIELDS.values() if x.required and x.key not in file.header]
         if missing:
             raise lacking(name, missing, file.header, "")
         before = rows.report.rows_read
@@ -169,7 +169,7 @@ class _Rows:
 
     report: ReadReport
     metres: float
-    chunks: list[Columns] = field(default_factory=list)
+    chunks: list[NgsimColumns] = field(default_factory=list)
     groups: dict[Group, int] = field(default_factory=dict)
     rows_of: Counter[Group] = field(default_factory=Counter)
     locations: Counter[str] = field(default_factory=Counter)
@@ -192,9 +192,9 @@ class _Rows:
             places = places[mask]
         if not len(block):
             return
-        columns: Columns = {}
-        for own, column in FIELDS.items():
-            kind = TYPES.get(own, np.float64)
+        columns: NgsimColumns = {}
+        for own, column in NGSIM_FIELDS.items():
+            kind = SAMPLE_TYPES.get(own, np.float64)
             given = column.key in block.cells.column_names
             values = block.values(column, column.key) if given else np.full(len(block), np.nan)
             if own == "vehicle_class":
@@ -205,7 +205,7 @@ class _Rows:
             columns[own] = (values * self.metres if kind is np.float32 else values).astype(kind)
         preceding = columns["preceding"]
         preceding[(preceding < 0) | (preceding == columns["vehicle"])] = 0
-        self.filled |= {NAMES[own] for own, values in columns.items() if values.any()}
+        self.filled |= {NGSIM_NAMES[own] for own, values in columns.items() if values.any()}
         start = _frame_zero(columns.pop("clock"), columns["frame"])
         codes, pairs = pd.factorize(start * len(names) + places)
         groups = []
@@ -263,7 +263,9 @@ def _recordings(read: _Rows, group: NDArray[np.int32]) -> tuple[NDArray[np.int16
     return np.array([place[named[key]] for key in read.groups], dtype=np.int16)[group], names
 
 
-def _kept_order(report: ReadReport, columns: Columns, key: NDArray[np.int64]) -> NDArray[np.intp]:
+def _kept_order(
+    report: ReadReport, columns: NgsimColumns, key: NDArray[np.int64]
+) -> NDArray[np.intp]:
     """Rows to keep in sorted order; duplicates are counted by kind."""
     order = np.argsort(key, kind="stable")  # stable: the first in the files stays
     key = key[order]
@@ -273,8 +275,8 @@ def _kept_order(report: ReadReport, columns: Columns, key: NDArray[np.int64]) ->
     first = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(key))))
     again, kept = order[repeated], order[first[repeated]]
     same = np.logical_and.reduce([values[again] == values[kept] for values in columns.values()])
-    report.drop(EXACT, int(same.sum()))
-    report.drop(CONFLICTING, int((~same).sum()))
+    report.drop(EXACT_DUPLICATE, int(same.sum()))
+    report.drop(CONFLICTING_DUPLICATE, int((~same).sum()))
     if not same.all():
         report.notes.append(
             "rows that disagree on the same vehicle and frame: the first in the files was kept; "
@@ -293,7 +295,11 @@ def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> Non
         lengths = lengths[lengths > 0]
         headways = part.loc[part["space_headway_m"] > 0, "space_headway_m"]
         if len(lengths):
-            what, found, (low, high) = "the median length of vehicles", float(lengths.median()), CAR
+            what, found, (low, high) = (
+                "the median length of vehicles",
+                float(lengths.median()),
+                CAR_LENGTH,
+            )
         elif len(headways):
             what, found = "the least headway (1 % quantile)", float(headways.quantile(0.01))
             low, high = JAM, float("inf")

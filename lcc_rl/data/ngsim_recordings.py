@@ -25,7 +25,7 @@ from typing import NamedTuple
 from lcc_rl.data.text import stem
 
 JITTER = 5_000  # ms; recordings of one site start at least 11,700 clock units apart
-SPREAD = 300_000  # ms; periods last 15 min, and a float32 clock is off by up to 66 s
+CLUSTER_SPREAD = 300_000  # ms; periods last 15 min, and a float32 clock is off by up to 66 s
 SECONDS_BELOW = 10**11  # an epoch below this is in seconds: in ms it would be in 1973
 
 
@@ -60,7 +60,7 @@ def name_recordings(rows: Counter[Group]) -> tuple[dict[Group, str], list[str]]:
             by_place[group[:2]].append(group)
     for (_, location), groups in by_place.items():
         for cluster in _clusters(groups):
-            if cluster[-1].start - cluster[0].start <= SPREAD:
+            if cluster[-1].start - cluster[0].start <= CLUSTER_SPREAD:
                 by_location[location] += cluster
     named: dict[Group, str] = {}
     for location, groups in by_location.items():

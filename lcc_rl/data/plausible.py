@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
+from lcc_rl.arrays import Mask
 from lcc_rl.data.agreement import OF_PAIRS, check_pairs
 from lcc_rl.data.grid import ORIGIN, Place, Places, divided
 from lcc_rl.data.trajectories import starts_of
@@ -17,12 +18,11 @@ from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
 SMOOTHING = "'data.smoothing={_target_:lcc_rl.data.smoothing.SavitzkyGolay,window_s:1.5}'"
-SHORTEST = 10.0  # parts of a record that was cut are at least so long [s]
+SHORTEST_PART = 10.0  # parts of a record that was cut are at least so long [s]
 HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; fewer samples say nothing
-Mask = NDArray[np.bool_]
 # Column, words with a place for the number found, these numbers, the threshold's name and which
 # samples are outside of it; both are ``[rows]``.
-Fault = tuple[str, str, NDArray[np.float64], str, Mask]
+Finding = tuple[str, str, NDArray[np.float64], str, Mask]
 
 
 class Plausible(Settings):
@@ -79,12 +79,12 @@ class Plausible(Settings):
         """
         starts = starts_of(table["episode"].to_numpy())
         wrong, lines, advice = self._outside(table, starts, place(table), setting, remedy)
-        kept = divided(table, wrong, np.zeros_like(wrong), SHORTEST)
+        kept = divided(table, wrong, np.zeros_like(wrong), SHORTEST_PART)
         lost = 1 - len(kept) / len(table)
         if lost > self.max_share or kept.empty:
             raise DataError(
                 f"{source}: {100 * lost:.3g} % of the samples are implausible or lie within less "
-                f"than {SHORTEST:g} s between such (at most {setting}.max_share="
+                f"than {SHORTEST_PART:g} s between such (at most {setting}.max_share="
                 f"{self.max_share:g} of them may), the first: {advice}"
             )
         if lines:
@@ -93,7 +93,7 @@ class Plausible(Settings):
             line = (
                 f"{records:,} of {len(starts):,} records were cut there: {count:,} samples, "
                 f"{count * usual_step(table):,.0f} s, are left out, with parts shorter than "
-                f"{SHORTEST:g} s"
+                f"{SHORTEST_PART:g} s"
             )
             lines.append(Concern(line))
         kept, more_lines = _not_negative(kept)
@@ -149,7 +149,7 @@ class Plausible(Settings):
         few = f"too few samples to tell whether speeds are in m/s: fewer than {LEAST_SAMPLES}"
         return [f"{few} a second apart"] if hard is None else []
 
-    def _faults(self, table: pd.DataFrame, first: Mask) -> Iterator[Fault]:
+    def _faults(self, table: pd.DataFrame, first: Mask) -> Iterator[Finding]:
         """What may be outside of a threshold; ``first`` marks the first row of each record."""
         time = table["time_s"].to_numpy(np.float64)
         step = np.diff(time, prepend=time[0])

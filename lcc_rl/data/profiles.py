@@ -16,7 +16,7 @@ from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Settings
 
 EvaluationShare = Annotated[float, Field(gt=0.0, le=1.0)]
-MANY = 5  # records, each of which has a line
+MOST_LINES = 5  # records, each of which has a line
 NONE_LEFT = "no speed profile left: at least one leader's record is needed"
 
 
@@ -190,7 +190,7 @@ def nothing(time_step: float) -> Profiles:
     return Profiles(torch.zeros(0), none, none, (), (), time_step)
 
 
-def join(parts: Sequence[Profiles]) -> Profiles:
+def joined(parts: Sequence[Profiles]) -> Profiles:
     """Put several profiles of one step into one collection."""
     sizes = [len(part.speeds) for part in parts]
     known = [part.lengths if part.reach is None else part.reach for part in parts]
@@ -207,7 +207,7 @@ def join(parts: Sequence[Profiles]) -> Profiles:
     )
 
 
-def described(profiles: Profiles) -> list[str]:
+def described_records(profiles: Profiles) -> list[str]:
     """Return duration, mean and greatest speed of each record in lines; of many, of the fastest."""
     lines = []
     for index, name in enumerate(profiles.names):
@@ -215,8 +215,8 @@ def described(profiles: Profiles) -> list[str]:
         seconds, most = (len(x) - 1) * profiles.time_step, float(x.max())
         line = f"{name}: {seconds:,.0f} s, speed {float(x.mean()):.3g} m/s, at most {most:.3g} m/s"
         lines.append((-most, line))
-    more = [f"… and {len(lines) - MANY:,} slower records"] if len(lines) > MANY else []
-    return [line for _, line in (sorted(lines)[:MANY] if more else lines)] + more
+    more = [f"… and {len(lines) - MOST_LINES:,} slower records"] if len(lines) > MOST_LINES else []
+    return [line for _, line in (sorted(lines)[:MOST_LINES] if more else lines)] + more
 
 
 def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:

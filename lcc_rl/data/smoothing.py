@@ -16,16 +16,14 @@ from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.signal import savgol_filter
 
+from lcc_rl.arrays import Floats
 from lcc_rl.data.grid import stretches
 from lcc_rl.data.trajectories import FRAME, Trajectories, find_leaders
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Settings
-
-Array = NDArray[np.float64]
 
 
 class SavitzkyGolay(Settings):
@@ -97,7 +95,7 @@ class SavitzkyGolay(Settings):
         """Rows at each end of a stretch whose window is not whole."""
         return self.window // 2
 
-    def smooth(self, position: Array) -> tuple[Array, Array, Array]:
+    def smooth(self, position: Floats) -> tuple[Floats, Floats, Floats]:
         """Smooth stretches that lie one after another, as if they were one.
 
         Args:

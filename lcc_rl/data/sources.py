@@ -14,7 +14,13 @@ import pandas as pd
 
 import lcc_rl.assets
 from lcc_rl.data.car_following import Criteria, extract
-from lcc_rl.data.episodes import DERIVED, FIELDS, OWN, derive_positions, load_episodes
+from lcc_rl.data.episodes import (
+    DERIVED_POSITIONS,
+    EPISODE_NAMES,
+    PAIR_FIELDS,
+    derive_positions,
+    read_episodes,
+)
 from lcc_rl.data.grid import Places, places
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible
@@ -25,7 +31,7 @@ from lcc_rl.settings import Settings
 
 ASSETS = Path(lcc_rl.assets.__file__).parent
 # Files of the package by name: recorded platoons and drives, drive cycles.
-SHIPPED = {
+SHIPPED_FILES = {
     path.stem: str(path)
     for kind in ("recorded/*.parquet", "cycles/*.csv")
     for path in ASSETS.glob(kind)
@@ -88,7 +94,7 @@ class EpisodesSource(Settings):
     plausible: Plausible | None = None  # None for the defaults
 
     def validate(self) -> None:
-        check_map(FIELDS, self.columns, self.units, "data")
+        check_map(PAIR_FIELDS, self.columns, self.units, "data")
 
     def load(self) -> LoadedEpisodes:
         """Read and validate.
@@ -98,12 +104,12 @@ class EpisodesSource(Settings):
                 than ``plausible`` allows.
         """
         files = find_files(self.path)
-        episodes, notes = load_episodes(files, self.columns, self.units)
+        episodes, notes = read_episodes(files, self.columns, self.units)
         count, source = episodes["episode"].nunique(), ", ".join(files)
         lines = [f"read {count:,} episodes, {len(episodes):,} rows, {source}", *notes]
-        named = {**{key: OWN[key] for key in self.units}, **self.columns}
-        source += read_as(FIELDS, named, self.units)
-        units = units_of(FIELDS, OWN, self.units)
+        named = {**{key: EPISODE_NAMES[key] for key in self.units}, **self.columns}
+        source += read_as(PAIR_FIELDS, named, self.units)
+        units = units_of(PAIR_FIELDS, EPISODE_NAMES, self.units)
         place = partial(places, files=files, columns=self.columns)
         return _plausible(self.plausible, episodes, source, lines, place=place, units=units)
 
@@ -134,7 +140,7 @@ def episodes_of(
     lines = [*report.lines(), *extraction.lines()]
     if not trajectories.samples["position_m"].to_numpy().any():
         derive_positions(episodes)
-        lines.append(DERIVED)
+        lines.append(DERIVED_POSITIONS)
     loaded = _plausible(plausible, episodes, source, lines, remedy, place, report.units)
     return replace(loaded, vehicles=report.names)
 
@@ -185,7 +191,7 @@ def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     files: list[str] = []
     for entry in [path] if isinstance(path, (str, Path)) else path:
         name = str(expanduser(entry))
-        found = [SHIPPED.get(name, name)]
+        found = [SHIPPED_FILES.get(name, name)]
         if Path(name).is_dir():
             name = str(Path(escape(name)) / "*")
         if has_magic(name) and not Path(name).exists():

@@ -13,22 +13,26 @@ import pandas as pd
 from lcc_rl.data.grid import continuous, places
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
-from lcc_rl.data.sources import SHIPPED, find_files
+from lcc_rl.data.sources import SHIPPED_FILES, find_files
 from lcc_rl.data.tables import Column, TableFile
 from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
 
-TIME, SPEED = "time_s", "speed_mps"
+TIME_COLUMN, SPEED_COLUMN = "time_s", "speed_mps"
 # What a table of drives has, and how the columns are called by default.
-FIELDS = (
+DRIVE_FIELDS = (
     Column("drive", "text", required=False),
     Column("time", "time"),
     Column("speed", "speed"),
 )
 # Columns of the first car of a native OpenACC file; blank cells divide a record.
 NATIVE = (Column("time", "time"), Column("speed", "speed", blank=True))
-COLUMNS: dict[str, str | None] = {"drive": "drive", "time": TIME, "speed": SPEED}
+DRIVE_COLUMNS: dict[str, str | None] = {
+    "drive": "drive",
+    "time": TIME_COLUMN,
+    "speed": SPEED_COLUMN,
+}
 
 
 def read_speed_record(
@@ -49,12 +53,14 @@ def read_speed_record(
         DataError: naming the file and the row or column at fault, also where a number is not
             malformed but implausible.
     """
-    file = SHIPPED.get(path, path)
+    file = SHIPPED_FILES.get(path, path)
     if not Path(expanduser(file)).is_file():
-        known = ", ".join(sorted(SHIPPED))
+        known = ", ".join(sorted(SHIPPED_FILES))
         raise DataError(f"{path}: no such file, and none of the package ({known})")
-    samples, _ = _read(TableFile(file), {**COLUMNS, "drive": None}, plausible, {}, divide=False)
-    return samples[TIME].to_numpy(), samples[SPEED].to_numpy()
+    samples, _ = _read(
+        TableFile(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {}, divide=False
+    )
+    return samples[TIME_COLUMN].to_numpy(), samples[SPEED_COLUMN].to_numpy()
 
 
 def read_drives(
@@ -90,7 +96,10 @@ def read_drives(
     if (own > 1).any():
         raise DataError(f"{path}: drive {own.idxmax()!r} is in several files; expected one")
     records = table.groupby("name", sort=True)
-    speeds = [resample(x[TIME].to_numpy(), x[SPEED].to_numpy(), time_step) for _, x in records]
+    speeds = [
+        resample(x[TIME_COLUMN].to_numpy(), x[SPEED_COLUMN].to_numpy(), time_step)
+        for _, x in records
+    ]
     names, drives = map(str, records.groups), map(str, records["drive"].first())
     profiles = from_records(speeds, [*names], [*drives], time_step)
     return profiles, [line for _, lines in read for line in lines]
@@ -112,7 +121,7 @@ def _read(
     )
     kept["drive"] = kept.pop("recording")
     parts = kept.groupby("drive")["episode"].transform("nunique") > 1
-    start = kept.groupby("episode")[TIME].transform("min").map("+{:g}s".format)
+    start = kept.groupby("episode")[TIME_COLUMN].transform("min").map("+{:g}s".format)
     kept["name"] = kept["drive"].where(~parts, kept["drive"] + start)
     line = f"read {kept['name'].nunique():,} speed record(s), {len(kept):,} rows, {table.path}"
     if table.preamble:
@@ -124,18 +133,18 @@ def _samples(
     table: TableFile, columns: Mapping[str, str | None], units: Mapping[str, str]
 ) -> pd.DataFrame:
     """Drive, as recording, time and speed of every row that has a speed."""
-    fields: Sequence[Column] = FIELDS
+    fields: Sequence[Column] = DRIVE_FIELDS
     if table.preamble:
-        fields = FIELDS if columns["drive"] is None else NATIVE
-        native = {TIME: "Time", SPEED: "Speed1"}
+        fields = DRIVE_FIELDS if columns["drive"] is None else NATIVE
+        native = {TIME_COLUMN: "Time", SPEED_COLUMN: "Speed1"}
         columns = {key: native.get(str(columns[key]), columns[key]) for key in ("time", "speed")}
-    elif columns["drive"] == COLUMNS["drive"] and columns["drive"] not in table.header:
+    elif columns["drive"] == DRIVE_COLUMNS["drive"] and columns["drive"] not in table.header:
         columns = {**columns, "drive": None}  # each file is one
     read = table.read(fields, columns, units, "leader.columns", ["speed"])
     if not len(read["time"]):
         raise DataError(f"{table.path}: holds 0 samples, at least 2 are needed")
     samples = pd.DataFrame(
-        {TIME: read["time"], SPEED: read["speed"], "file": 0, "row": read["row"]}
+        {TIME_COLUMN: read["time"], SPEED_COLUMN: read["speed"], "file": 0, "row": read["row"]}
     )
     samples["recording"] = read.get("drive", stem(table.path))
     samples["episode"] = np.unique(samples["recording"], return_inverse=True)[1]

@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
+from lcc_rl.arrays import Integers
 from lcc_rl.data.agreement import LEAST_WAY
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.grid import Places, continuous, on_grid, places
@@ -28,7 +29,7 @@ from lcc_rl.data.trajectories import (
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Positive, Settings
 
-FIELDS = (
+TABLE_FIELDS = (
     Column("vehicle", "text", blank=True),
     Column("time", "time", blank=True),
     Column("speed", "speed", blank=True),
@@ -39,13 +40,16 @@ FIELDS = (
     Column("length", "length", least=0.0, blank=True, required=False),
     Column("recording", "text", blank=True, required=False),
 )
-COLUMNS: dict[str, str | None] = {"vehicle": "vehicle", "time": "time_s", "speed": "speed_mps"}
+TABLE_COLUMNS: dict[str, str | None] = {
+    "vehicle": "vehicle",
+    "time": "time_s",
+    "speed": "speed_mps",
+}
 NOBODY = ("", "0", "-1", "0.0", "-1.0")  # in the column leader
-MEASURED = ("time", "speed", "position")  # a row in which one is blank is left out
+TABLE_MEASURED = ("time", "speed", "position")  # a row in which one is blank is left out
 IDENTIFYING = ("vehicle", "lane", "recording")  # of the rows that are left none may be blank
 AGREE = (0.8, 1.25)  # way by positions over way by speeds
 JUMP = 10.0  # m between samples, more than driven: positions begin anew
-Whole = NDArray[np.int64]
 
 
 class TableSource(Settings):
@@ -60,7 +64,7 @@ class TableSource(Settings):
     # What the table calls ``vehicle``, ``time``, ``speed``, ``position`` (front bumper along the
     # road), ``lane``, ``leader`` (blank or 0 for none), ``gap`` (bumper to bumper), ``length`` and
     # ``recording``; null for what it does not have.
-    columns: Mapping[str, str | None] = Field(default_factory=lambda: dict(COLUMNS))
+    columns: Mapping[str, str | None] = Field(default_factory=lambda: dict(TABLE_COLUMNS))
     units: Mapping[str, str] = Field(default_factory=dict)  # such as {speed: km/h}; else SI
     vehicle_length: Positive | None = None  # of vehicles whose length no column gives [m]
     smoothing: Callable | None = None  # of positions, see lcc_rl.data.smoothing
@@ -68,8 +72,8 @@ class TableSource(Settings):
     plausible: Plausible | None = None  # None for the defaults
 
     def validate(self) -> None:
-        self.columns = {**COLUMNS, **self.columns}
-        check_map(FIELDS, self.columns, self.units, "data")
+        self.columns = {**TABLE_COLUMNS, **self.columns}
+        check_map(TABLE_FIELDS, self.columns, self.units, "data")
         given = {key for key, name in self.columns.items() if name is not None}
         sized = "length" in given or self.vehicle_length is not None
         if not ("leader" in given or {"lane", "position"} <= given):
@@ -90,7 +94,7 @@ class TableSource(Settings):
             DataError: naming the file, row and column, if a file is missing, damaged or holds what
                 it must not, no episode is left, or more are implausible than ``plausible`` allows.
         """
-        how = FIELDS, self.columns, self.units
+        how = TABLE_FIELDS, self.columns, self.units
         report = ReadReport(find_files(self.path), read_as(*how), units_of(*how))
         rows = self._rows(report)
         names = {**self.columns, "preceding": self.columns.get("leader")}
@@ -108,7 +112,9 @@ class TableSource(Settings):
         for number, label in enumerate(labels(report.files)):
             name = report.files[number]
             table = TableFile(name)
-            part = table.read(FIELDS, self.columns, self.units, "data.columns", MEASURED)
+            part = table.read(
+                TABLE_FIELDS, self.columns, self.units, "data.columns", TABLE_MEASURED
+            )
             report.rows_read += table.count
             for key in (key for key in IDENTIFYING if key in part):
                 if (blank := part[key] == "").any():
@@ -242,7 +248,7 @@ def _check_way(rows: pd.DataFrame, place: Places, report: ReadReport) -> None:
             )
 
 
-def _samples(rows: pd.DataFrame, frame: Whole, report: ReadReport) -> Trajectories:
+def _samples(rows: pd.DataFrame, frame: Integers, report: ReadReport) -> Trajectories:
     """The rows as trajectories, with leaders and headways."""
     recording = rows["recording"].cat
     rows = rows.assign(recording=recording.codes)
@@ -278,7 +284,7 @@ def _samples(rows: pd.DataFrame, frame: Whole, report: ReadReport) -> Trajectori
     )
 
 
-def _next_ahead(rows: pd.DataFrame, frame: Whole) -> Whole:
+def _next_ahead(rows: pd.DataFrame, frame: Integers) -> Integers:
     """The nearest vehicle ahead on the same lane in the same frame; 0 for none."""
     table = rows[["recording", "lane", "position", "vehicle"]].assign(frame=frame)
     ordered = table.sort_values(["recording", "frame", "lane", "position"], kind="stable")

@@ -36,12 +36,12 @@ from lcc_rl.data.trajectories import FOOT
 from lcc_rl.errors import ConfigError, DataError, unknown_name
 
 PARQUET = (".parquet", ".pq")
-LARGEST = 1e12  # in SI: beyond any time or place, and within every type
+LARGEST_CELL = 1e12  # in SI: beyond any time or place, and within every type
 LONGEST_TEXT = 1000  # of a name, signs
 LARGEST_ID = 2**53  # beyond this, whole numbers no longer fit a float
 THOUSANDS = r"^-?[0-9]{1,3}(,[0-9]{3})+(\.[0-9]*)?$"
 NUMBER = r"^-?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI][nN][fF]|[nN][aA][nN])$"
-NUMERIC = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null, pa.types.is_decimal)
+NUMERIC_TYPES = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null, pa.types.is_decimal)
 ISO, FRAMES = "iso", "frames/"  # dates and times of ISO 8601; before the frames a second
 SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": FOOT, "kn": 1852 / 3600}
 # Units by quantity, and their size; the first is the SI unit.
@@ -52,7 +52,7 @@ UNITS: dict[str, dict[str, float]] = {
 }
 SI = {quantity: next(iter(units)) for quantity, units in UNITS.items()}
 # What names of columns call units other than SI; "min" is also the least.
-NAMED = {
+UNIT_WORDS = {
     "time": {"ms": "ms|msecs?|milliseconds?", "us": "us|µs|microseconds?", "ns": "ns|nanoseconds?"},
     "speed": {
         "km/h": "km ?/?h|kmph|kph|(kilomet(re|er)s|km) per h(ou)?r?",
@@ -82,8 +82,8 @@ class Column:
 
     key: str
     quantity: str = "number"
-    least: float = -LARGEST
-    most: float = LARGEST
+    least: float = -LARGEST_CELL
+    most: float = LARGEST_CELL
     whole: bool = False
     blank: bool = False
     required: bool = True
@@ -131,14 +131,14 @@ def unit_size(quantity: str, unit: str) -> float | None:
     if quantity == "time" and unit.startswith(FRAMES):
         with suppress(ValueError):
             rate = float(unit.removeprefix(FRAMES))
-            return 1 / rate if 0.0 < rate < LARGEST else None
+            return 1 / rate if 0.0 < rate < LARGEST_CELL else None
     return UNITS[quantity].get(unit)
 
 
 def named_unit(name: str, quantity: str) -> str | None:
     """Return the unit that the name of a column says, unless it is SI: ``mph`` of ``v (mph)``."""
     words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^\w/]|_", " ", name).lower()
-    for unit, spelled in NAMED.get(quantity, {}).items():
+    for unit, spelled in UNIT_WORDS.get(quantity, {}).items():
         if re.search(rf"(?<![^\W\d])({spelled})(?![^\W\d])", words):
             return unit
     return None
@@ -346,7 +346,7 @@ class Block:
         def fault(row: int, words: str) -> DataError:
             return self.file.fault(int(self.row[row]), column.key, words)
 
-        return checked(self.cells[name], column, fault, scale, self.file.comma)
+        return checked_cells(self.cells[name], column, fault, scale, self.file.comma)
 
 
 def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: str) -> DataError:
@@ -364,7 +364,7 @@ def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: 
 # -- cells -----------------------------------------------------------------------------------------
 
 
-def checked(
+def checked_cells(
     cells: Cells, column: Column, fault: Fault, scale: float = 1.0, comma: bool = False
 ) -> NDArray:
     """Return the values of a column, checked.
@@ -446,7 +446,7 @@ def numbers_of(cells: Cells, fault: Fault, comma: bool = False) -> NDArray[np.fl
         if not sound.all():
             row = int(np.argmin(sound))
             raise fault(row, f"holds {_shown(given[row])}; expected a number")
-    elif not any(kind(cells.type) for kind in NUMERIC):
+    elif not any(kind(cells.type) for kind in NUMERIC_TYPES):
         raise fault(0, f"is of type {cells.type}; expected numbers")
     return np.asarray(pc.cast(cells, pa.float64(), safe=False), dtype=np.float64)
 

@@ -24,7 +24,7 @@ PREAMBLE = 20  # lines within which the header of a native OpenACC file begins
 BLOCK_BYTES, LONGEST_LINE = 1 << 22, 1 << 24  # read at once
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 # What files are that are no table in UTF-8, by their first bytes, and the remedy.
-OTHERS = {
+OTHER_FORMATS = {
     b"PK\x03\x04": " but a spreadsheet (xlsx, ods) or zip archive; save the table as CSV",
     b"\xd0\xcf\x11\xe0": " but an Excel workbook (xls); save the table as CSV",
     b"MATLAB": " but a MATLAB file (mat); save the table with writetable(…, 'x.csv')",
@@ -35,7 +35,7 @@ OTHERS = {
 
 
 @contextmanager
-def reading(name: str | Path) -> Iterator[BufferedReader]:
+def opened(name: str | Path) -> Iterator[BufferedReader]:
     """Open a plain or gzipped file, distinguished by its first bytes.
 
     Raises:
@@ -73,7 +73,7 @@ def line_chunks(path: Path, notes: list[str]) -> Iterator[bytes]:
         DataError: if it cannot be read, or is no text.
     """
     rest = b""
-    with reading(path) as file:
+    with opened(path) as file:
         wide = file.peek(2)[:2] in UTF16
         source: Any = EncodedFile(file, "utf-8", "utf-16") if wide else file
         notes += [f"{path}: is not UTF-8 and was read as UTF-16"] * wide
@@ -85,7 +85,7 @@ def line_chunks(path: Path, notes: list[str]) -> Iterator[bytes]:
                 if len(rest) > LONGEST_LINE:
                     raise DataError(f"{path}: is not a text table; expected lines")
         except UnicodeError:
-            raise DataError(f"{path}: is not UTF-8 text{OTHERS[UTF16[0]]}") from None
+            raise DataError(f"{path}: is not UTF-8 text{OTHER_FORMATS[UTF16[0]]}") from None
     if rest:
         yield _as_utf8(rest, path, notes)
 
@@ -94,8 +94,8 @@ def _as_utf8(content: bytes, path: Path, notes: list[str]) -> bytes:
     """Text as UTF-8, also where it is Latin-1."""
     if is_text(content):
         return content
-    if content.startswith((b"\0", *OTHERS)) or b"\0" in content:
-        kinds = (kind for start, kind in OTHERS.items() if content.startswith(start))
+    if content.startswith((b"\0", *OTHER_FORMATS)) or b"\0" in content:
+        kinds = (kind for start, kind in OTHER_FORMATS.items() if content.startswith(start))
         raise DataError(f"{path}: is not UTF-8 text{next(kinds, '; expected a table')}")
     line = f"{path}: is not UTF-8 and was read as Latin-1"
     notes += [line] * (line not in notes)

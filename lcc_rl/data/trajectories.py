@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 FOOT = 0.3048  # m
 FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
-KEYS = ("recording", "vehicle", "frame", "preceding")
+SAMPLE_KEYS = ("recording", "vehicle", "frame", "preceding")
 # Columns of trajectories beside the recording.
-TYPES = {
+SAMPLE_TYPES = {
     "vehicle": np.int64,
     "frame": np.int32,
     "segment": np.int32,
@@ -158,7 +158,7 @@ def assembled(
     samples: dict[str, Any] = {
         "recording": pd.Categorical.from_codes(code, categories=pd.Index(recordings))
     }
-    for name, kind in TYPES.items():
+    for name, kind in SAMPLE_TYPES.items():
         values = columns.pop(name) if name in columns else np.zeros(len(code))
         samples[name] = values.astype(kind, copy=False)
     return Trajectories(pd.DataFrame({**samples, **columns}, copy=False), report)
@@ -166,7 +166,7 @@ def assembled(
 
 def _fill_headways(columns: dict[str, NDArray], report: ReadReport) -> None:
     """Derive blank or zero headways from the positions of a frame; NaN where there is none."""
-    code, vehicle, frame, preceding = (columns[name] for name in KEYS)
+    code, vehicle, frame, preceding = (columns[name] for name in SAMPLE_KEYS)
     headway = columns.setdefault("space_headway_m", np.zeros(len(code)))
     follows = preceding > 0
     given = follows & (headway != 0) & ~np.isnan(headway)

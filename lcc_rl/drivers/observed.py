@@ -11,7 +11,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from lcc_rl.data.episodes import ALIASES
+from lcc_rl.data.episodes import EPISODE_ALIASES
 from lcc_rl.data.grid import places
 from lcc_rl.errors import Concern, DataError
 from lcc_rl.settings import NonNegative, Settings
@@ -172,7 +172,7 @@ def observe(episodes: pd.DataFrame, selection: Selection | None = None) -> Obser
 
 def _canonical(episodes: pd.DataFrame) -> pd.DataFrame:
     """Check columns and types; order by episode and time."""
-    aliases = {old: new for old, new in ALIASES.items() if new not in episodes.columns}
+    aliases = {old: new for old, new in EPISODE_ALIASES.items() if new not in episodes.columns}
     frame = episodes.rename(columns=aliases)
     missing = [name for name in ("episode", *NUMERIC_COLUMNS) if name not in frame.columns]
     if missing:

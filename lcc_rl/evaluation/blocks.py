@@ -16,7 +16,7 @@ from lcc_rl.io.files import parquet_metadata, read_parquet, write_parquet
 from lcc_rl.version import __version__
 
 BLOCKS = "blocks"
-MARK = "lcc_rl.block"  # in the metadata of a block's files
+BLOCK_MARK = "lcc_rl.block"  # in the metadata of a block's files
 Tables = tuple[pd.DataFrame, pd.DataFrame]  # rows, and time series of sample episodes
 
 
@@ -60,7 +60,7 @@ class Store:
             found = parquet_metadata(self._paths(strategy, block)[0])
         except ResultsError:
             return False
-        return found.get(MARK) == self.marks[strategy]
+        return found.get(BLOCK_MARK) == self.marks[strategy]
 
     def put(self, strategy: int, block: int, tables: Tables) -> None:
         """Keep a block of a strategy."""
@@ -69,7 +69,7 @@ class Store:
             return
         rows, steps = self._paths(strategy, block)
         steps.unlink(missing_ok=True)
-        metadata = {MARK: self.marks[strategy]}
+        metadata = {BLOCK_MARK: self.marks[strategy]}
         if len(tables[1]):
             write_parquet(tables[1], steps, metadata)
         write_parquet(tables[0], rows, metadata)

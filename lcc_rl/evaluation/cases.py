@@ -21,16 +21,16 @@ from lcc_rl.pieces.base import REWARD
 from lcc_rl.pieces.hybrid import COUNTERS, WINNER
 from lcc_rl.results.windows import DRIVE, SOURCE
 
-WINDOWS = "windows"
-ERRORS = ("gap_error", "speed_error", "leader_speed_error")
-RECORDED = ("speed", "gap", "acceleration", "jerk", "power", *ERRORS)
+WINDOW_CASES = "windows"
+TRACKING_ERRORS = ("gap_error", "speed_error", "leader_speed_error")
+CASE_ENTRIES = ("speed", "gap", "acceleration", "jerk", "power", *TRACKING_ERRORS)
 INDEX = (AUTOMATED, "index")
-KEYS = [("leader", "speed"), *(("vehicles", name) for name in RECORDED), REWARD]
-KEYS += [INDEX, WINNER, *COUNTERS]
-Series = dict[str, Tensor]  # ``[time, runs, vehicles]``
+CASE_KEYS = [("leader", "speed"), *(("vehicles", name) for name in CASE_ENTRIES), REWARD]
+CASE_KEYS += [INDEX, WINNER, *COUNTERS]
+CaseSeries = dict[str, Tensor]  # ``[time, runs, vehicles]``
 
 
-def evaluate(
+def evaluate_cases(
     strategy: Strategy, cfg: StudyConfig, inputs: Inputs
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Drive one strategy through every case, the held-out windows and the whole records.
@@ -40,8 +40,8 @@ def evaluate(
     """
     rows, steps = [], []
     for case in cases_of(cfg, inputs):
-        series = drive(strategy, case, inputs, cfg.evaluation.seed, cfg.device)
-        frame = measure(series)
+        series = drive_runs(strategy, case, inputs, cfg.evaluation.seed, cfg.device)
+        frame = measured_series(series)
         labels = {
             "strategy": strategy.name,
             "training_seed": pd.array([strategy.seed] * len(frame), dtype="Int64"),
@@ -66,7 +66,7 @@ def evaluate(
 
 def cases_of(cfg: StudyConfig, inputs: Inputs) -> list[Case]:
     """Return the cases of an evaluation, its held-out windows and its whole records."""
-    windows = Case(WINDOWS, inputs.evaluation, len(cfg.scenario.vehicles))
+    windows = Case(WINDOW_CASES, inputs.evaluation, len(cfg.scenario.vehicles))
     return [*inputs.cases, windows, *(inputs.full_length if cfg.evaluation.full_length else ())]
 
 
@@ -87,9 +87,9 @@ def of_case(cfg: StudyConfig, case: Case) -> StudyConfig:
     return cfg
 
 
-def drive(
+def drive_runs(
     strategy: Strategy, case: Case, inputs: Inputs, seed: int = 0, device: str = "cpu"
-) -> Series:
+) -> CaseSeries:
     """Drive a strategy behind every record of a case, side by side.
 
     Returns:
@@ -102,7 +102,7 @@ def drive(
     env = build_env(cfg, case.profile, inputs.population, runs, 0, device, True)
     ids, drivers = torch.arange(runs, device=env.device), len(inputs.population.time_gap)
     given = reset_options(env, ids, ids % drivers, seed, drivers)
-    record, _ = play(env, strategy.policy, given, KEYS, strategy.title)
+    record, _ = play(env, strategy.policy, given, CASE_KEYS, strategy.title)
     index, vehicles = record.pop(INDEX, None), len(cfg.scenario.vehicles)
     series = {"leader": record.pop(("leader", "speed"))}
     for (space, name), entry in record.items():
@@ -114,7 +114,7 @@ def drive(
     return series
 
 
-def measure(series: Series) -> pd.DataFrame:
+def measured_series(series: CaseSeries) -> pd.DataFrame:
     """Return one row per run and vehicle.
 
     Speed errors are e_v(i,0), as in the paper's tables. ``energy_ratio`` is Σ e_v(i,i−1)² over
@@ -155,7 +155,7 @@ def measure(series: Series) -> pd.DataFrame:
     return frame
 
 
-def trace(series: Series, time_step: float) -> pd.DataFrame:
+def trace(series: CaseSeries, time_step: float) -> pd.DataFrame:
     """Return a row per moment and vehicle of the first run; the leader is vehicle 0."""
     leader = series["leader"][1:, 0]
     steps, vehicles = series["jerk"].shape[0], series["jerk"].shape[2]

@@ -33,11 +33,11 @@ from lcc_rl.pieces.base import ACTION, STEP, next_key
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.views import VEHICLES, Views
 
-MEASURED = ("gap", "relative_speed", "time_gap", "speed")
-BOTH, OWN = "clairvoyant", "clairvoyant own"
+CONSTRAINED = ("gap", "relative_speed", "time_gap", "speed")
+BOUND_BOTH, BOUND_OWN = "clairvoyant", "clairvoyant own"
 MARGIN = 1.01  # the limits are kept with one per cent to spare
 LEAST_GAP = 0.5  # [m]
-FAR = 20.0  # beyond this a limit is not missed by more [m]
+FAR_GAP = 20.0  # beyond this a limit is not missed by more [m]
 LARGEST_STEP, SMALLEST_STEP = 0.02, 0.001  # of an action per iteration
 FLOW_PRICE = 3.0  # share of the energy that the loss of the whole flow costs
 
@@ -87,7 +87,7 @@ def clairvoyant(
     """
     require(iterations >= 1, f"iterations must be at least 1, got {iterations}")
     env, given = _episodes(strategy, inputs, drivers, seed)
-    source = DifferentiableRollout(env, [(VEHICLES, name) for name in MEASURED], (), compiled)
+    source = DifferentiableRollout(env, [(VEHICLES, name) for name in CONSTRAINED], (), compiled)
     policy: Any = strategy.policy
     network, steps = policy.module.requires_grad_(False), env.base_env.horizon
     # Plans follow the smooth energy; the best one is chosen by the energy that is measured.
@@ -109,7 +109,7 @@ def clairvoyant(
         means = {"kJ": float(price.detach().mean()), "missed": float(missed.detach().mean())}
         report(iteration + 1, means)
     planned = Planned(strategy.policy, found.shifts)
-    return replace(strategy, name=OWN if own else BOTH, policy=planned, seed=None)
+    return replace(strategy, name=BOUND_OWN if own else BOUND_BOTH, policy=planned, seed=None)
 
 
 def _episodes(
@@ -216,10 +216,10 @@ class Goal:
 
 def misses(data: TensorDictBase, string: VehicleString) -> Tensor:
     """Return the price of the limits missed in each episode, ``[batch]``, zero where kept."""
-    views = Views(string, AUTOMATED, [f"next.self.{name}" for name in MEASURED])
+    views = Views(string, AUTOMATED, [f"next.self.{name}" for name in CONSTRAINED])
     gap, relative_speed, time_gap, _ = views(*(data.get(key) for key in views.keys))
     closing = -relative_speed
     longest = LONG_TIME_GAP / MARGIN * gap / time_gap.clamp(min=1e-3)
-    over = torch.stack([MARGIN * UNSAFE_TTC * closing - gap, gap - longest]).clamp(0.0, FAR)
+    over = torch.stack([MARGIN * UNSAFE_TTC * closing - gap, gap - longest]).clamp(0.0, FAR_GAP)
     near = (LEAST_GAP - gap).clamp(min=0.0)
     return ((over + 0.3 * over.square()).sum(0) + 10.0 * near).flatten(1).sum(1)

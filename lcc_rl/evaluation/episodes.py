@@ -21,7 +21,7 @@ from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.rows import (
     FILTER_ENTRIES,
     INDEX,
-    KEYS,
+    ROW_KEYS,
     as_frame,
     describe,
     desired_speeds,
@@ -171,7 +171,7 @@ class Episodes:
         )
         self.energy = build_energy(self.cfg)
         filtered = self.cfg.scenario.filters.get(AUTOMATED) is not None
-        keys = [*KEYS, INDEX, CLASS, *(FILTER_ENTRIES if filtered else ())]
+        keys = [*ROW_KEYS, INDEX, CLASS, *(FILTER_ENTRIES if filtered else ())]
         self.player = Player(env, strategy.policy, keys, strategy.title, compiled)
         count = min(sample_episodes, len(plan))
         self.samples = set(np.linspace(0, len(plan) - 1, count).round().astype(int).tolist())

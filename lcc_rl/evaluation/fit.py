@@ -15,8 +15,8 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.runs import differing, flatten
 
-FIRST = "module.0.0.weight"  # of a policy's network
-TRAFFIC = ("data", "split", "drivers")
+FIRST_LAYER = "module.0.0.weight"  # of a policy's network
+TRAFFIC_NODES = ("data", "split", "drivers")
 
 
 def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
@@ -117,7 +117,7 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     """
     if cfg.task is not None or Path(path).parts[:1] == (PRETRAINED,):
         return ""
-    changed = [name for name in TRAFFIC if getattr(own, name) != getattr(cfg, name)]
+    changed = [name for name in TRAFFIC_NODES if getattr(own, name) != getattr(cfg, name)]
     if not changed:
         return ""
     nodes = {name: getattr(own, name) for name in changed}
@@ -136,7 +136,7 @@ def check_width(policy: TensorDictModule, weights: Mapping[str, Any], path: str)
     Raises:
         ConfigError: naming both numbers.
     """
-    one, other = (state.get(FIRST) for state in (weights, policy.state_dict()))
+    one, other = (state.get(FIRST_LAYER) for state in (weights, policy.state_dict()))
     if one is not None and other is not None and one.shape[1] != other.shape[1]:
         raise ConfigError(
             f"policy={path} was trained with {one.shape[1]} observed entries; in this "

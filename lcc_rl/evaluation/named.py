@@ -40,7 +40,7 @@ NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
 YAML, MODULE = (".yaml", ".yml"), ".py"
 ONNX, ONNX_POLICY = ".onnx", "lcc_rl.interfaces.onnx_policy.OnnxPolicy"
 DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")  # my_pieces.PID
-OTHERS = (
+OTHER_WORDS = (
     "<module.Class>",
     "<controller.yaml>",
     "<program.onnx>",
@@ -182,7 +182,7 @@ def _described(who: Any) -> Any:
         inside = Path(who).stem
         raise ConfigError(f"{who} is a module: name a class or function in it, {inside}.<Class>")
     if DOTTED.fullmatch(who) is None:
-        error = unknown_name("strategy", who, [*rules(), *OTHERS])
+        error = unknown_name("strategy", who, [*rules(), *OTHER_WORDS])
         raise ConfigError(f"{error} {own_file('controller', who)}")
     if inspect.isclass(find_target(who, f"compare={who}")):
         return {TARGET: who}

@@ -32,7 +32,7 @@ from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.string import COMMAND, WANTED
 from lcc_rl.results.windows import DRIVE, LEADER_COLUMNS, REPEAT, SOURCE
 
-RECORDED = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
+ROW_ENTRIES = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
 SUMMED = (
     "energy_kj",
     "net_energy_kj",
@@ -50,8 +50,8 @@ SAMPLED = (
     "desired_speed_mps",
     "time_gap_s",
 )
-KEYS = [("leader", name) for name in ("speed", "acceleration")]
-KEYS += [("vehicles", name) for name in RECORDED]
+ROW_KEYS = [("leader", name) for name in ("speed", "acceleration")]
+ROW_KEYS += [("vehicles", name) for name in ROW_ENTRIES]
 INDEX = (AUTOMATED, "index")
 # Behind a safety filter: for which steps it answers, what it was told and what it commanded.
 FILTER_ENTRIES = tuple((AUTOMATED, name) for name in ("promised", "safe"))

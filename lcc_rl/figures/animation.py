@@ -21,18 +21,18 @@ from lcc_rl.figures.drawing import INK, legend_above, new_figure, style
 from lcc_rl.figures.ring_picture import ring_picture
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.results.motion import Motion, Series
+from lcc_rl.results.motion import MotionSeries, SampleMotion
 
-FORMS = (".html", ".svg", ".gif", ".mp4")
-COLOURS = {"leader": INK, AUTOMATED: "#0072b2", HUMAN: "#d55e00"}
-NAMES = ("human driver", "controlled car")  # a human may drive it, too, as a baseline
-LARGEST = 50_000  # moments of vehicles in a page, each a speed and a gap
-FEW = 6  # vehicles whose lines are all thick
-RATE, LONGEST = 10, 150  # frames per second, and at most
+ANIMATION_FORMATS = (".html", ".svg", ".gif", ".mp4")
+ROLE_COLOURS = {"leader": INK, AUTOMATED: "#0072b2", HUMAN: "#d55e00"}
+ROLE_WORDS = ("human driver", "controlled car")  # a human may drive it, too, as a baseline
+LARGEST_PAGE = 50_000  # moments of vehicles in a page, each a speed and a gap
+FEW_VEHICLES = 6  # vehicles whose lines are all thick
+FRAME_RATE, MOST_FRAMES = 10, 150  # frames per second, and at most
 DPI = 80
 
 
-def animate(motions: Mapping[str, Motion], path: str | Path) -> Path:
+def animate(motions: Mapping[str, SampleMotion], path: str | Path) -> Path:
     """Write an animation; the ending chooses the form.
 
     A page (``.html``) plays in any browser, with a slider; a ``.gif`` or ``.mp4`` plays a long
@@ -67,18 +67,18 @@ def animate(motions: Mapping[str, Motion], path: str | Path) -> Path:
 
 def check_ending(path: Path, episodes: int = 1) -> None:
     """Check that an animation can be written in the form that its file's ending means."""
-    if path.suffix not in FORMS:
-        raise unknown_name("ending of an animation", path.suffix, FORMS)
+    if path.suffix not in ANIMATION_FORMATS:
+        raise unknown_name("ending of an animation", path.suffix, ANIMATION_FORMATS)
     if episodes > 1 and path.suffix != ".svg":
         raise ConfigError(f"{path.suffix} shows one strategy; of a ring, an .svg shows several")
     if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
         raise ConfigError("an .mp4 needs ffmpeg, which is not installed; write a .html or .gif")
 
 
-def page(motion: Motion, title: str) -> str:
+def page(motion: SampleMotion, title: str) -> str:
     """Return the page, all data inside."""
     # The fewest steps between moments that keep it small.
-    every = -(-motion.speed.size // LARGEST)
+    every = -(-motion.speed.size // LARGEST_PAGE)
     short = motion.at(slice(None, None, every))
     data = {
         "title": title,
@@ -90,8 +90,8 @@ def page(motion: Motion, title: str) -> str:
         "leader": None if short.leader is None else _numbers(short.leader),
         "length": motion.length,
         "circumference": motion.circumference,
-        "colours": COLOURS,
-        "names": {"leader": "leader", AUTOMATED: NAMES[1], HUMAN: NAMES[0]},
+        "colours": ROLE_COLOURS,
+        "names": {"leader": "leader", AUTOMATED: ROLE_WORDS[1], HUMAN: ROLE_WORDS[0]},
     }
     # Within a script no tag may begin.
     text = json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
@@ -99,15 +99,15 @@ def page(motion: Motion, title: str) -> str:
     return template.replace("DATA", text, 1)
 
 
-def _numbers(values: Series) -> list[float]:
+def _numbers(values: MotionSeries) -> list[float]:
     return [round(float(value), 2) for value in values]
 
 
-def frames(motion: Motion, title: str) -> Iterator[Figure]:
+def frames(motion: SampleMotion, title: str) -> Iterator[Figure]:
     """Yield the one figure of an animation at every frame, drawn anew each time."""
-    count = min(max(round(RATE * float(motion.time[-1] - motion.time[0])), 2), LONGEST)
+    count = min(max(round(FRAME_RATE * float(motion.time[-1] - motion.time[0])), 2), MOST_FRAMES)
     moments = np.linspace(0, len(motion.time) - 1, count).round().astype(int)
-    faster = (motion.time[-1] - motion.time[0]) * RATE / count
+    faster = (motion.time[-1] - motion.time[0]) * FRAME_RATE / count
     figure = new_figure(8.0, 7.4 if motion.circumference else 5.6)
     road, speeds, gaps = figure.subplots(
         3, 1, height_ratios=(3 if motion.circumference else 1, 2, 2)
@@ -131,7 +131,7 @@ def frames(motion: Motion, title: str) -> Iterator[Figure]:
         yield figure
 
 
-def road_picture(motion: Motion) -> Any:
+def road_picture(motion: SampleMotion) -> Any:
     """Return the road at the last moment of a motion, ``[height, width, 3]``, uint8."""
     figure = new_figure(8.0, 6.4 if motion.circumference else 1.6)
     road = figure.subplots()
@@ -146,7 +146,7 @@ def _pixels(figure: Figure) -> Any:
     return np.asarray(figure.canvas.buffer_rgba())  # type: ignore[attr-defined]
 
 
-def _on_road(road: Axes, motion: Motion) -> Callable[[int], None]:
+def _on_road(road: Axes, motion: SampleMotion) -> Callable[[int], None]:
     """Draw the cars of a motion; return what places them as they are at a moment."""
     cars = LineCollection([], linewidths=9.0, capstyle="butt")
     road.add_collection(cars)
@@ -154,19 +154,21 @@ def _on_road(road: Axes, motion: Motion) -> Callable[[int], None]:
     return partial(_around if motion.circumference else _along, road, cars, motion)
 
 
-def _hues(motion: Motion) -> list[str]:
-    return [COLOURS.get(role, COLOURS[AUTOMATED]) for role in motion.roles]
+def _hues(motion: SampleMotion) -> list[str]:
+    return [ROLE_COLOURS.get(role, ROLE_COLOURS[AUTOMATED]) for role in motion.roles]
 
 
-def _lines(axis: Axes, motion: Motion, values: Series, label: str, leader: Series | None) -> None:
+def _lines(
+    axis: Axes, motion: SampleMotion, values: MotionSeries, label: str, leader: MotionSeries | None
+) -> None:
     """Draw an entry of all vehicles over time, automated ones above all others."""
     if leader is not None:
         axis.plot(motion.time, leader, color=INK, lw=1.4, label="leader")
     named = set()
     for vehicle, (role, hue) in enumerate(zip(motion.roles, _hues(motion), strict=True)):
-        bold = role != HUMAN or len(motion.roles) <= FEW
+        bold = role != HUMAN or len(motion.roles) <= FEW_VEHICLES
         look: dict[str, Any] = {"lw": 1.4, "zorder": 3} if bold else {"lw": 0.6, "alpha": 0.3}
-        name = None if hue in named else NAMES[role != HUMAN]
+        name = None if hue in named else ROLE_WORDS[role != HUMAN]
         named.add(hue)
         axis.plot(motion.time, values[:, vehicle], color=hue, label=name, **look)
     axis.set_xlim(motion.time[0], motion.time[-1])
@@ -174,7 +176,7 @@ def _lines(axis: Axes, motion: Motion, values: Series, label: str, leader: Serie
     style(axis, "", label)
 
 
-def _along(axis: Axes, cars: LineCollection, motion: Motion, moment: int) -> None:
+def _along(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int) -> None:
     """Place the cars on an open road, in a view that moves with the leader."""
     front = float(motion.front[moment])
     fronts = [*motion.position[moment], front]
@@ -187,7 +189,7 @@ def _along(axis: Axes, cars: LineCollection, motion: Motion, moment: int) -> Non
     axis.set_xlabel("position [m]")
 
 
-def _around(axis: Axes, cars: LineCollection, motion: Motion, moment: int) -> None:
+def _around(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int) -> None:
     """Place the cars on a circle."""
     turn = 2.0 * np.pi / float(motion.circumference or 1.0)
     reach = np.linspace(-motion.length, 0.0, 5)
@@ -198,17 +200,17 @@ def _around(axis: Axes, cars: LineCollection, motion: Motion, moment: int) -> No
     axis.axis("off")
 
 
-def _write_gif(motion: Motion, title: str, path: Path) -> None:
+def _write_gif(motion: SampleMotion, title: str, path: Path) -> None:
     images = []
     for figure in frames(motion, title):
         image = Image.fromarray(_pixels(figure)).convert("RGB")
         images.append(image.quantize(64, Image.Quantize.FASTOCTREE))
-    settings = {"duration": 1000 // RATE, "loop": 0, "optimize": True}
+    settings = {"duration": 1000 // FRAME_RATE, "loop": 0, "optimize": True}
     images[0].save(path, "GIF", save_all=True, append_images=images[1:], **settings)
 
 
-def _write_mp4(motion: Motion, title: str, path: Path) -> None:
-    writer = FFMpegWriter(fps=RATE, extra_args=["-f", "mp4", "-pix_fmt", "yuv420p"])
+def _write_mp4(motion: SampleMotion, title: str, path: Path) -> None:
+    writer = FFMpegWriter(fps=FRAME_RATE, extra_args=["-f", "mp4", "-pix_fmt", "yuv420p"])
     for number, figure in enumerate(frames(motion, title)):
         if number == 0:
             writer.setup(figure, str(path), dpi=DPI)

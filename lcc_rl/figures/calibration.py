@@ -13,9 +13,9 @@ from lcc_rl.drivers.parameters import DEFAULT_MODEL, MODEL, parameters_of
 from lcc_rl.drivers.twins import REACTING, RECORDED_DRIVERS, TWINS, densities, ratios
 from lcc_rl.errors import DataError
 from lcc_rl.figures.drawing import (
-    COLUMN,
+    COLUMN_WIDTH,
     INK,
-    PAGE,
+    PAGE_WIDTH,
     SOFT,
     footnote,
     grid,
@@ -26,8 +26,8 @@ from lcc_rl.figures.drawing import (
 )
 from lcc_rl.results.render import signed
 
-COLOURS = {"local": "#0072b2", "global": "#d55e00"}
-DRIVERS = {RECORDED_DRIVERS: INK, TWINS: "#d55e00", REACTING: "#0072b2"}
+MODE_COLOURS = {"local": "#0072b2", "global": "#d55e00"}
+DRIVER_COLOURS = {RECORDED_DRIVERS: INK, TWINS: "#d55e00", REACTING: "#0072b2"}
 RATIOS = {"energy": "energy\nper km", "lost": "lost to\naccelerating", "distance": "distance"}
 
 
@@ -51,7 +51,7 @@ def calibration_figure(drivers: pd.DataFrame) -> Figure:
         if drivers[one.column].nunique() > 1
     }
     rows = 1 + len(shown) // 3
-    figure = new_figure(PAGE, 0.4 + 1.9 * rows)
+    figure = new_figure(PAGE_WIDTH, 0.4 + 1.9 * rows)
     first, *others = figure.subplots(rows, 3).ravel()
     for axis in others[len(shown) :]:
         axis.remove()
@@ -87,8 +87,8 @@ def joint_figure(drivers: pd.DataFrame) -> Figure:
     mode, table = next(iter(_modes(drivers).items()))
     speed, gap = (table[name].to_numpy(float) for name in ("desired_speed_mps", "time_gap_s"))
     bound = table["desired_speed_at_bound"].to_numpy(bool)
-    colour = COLOURS.get(mode, INK)
-    figure = new_figure(COLUMN, 3.6)
+    colour = MODE_COLOURS.get(mode, INK)
+    figure = new_figure(COLUMN_WIDTH, 3.6)
     spec = figure.add_gridspec(2, 2, width_ratios=(4, 1), height_ratios=(1, 4))
     centre = figure.add_subplot(spec[1, 0])
     top = figure.add_subplot(spec[0, 0], sharex=centre)
@@ -120,13 +120,13 @@ def twins_figure(twins: pd.DataFrame) -> Figure:
         twins: what was measured, see :class:`lcc_rl.drivers.calibrator.Calibration`.
     """
     modes = list(dict.fromkeys(twins["mode"]))
-    figure = new_figure(PAGE, 0.3 + 2.2 * len(modes))
+    figure = new_figure(PAGE_WIDTH, 0.3 + 2.2 * len(modes))
     for mode, row in zip(modes, np.atleast_2d(figure.subplots(len(modes), 3)), strict=True):
         part = twins[twins["mode"] == mode]
         found = {who: part[part["driver"] == who] for who in dict.fromkeys(part["driver"])}
         spectra, share, gaps = row
         for who, one in found.items():
-            look: dict[str, Any] = {"color": DRIVERS[who], "label": who, "linewidth": 1.3}
+            look: dict[str, Any] = {"color": DRIVER_COLOURS[who], "label": who, "linewidth": 1.3}
             density = densities(one).mean()
             spectra.semilogy(density.index, density, **look)
             ordered = np.sort(one["gap_m"])
@@ -134,8 +134,8 @@ def twins_figure(twins: pd.DataFrame) -> Figure:
             if who != RECORDED_DRIVERS:
                 near = ratios(one, found[RECORDED_DRIVERS])
                 places = [100.0 * (near[name] - 1.0) for name in RATIOS]
-                share.plot(places, range(len(RATIOS)), "o", color=DRIVERS[who], label=who)
-        share.axvline(0.0, color=DRIVERS[RECORDED_DRIVERS], linewidth=1.0)
+                share.plot(places, range(len(RATIOS)), "o", color=DRIVER_COLOURS[who], label=who)
+        share.axvline(0.0, color=DRIVER_COLOURS[RECORDED_DRIVERS], linewidth=1.0)
         share.set_yticks(range(len(RATIOS)), list(RATIOS.values()))
         share.set_ylim(len(RATIOS) - 0.5, -0.5)
         style(spectra, "frequency [Hz]", "acceleration [m²/s⁴/Hz]")
@@ -171,7 +171,7 @@ def _modes(drivers: pd.DataFrame) -> dict[str, pd.DataFrame]:
 def _boxes(axis: Axes, values: dict[str, pd.Series]) -> None:
     """Draw a box per mode, or a line if the parameter was held constant."""
     for place, (mode, series) in enumerate(values.items()):
-        colour = COLOURS.get(mode, INK)
+        colour = MODE_COLOURS.get(mode, INK)
         numbers = series.to_numpy(float)
         if len(numbers) > 1 and np.ptp(numbers) == 0.0:
             axis.plot([place - 0.25, place + 0.25], numbers[[0, 0]], color=colour, linewidth=2)

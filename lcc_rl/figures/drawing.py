@@ -21,7 +21,7 @@ from lcc_rl.io.atomic import atomic_path
 from lcc_rl.results.names import in_words
 
 INK, SOFT = "#222222", "#8a8a8a"
-COLUMN, PAGE = 3.5, 7.2  # widths of one column of a journal, and of two [in]
+COLUMN_WIDTH, PAGE_WIDTH = 3.5, 7.2  # widths of one column of a journal, and of two [in]
 LABEL = 28  # signs of a name in one line of a figure
 # Decorates what draws: sizes of print, and letters that stay letters in vector formats.
 paper = mpl.rc_context(
@@ -55,12 +55,16 @@ COLOURS = {
     "human": "#b0a080",
     "direct": INK,
 }
-OTHERS = ("#cc79a7", "#882255", "#117733")  # of the user's own; none of whom they are compared with
+OWN_COLOURS = (
+    "#cc79a7",
+    "#882255",
+    "#117733",
+)  # of the user's own; none of whom they are compared with
 
 
 def colour(strategy: str) -> str:
     """Return the colour that a strategy has in every figure."""
-    return COLOURS.get(strategy) or OTHERS[sum(strategy.encode()) % len(OTHERS)]
+    return COLOURS.get(strategy) or OWN_COLOURS[sum(strategy.encode()) % len(OWN_COLOURS)]
 
 
 def new_figure(width: float, height: float) -> Figure:

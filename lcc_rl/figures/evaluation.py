@@ -17,9 +17,9 @@ from matplotlib.ticker import MaxNLocator
 from lcc_rl.config.words import FILTERED
 from lcc_rl.evaluation.named import is_shipped
 from lcc_rl.figures.drawing import (
-    COLUMN,
+    COLUMN_WIDTH,
     INK,
-    PAGE,
+    PAGE_WIDTH,
     SOFT,
     colour,
     dots,
@@ -120,7 +120,7 @@ def study_figures(
         if len(steps) and (steps["strategy"] == name).any():
             yield f"episode {name}", sample_episode(steps, name)
         if "direct" in names:
-            yield f"human_energy {name}", human_energy(means, name)
+            yield f"human_energy {name}", human_energy_figure(means, name)
         # Who collides, and so drives less of an episode, saves nothing.
         whole = not episodes.loc[episodes["strategy"] == name, "collided"].any()
         for baseline in (*AGAINST, "recorded") if many and whole else ():
@@ -134,7 +134,7 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
     """Speeds, accelerations and gaps of one held-out episode (Fig. 7)."""
     rows = _one_episode(steps, strategy)
     first = rows.iloc[0]
-    figure = new_figure(COLUMN, 4.4)
+    figure = new_figure(COLUMN_WIDTH, 4.4)
     axes = figure.subplots(3, 1, sharex=True)
     for axis, entry in zip(axes, ("speed", "acceleration", "gap"), strict=True):
         _over_time(axis, rows, entry)
@@ -154,7 +154,7 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, report:
     """Speeds of one episode, and what each strategy of a report saves."""
     table = report.short
     lines = max(len(lines_of(str(name)).splitlines()) for name in table["strategy"])
-    figure = new_figure(PAGE, max(2.7, 0.9 + 0.13 * lines * len(table)))
+    figure = new_figure(PAGE_WIDTH, max(2.7, 0.9 + 0.13 * lines * len(table)))
     left, right = figure.subplots(1, 2, width_ratios=(4, 5))
     _over_time(left, _one_episode(steps, strategy), "speed")
     style(left, "time [s]", "speed [m/s]")
@@ -199,7 +199,7 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
     return rows.rename(columns=lambda name: re.sub(f"^hdv{behind}_", "hdv_", name))
 
 
-def human_energy(means: Means, strategy: str) -> Figure:
+def human_energy_figure(means: Means, strategy: str) -> Figure:
     """Human driver's energy behind the controlled car and directly behind the leader (Fig. 9)."""
     names = {"direct": "directly behind the leader", strategy: f"behind {in_words(strategy)}"}
     return _by_driver(means, "hdv_path_energy_kj", names, "the human driver")
@@ -224,7 +224,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> 
     baseline, strategy = names
     # Rounded to joules: bins have a width also where drivers are alike.
     energy = by_driver(means.drivers, column)[[baseline, strategy]].dropna().round(3)
-    figure = new_figure(PAGE, 2.7)
+    figure = new_figure(PAGE_WIDTH, 2.7)
     left, right = figure.subplots(1, 2)
     bins = np.histogram_bin_edges(energy.to_numpy(), 30)
     for (name, label), alpha in zip(names.items(), (0.45, 0.6), strict=True):

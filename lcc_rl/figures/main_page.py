@@ -15,7 +15,7 @@ from lcc_rl.results.names import in_words
 from lcc_rl.results.render import for_print, full_rows
 from lcc_rl.results.report import AGAINST, UNTRAINED, Report
 
-TITLE = "lcc_rl: data → drivers → policies → results"
+MAIN_TITLE = "lcc_rl: data → drivers → policies → results"
 LIMIT = "efficiency"
 HELD_TO = (
     f"The networks learn within a limit of long time gaps, agent.limits.{LIMIT}={{limit}} of the "
@@ -26,11 +26,11 @@ AS_RECORDED = (
     "drivers of the training recordings; rows with more save by falling back."
 )
 # Files of figures, in the job's folder and without their ending, and their captions.
-RESULTS = {
+RESULT_FIGURES = {
     "evaluation/figures/overview": "A held-out episode, and the path energy per vehicle and km",
     "evaluation/figures/learning_curve": "The trainings: what they minimise, and their limit",
 }
-DRIVERS = {
+DRIVER_FIGURES = {
     "calibration/calibration": "Calibrated drivers: error and parameters",
     "calibration/joint_distribution": "Desired speed and time gap of the drivers",
 }
@@ -72,7 +72,7 @@ def write_page(folder: str | Path, commands: Sequence[str], report: Report, size
         return [(caption, path) for path, caption in paths.items() if path.exists()]
 
     words = f"{report.verdict}\n\n{report.note}"
-    page.add("Results", words, [(size, for_print(report))], figures(RESULTS))
+    page.add("Results", words, [(size, for_print(report))], figures(RESULT_FIGURES))
     learned = [str(name) for name in report.short["strategy"] if name not in UNTRAINED]
     improvements = {
         f"evaluation/figures/improvement_{own}_vs_{in_file(name)}": (
@@ -81,11 +81,11 @@ def write_page(folder: str | Path, commands: Sequence[str], report: Report, size
         for own in learned[-1:]
         for name in AGAINST
     }
-    for heading, names in {"By driver": improvements, "Drivers": DRIVERS}.items():
+    for heading, names in {"By driver": improvements, "Drivers": DRIVER_FIGURES}.items():
         if drawn := figures(names):
             page.add(heading, figures=drawn)
     cells = [[label.strip(), *row] for label, row in full_rows(report)]
     columns = ["measure", *(in_words(str(name)) for name in report.table["strategy"])]
     every = pd.DataFrame(cells, columns=columns)
     page.add("All measures", tables=[("Means per strategy", every)])
-    return page.write(TITLE, commands)
+    return page.write(MAIN_TITLE, commands)

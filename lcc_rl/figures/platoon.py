@@ -12,16 +12,22 @@ from matplotlib.figure import Figure
 
 from lcc_rl.data.leaders import Case
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.figures.drawing import INK, PAGE, legend_above, new_figure, paper, style, unbox
+from lcc_rl.figures.drawing import INK, PAGE_WIDTH, legend_above, new_figure, paper, style, unbox
 from lcc_rl.results.names import in_words
 
-SHOWN = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")  # strategies with a panel
-HYBRIDS = ("hcfs", "hcfs oracle")
-NEAR, FAR = np.array([0.0, 0.45, 0.70]), np.array([0.90, 0.62, 0.0])
+PANEL_STRATEGIES = (
+    "cacc paper_like",
+    "cacc tuned",
+    "cacc",
+    "ddpg",
+    "hcfs",
+)  # strategies with a panel
+PANEL_HYBRIDS = ("hcfs", "hcfs oracle")
+NEAR_COLOUR, FAR_COLOUR = np.array([0.0, 0.45, 0.70]), np.array([0.90, 0.62, 0.0])
 BOUND = "#b00020"
-PAPER = {"case 1": (0.37, 10.76)}  # first and last speed in the paper [m/s]
-PARENTS = {"CACC": "#e8e8e8", "DDPG": "#0072b2"}  # by the value of the column "winner"
-WHO_DRIVES = ListedColormap(list(PARENTS.values()))
+PAPER_SPEEDS = {"case 1": (0.37, 10.76)}  # first and last speed in the paper [m/s]
+WINNER_COLOURS = {"CACC": "#e8e8e8", "DDPG": "#0072b2"}  # by the value of the column "winner"
+WHO_DRIVES = ListedColormap(list(WINNER_COLOURS.values()))
 
 
 def platoon_figures(steps: pd.DataFrame, bound: float) -> Iterator[tuple[str, Figure]]:
@@ -34,7 +40,7 @@ def platoon_figures(steps: pd.DataFrame, bound: float) -> Iterator[tuple[str, Fi
     for case in dict.fromkeys(steps["case"]) if len(steps) else ():
         yield f"{case} velocities", velocities(steps, case)
         yield f"{case} jerk", jerks(steps, case, bound)
-        for strategy in HYBRIDS:
+        for strategy in PANEL_HYBRIDS:
             if (steps["strategy"] == strategy).any():
                 yield f"{case} switching {strategy}", switching(steps, case, strategy)
 
@@ -48,21 +54,23 @@ def record_figure(record: Profiles, from_s: float, cases: Sequence[Case]) -> Fig
         from_s: where that part begins [s].
         cases: the windows for tests.
     """
-    figure = new_figure(PAGE, 3.6)
+    figure = new_figure(PAGE_WIDTH, 3.6)
     grid = figure.subplot_mosaic([["record"] * len(cases), [case.name for case in cases]])
     axis, windows = grid.pop("record"), list(grid.values())
     seconds = _speeds(axis, record)
-    axis.axvspan(from_s, seconds[-1], color=PARENTS["DDPG"], alpha=0.15, lw=0, label="training")
+    axis.axvspan(
+        from_s, seconds[-1], color=WINNER_COLOURS["DDPG"], alpha=0.15, lw=0, label="training"
+    )
     axis.set_title(_in_record(record), loc="right")
     legend_above(axis)
     for window, case in zip(windows, cases, strict=True):
         ends = _speeds(window, case.profile)[[0, -1]]
         window.set_ylim(-0.5, 13.0)
         window.set_title(f"{case.name}\n{_in_record(case.profile)}")
-        if case.name in PAPER:
+        if case.name in PAPER_SPEEDS:
             window.plot(
                 ends,
-                PAPER[case.name],
+                PAPER_SPEEDS[case.name],
                 "o",
                 color=BOUND,
                 label="first and last speed\nin the paper",
@@ -124,7 +132,7 @@ def jerks(steps: pd.DataFrame, case: str, bound: float) -> Figure:
 def shown(steps: pd.DataFrame) -> list[str]:
     """Return the strategies of :data:`SHOWN` that there are; all if there is none of them."""
     names = list(dict.fromkeys(steps["strategy"]))
-    return [name for name in SHOWN if name in names] or names
+    return [name for name in PANEL_STRATEGIES if name in names] or names
 
 
 def _panels(
@@ -132,7 +140,7 @@ def _panels(
 ) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
     """Return a figure with a panel per strategy, and each panel with its rows."""
     names = shown(rows)
-    figure = new_figure(PAGE, 0.8 + 1.3 * len(names))
+    figure = new_figure(PAGE_WIDTH, 0.8 + 1.3 * len(names))
     axes = figure.subplots(len(names), 1, sharex=True, sharey=sharey, squeeze=False)[:, 0]
     for axis, name in zip(axes, names, strict=True):
         axis.set_title(in_words(name), loc="right")
@@ -150,7 +158,7 @@ def _lines(axis: Axes, rows: pd.DataFrame, column: str) -> None:
         own = rows[rows["follower"] == follower]
         label = f"follower {follower}" if follower in (1, followers) else None
         share = (follower - 1) / max(followers - 1, 1)
-        hue = tuple((1.0 - share) * NEAR + share * FAR)
+        hue = tuple((1.0 - share) * NEAR_COLOUR + share * FAR_COLOUR)
         axis.plot(own["time_s"], own[column], color=hue, lw=1.0, label=label)
 
 
@@ -166,13 +174,13 @@ def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
     rows = steps[(steps["case"] == case) & (steps["strategy"] == strategy)]
     rows = rows[rows["follower"] > 0]
     raster = rows.pivot_table(index="follower", columns="time_s", values="winner")
-    figure = new_figure(PAGE, 0.9 + 0.16 * len(raster))
+    figure = new_figure(PAGE_WIDTH, 0.9 + 0.16 * len(raster))
     axis = figure.subplots()
     step = float(raster.columns[0])
     edges = np.append(raster.columns.to_numpy(float) - step, raster.columns[-1])
     rims = np.arange(len(raster) + 1) + 0.5
     axis.pcolormesh(edges, rims, raster.to_numpy(), cmap=WHO_DRIVES, vmin=0.0, vmax=1.0)
-    for name, hue in PARENTS.items():
+    for name, hue in WINNER_COLOURS.items():
         axis.plot([], [], "s", color=hue, label=name)
     axis.set_yticks(raster.index)
     style(axis, "time [s]", "follower")

@@ -9,13 +9,19 @@ from html import escape
 from matplotlib.colors import to_hex
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.figures.space_time import COLOURS
+from lcc_rl.figures.space_time import SPEED_COLOURS
 from lcc_rl.functional.pattern import HUMAN
-from lcc_rl.results.motion import Motion, Series
+from lcc_rl.results.motion import MotionSeries, SampleMotion
 
-FASTER, STEP = 20.0, 1.5  # times as fast as it was driven; between two key frames [s]
-WIDE, HIGH, RADIUS, ROAD, CAR = 330, 380, 118, 24, 12  # of a panel, its ring, road and cars [px]
-FRAME = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {high}" width="{wide}" \
+SPEED_UP, KEY_STEP = 20.0, 1.5  # times as fast as it was driven; between two key frames [s]
+WIDE, HIGH, RADIUS, ROAD, CAR_SIZE = (
+    330,
+    380,
+    118,
+    24,
+    12,
+)  # of a panel, its ring, road and cars [px]
+SVG_FRAME = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {high}" width="{wide}" \
 height="{high}" font-family="system-ui, 'Segoe UI', Roboto, sans-serif" text-anchor="middle">
 <title>{title}</title>
 <style>.card {{ fill: #fff; stroke: #dfe3e8 }} .road {{ stroke: #e4e7ec; fill: none }}
@@ -32,7 +38,7 @@ height="{high}" font-family="system-ui, 'Segoe UI', Roboto, sans-serif" text-anc
 """
 
 
-def ring_picture(motions: Mapping[str, Motion]) -> str:
+def ring_picture(motions: Mapping[str, SampleMotion]) -> str:
     """Return an SVG of rings side by side, in which the cars drive and change their colour.
 
     Args:
@@ -49,13 +55,13 @@ def ring_picture(motions: Mapping[str, Motion]) -> str:
     size = {"wide": wide, "high": HIGH, "inner": wide - 1, "below": HIGH - 1}
     bar = _bar(next(iter(motions.values())), wide)
     title = escape("; ".join(motions))
-    return FRAME.format(**size, title=title, panels="\n".join(panels), time=bar)
+    return SVG_FRAME.format(**size, title=title, panels="\n".join(panels), time=bar)
 
 
-def _panel(name: str, motion: Motion, place: int, top: float) -> str:
+def _panel(name: str, motion: SampleMotion, place: int, top: float) -> str:
     """Return one ring with its cars."""
     step = float(motion.time[1] - motion.time[0])
-    shown = motion.at(slice(None, None, max(round(STEP / step), 1)))
+    shown = motion.at(slice(None, None, max(round(KEY_STEP / step), 1)))
     turn = 360.0 / float(motion.circumference or 1.0)  # of a metre [degrees]
     angles = -turn * (shown.position - 0.5 * motion.length)
     long = math.radians(turn) * RADIUS * motion.length
@@ -74,27 +80,27 @@ def _panel(name: str, motion: Motion, place: int, top: float) -> str:
     )
 
 
-def _car(marked: bool, angles: Series, shares: Series, long: float, time: str) -> str:
+def _car(marked: bool, angles: MotionSeries, shares: MotionSeries, long: float, time: str) -> str:
     """Return a car that turns by the angles [degrees], coloured by shares of the top speed."""
-    hues = ";".join(to_hex(COLOURS(share)) for share in shares)
+    hues = ";".join(to_hex(SPEED_COLOURS(share)) for share in shares)
     mark = (
         f'<circle class="mark" cx="{RADIUS}" r="{0.8 * long:.1f}" fill="none" stroke-width="2.5"/>'
     )
     return (
-        f'<g>{mark * marked}<rect class="car" x="{RADIUS - CAR / 2}" y="{-long / 2:.1f}" '
-        f'width="{CAR}" height="{long:.1f}" rx="3.5">'
+        f'<g>{mark * marked}<rect class="car" x="{RADIUS - CAR_SIZE / 2}" y="{-long / 2:.1f}" '
+        f'width="{CAR_SIZE}" height="{long:.1f}" rx="3.5">'
         f'<animate attributeName="fill" {time} values="{hues}"/></rect>'
         f'<animateTransform attributeName="transform" type="rotate" {time} '
         f'values="{";".join(f"{angle:.1f}" for angle in angles)}"/></g>'
     )
 
 
-def _time_of(motion: Motion) -> str:
-    duration = (motion.time[-1] - motion.time[0]) / FASTER
+def _time_of(motion: SampleMotion) -> str:
+    duration = (motion.time[-1] - motion.time[0]) / SPEED_UP
     return f'dur="{duration:.2f}s" repeatCount="indefinite"'
 
 
-def _bar(motion: Motion, wide: int) -> str:
+def _bar(motion: SampleMotion, wide: int) -> str:
     """Return a bar that grows with the time."""
     first, last = float(motion.time[0]), float(motion.time[-1])
     room, low = wide - 80, HIGH - 34

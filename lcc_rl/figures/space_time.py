@@ -13,21 +13,23 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.figures.drawing import COLUMN, PAGE, lines_of, new_figure, paper, unbox
+from lcc_rl.figures.drawing import COLUMN_WIDTH, PAGE_WIDTH, lines_of, new_figure, paper, unbox
 from lcc_rl.functional.pattern import HUMAN
-from lcc_rl.results.motion import Motion, motion_of, sample_episodes, telling
+from lcc_rl.results.motion import SampleMotion, motion_of, sample_episodes, telling
 
 FEWEST = 3  # vehicles; of fewer, speeds over time show all
-EVERY = 5  # steps between the points of a line
-WIDEST = 3  # panels
+POINT_STEPS = 5  # steps between the points of a line
+MOST_PANELS = 3  # panels
 RIMS = {True: "controlled", False: "human"}  # the fewer of both
 # Red stands, blue drives: ends that differ without red and green, and nothing fades into white.
-COLOURS = LinearSegmentedColormap.from_list("speed", ["#a50f15", "#f0a202", "#2ca25f", "#08519c"])
+SPEED_COLOURS = LinearSegmentedColormap.from_list(
+    "speed", ["#a50f15", "#f0a202", "#2ca25f", "#08519c"]
+)
 
 
 @paper
 def space_time(
-    steps: pd.DataFrame, names: Sequence[str], cfg: Mapping[str, Any], every: int = EVERY
+    steps: pd.DataFrame, names: Sequence[str], cfg: Mapping[str, Any], every: int = POINT_STEPS
 ) -> Figure | None:
     """Positions over time of one sample episode, a panel per strategy (the same episode).
 
@@ -51,13 +53,13 @@ def space_time(
             continue
     most = max((len(motion.roles) for motion in found.values()), default=0)
     # Strategies that drive all of the string.
-    whole = [name for name, m in found.items() if len(m.roles) == most >= FEWEST][:WIDEST]
+    whole = [name for name, m in found.items() if len(m.roles) == most >= FEWEST][:MOST_PANELS]
     if not whole:
         return None
     speeds = np.concatenate([found[name].speed.ravel() for name in whole])
     low, top = float(speeds.min()), float(speeds.max())
     scale = (low if low > 0.3 * top else 0.0, top)  # nobody nearly stands: colours tell more
-    figure = new_figure(COLUMN if len(whole) == 1 else PAGE, 2.6)
+    figure = new_figure(COLUMN_WIDTH if len(whole) == 1 else PAGE_WIDTH, 2.6)
     axes = figure.subplots(1, len(whole), sharey=True, squeeze=False)[0]
     for axis, name in zip(axes, whole, strict=True):
         lines = _panel(axis, found[name], scale)
@@ -71,12 +73,12 @@ def space_time(
     return figure
 
 
-def _few(motion: Motion) -> bool:
+def _few(motion: SampleMotion) -> bool:
     """Whether at least half of the vehicles are people's."""
     return 2 * motion.roles.count(HUMAN) >= len(motion.roles)
 
 
-def _panel(axis: Axes, motion: Motion, scale: tuple[float, float]) -> LineCollection:
+def _panel(axis: Axes, motion: SampleMotion, scale: tuple[float, float]) -> LineCollection:
     """Draw the lines of all vehicles; return them for the scale of colours."""
     around = motion.circumference or np.inf
     shown = motion.position if np.isinf(around) else motion.position % around
@@ -89,7 +91,7 @@ def _panel(axis: Axes, motion: Motion, scale: tuple[float, float]) -> LineCollec
         if framed:
             frame = LineCollection(list(parts[whole]), colors="black", linewidths=2.0, zorder=above)
             axis.add_collection(frame)
-        lines = LineCollection(list(parts[whole]), cmap=COLOURS, linewidths=0.8, zorder=above)
+        lines = LineCollection(list(parts[whole]), cmap=SPEED_COLOURS, linewidths=0.8, zorder=above)
         lines.set_array(motion.speed[:-1, vehicle][whole])
         lines.set_clim(*scale)
         axis.add_collection(lines)

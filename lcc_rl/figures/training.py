@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lcc_rl.figures.drawing import (
-    COLUMN,
+    COLUMN_WIDTH,
     INK,
-    PAGE,
+    PAGE_WIDTH,
     colour,
     footnote,
     legend_above,
@@ -22,11 +22,13 @@ from lcc_rl.results.bootstrap import band
 from lcc_rl.results.names import in_words
 from lcc_rl.results.report import several
 
-WINDOW = 10  # iterations of the rolling mean
-BAND = f"band: 95 % interval over seeds;\nof one seed 5th to 95th percentile of {WINDOW} batches"
-SHARE = "share_"  # prefix of the columns of limits
+ROLLING = 10  # iterations of the rolling mean
+BAND_NOTE = (
+    f"band: 95 % interval over seeds;\nof one seed 5th to 95th percentile of {ROLLING} batches"
+)
+LIMIT_PREFIX = "share_"  # prefix of the columns of limits
 # What a limit's share of the time is spent in.
-LIMITS = {
+LIMIT_LABELS = {
     "safety": "unsafe time-to-collision",
     "efficiency": "long time gap",
     "gap": "long gap",
@@ -42,11 +44,11 @@ def training_figure(training: pd.DataFrame) -> Figure:
         training: rows of training.parquet of one or more runs, with ``variant``, ``seed`` and
             their settings (:func:`lcc_rl.results.load`).
     """
-    held = [name for name in map(str, training) if name.startswith(SHARE)]
+    held = [name for name in map(str, training) if name.startswith(LIMIT_PREFIX)]
     if not held:
         return learning_curve(training)
     limits = [name for name in held if training[name].fillna(0.0).any()]
-    figure = new_figure(PAGE if limits else COLUMN, 2.7)
+    figure = new_figure(PAGE_WIDTH if limits else COLUMN_WIDTH, 2.7)
     first, *others = figure.subplots(1, 1 + len(limits), squeeze=False)[0]
     draw_curves(first, training, "loss_actor")
     style(first, "training episodes", "objective, less is better")
@@ -58,7 +60,7 @@ def training_figure(training: pd.DataFrame) -> Figure:
             line.set_label("")
             values = np.asarray(line.get_ydata(), float)
             top = max(top, float(values[len(values) // 5 :].max()))
-        what = name.removeprefix(SHARE)
+        what = name.removeprefix(LIMIT_PREFIX)
         bound = training.get(f"limit_{what}")
         if bound is not None and bound.nunique() == 1:  # all runs have the same limit
             percent = 100.0 * float(bound.iloc[0])
@@ -66,9 +68,13 @@ def training_figure(training: pd.DataFrame) -> Figure:
             legend_above(axis)
             top = max(top, percent)
         axis.set_ylim(0.0, max(1.2 * top, 1e-3))
-        style(axis, "training episodes", f"{LIMITS.get(what, what)} [% of the time]")
-    never = [LIMITS.get(name.removeprefix(SHARE), name) for name in held if name not in limits]
-    footnote(figure, "\n".join([BAND, *(f"{what}: in no batch" for what in never)]))
+        style(axis, "training episodes", f"{LIMIT_LABELS.get(what, what)} [% of the time]")
+    never = [
+        LIMIT_LABELS.get(name.removeprefix(LIMIT_PREFIX), name)
+        for name in held
+        if name not in limits
+    ]
+    footnote(figure, "\n".join([BAND_NOTE, *(f"{what}: in no batch" for what in never)]))
     return figure
 
 
@@ -79,13 +85,15 @@ def learning_curve(training: pd.DataFrame) -> Figure:
     Args:
         training: rows of training.parquet of one or more runs, with ``variant`` and ``seed``.
     """
-    figure = new_figure(COLUMN, 2.7)
+    figure = new_figure(COLUMN_WIDTH, 2.7)
     axis = figure.subplots()
     floor, _ = draw_curves(axis, training, "episode_reward")
     axis.set_ylim(bottom=1.25 * floor - 0.1)
-    style(axis, "training episodes", f"mean reward per episode\n(rolling mean of {WINDOW} batches)")
+    style(
+        axis, "training episodes", f"mean reward per episode\n(rolling mean of {ROLLING} batches)"
+    )
     legend_above(axis, 1)
-    footnote(figure, BAND)
+    footnote(figure, BAND_NOTE)
     return figure
 
 
@@ -104,7 +112,7 @@ def draw_curves(axis: Axes, training: pd.DataFrame, column: str) -> tuple[float,
         if rows[column].isna().all():
             continue
         curves = rows.pivot_table(index="episodes", columns="seed", values=column).dropna()
-        smooth = curves.rolling(WINDOW, min_periods=1)
+        smooth = curves.rolling(ROLLING, min_periods=1)
         line = smooth.mean().mean(axis=1)
         count = curves.shape[1]
         if count > 1:

@@ -31,7 +31,7 @@ from lcc_rl.results.policies import load_policy
 STRING = VehicleString((AUTOMATED, HUMAN))
 COMMAND_KEY = ("command", AUTOMATED)
 PRESENT_KEY = ("behind", "present")
-MEASURED: tuple[Key, ...] = (
+MEASURED_KEYS: tuple[Key, ...] = (
     *(("leader", name) for name in ("speed", "acceleration")),
     *(("vehicles", name) for name in ("speed", "gap", "relative_speed", "acceleration")),
     *(PRESENT_KEY, SEED, STEP),
@@ -56,7 +56,7 @@ class Measured(NamedTuple):
     present: float
 
 
-def entries(rows: Sequence[Measured]) -> State:
+def state_of(rows: Sequence[Measured]) -> State:
     """Return measurements as entries of an environment, one row per vehicle."""
     table = torch.tensor(rows, dtype=torch.float32)
     seen = dict(zip(Measured._fields, table.split(1, -1), strict=True))
@@ -123,13 +123,13 @@ class Driver:
 
     def _check(self) -> None:
         for key in self.reads():
-            if key not in (*MEASURED, *self.kept):
-                known = ", ".join(".".join(key) for key in MEASURED)
+            if key not in (*MEASURED_KEYS, *self.kept):
+                known = ", ".join(".".join(key) for key in MEASURED_KEYS)
                 raise ConfigError(
                     f"{self.name} reads {'.'.join(key)}, which is not measured here, only {known}"
                 )
         none = torch.zeros(BATCH, 1).long()
-        trial = entries([Measured(*[1.0] * len(Measured._fields))] * BATCH) | {
+        trial = state_of([Measured(*[1.0] * len(Measured._fields))] * BATCH) | {
             SEED: none,
             STEP: none,
         }

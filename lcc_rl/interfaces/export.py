@@ -19,7 +19,7 @@ import torch
 
 from lcc_rl.errors import ConfigError, how_to_install, require, unknown_name
 from lcc_rl.evaluation.named import is_policy, rules
-from lcc_rl.interfaces.exported import Remembering, described, program
+from lcc_rl.interfaces.exported import Remembering, described_input, program
 from lcc_rl.interfaces.onnx_policy import MAKES, TAKES
 from lcc_rl.interfaces.ring_page import ring_page
 from lcc_rl.io.atomic import atomic_path, new_file
@@ -55,14 +55,14 @@ def export(policy: str | Path, path: str | Path, trust: Sequence[str] = ()) -> P
         >>> export("pretrained/alcc_limits", "alcc.pt2")  # doctest: +SKIP
     """
     path = new_file(path, "name")
-    if path.suffix not in FORMS:
-        raise unknown_name("ending", path.suffix, FORMS)
+    if path.suffix not in EXPORTERS:
+        raise unknown_name("ending", path.suffix, EXPORTERS)
     require(
         is_policy(str(policy)) or str(policy) not in rules(),
         f"{policy} is a rule; only a trained policy can be exported: give a run folder, a policy "
         f"file or {PRETRAINED}/<name>",
     )
-    content = FORMS[path.suffix](policy, trust)
+    content = EXPORTERS[path.suffix](policy, trust)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path
@@ -71,7 +71,7 @@ def export(policy: str | Path, path: str | Path, trust: Sequence[str] = ()) -> P
 def _program(policy: str | Path, trust: Sequence[str]) -> tuple[Any, str]:
     """Return the exported program, and what is to know about it as JSON."""
     module = program(policy, trust)
-    inputs = [described(name)._asdict() for name in module.names]
+    inputs = [described_input(name)._asdict() for name in module.names]
     own = module.policy if isinstance(module, Remembering) else module
     about: dict[str, Any] = {"policy": str(policy), "lcc_rl": __version__, "inputs": inputs}
     about |= {"output": "acceleration [m/s²]", "filter": own.safety is not None}
@@ -122,7 +122,7 @@ def _as_onnx(policy: str | Path, trust: Sequence[str]) -> bytes:
     return content
 
 
-FORMS = {".onnx": _as_onnx, ".pt2": _as_pt2, ".html": _as_page}
+EXPORTERS = {".onnx": _as_onnx, ".pt2": _as_pt2, ".html": _as_page}
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -136,7 +136,7 @@ def main(words: Sequence[str] | None = None) -> int:
     if path.suffix == ".html":
         print(f"{path}: the ring road in the browser, with {options.policy}")
         return 0
-    for item in map(described, program(options.policy, options.trust).names):
+    for item in map(described_input, program(options.policy, options.trust).names):
         print(f"  {item.name} [{item.unit}]: {item.meaning}")
     print(f"{path}: from these, in this order, the acceleration [m/s²]")
     return 0

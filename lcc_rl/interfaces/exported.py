@@ -24,7 +24,7 @@ from lcc_rl.pieces.views import VEHICLES
 from lcc_rl.results.policies import load_policy
 
 # Entries computed inside from other measurements: v_ahead − v.
-DERIVED = {
+DERIVED_INPUTS = {
     "self.relative_speed": ("ahead.speed", "self.speed"),
     "behind.relative_speed": ("self.speed", "behind.speed"),
 }
@@ -62,12 +62,12 @@ class ExportedPolicy(nn.Module):
         seen = observation.columns()
         needed = [name for column in seen for name in column]
         needed += FILTER_READS if safety is not None else ()
-        flat = [base for name in needed for base in DERIVED.get(name, (name,))]
+        flat = [base for name in needed for base in DERIVED_INPUTS.get(name, (name,))]
         self.names = list(dict.fromkeys(flat))
         self.columns = [[self._places(name) for name in column] for column in seen]
 
     def _places(self, name: str) -> tuple[int, ...]:
-        bases = DERIVED.get(name, (name,))
+        bases = DERIVED_INPUTS.get(name, (name,))
         if name == "behind.relative_speed" and BEHIND_PRESENT in self.names:
             bases = (*bases, BEHIND_PRESENT)
         return tuple(self.names.index(base) for base in bases)
@@ -103,7 +103,7 @@ class Remembering(nn.Module):
         self.policy, memory = policy, policy.memory
         self.repeat = memory.depth if memory.stacked else memory.repeat
         self.width = 1 + memory.counted * self.repeat
-        flat = [base for name in memory.sources for base in DERIVED.get(name, (name,))]
+        flat = [base for name in memory.sources for base in DERIVED_INPUTS.get(name, (name,))]
         names = [name for name in policy.names if not name.startswith(REMEMBERED)]
         self.names = list(dict.fromkeys([*names, *flat]))
 
@@ -111,7 +111,8 @@ class Remembering(nn.Module):
         """Return the acceleration to command, and the memory of the next step."""
         measured = dict(zip(self.names, state.split(1, -1), strict=True))
         pairs = (
-            [measured[x] for x in DERIVED.get(name, (name,))] for name in self.policy.memory.sources
+            [measured[x] for x in DERIVED_INPUTS.get(name, (name,))]
+            for name in self.policy.memory.sources
         )
         now = torch.cat([one - other[0] if other else one for one, *other in pairs], -1)
         begun, kept = memory.split((1, self.width - 1), -1)
@@ -122,7 +123,7 @@ class Remembering(nn.Module):
         return acceleration, torch.cat([torch.ones_like(begun), kept], -1)
 
 
-def described(name: str) -> Input:
+def described_input(name: str) -> Input:
     """Return name, unit and meaning of a measurement such as ``"ahead.speed"``."""
     view, entry = name.split(".")[:2]
     whose = {"self": "own", "ahead": "of the vehicle ahead", "behind": "of the vehicle behind"}

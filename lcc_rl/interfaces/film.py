@@ -12,7 +12,7 @@ from lcc_rl.errors import require
 from lcc_rl.figures.animation import road_picture
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import RolePlaces, StringMotion
-from lcc_rl.results.motion import Motion
+from lcc_rl.results.motion import SampleMotion
 
 
 class Film:
@@ -54,7 +54,7 @@ class Film:
             others = iter(sorted(roles, key=AUTOMATED.__eq__))
             roles = tuple(AUTOMATED if i in own else next(others) for i in range(len(string)))
         leader = None if string.ring else ahead
-        return road_picture(Motion(time, roles, speed, gap, front, leader, length, around))
+        return road_picture(SampleMotion(time, roles, speed, gap, front, leader, length, around))
 
     def _look(self, *key: str) -> Any:
         """Return an entry of the present state."""

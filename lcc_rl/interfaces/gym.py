@@ -22,16 +22,16 @@ from lcc_rl.envs.factory import make_env
 from lcc_rl.envs.rowwise import Array
 from lcc_rl.errors import ConfigError, require, unknown_name
 
-VARIANTS = ("alcc", "reference", "own_energy")
-TERMS, MASK = "reward_terms", "reset_mask"
-LARGEST = 1e6  # beyond every speed [m/s], gap [m] and time [s] of a string, scaled
+GYM_VARIANTS = ("alcc", "reference", "own_energy")
+TERMS_INFO, MASK_OPTION = "reward_terms", "reset_mask"
+LARGEST_SCALED = 1e6  # beyond every speed [m/s], gap [m] and time [s] of a string, scaled
 MODES = ["rgb_array"]
-FIRST = np.zeros(1, np.int64)  # the place of the only episode
+FIRST_EPISODE = np.zeros(1, np.int64)  # the place of the only episode
 
 
 def register() -> None:
     """Register ``lcc_rl/alcc-v0``, ``lcc_rl/reference-v0`` and ``lcc_rl/own_energy-v0``."""
-    for variant in VARIANTS:
+    for variant in GYM_VARIANTS:
         if (name := f"lcc_rl/{variant}-v0") not in gymnasium.registry:
             gymnasium.register(
                 id=name,
@@ -92,7 +92,7 @@ def _options(options: Any) -> dict[str, Any]:
 def _spaces(episodes: ArrayEpisodes) -> tuple[Box, Box]:
     """Return the spaces of observation and action (a share of 3 m/s²)."""
     shape = episodes.observation.shape[1:]
-    return Box(-LARGEST, LARGEST, shape, np.float32), Box(-1.0, 1.0, (1,), np.float32)
+    return Box(-LARGEST_SCALED, LARGEST_SCALED, shape, np.float32), Box(-1.0, 1.0, (1,), np.float32)
 
 
 class CarFollowing(gymnasium.Env[Array, Array]):
@@ -140,7 +140,7 @@ class CarFollowing(gymnasium.Env[Array, Array]):
             ConfigError: naming the seed or the option and its range; nothing changes then.
         """
         seed = checked_seed(seed)
-        observation = self.episodes.reset(FIRST, [seed], _options(options))[0]
+        observation = self.episodes.reset(FIRST_EPISODE, [seed], _options(options))[0]
         super().reset(seed=seed)
         self.running = True
         return observation, {}
@@ -152,7 +152,7 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         results = self.episodes.step([action])
         reward, terminated, truncated, *terms = results[0].tolist()
         self.running = not (terminated or truncated)
-        info = {TERMS: dict(zip(self.episodes.terms, terms, strict=True))}
+        info = {TERMS_INFO: dict(zip(self.episodes.terms, terms, strict=True))}
         return self.episodes.observation[0], reward, bool(terminated), bool(truncated), info
 
     def render(self) -> Any:
@@ -231,10 +231,12 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
                 :meth:`CarFollowing.reset`; nothing changes then.
         """
         options, count = _options(options), self.num_envs
-        mask = np.asarray(options.pop(MASK, [True] * count), np.object_)
+        mask = np.asarray(options.pop(MASK_OPTION, [True] * count), np.object_)
         truths = all(isinstance(each, bool | np.bool_) for each in mask.flat)
         if mask.shape != (count,) or not truths or not mask.any():
-            raise ConfigError(f"{MASK} must be {count} truth values, one true, got {mask.tolist()}")
+            raise ConfigError(
+                f"{MASK_OPTION} must be {count} truth values, one true, got {mask.tolist()}"
+            )
         seeds, places = _seeds(seed, count), np.flatnonzero(mask)
         observation = self.episodes.reset(places, seeds, options)
         super().reset(seed=seeds[0])
@@ -254,11 +256,11 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
         ends = results[:, 1:3] > 0.0
         done: Any = ends.any(1)
         info: dict[str, Any] = {
-            TERMS: dict(zip(self.episodes.terms, results[:, 3:].T, strict=True))
+            TERMS_INFO: dict(zip(self.episodes.terms, results[:, 3:].T, strict=True))
         }
         same = self.mode == AutoresetMode.SAME_STEP
         if same and done.any():
-            final = {TERMS: info[TERMS], f"_{TERMS}": done}
+            final = {TERMS_INFO: info[TERMS_INFO], f"_{TERMS_INFO}": done}
             info |= {"final_obs": observation, "_final_obs": done}
             info |= {"final_info": final, "_final_info": done}
             observation = self.episodes.reset(np.flatnonzero(done))

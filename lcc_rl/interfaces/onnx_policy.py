@@ -28,10 +28,10 @@ from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import Positive, Settings, given_as, parse
 
 ABOUT = "lcc_rl"  # key of the metadata
-STATE, MEMORY = TAKES = ("state", "memory")
+STATE_INPUT, MEMORY_INPUT = TAKES = ("state", "memory")
 MAKES = ("acceleration", "next_memory")
 # What a program may read, and its unit: entries of a vehicle and of its neighbours.
-MEASURED = {
+INPUT_UNITS = {
     f"{view}.{key[1]}": entry.unit
     for view in (SELF, AHEAD, BEHIND)
     for key, entry in declared(Piece).items()
@@ -48,13 +48,13 @@ class ProgramInput(Settings):
     meaning: str = ""
 
     def validate(self) -> None:
-        if self.name not in MEASURED:
+        if self.name not in INPUT_UNITS:
             raise ValueError(
                 f"{self.name!r} is not measured: expected self, ahead or behind and an entry of "
                 "a vehicle, such as ahead.speed; what a program remembers is its input memory"
             )
-        if self.unit != MEASURED[self.name]:
-            raise ValueError(f"{self.name} is in {MEASURED[self.name]}, got {self.unit!r}")
+        if self.unit != INPUT_UNITS[self.name]:
+            raise ValueError(f"{self.name} is in {INPUT_UNITS[self.name]}, got {self.unit!r}")
 
 
 class ProgramFacts(Settings):
@@ -108,17 +108,17 @@ class Program:
         """Check names, types and widths of inputs and outputs; return the width of the memory."""
         takes, makes = self.session.get_inputs(), self.session.get_outputs()
         names = [[one.name for one in side] for side in (takes, makes)]
-        count = 1 + (MEMORY in names[0])
+        count = 1 + (MEMORY_INPUT in names[0])
         wanted = [list(TAKES[:count]), list(MAKES[:count])]
         shapes = {one.name: one.shape for one in takes}
-        state, memory = shapes.get(STATE, []), shapes.get(MEMORY, ["batch", 0])
+        state, memory = shapes.get(STATE_INPUT, []), shapes.get(MEMORY_INPUT, ["batch", 0])
         right = names == wanted and len(memory) == 2 and isinstance(memory[1], int)
         right = right and len(state) == 2 and state[1] == len(self.names)
         if not right or any(one.type != "tensor(float)" for one in (*takes, *makes)):
             raise ResultsError(
-                f"{self.path}: expected the input {STATE} [batch, {len(self.names)}], maybe "
-                f"{MEMORY} [batch, n], and the outputs {' and '.join(MAKES[:count])}, in single "
-                f"precision; got {names[0]} of {list(shapes.values())}, {names[1]}"
+                f"{self.path}: expected the input {STATE_INPUT} [batch, {len(self.names)}], maybe "
+                f"{MEMORY_INPUT} [batch, n], and the outputs {' and '.join(MAKES[:count])}, in "
+                f"single precision; got {names[0]} of {list(shapes.values())}, {names[1]}"
             )
         return int(memory[1])
 

@@ -32,8 +32,8 @@ from lcc_rl.pieces.controllers import stream_name
 from lcc_rl.pieces.drivers import DriverModel
 from lcc_rl.settings import values
 
-TASK = ("variant=alcc", "task=ring-22")
-RULES = ("follower_stopper", "pi_saturation")
+RING_TASK = ("variant=alcc", "task=ring-22")
+RING_RULES = ("follower_stopper", "pi_saturation")
 # What the page computes.
 LAYERS, VIEWS = (nn.Linear, nn.ReLU, nn.Tanh), ("self", "ahead", "behind", "memory")
 
@@ -56,10 +56,10 @@ def ring_page(policy: str | Path, trust: Sequence[str] = ()) -> str:
 
 def page_data(policy: str | Path, trust: Sequence[str] = ()) -> dict[str, Any]:
     """Return all numbers of the page; arguments as of :func:`ring_page`."""
-    cfg = load("evaluate", TASK)
+    cfg = load("evaluate", RING_TASK)
     scenario, energy = cfg.scenario, build_energy(cfg).models[0]
     assert isinstance(energy, CirclesFuel)
-    rules = {name: Driver(name, scenario.time_step).pieces[0] for name in RULES}
+    rules = {name: Driver(name, scenario.time_step).pieces[0] for name in RING_RULES}
     return {
         "policy": str(policy),
         "time_step": scenario.time_step,

@@ -20,10 +20,10 @@ from unittest.mock import patch
 import torch
 
 from lcc_rl.errors import ConfigError, Diverged, how_to_install
-from lcc_rl.interfaces.driver import PRESENT_KEY, Driver, Measured, entries
+from lcc_rl.interfaces.driver import PRESENT_KEY, Driver, Measured, state_of
 from lcc_rl.pieces.base import SEED, STEP, State
 
-EXACT, RELEASED = 0, -1.0  # SUMO's speed mode without checks, and the speed that releases
+UNCHECKED, RELEASED = 0, -1.0  # SUMO's speed mode without checks, and the speed that releases
 
 
 def load_sumo() -> Any:
@@ -104,9 +104,9 @@ class Bridge:
             return {}
         for car, row in measured.items():
             if car not in self.driven:
-                self._take(car, entries([row]))
+                self._take(car, state_of([row]))
         before = {key: torch.cat([self.driven[car][key] for car in measured]) for key in self.keys}
-        wanted, after = self.driver(entries(list(measured.values())) | before, before)
+        wanted, after = self.driver(state_of(list(measured.values())) | before, before)
         after |= {SEED: before[SEED], STEP: before[STEP] + 1}
         commands = dict(zip(measured, wanted.tolist(), strict=True))
         for car, acceleration in commands.items():
@@ -133,7 +133,7 @@ class Bridge:
     def _set(self, car: str, speed: float) -> None:
         if car not in self.modes:
             self.modes[car] = self.sumo.vehicle.getSpeedMode(car)
-            self.sumo.vehicle.setSpeedMode(car, EXACT)
+            self.sumo.vehicle.setSpeedMode(car, UNCHECKED)
         self.sumo.vehicle.setSpeed(car, max(speed, 0.0))
 
     def _release(self, car: str, present: bool) -> None:

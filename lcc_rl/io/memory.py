@@ -13,11 +13,11 @@ from lcc_rl.errors import ConfigError
 if TYPE_CHECKING:
     import torch
 
-PROCESS, MEMORY, GROUPS = Path("/proc/self/cgroup"), Path("/proc/meminfo"), Path("/sys/fs/cgroup")
+PROCESS, MEMINFO, GROUPS = Path("/proc/self/cgroup"), Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 # Of a control group: files of its limit and its use, and the line of memory.stat on file pages.
 VERSION_1 = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 VERSION_2 = ("memory.max", "memory.current", "inactive_file")
-UNITS = ("B", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB")
+SIZE_UNITS = ("B", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB")
 
 
 def require_memory(needs: Mapping[str, float], device: torch.device | str = "cpu") -> None:
@@ -72,14 +72,14 @@ def available(device: torch.device | str = "cpu") -> int | None:
 def amount(size: float) -> str:
     """Return a number of bytes with its unit, e.g. ``"1.9 TiB"``."""
     place = 0
-    while size >= 1000 and place < len(UNITS) - 1:
+    while size >= 1000 and place < len(SIZE_UNITS) - 1:
         size, place = size / 1024, place + 1
-    return f"{size:.2g} {UNITS[place]}" if size < 100 else f"{size:.0f} {UNITS[place]}"
+    return f"{size:.2g} {SIZE_UNITS[place]}" if size < 100 else f"{size:.0f} {SIZE_UNITS[place]}"
 
 
 def _of_system() -> Iterator[int]:
     with suppress(OSError, ValueError, IndexError):
-        _, _, after = MEMORY.read_text("utf-8").partition("MemAvailable:")
+        _, _, after = MEMINFO.read_text("utf-8").partition("MemAvailable:")
         yield int(after.split()[0]) * 1024
         return
     with suppress(OSError, ValueError, AttributeError):  # no such name, or no such system

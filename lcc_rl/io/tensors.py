@@ -15,7 +15,7 @@ from lcc_rl.errors import ResultsError
 from lcc_rl.io.atomic import atomic_path
 
 # Of what is stored here: weights, sums in double precision, counters, flags.
-KINDS = (torch.float32, torch.float64, torch.int64, torch.bool)
+TENSOR_TYPES = (torch.float32, torch.float64, torch.int64, torch.bool)
 
 
 def write_torch(content: Any, path: str | Path) -> None:
@@ -93,7 +93,7 @@ def check_like(found: Any, wanted: Any, name: str) -> None:
         for place, value in enumerate(found):
             check_like(value, None, f"{name}[{place}]")
     elif isinstance(found, Tensor):
-        if found.dtype not in KINDS:
+        if found.dtype not in TENSOR_TYPES:
             raise ValueError(f"{name} is of type {found.dtype}")
         if not bool(torch.isfinite(found).all()):
             raise ValueError(f"{name} holds values that are no numbers")

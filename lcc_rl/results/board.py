@@ -15,12 +15,12 @@ from lcc_rl.results import measures, render
 from lcc_rl.results.bootstrap import LEAST_DRIVES
 from lcc_rl.results.measures import FINAL_SPREAD, FLOW, MEASURES, Shown
 from lcc_rl.results.names import in_words
-from lcc_rl.results.render import MISSING, markdown_row, saved, signed
+from lcc_rl.results.render import DASH, markdown_row, saved_text, signed
 from lcc_rl.results.report import FLOW_LOST, FLOW_NAMED
 from lcc_rl.results.task import Task
 
-Row = Mapping[str, Any]
-COLUMNS = (
+BoardRow = Mapping[str, Any]
+BOARD_COLUMNS = (
     Shown("where", "task, leaders"),
     Shown("score", "score"),
     Shown("saved", "saved [%]\nagainst"),
@@ -31,8 +31,8 @@ COLUMNS = (
     Shown("kept", "limits\nkept"),
 )
 HEAD = ["leaders", "driven by", "saved [%]", "flow [1/h]", "flow [%]", "limits not kept"]
-SHARE = ("saving", "saving_low", "saving_high")
-COPIED = ("score", *SHARE, "distance_lost", FLOW, FLOW_LOST, "string_ratio", FINAL_SPREAD)
+SAVED_SHARE = ("saving", "saving_low", "saving_high")
+COPIED = ("score", *SAVED_SHARE, "distance_lost", FLOW, FLOW_LOST, "string_ratio", FINAL_SPREAD)
 
 
 def row_of(
@@ -70,12 +70,12 @@ def _number(value: Any) -> float | None:
     return float(f"{value:.7g}") if np.isfinite(value) else None
 
 
-def score_table(who: str, rows: Sequence[Row]) -> Table:
+def score_table(who: str, rows: Sequence[BoardRow]) -> Table:
     """Return rows as a table for the terminal, within 80 characters."""
     lines: list[dict[str, str]] = []
     for row in rows:
         if not lines or row["task"] not in (line["where"] for line in lines):
-            lines.append(dict.fromkeys((column.key for column in COLUMNS), ""))
+            lines.append(dict.fromkeys((column.key for column in BOARD_COLUMNS), ""))
             against = in_words(row["against"])
             lines[-1] |= {"where": row["task"], "score": unit_of(row), "saved": against}
         lines.append({"where": f"  {row['source']}", **_cells(row)})
@@ -84,25 +84,25 @@ def score_table(who: str, rows: Sequence[Row]) -> Table:
         "windows where there are fewer than five drives, too narrow if one drive has several; "
         "score.json has every limit and value."
     )
-    return render.as_rich(pd.DataFrame(lines), COLUMNS, in_words(who), caption)
+    return render.as_rich(pd.DataFrame(lines), BOARD_COLUMNS, in_words(who), caption)
 
 
-def unit_of(row: Row) -> str:
+def unit_of(row: BoardRow) -> str:
     """Return the unit of a row's score."""
     return str(row["unit"] or ("m/s" if row["measure"].endswith("_mps") else "–"))
 
 
-def _cells(row: Row) -> dict[str, str]:
+def _cells(row: BoardRow) -> dict[str, str]:
     """Return the cells of a row as text."""
-    share = [np.nan if row[key] is None else 100.0 * row[key] for key in SHARE]
+    share = [np.nan if row[key] is None else 100.0 * row[key] for key in SAVED_SHARE]
     ratio, flow, lost = row["string_ratio"], row[FLOW], row[FLOW_LOST]
     return {
         "score": f"{row['score']:.2f}",
-        "saved": saved(*share),
+        "saved": saved_text(*share),
         "distance": signed(-100.0 * row["distance_lost"]),
-        "flow": MISSING if flow is None else f"{flow:,.0f}",
-        "flow_pct": MISSING if lost is None else signed(-100.0 * lost),
-        "ratio": MISSING if ratio is None else f"{ratio:.2f}",
+        "flow": DASH if flow is None else f"{flow:,.0f}",
+        "flow_pct": DASH if lost is None else signed(-100.0 * lost),
+        "ratio": DASH if ratio is None else f"{ratio:.2f}",
         "drives": str(row["drives"]),
         "kept": "yes" if row["kept"] else ",\n".join(broken(row)),
     }
@@ -139,7 +139,7 @@ def check_alike(documents: Mapping[str, Mapping[str, Any]]) -> None:
     Raises:
         ConfigError: naming the file, the row, and what differs, or contradicts itself.
     """
-    first: dict[tuple[str, str], Row] = {}
+    first: dict[tuple[str, str], BoardRow] = {}
     files: dict[tuple[str, str, str], str] = {}
     for file, document in documents.items():
         for row in document["results"]:
@@ -162,18 +162,18 @@ def check_alike(documents: Mapping[str, Mapping[str, Any]]) -> None:
                 )
 
 
-def check_row(row: Row, where: str) -> None:
+def check_row(row: BoardRow, where: str) -> None:
     """Check that what a row says agrees with its own numbers; ``where`` names it.
 
     Raises:
         ConfigError: saying what does not.
     """
-    numbers = [row.get("score"), *(row[key] for key in SHARE)]
+    numbers = [row.get("score"), *(row[key] for key in SAVED_SHARE)]
     numbers += [limit[key] for limit in row["limits"].values() for key in ("bound", "value")]
     for number in numbers:
         good = number is None or (isinstance(number, int | float) and isfinite(number))
         require(good, f"{where}: expected numbers, got {number!r}")
-    value, low, high = (row[key] for key in SHARE)
+    value, low, high = (row[key] for key in SAVED_SHARE)
     inside = value is None or low is None or low <= value <= high
     require(inside, f"{where}: the saving {value} is not within its interval {low} … {high}")
     wrong = broken(row)
@@ -183,13 +183,13 @@ def check_row(row: Row, where: str) -> None:
     )
 
 
-def _sample(row: Row) -> str:
+def _sample(row: BoardRow) -> str:
     return (
         f"{row['drives']} drives" if row["drives"] >= LEAST_DRIVES else f"{row['windows']} windows"
     )
 
 
-def _markdown(row: Row) -> list[str]:
+def _markdown(row: BoardRow) -> list[str]:
     """Return saving, flow, and the limits that are not kept.
 
     A saving is bold where all limits are kept, and a flow where much of it is lost.
@@ -201,7 +201,7 @@ def _markdown(row: Row) -> list[str]:
     return [share, cells["flow"], flow, ", ".join(broken(row))]
 
 
-def broken(row: Row) -> list[str]:
+def broken(row: BoardRow) -> list[str]:
     """Return the limits that are not kept, by their first words, and the number of collisions."""
     found = [f"{row['collisions']} coll."] if row["collisions"] else []
     for name, limit in row["limits"].items():

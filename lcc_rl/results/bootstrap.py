@@ -8,16 +8,17 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from lcc_rl.arrays import Floats
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
 LEAST_DRIVES = 5  # fewer tell too little of how drives differ
-SEED = 0  # of the resampling: the same rows give the same interval
-ALONE = -1  # stream of seeds that are resampled without windows
+RESAMPLING_SEED = 0  # of the resampling: the same rows give the same interval
+WITHOUT_WINDOWS = -1  # stream of seeds that are resampled without windows
 
-Array = NDArray[np.float64]
-Side = Mapping[str, Array]  # columns of one side of a comparison, each ``[..., windows, seeds]``
+Side = Mapping[str, Floats]  # columns of one side of a comparison, each ``[..., windows, seeds]``
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,9 @@ def estimate(
     value = float(statistic(*({key: x.mean((-2, -1)) for key, x in one.items()} for one in sides)))
     if not np.isfinite(value) or max(n for one in sides for n in _sizes(one)) < 2:
         return Estimate(value)
-    streams = [ALONE if alone else 1 if paired else side for side in range(1, len(sides) + 1)]
+    streams = [
+        WITHOUT_WINDOWS if alone else 1 if paired else side for side in range(1, len(sides) + 1)
+    ]
     drawn = (
         {key: resampled(x, stream, drives) for key, x in one.items()}
         for one, stream in zip(sides, streams, strict=True)
@@ -88,34 +91,34 @@ def _sizes(side: Side) -> tuple[int, ...]:
     return next(iter(side.values())).shape[-2:]
 
 
-def resampled(table: Array, stream: int, drives: Sequence[object] | None = None) -> Array:
+def resampled(table: Floats, stream: int, drives: Sequence[object] | None = None) -> Floats:
     """Return the resampled means of ``[..., windows, seeds]``; a stream draws its own seeds."""
     drawn = drawn_windows(table.shape[-2], drives) @ table
-    return np.asarray((drawn * weights(table.shape[-1], stream)).sum(-1))
+    return np.asarray((drawn * resample_weights(table.shape[-1], stream)).sum(-1))
 
 
-def drawn_windows(count: int, drives: Sequence[object] | None = None) -> Array:
+def drawn_windows(count: int, drives: Sequence[object] | None = None) -> Floats:
     """Return the weights of windows in every resample, ``[RESAMPLES, count]``; of whole drives."""
     if drives is None or len(set(drives)) < LEAST_DRIVES:
-        return weights(count, 0)
+        return resample_weights(count, 0)
     names = {name: code for code, name in enumerate(dict.fromkeys(drives))}
-    drawn = weights(len(names), 0)[:, [names[name] for name in drives]]
+    drawn = resample_weights(len(names), 0)[:, [names[name] for name in drives]]
     return np.asarray(drawn / drawn.sum(1, keepdims=True))
 
 
 @lru_cache(maxsize=8)  # a table asks for the same ones again and again
-def weights(count: int, stream: int) -> Array:
+def resample_weights(count: int, stream: int) -> Floats:
     """Return the weights of ``count`` units in every resample, ``[RESAMPLES, count]``."""
-    if stream == ALONE:
-        drawn = np.random.default_rng(SEED).integers(0, count, (RESAMPLES, count))
+    if stream == WITHOUT_WINDOWS:
+        drawn = np.random.default_rng(RESAMPLING_SEED).integers(0, count, (RESAMPLES, count))
         drawn += count * np.arange(RESAMPLES)[:, None]
         times = np.bincount(drawn.ravel(), minlength=RESAMPLES * count)
         return times.reshape(RESAMPLES, count) / count
-    draws, generator = max(count - 1, 1), np.random.default_rng([SEED, stream])
+    draws, generator = max(count - 1, 1), np.random.default_rng([RESAMPLING_SEED, stream])
     return generator.multinomial(draws, np.full(count, 1.0 / count), RESAMPLES) / draws
 
 
-def bounds(values: Array) -> Array:
+def bounds(values: Floats) -> Floats:
     """Return the bounds of an interval from resampled values, ``[2, ...]``, by percentiles."""
     tail = (1.0 - CONFIDENCE) / 2.0
     return np.asarray(np.quantile(values, [tail, 1.0 - tail], axis=-1))
@@ -136,13 +139,13 @@ def _only(side: Side) -> Any:
     return side[""]
 
 
-def band(curves: Array) -> Array:
+def band(curves: Floats) -> Floats:
     """Return the bounds of the mean over seeds at every point of a curve, ``[2, points]``.
 
     Args:
         curves: ``[points, seeds]``, at least two seeds.
     """
-    return bounds(curves @ weights(curves.shape[1], ALONE)[: RESAMPLES // 9].T)
+    return bounds(curves @ resample_weights(curves.shape[1], WITHOUT_WINDOWS)[: RESAMPLES // 9].T)
 
 
 def share_saved(value: Any, baseline: Any) -> Any:

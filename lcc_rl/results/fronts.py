@@ -18,8 +18,8 @@ from lcc_rl.results.bootstrap import Estimate, Side, estimate, share_saved
 from lcc_rl.results.measures import FLOW, LONG_GAPS, PATH
 from lcc_rl.results.windows import DISTANCE, DRIVE
 
-KINDS = ["variant", "policy"]
-ENERGY, SHARE = PATH, LONG_GAPS
+FRONT_KINDS = ["variant", "policy"]
+ENERGY, LONG_SHARE = PATH, LONG_GAPS
 # Of a fleet.
 NET = "total_net_energy_kj"
 FLEET = NET, DISTANCE, FLOW
@@ -41,7 +41,7 @@ def front(windows: pd.DataFrame, kind: Sequence[str], columns: Sequence[str]) ->
         ResultsError: if it is missing, or lacks a window or seed at one of its limits.
     """
     name = " ".join(kind)
-    rows = windows[(windows[KINDS] == list(kind)).all(axis=1)]
+    rows = windows[(windows[FRONT_KINDS] == list(kind)).all(axis=1)]
     if rows.empty:
         raise ResultsError(f"there are no trainings of {name}")
     axes = ["limit", "profile_id", "training_seed"]
@@ -103,19 +103,19 @@ def saving_at(
     """
 
     def measure(*curves: Curve) -> float:
-        return float(share_saved(*(energy_at(x[ENERGY], x[SHARE], at) for x in curves)))
+        return float(share_saved(*(energy_at(x[ENERGY], x[LONG_SHARE], at) for x in curves)))
 
-    return compare_fronts(windows, one, other, (ENERGY, SHARE), measure)
+    return compare_fronts(windows, one, other, (ENERGY, LONG_SHARE), measure)
 
 
-def per_distance(curve: Curve) -> NDArray[np.float64]:
+def energy_per_distance(curve: Curve) -> NDArray[np.float64]:
     """Return the energy per distance, ``[limits]``."""
     return curve[NET] / curve[DISTANCE]
 
 
-def saved(point: Curve, baseline: Curve) -> float:
+def fleet_saved(point: Curve, baseline: Curve) -> float:
     """Return the share of a baseline's energy per distance that a fleet saves."""
-    return float(share_saved(per_distance(point)[0], per_distance(baseline)[0]))
+    return float(share_saved(energy_per_distance(point)[0], energy_per_distance(baseline)[0]))
 
 
 def flow_gained(point: Curve, baseline: Curve) -> float:
@@ -129,13 +129,13 @@ def saved_at_flow(point: Curve, rule: Curve) -> float:
     NaN if the front does not reach that flow.
     """
     order = np.argsort(rule[FLOW])
-    spent, flow = per_distance(rule)[order], rule[FLOW][order]
+    spent, flow = energy_per_distance(rule)[order], rule[FLOW][order]
     rival = np.interp(point[FLOW][0], flow, spent, left=np.nan, right=np.nan)
-    return float(share_saved(per_distance(point)[0], rival))
+    return float(share_saved(energy_per_distance(point)[0], rival))
 
 
 def points(windows: pd.DataFrame) -> pd.DataFrame:
     """Return one row per kind of controller and limit: means over windows and seeds."""
-    rows = windows.groupby([*KINDS, "limit"], sort=False)
+    rows = windows.groupby([*FRONT_KINDS, "limit"], sort=False)
     table = rows.mean(numeric_only=True).drop(columns=["training_seed", "profile_id"])
     return table.assign(seeds=rows["training_seed"].nunique()).reset_index()

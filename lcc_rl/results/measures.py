@@ -23,7 +23,7 @@ TTC, LONG_GAPS = "share_ttc_unsafe", "share_time_gap_long_moving"
 SHORT_NAMES = {TTC: "unsafe_ttc_pct", LONG_GAPS: "long_time_gap_pct"}  # of columns of short tables
 BARE, TURNED = "share_ttc_unpromised", "share_turned_unsafe"
 SPEED_STD, FINAL_SPREAD = "speed_std_mps", "final_speed_spread_mps"
-LEAST, SHARE, PERCENT = "≥", "share_", "{:.2%}"
+AT_LEAST, SHARE, PERCENT = "≥", "share_", "{:.2%}"
 
 
 class Shown(NamedTuple):
@@ -92,7 +92,7 @@ class Measure:
 
     def keeps(self, value: float, bound: float) -> bool:
         """Whether a limit is kept; NaN, the value of a vehicle that does not exist, keeps it."""
-        return not (value < bound if LEAST in self.limit else value > bound)
+        return not (value < bound if AT_LEAST in self.limit else value > bound)
 
     def bounded(self, bound: float) -> str:
         """Return a limit in words, with line breaks as in the heading of a column."""

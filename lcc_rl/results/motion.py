@@ -15,12 +15,12 @@ from lcc_rl.errors import ResultsError
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING, parse_string
 from lcc_rl.settings import TARGET
 
-Series = NDArray[np.float64]
-EPISODE_COLUMNS = ("profile", "driver_id", "repeat")  # columns by which sample episodes differ
+MotionSeries = NDArray[np.float64]
+SAMPLE_KEYS = ("profile", "driver_id", "repeat")  # columns by which sample episodes differ
 
 
 @dataclass(frozen=True)
-class Motion:
+class SampleMotion:
     """One sample episode of one strategy.
 
     Args:
@@ -35,28 +35,28 @@ class Motion:
         circumference: of a ring [m]; None on an open road.
     """
 
-    time: Series
+    time: MotionSeries
     roles: tuple[str, ...]
-    speed: Series
-    gap: Series
-    front: Series
-    leader: Series | None
+    speed: MotionSeries
+    gap: MotionSeries
+    front: MotionSeries
+    leader: MotionSeries | None
     length: float
     circumference: float | None
 
     @property
-    def position(self) -> Series:
+    def position(self) -> MotionSeries:
         """Front bumper of every vehicle, ``[T, N]`` [m]."""
-        found: Series = self.front[:, None] - np.cumsum(self.gap + self.length, axis=1)
+        found: MotionSeries = self.front[:, None] - np.cumsum(self.gap + self.length, axis=1)
         return found
 
     @property
-    def ahead(self) -> Series:
+    def ahead(self) -> MotionSeries:
         """Speed of the vehicle ahead of each, ``[T, N]`` [m/s]."""
         first = self.speed[:, -1] if self.leader is None else self.leader
         return np.column_stack([first, self.speed[:, :-1]])
 
-    def at(self, moments: slice) -> Motion:
+    def at(self, moments: slice) -> SampleMotion:
         """Return the motion at some moments only."""
         return replace(
             self,
@@ -86,7 +86,7 @@ def sample_episodes(steps: pd.DataFrame, strategy: str) -> dict[str, pd.DataFram
     else:
         if rows["training_seed"].notna().any():
             rows = rows[rows["training_seed"] == rows["training_seed"].min()]
-        keys = [name for name in EPISODE_COLUMNS if name in rows]
+        keys = [name for name in SAMPLE_KEYS if name in rows]
         groups = rows.groupby(keys, sort=False)
         found = {f"profile {key[0]}, driver {key[1]}": part for key, part in groups}
     if not found:
@@ -105,7 +105,7 @@ def telling(steps: pd.DataFrame) -> pd.DataFrame:
     return steps[(steps[keys] == list(chosen)).all(axis=1)]
 
 
-def motion_of(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Motion:
+def motion_of(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> SampleMotion:
     """Return the motion of one sample episode.
 
     Positions follow from the gaps behind the leader; on a ring from those behind the first
@@ -125,14 +125,14 @@ def motion_of(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Motion:
     if scenario["road"] == RING:
         front = np.cumsum(speed[:, 0] * step) + gap[:, 0] + length
         around = float(scenario["circumference"])
-        return Motion(time, roles, speed, gap, front, None, length, around)
+        return SampleMotion(time, roles, speed, gap, front, None, length, around)
     if leader is None:
         raise ResultsError("the sample episode has no leader")
     front = np.cumsum(leader * step)
-    return Motion(time, roles, speed, gap, front, leader, length, None)
+    return SampleMotion(time, roles, speed, gap, front, leader, length, None)
 
 
-Found = tuple[Series, Series | None, Series, Series, tuple[str, ...]]
+Found = tuple[MotionSeries, MotionSeries | None, MotionSeries, MotionSeries, tuple[str, ...]]
 
 
 def _of_platoon(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:

@@ -7,11 +7,18 @@ import pandas as pd
 from lcc_rl.config.words import FILTERED
 
 # A column's unit by the end of its name.
-UNITS = {"kj_per_km": "kJ/km", "mps3": "m/s³", "mps": "m/s", "pct": "%", "kj": "kJ", "ms": "ms"}
-UNITS |= {"m": "m", "s": "s", "vph": "1/h", "g_per_km": "g/km"}
+SUFFIX_UNITS = {
+    "kj_per_km": "kJ/km",
+    "mps3": "m/s³",
+    "mps": "m/s",
+    "pct": "%",
+    "kj": "kJ",
+    "ms": "ms",
+}
+SUFFIX_UNITS |= {"m": "m", "s": "s", "vph": "1/h", "g_per_km": "g/km"}
 INITIALS = ("cav", "hdv", "ttc", "sd")
 HUMAN, NETWORK = "human", "alcc"
-ALONE = "constant_filtered"
+FILTER_ALONE = "constant_filtered"
 # Who learns, or has several gains: further words of a name, if any, say which.
 SEVERAL = {
     "reference": "network, for itself",
@@ -26,7 +33,7 @@ WHO = SEVERAL | {
     "idm": "one driver (IDM)",
     HUMAN: "simulated drivers",
     "recorded": "the recorded drivers",
-    ALONE: "safety filter alone",
+    FILTER_ALONE: "safety filter alone",
     "idm_acc": "tuned IDM",
     "acc": "tuned ACC",
     "mpc": "MPC",
@@ -71,7 +78,7 @@ def heading(column: str) -> str:
         >>> heading("total_energy_kj"), heading("cav_saving_pct")
         ('total energy [kJ]', 'CAV saving [%]')
     """
-    suffix = next((end for end in UNITS if column.endswith(f"_{end}")), "")
+    suffix = next((end for end in SUFFIX_UNITS if column.endswith(f"_{end}")), "")
     words = (column.removesuffix(f"_{suffix}") if suffix else column).split("_")
     text = " ".join(word.upper() if word in INITIALS else word for word in words)
-    return f"{text} [{UNITS[suffix]}]" if suffix else text
+    return f"{text} [{SUFFIX_UNITS[suffix]}]" if suffix else text

@@ -20,7 +20,7 @@ from lcc_rl.runs.states import CONFIG, no_run, run_folders
 from lcc_rl.settings import Settings, parse
 
 PRETRAINED = "pretrained"
-SHIPPED = Path(str(files("lcc_rl.assets"))) / PRETRAINED
+SHIPPED_POLICIES = Path(str(files("lcc_rl.assets"))) / PRETRAINED
 # Variants that build on the policy of another one.
 BUILDS_ON = {"hcfs": "ddpg"}
 S = TypeVar("S", bound=Settings)
@@ -73,7 +73,7 @@ def save_policy(weights: Mapping[str, Any], cfg: StudyConfig, path: Path) -> Non
 
 def of_task(path: str, task: str | None) -> str:
     """Return the policy that ships for a task where ``"pretrained"`` is asked and there is one."""
-    if path == PRETRAINED and task is not None and (SHIPPED / f"{task}.pt").is_file():
+    if path == PRETRAINED and task is not None and (SHIPPED_POLICIES / f"{task}.pt").is_file():
         return f"{PRETRAINED}/{task}"
     return path
 
@@ -84,9 +84,9 @@ def pretrained_path(variant: str) -> Path:
     Raises:
         ConfigError: if none does.
     """
-    path = SHIPPED / f"{BUILDS_ON.get(variant, variant)}.pt"
+    path = SHIPPED_POLICIES / f"{BUILDS_ON.get(variant, variant)}.pt"
     if not path.is_file():
-        names = sorted(file.stem for file in SHIPPED.glob("*.pt"))
+        names = sorted(file.stem for file in SHIPPED_POLICIES.glob("*.pt"))
         raise ConfigError(
             f"no pretrained policy ships for {variant}, only for {', '.join(names)}; train one "
             "(lcc-rl train) and give its folder"

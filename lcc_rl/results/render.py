@@ -20,11 +20,11 @@ from lcc_rl.results.names import heading, in_words
 from lcc_rl.results.report import Report
 from lcc_rl.runs.output import PLAIN
 
-MISSING = "–"
-WIDTH, WIDEST = 80, 10_000  # characters
+DASH = "–"
+WIDTH, UNLIMITED = 80, 10_000  # characters
 
 
-class Column(NamedTuple):
+class TableColumn(NamedTuple):
     """A column of a table as text: its heading, its cells, and whether it holds numbers."""
 
     heading: str
@@ -42,7 +42,7 @@ def signed(value: float, form: str = "+z.1f") -> str:
     return f"{value:{form}}".replace("-", "−")
 
 
-def columns(frame: pd.DataFrame) -> list[Column]:
+def columns(frame: pd.DataFrame) -> list[TableColumn]:
     """Return the columns of a table as text.
 
     A column's unit is the end of its name (``energy_kj``, ``saving_pct``), and ``x``, ``x_low``,
@@ -51,7 +51,7 @@ def columns(frame: pd.DataFrame) -> list[Column]:
     """
     bounds = {f"{name}{end}" for name in frame for end in ("_low", "_high")}
     return [
-        Column(heading(name), column_cells(frame, name), _is_number(frame[name]))
+        TableColumn(heading(name), column_cells(frame, name), _is_number(frame[name]))
         for name in map(str, frame)
         if name not in bounds
     ]
@@ -82,7 +82,7 @@ def as_latex(frame: pd.DataFrame) -> str:
     cells = pd.DataFrame({column.heading: column.cells for column in shown})
     places = "".join("r" if column.number else "l" for column in shown)
     text = cells.to_latex(index=False, escape=True, column_format=places).rstrip()
-    return text.replace("−", "$-$").replace(" … ", " to ").replace(MISSING, "--")
+    return text.replace("−", "$-$").replace(" … ", " to ").replace(DASH, "--")
 
 
 def column_cells(frame: pd.DataFrame, name: str) -> list[str]:
@@ -93,7 +93,7 @@ def column_cells(frame: pd.DataFrame, name: str) -> list[str]:
         return cells
     low, high = ([_cell(x, places) for x in frame[f"{name}_{end}"]] for end in ("low", "high"))
     return [
-        cell if MISSING in ends else f"{cell} ({' … '.join(ends)})"
+        cell if DASH in ends else f"{cell} ({' … '.join(ends)})"
         for cell, *ends in zip(cells, low, high, strict=True)
     ]
 
@@ -122,7 +122,7 @@ def _cell(value: object, places: int) -> str:
         return f"{value:,}"
     if isinstance(value, (float, np.floating)) and np.isfinite(value):
         return signed(float(value), f"z,.{places}f")  # no negative zero
-    return value if isinstance(value, str) else MISSING
+    return value if isinstance(value, str) else DASH
 
 
 def terminal(report: Report, title: str = "", full: bool = False) -> RenderableType:
@@ -156,13 +156,13 @@ def _short_cells(table: pd.DataFrame, name: str) -> list[str]:
     if f"{name}_low" not in table:
         return column_cells(table, name)
     bounds = zip(*(table[f"{name}{end}"] for end in ("", "_low", "_high")), strict=True)
-    return [saved(*row) for row in bounds]
+    return [saved_text(*row) for row in bounds]
 
 
-def saved(share: float, low: float, high: float) -> str:
+def saved_text(share: float, low: float, high: float) -> str:
     """Return a saving [%] with sign and interval."""
     if pd.isna(share):
-        return MISSING
+        return DASH
     within = "" if pd.isna(low) else f" ({low:.1f} … {high:.1f})"
     return f"{share:+.1f}{within}".replace("-", "−")
 
@@ -173,7 +173,7 @@ def full_rows(report: Report) -> Iterator[tuple[str, list[str]]]:
         values = report.table[one.key].astype(float)
         if values.notna().any():
             known = zip(report.table[one.key], np.isfinite(values), strict=True)
-            cells = (one.form.format(x) if k else MISSING for x, k in known)
+            cells = (one.form.format(x) if k else DASH for x, k in known)
             yield one.label, [cell.replace("-", "−") for cell in cells]
 
 
@@ -230,10 +230,12 @@ def chosen(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
     return table[list(dict.fromkeys(kept))]
 
 
-def show(table: RenderableType) -> None:
+def print_table(table: RenderableType) -> None:
     """Print a table or a text, as wide as the terminal or ``COLUMNS``; else as its content."""
     console = Console()
     if not console.is_terminal and "COLUMNS" not in os.environ:
-        wide = Console(width=WIDEST).measure(table).maximum  # a console measures within its width
+        wide = (
+            Console(width=UNLIMITED).measure(table).maximum
+        )  # a console measures within its width
         console = Console(width=max(wide, console.width))
     console.print(table)

@@ -30,13 +30,13 @@ from lcc_rl.results.measures import (
 )
 from lcc_rl.results.names import HUMAN, NETWORK, in_words
 from lcc_rl.results.task import Task
-from lcc_rl.results.units import burns_one_fuel, check_unit, per_distance
+from lcc_rl.results.units import burns_one_fuel, check_unit, in_unit
 from lcc_rl.results.windows import DISTANCE, DRIVE, TRAINED, WAYS, savings, windows_of
 
 # Whom tables compare with, and whom the verdict compares a network with: the first that there is.
 AGAINST = (HUMAN, "idm", "idm_acc_filtered", "idm_acc", "rule", "reference")
 RULE = "rule"  # the IDM tuned on the same data, by the gradient
-RULES = (RULE, "idm_acc_filtered", "idm_acc")
+RULE_ROWS = (RULE, "idm_acc_filtered", "idm_acc")
 # Strategies that networks are compared with. All but the rule learn nothing.
 UNTRAINED = (
     *("direct", "idm", HUMAN, "recorded", "constant_filtered", RULE),
@@ -191,7 +191,7 @@ def score_of(task: Task, part: pd.DataFrame, energy: Fleet | None) -> float:
     if not task.measure.per or energy is None:
         return value
     check_unit(task.unit, energy)
-    return per_distance(value, task.unit, energy)
+    return in_unit(value, task.unit, energy)
 
 
 def report(
@@ -268,7 +268,7 @@ def _of_energy(table: pd.DataFrame, energy: Fleet | None, filtered: bool) -> dic
     columns |= {one.shown.key: (one.scale * cars[one.key]).round(2) for one in short}
     shown = [Shown("energy_kj_per_km", "energy\n[kJ/km]")]
     if energy is not None and burns_one_fuel(energy):
-        columns["fuel_g_per_km"] = cars[PATH_PER_KM] * per_distance(1.0, "g/km", energy)
+        columns["fuel_g_per_km"] = cars[PATH_PER_KM] * in_unit(1.0, "g/km", energy)
         shown.append(Shown("fuel_g_per_km", "fuel\n[g/km]"))
     shown += [] if against is None else [SAVED, WAY]
     shown += [*(one.shown for one in short), COLLISIONS]
@@ -352,10 +352,10 @@ def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> 
     """
     cars = found[found[PATH].notna()].to_dict("records")
     rows: dict[str, Any] = {str(row["strategy"]): row for row in cars}
-    other = next((name for name in (*RULES, HUMAN) if name in rows), None)
+    other = next((name for name in (*RULE_ROWS, HUMAN) if name in rows), None)
     if other is None:
         return ""
-    learned = [name for name, row in rows.items() if row["seeds"] and name not in RULES]
+    learned = [name for name, row in rows.items() if row["seeds"] and name not in RULE_ROWS]
     names = [NETWORK] if NETWORK in rows else learned
     words = []
     for name in names:
@@ -363,7 +363,7 @@ def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> 
             words.append(_sentence(windows, rows, name, other))
         elif of_few:
             both = (f"{rows[x][PATH_PER_KM]:,.1f} kJ ({in_words(x)})" for x in (name, other))
-            few = f"{counted(count)} allow no finding."
+            few = f"{counted_windows(count)} allow no finding."
             words.append(f"Per vehicle and km: {', '.join(both)}; {few}")
     least = min(rows, key=lambda name: rows[name][PATH_PER_KM])
     # It may be a rule of the user's own.
@@ -449,7 +449,7 @@ def several(count: int, what: str) -> str:
     return f"{count} {what}{'s' * (count != 1)}"
 
 
-def counted(windows: int, which: str = "") -> str:
+def counted_windows(windows: int, which: str = "") -> str:
     """Return a number of windows in words, ``which`` such as ``"held-out "``."""
     return several(windows, f"{which}window")
 
@@ -458,7 +458,7 @@ def sample_of(rows: pd.DataFrame, drivers: pd.DataFrame | None = None) -> str:
     """Return how many windows and drivers rows are of, for a title."""
     windows, people = rows["profile_id"].nunique(), (rows if drivers is None else drivers)
     size = several(people["driver_id"].nunique(), "driver")
-    return f"{counted(windows, 'held-out ')} × {size}"
+    return f"{counted_windows(windows, 'held-out ')} × {size}"
 
 
 def few_windows(windows: int, seconds: float | None = None) -> str:
@@ -470,5 +470,5 @@ def few_windows(windows: int, seconds: float | None = None) -> str:
     """
     if windows >= FEW_WINDOWS or windows * (seconds or 0.0) >= SHORT:
         return ""
-    found = counted(windows) + (f" of {seconds:g} s" if seconds else "")
+    found = counted_windows(windows) + (f" of {seconds:g} s" if seconds else "")
     return f"{found}: these numbers show that everything runs, and mean nothing else"

@@ -24,7 +24,7 @@ EPISODES = "episodes.parquet"  # a run's last file: with it the run is finished
 STEPS = "steps.parquet"
 PARTS, FINAL = ".parts", "evaluation"  # of a job of lcc-rl run: its parts' settings; its last part
 # What no command of other settings may replace: results, and what a stopped run resumes from.
-KEPT = (EPISODES, "drivers.parquet", "checkpoint.pt", "command.txt", "blocks")
+RUN_FILES = (EPISODES, "drivers.parquet", "checkpoint.pt", "command.txt", "blocks")
 
 
 def save_config(cfg: BaseConfig, folder: Path) -> None:
@@ -47,7 +47,7 @@ def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:
     stored = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else {}
     if stored and not {"seed", "data"} <= stored.keys():
         raise ResultsError(f"{folder} holds a {CONFIG} of something else; choose another folder")
-    kept = [name for name in KEPT if (folder / name).exists()]
+    kept = [name for name in RUN_FILES if (folder / name).exists()]
     if not kept:
         return
     keys = differing(dict(flatten(stored)), dict(flatten(as_plain(cfg))))
@@ -117,7 +117,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
+def naming_run(path: Path) -> Iterator[None]:
     """Name a run, or a table, whose rows or settings are not what their reader expects.
 
     Raises:

@@ -8,10 +8,10 @@ from lcc_rl.errors import ConfigError, unknown_name
 KJ_PER_WH = 3.6
 MPG = 235.215  # miles per US gallon times litres per 100 km
 ELECTRIC = {"kJ/km": 1.0, "Wh/km": 1.0 / KJ_PER_WH}
-UNITS = (*ELECTRIC, "g/km", "L/100km", "mpg")
+ENERGY_UNITS = (*ELECTRIC, "g/km", "L/100km", "mpg")
 
 
-def per_distance(kj_per_km: float, unit: str, energy: Fleet) -> float:
+def in_unit(kj_per_km: float, unit: str, energy: Fleet) -> float:
     """Convert energy per distance [kJ/km] to one of :data:`UNITS`.
 
     Args:
@@ -35,8 +35,8 @@ def per_distance(kj_per_km: float, unit: str, energy: Fleet) -> float:
 
 def check_unit(unit: str, energy: Fleet) -> None:
     """Check that a unit is known and means something for all vehicles, see :func:`per_distance`."""
-    if unit not in UNITS:
-        raise unknown_name("unit (task.unit)", unit, UNITS)
+    if unit not in ENERGY_UNITS:
+        raise unknown_name("unit (task.unit)", unit, ENERGY_UNITS)
     if unit not in ELECTRIC and not burns_one_fuel(energy):
         raise ConfigError(
             f"task.unit={unit} needs vehicles that all burn one fuel; these burn several, or some "

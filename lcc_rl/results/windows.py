@@ -16,13 +16,13 @@ from lcc_rl.results.bootstrap import NOTHING, Estimate, saving, share_saved
 from lcc_rl.results.runs import EPISODES
 
 WINDOWS, DRIVERS = "windows.parquet", "drivers.parquet"
-KEYS = ["profile_id", "driver_id"]
+PAIR_KEYS = ["profile_id", "driver_id"]
 REPEAT = "repeat"  # which draw of the noise of its profile and driver a row is of, if several
 DRIVE = "drive"  # what a row's window is cut from; windows of one are alike
 SOURCE = "source"  # of a row's leader, if a mixture has several
 LEADER_COLUMNS = ("leader_path_energy_kj", "leader_speed_mps")
 STRATEGY, TRAINED = "strategy", "training_seed"
-WINDOW = [STRATEGY, TRAINED, "profile_id"]
+WINDOW_KEYS = [STRATEGY, TRAINED, "profile_id"]
 PER_WINDOW = ["profile", SOURCE, DRIVE]  # the same in all rows of a window
 WAYS = ("cav_distance_m", "hdv_distance_m")  # of all vehicles
 DISTANCE, DAMPING = "distance_m", "damping_time_s"
@@ -52,7 +52,7 @@ def windows_of(rows: Rows, columns: Sequence[str] = ()) -> pd.DataFrame:
         contain the least or the largest value. ``episodes`` is the number of rows, ``collisions``
         of those that collided, ``worst_share_…`` the largest share of an episode.
     """
-    return fold(rows, [*WINDOW, *PER_WINDOW], columns)
+    return fold(rows, [*WINDOW_KEYS, *PER_WINDOW], columns)
 
 
 def fold(rows: Rows, by: Sequence[str], columns: Sequence[str] = ()) -> pd.DataFrame:
@@ -115,7 +115,7 @@ def _sums(frame: pd.DataFrame, by: Sequence[str], columns: Sequence[str]) -> pd.
     """Return sums, counts and ends of columns by keys."""
     numbers = [str(name) for name in frame.select_dtypes(["number", "bool"])]
     names = [
-        name for name in columns or numbers if name in numbers and name not in (*KEYS, TRAINED)
+        name for name in columns or numbers if name in numbers and name not in (*PAIR_KEYS, TRAINED)
     ]
     if not columns:
         shares = [name for name in names if name.startswith("share_")]
@@ -210,7 +210,7 @@ def savings(
     if TRAINED not in chosen:
         chosen = chosen.assign(**{TRAINED: np.nan})
     ways = [name for name in per if name in rows]
-    groups = chosen.groupby([*WINDOW[:2], "profile_id"], dropna=False, sort=False)
+    groups = chosen.groupby([*WINDOW_KEYS[:2], "profile_id"], dropna=False, sort=False)
     means = groups[list(dict.fromkeys([column, *ways]))].mean().reset_index()
     means[TRAINED] = means[TRAINED].astype(object).fillna(-1)
     means["way"] = means[ways].sum(axis=1) if ways else 1.0

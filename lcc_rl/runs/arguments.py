@@ -12,7 +12,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from lcc_rl.errors import ConfigError
 
-WIDTH = 79
+HELP_WIDTH = 79
 FINITE = ConfigDict(allow_inf_nan=False)
 
 
@@ -31,7 +31,9 @@ class Arguments(ArgumentParser):
 def wrapped(text: str) -> str:
     """Return a text whose paragraphs fit 80 columns; those with commands stay as they are."""
     parts = text.strip().split("\n\n")
-    prose = [part if "lcc-rl " in part else fill(" ".join(part.split()), WIDTH) for part in parts]
+    prose = [
+        part if "lcc-rl " in part else fill(" ".join(part.split()), HELP_WIDTH) for part in parts
+    ]
     return "\n\n".join(prose)
 
 

@@ -20,7 +20,7 @@ def check_columns(columns: dict[str, Any]) -> dict[str, Any]:
     return columns
 
 
-Columns = Annotated[dict[str, Any], AfterValidator(check_columns)]
+RecordColumns = Annotated[dict[str, Any], AfterValidator(check_columns)]
 
 
 class Checkpoint(Settings):
@@ -30,8 +30,8 @@ class Checkpoint(Settings):
     iteration: Whole
     updates: Whole
     agent: dict[str, Any]
-    rows: Columns  # the record, an entry per iteration
-    times: Columns
+    rows: RecordColumns  # the record, an entry per iteration
+    times: RecordColumns
     memory: dict[str, Any]
 
     def validate(self) -> None:

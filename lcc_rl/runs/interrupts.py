@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 
 # Exit codes.
 BAD_INPUT, INTERRUPTED = 2, 130
-SIGNALS = (
+ENDING_SIGNALS = (
     signal.SIGINT,
     signal.SIGTERM,
     *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []),
@@ -29,7 +29,7 @@ def _end(*_: Any) -> NoReturn:
 
 def end_quietly() -> None:
     """Exit with one line instead of a traceback while a command is still importing."""
-    for kind in SIGNALS:
+    for kind in ENDING_SIGNALS:
         # A shell may have started this process in the background with SIGINT ignored.
         if signal.getsignal(kind) is not signal.SIG_IGN:
             signal.signal(kind, _end)
@@ -41,7 +41,7 @@ def _handled_by(
 ) -> Iterator[None]:
     """Let signals call ``action(signal, restore)`` in the main thread; restore them at the end."""
     main = threading.current_thread() is threading.main_thread()
-    before = {kind: signal.getsignal(kind) for kind in SIGNALS} if main else {}
+    before = {kind: signal.getsignal(kind) for kind in ENDING_SIGNALS} if main else {}
 
     def restore() -> None:
         for kind, previous in before.items():

@@ -17,8 +17,8 @@ from lcc_rl.errors import ConfigError, how_to_install
 from lcc_rl.results.runs import CONFIG, flatten, read_settings
 from lcc_rl.settings import Settings
 
-Row = Mapping[str, float]
-MARK = "lcc_rl.id"
+TrainingRow = Mapping[str, float]
+RUN_TAG = "lcc_rl.id"
 NOT_MLFLOW = re.compile(r"[^\w\-. :/]")  # signs that names of its parameters may not have
 
 
@@ -26,7 +26,7 @@ class Silent:
     """Logs nothing; training.parquet holds the rows."""
 
     @contextmanager
-    def opened(self, folder: Path) -> Iterator[Callable[[Row], None]]:
+    def opened(self, folder: Path) -> Iterator[Callable[[TrainingRow], None]]:
         """Yield a function that ignores a row."""
         yield lambda row: None
 
@@ -46,7 +46,7 @@ class RowLogger(Settings):
     offline: bool = True  # wandb keeps its files on this machine until wandb sync
 
     @contextmanager
-    def opened(self, folder: Path) -> Iterator[Callable[[Row], None]]:
+    def opened(self, folder: Path) -> Iterator[Callable[[TrainingRow], None]]:
         """Yield a function that logs a row at its iteration."""
         with self._run(folder) as send:
             yield lambda row: send(_numbers(row), step=int(row["iteration"]))
@@ -98,12 +98,12 @@ def _of_mlflow(
 
     mlflow.set_tracking_uri(address)
     experiment = mlflow.set_experiment(project).experiment_id
-    chosen = f"tags.`{MARK}` = '{run_id}'"
+    chosen = f"tags.`{RUN_TAG}` = '{run_id}'"
     for run in mlflow.search_runs([experiment], chosen, output_format="list"):
         mlflow.start_run(run.info.run_id)
         break
     else:
-        mlflow.start_run(run_name=name, tags={MARK: run_id})
+        mlflow.start_run(run_name=name, tags={RUN_TAG: run_id})
         values = {NOT_MLFLOW.sub("_", key)[:250]: str(x)[:500] for key, x in flatten(settings)}
         mlflow.log_params(values)
     return mlflow.log_metrics, mlflow.end_run

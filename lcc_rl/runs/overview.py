@@ -14,7 +14,7 @@ from lcc_rl.runs.output import PLAIN
 from lcc_rl.runs.progress import clock
 from lcc_rl.runs.states import STATES, RunState, survey
 
-COLOURS = {"finished": "green", "running": "cyan", "stopped": "yellow", "failed": "red"}
+STATE_COLOURS = {"finished": "green", "running": "cyan", "stopped": "yellow", "failed": "red"}
 URGENCY = ("running", "failed", "stopped", "finished")
 
 
@@ -41,7 +41,7 @@ def remaining(states: Sequence[RunState], planned: int = 0) -> float | None:
     return max(max(own), (sum(own) + later) / len(running))
 
 
-def headline(root: Path, states: Sequence[RunState], planned: int) -> str:
+def overview_line(root: Path, states: Sequence[RunState], planned: int) -> str:
     """Return a summary of the folder in one line."""
     numbers = counts(states, planned)
     parts = [f"{count} {kind}" for kind, count in numbers.items() if count]
@@ -62,7 +62,9 @@ def progress(state: RunState) -> str:
     return f"{state.done}/{state.total}" if state.total else ""
 
 
-def draw(root: Path, states: Sequence[RunState], planned: int, most: int | None = None) -> Group:
+def states_table(
+    root: Path, states: Sequence[RunState], planned: int, most: int | None = None
+) -> Group:
     """Return the runs as a table for a terminal.
 
     Args:
@@ -77,14 +79,14 @@ def draw(root: Path, states: Sequence[RunState], planned: int, most: int | None 
     for heading in ("state", "iteration", "left"):
         table.add_column(heading)
     for state in shown[:most]:
-        colour = COLOURS[state.state]
+        colour = STATE_COLOURS[state.state]
         kind = f"[{colour}]{state.state}[/]"
         # An error below the name, where it has room.
         name = f"{state.name}\n  {state.error}" if state.error else state.name
         table.add_row(escape(name), kind, progress(state), left(state))
     if most and len(shown) > most:
         table.add_row(f"… {len(shown) - most} more")
-    return Group(table, escape(headline(root, states, planned)))
+    return Group(table, escape(overview_line(root, states, planned)))
 
 
 def live(root: Path, planned: Callable[[], int], console: Console, every: float = 2.0) -> Live:
@@ -92,6 +94,6 @@ def live(root: Path, planned: Callable[[], int], console: Console, every: float 
 
     def picture() -> Group:
         # Seven lines: heading, borders and summary; a long error may still wrap.
-        return draw(root, survey(root), planned(), max(1, console.height - 7))
+        return states_table(root, survey(root), planned(), max(1, console.height - 7))
 
     return Live(get_renderable=picture, console=console, refresh_per_second=1 / every)

@@ -11,7 +11,7 @@ from lcc_rl.io.memory import torch_device
 
 log = logging.getLogger("lcc_rl")
 
-SINGLE = 1e-4  # relative error beyond which products are no longer single precision
+SINGLE_PRECISION = 1e-4  # relative error beyond which products are no longer single precision
 
 
 def prepare_torch(cfg: BaseConfig) -> torch.device:
@@ -42,7 +42,7 @@ def set_precision(name: str) -> float:
     if name == "highest":
         return best
     error = product_error()
-    report = log.info if error < SINGLE else log.warning
+    report = log.info if error < SINGLE_PRECISION else log.warning
     report("matmul_precision=%s: relative error %.1g, at the highest %.1g", name, error, best)
     return error
 

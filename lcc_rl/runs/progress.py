@@ -183,7 +183,7 @@ class ProgressReporter:
             temporary.write_text(json.dumps(state), encoding="utf-8")
 
 
-def watch(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> None:
+def watch_jobs(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> None:
     """Show the progress of jobs in other processes until all are done or one fails.
 
     Args:

@@ -28,12 +28,12 @@ from lcc_rl.io.atomic import SUBFOLDERS, atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json, read_text
 from lcc_rl.runs.interrupts import was_interrupted
 
-LOCK, ERROR, PROGRESS, HYDRA = ".lock", "error.txt", "progress.json", ".hydra"
+LOCK, ERROR, PROGRESS, HYDRA_FOLDER = ".lock", "error.txt", "progress.json", ".hydra"
 # The table that a run writes last: a training or evaluation, a calibration.
-RESULTS = ("episodes.parquet", "drivers.parquet")
+RESULT_TABLES = ("episodes.parquet", "drivers.parquet")
 CONFIG = "config.yaml"
-MARKS = {CONFIG, ERROR, LOCK, *RESULTS}
-NAMED = 3  # runs or tables that a message names
+MARKS = {CONFIG, ERROR, LOCK, *RESULT_TABLES}
+MOST_NAMED = 3  # runs or tables that a message names
 STATES = ("finished", "running", "stopped", "failed")
 
 
@@ -139,7 +139,7 @@ def forget(folder: Path) -> None:
 
 def withdraw(folders: Sequence[Path]) -> None:
     """Remove the folder of a run that did not begin, and those above it, if they hold no more."""
-    if _holds_only(folders[0], {HYDRA, ERROR, LOCK}):
+    if _holds_only(folders[0], {HYDRA_FOLDER, ERROR, LOCK}):
         shutil.rmtree(folders[0])
         with suppress(OSError):  # one that holds something else
             for folder in folders[1:]:
@@ -149,7 +149,9 @@ def withdraw(folders: Sequence[Path]) -> None:
 def clean(root: Path) -> list[Path]:
     """Remove the folders of failed runs that hold neither rows nor a state; return them."""
     failed = [root / run.name for run in survey(root) if run.state == "failed"]
-    empty = [run for run in failed if _holds_only(run, {HYDRA, ERROR, LOCK, CONFIG, PROGRESS})]
+    empty = [
+        run for run in failed if _holds_only(run, {HYDRA_FOLDER, ERROR, LOCK, CONFIG, PROGRESS})
+    ]
     for folder in empty:
         shutil.rmtree(folder)
     return empty
@@ -169,21 +171,21 @@ def record(folder: Path, error: BaseException) -> None:
     """
     if was_interrupted(error):
         return
-    text = described(error) + "\n"
+    text = described_error(error) + "\n"
     if not isinstance(input_error(error) or error, (LccError, OSError)):
         text += "\n" + "".join(traceback.format_exception(error))
     with suppress(ResultsError), atomic_path(folder / ERROR) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
-def described(error: BaseException) -> str:
+def described_error(error: BaseException) -> str:
     """Return an error as one line; its type comes first unless it is an input error."""
     return one_line(str(input_error(error) or f"{type(error).__name__}: {error}"))
 
 
 def is_finished(folder: Path) -> bool:
     """Whether a run's folder holds the table that is written last."""
-    return any((folder / table).exists() for table in RESULTS)
+    return any((folder / table).exists() for table in RESULT_TABLES)
 
 
 def inspect_run(folder: Path, name: str | None = None) -> RunState:
@@ -230,7 +232,7 @@ def run_folders(root: Path) -> list[Path]:
     found = []
     # A folder that cannot be listed may be a run, whose state says so.
     for place, folders, files in os.walk(root, onerror=lambda e: found.append(Path(e.filename))):
-        is_run = bool(MARKS.intersection(files)) or HYDRA in folders
+        is_run = bool(MARKS.intersection(files)) or HYDRA_FOLDER in folders
         own = SUBFOLDERS if is_run else ()
         folders[:] = sorted(x for x in folders if not x.startswith(".") and x not in own)
         if is_run:
@@ -248,8 +250,8 @@ def no_run(folder: Path) -> ConfigError:
     text = f"{folder}: not a run folder: it has no {CONFIG}"
     for what, found in (("run", runs), ("table", tables)):
         if found:
-            names = ", ".join(str(path.relative_to(folder)) for path in found[:NAMED])
-            more = f" … ({len(found)})" if len(found) > NAMED else ""
+            names = ", ".join(str(path.relative_to(folder)) for path in found[:MOST_NAMED])
+            more = f" … ({len(found)})" if len(found) > MOST_NAMED else ""
             text += f"; it holds the {what}{'s' * (len(found) > 1)} {names}{more}"
     if runs:
         text += f"; lcc_rl.results.load({str(folder)!r}) reads all runs"

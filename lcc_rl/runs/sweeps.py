@@ -31,7 +31,16 @@ from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json
 from lcc_rl.runs.interrupts import BAD_INPUT, was_interrupted
 from lcc_rl.runs.overview import live
-from lcc_rl.runs.states import CONFIG, Busy, busy, described, is_claimed, no_run, record, survey
+from lcc_rl.runs.states import (
+    CONFIG,
+    Busy,
+    busy,
+    described_error,
+    is_claimed,
+    no_run,
+    record,
+    survey,
+)
 
 log = logging.getLogger("lcc_rl")
 
@@ -203,7 +212,7 @@ def limit_batches(config: DictConfig) -> None:
 
 
 @dataclass(frozen=True)
-class Plan:
+class SweepPlan:
     """Plan of a sweep.
 
     Args:
@@ -215,7 +224,7 @@ class Plan:
     varied: list[str] = field(default_factory=list)
 
 
-def make_plan(config: DictConfig) -> Plan:
+def make_plan(config: DictConfig) -> SweepPlan:
     """Return the plan of a sweep's configuration."""
     typed = [str(item) for item in config.hydra.overrides.task]
     params = config.hydra.sweeper.get("params") or {}
@@ -224,16 +233,16 @@ def make_plan(config: DictConfig) -> Plan:
     swept = {item.get_key_element(): item for item in parsed if item.is_sweep_override()}
     varied = [key_of(key) for key in swept]
     values = (islice(item.sweep_string_iterator(), MOST_RUNS + 1) for item in swept.values())
-    return Plan(math.prod(sum(1 for _ in some) for some in values), varied)
+    return SweepPlan(math.prod(sum(1 for _ in some) for some in values), varied)
 
 
-def read_plan(folder: Path) -> Plan:
+def read_plan(folder: Path) -> SweepPlan:
     """Return the plan of the sweep in a folder, an empty one if there is none."""
     try:
-        plan = Plan(**read_json(folder / PLAN))
-        return Plan(int(plan.runs), [str(key) for key in plan.varied])
+        plan = SweepPlan(**read_json(folder / PLAN))
+        return SweepPlan(int(plan.runs), [str(key) for key in plan.varied])
     except (ResultsError, ValueError, TypeError, OverflowError):
-        return Plan()
+        return SweepPlan()
 
 
 def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path) -> Any:
@@ -257,7 +266,7 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
         if was_interrupted(error):  # the interrupt broke into a library, which made it this error
             raise KeyboardInterrupt from error
         record(folder, error)
-        log.error("%s failed: %s", folder.name, described(error))
+        log.error("%s failed: %s", folder.name, described_error(error))
         return None
 
 

@@ -30,20 +30,29 @@ from lcc_rl.studies.alcc import results as alcc_results
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.hcfs import results as hcfs_results
 from lcc_rl.studies.hcfs import study as hcfs
-from lcc_rl.studies.results import PAGE, StudyResults
+from lcc_rl.studies.results import RESULTS_PAGE, StudyResults
 from lcc_rl.studies.study import Study
 
 log = logging.getLogger("lcc_rl")
 
-GIVEN = ("seed", "variant")
+SET_BY_STUDY = ("seed", "variant")
 # What the folder of a study holds.
-MADE = {PAGE, "calibration", "train", "ablations", "evaluation", "tables", "figures", "ddpg"}
+MADE = {
+    RESULTS_PAGE,
+    "calibration",
+    "train",
+    "ablations",
+    "evaluation",
+    "tables",
+    "figures",
+    "ddpg",
+}
 MADE |= {f"{name}.parquet" for name in ("trajectories", "episodes", "steps", "training")}
-OWN = (
+OWN_FOLDER_WORDS = (
     "every run has its own; --seeds is their number, counted from 0, and options of this command "
     "choose the variants"
 )
-RESULTS: dict[str, Callable[..., StudyResults]] = {
+STUDY_RESULTS: dict[str, Callable[..., StudyResults]] = {
     "alcc": alcc_results.study_results,
     "hcfs": hcfs_results.study_results,
     "ring": ring.study_results,
@@ -77,7 +86,7 @@ def parser() -> ArgumentParser:
     commands = top.add_subparsers(required=True, dest="study")
     one = _trained(commands, "alcc", "Adaptive Leading Cruise Control (arXiv 2210.02147)")
     one.set_defaults(run=run_alcc)
-    _listing(one, "--parts", alcc.PARTS, "which parts to run: " + ",".join(alcc.PARTS))
+    _listing(one, "--parts", alcc.STUDY_PARTS, "which parts to run: " + ",".join(alcc.STUDY_PARTS))
     names = f"all by default: {','.join(alcc.ABLATIONS)}; or your own as name:override"
     _listing(one, "--ablations", (), f"which ablations; {names}")
     two = _trained(commands, "hcfs", "Hybrid Car-Following Strategy (IEEE T-ASE 2021)")
@@ -116,12 +125,12 @@ def main(words: list[str]) -> int:
     arguments, overrides = top.parse_known_args(words)
     if wrong := [item for item in overrides if item.startswith("-")]:
         top.error(f"unknown: {' '.join(wrong)}")
-    check_overrides(overrides, GIVEN, OWN)
+    check_overrides(overrides, SET_BY_STUDY, OWN_FOLDER_WORDS)
     arguments.overrides = overrides
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     arguments.out = own_folder(arguments.out, "--out", MADE.issuperset)
     with claim(arguments.out):
         arguments.run(arguments)
-        RESULTS[arguments.study](arguments.out, arguments.formats)
-    log.info("tables and figures: %s", arguments.out / PAGE)
+        STUDY_RESULTS[arguments.study](arguments.out, arguments.formats)
+    log.info("tables and figures: %s", arguments.out / RESULTS_PAGE)
     return 0

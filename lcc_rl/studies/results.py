@@ -14,7 +14,7 @@ from lcc_rl.io.files import write_parquet
 from lcc_rl.results.names import worded
 from lcc_rl.results.render import as_markdown
 
-PAGE = "results.md"
+RESULTS_PAGE = "results.md"
 
 
 class StudyResults:
@@ -47,7 +47,7 @@ class StudyResults:
         Raises:
             ResultsError: if the page cannot be written.
         """
-        with atomic_path(self.folder / PAGE) as temporary:
+        with atomic_path(self.folder / RESULTS_PAGE) as temporary:
             text = "\n\n".join([f"# {title}", *self.blocks])
             temporary.write_text(f"{text}\n", encoding="utf-8")
-        return self.folder / PAGE
+        return self.folder / RESULTS_PAGE

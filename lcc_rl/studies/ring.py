@@ -19,7 +19,7 @@ from lcc_rl.results.render import signed
 from lcc_rl.results.runs import EPISODES, STEPS, stored_config
 from lcc_rl.studies.results import StudyResults
 
-EVALUATION = "evaluation"
+RING_EVALUATION = "evaluation"
 HUMAN = "human"
 RIVALS = ("follower_stopper", "pi_saturation")
 SETTINGS = (
@@ -29,7 +29,7 @@ SETTINGS = (
     "evaluation.humans_first=300",
     "scenario.horizon=3000",
 )
-TITLE = "One automated car on a ring"
+RING_TITLE = "One automated car on a ring"
 # Stern et al., Transportation Research C 89 (2018), experiment A: FollowerStopper in 22 cars.
 FIELD = {"driven by": "field experiment", "speeds against humans": "−80.8 %", "fuel": "−42.5 %"}
 
@@ -44,7 +44,7 @@ def run(folder: Path, overrides: Sequence[str]) -> None:
     Raises:
         LccError: one clear error for wrong settings or files.
     """
-    complete(load("evaluate", [*SETTINGS, *overrides]), folder / EVALUATION)
+    complete(load("evaluate", [*SETTINGS, *overrides]), folder / RING_EVALUATION)
 
 
 def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
@@ -57,7 +57,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     Raises:
         ResultsError: if a table is missing or cannot be read.
     """
-    place = folder / EVALUATION
+    place = folder / RING_EVALUATION
     rows, steps = (read_parquet(place / name) for name in (EPISODES, STEPS))
     cfg, found = stored_config(place), StudyResults(folder, formats)
     first = cfg["evaluation"]["humans_first"]
@@ -68,7 +68,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
         figure = space_time(steps, [name], cfg)
         if figure is not None:
             found.figure(name.replace("/", "_"), in_words(name), figure)
-    found.write(TITLE)
+    found.write(RING_TITLE)
     return found
 
 

@@ -11,14 +11,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lcc_rl.arrays import Floats
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.drivers.parameters import fitted
 from lcc_rl.drivers.population import DriverPopulation
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import PARAMETERS, simulate_follower
 from lcc_rl.synthetic.stop_and_go import StopAndGo
-
-Array = NDArray[np.float64]
 
 # A driver whose desired speed is below this multiple of its platoon's level would fall behind.
 KEEPS_UP = 1.2
@@ -87,7 +86,7 @@ def _drawn(
     vehicles: int,
     noise: float,
     recordings: Sequence[tuple[NDArray[np.int64], np.random.Generator]],
-) -> list[tuple[Array, NDArray[np.int64], Array, Array]]:
+) -> list[tuple[Floats, NDArray[np.int64], Floats, Floats]]:
     """Draw leaders' speeds, drivers, noise and lengths of each recording, platoons last.
 
     Series of short recordings go on, so that all have the length of the longest.
@@ -104,13 +103,13 @@ def _drawn(
     return drawn
 
 
-def _longer(values: Array, steps: int) -> Array:
+def _longer(values: Floats, steps: int) -> Floats:
     """Return a series with its last values repeated to a number of steps."""
     return np.concatenate([values, np.repeat(values[-1:], steps - len(values), axis=0)])
 
 
 def draw_drivers(
-    drivers: DriverPopulation, level: Array, shape: tuple[int, int], generator: np.random.Generator
+    drivers: DriverPopulation, level: Floats, shape: tuple[int, int], generator: np.random.Generator
 ) -> Tensor:
     """Draw drivers that can keep up with their platoon.
 
@@ -131,7 +130,7 @@ def draw_drivers(
     return order[torch.from_numpy(place.astype(np.int64))]
 
 
-def drive_ranks(ahead: Tensor, ranks: list[DriverPopulation], xi: Tensor) -> tuple[Array, Array]:
+def drive_ranks(ahead: Tensor, ranks: list[DriverPopulation], xi: Tensor) -> tuple[Floats, Floats]:
     """Drive platoons behind their leaders, from the equilibrium at the first speed.
 
     Args:
@@ -168,7 +167,7 @@ def _truth(ranks: list[DriverPopulation]) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def _positions(speed: Array, gap: Array, length: Array) -> Array:
+def _positions(speed: Floats, gap: Floats, length: Floats) -> Floats:
     """Front bumpers ``[time, vehicles, platoons]`` [m]; the last vehicle starts at its length."""
     step = 0.5 * FRAME * (speed[1:, 0] + speed[:-1, 0])
     first = np.concatenate([np.zeros_like(step[:1]), np.cumsum(step, axis=0)])
@@ -182,7 +181,7 @@ def _identity(vehicles: int, platoons: int) -> NDArray[np.int64]:
 
 
 def _samples(
-    speed: Array, position: Array, length: Array, warm_up: int, seen: NDArray[np.int64]
+    speed: Floats, position: Floats, length: Floats, warm_up: int, seen: NDArray[np.int64]
 ) -> pd.DataFrame:
     """Rows of the recorded part; platoon after platoon along the time of the recording."""
     vehicles, platoons = length.shape

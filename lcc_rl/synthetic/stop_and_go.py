@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from lcc_rl.arrays import Floats
 from lcc_rl.settings import NonNegative, Positive, Settings, Share
-
-Array = NDArray[np.float64]
 
 
 class StopAndGo(Settings):
@@ -45,7 +43,7 @@ class StopAndGo(Settings):
 
     def drive(
         self, count: int, steps: int, time_step: float, generator: np.random.Generator
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Floats, Floats]:
         """Drive leaders side by side.
 
         Levels and jumps are stratified samples of their distributions, which reduces the variance
@@ -70,7 +68,7 @@ class StopAndGo(Settings):
         target = np.where(wave < ndtri(self.stop_share), 0.0, traffic + ripple)
         return self._track(np.maximum(target, 0.0), time_step), level
 
-    def _track(self, target: Array, time_step: float) -> Array:
+    def _track(self, target: Floats, time_step: float) -> Floats:
         """Speeds of leaders that track target speeds, both ``[steps + 1, count]``."""
         speed = target[0]
         acceleration = np.zeros_like(speed)
@@ -87,7 +85,7 @@ class StopAndGo(Settings):
         return np.stack(speeds)
 
 
-def jumps(shape: tuple[int, int], rate: float, generator: np.random.Generator) -> Array:
+def jumps(shape: tuple[int, int], rate: float, generator: np.random.Generator) -> Floats:
     """Standard normal values that hold until the next jump.
 
     Args:
@@ -106,7 +104,7 @@ def jumps(shape: tuple[int, int], rate: float, generator: np.random.Generator) -
     return np.take_along_axis(values, last, axis=0)
 
 
-def stratified_normal(count: int, generator: np.random.Generator) -> Array:
+def stratified_normal(count: int, generator: np.random.Generator) -> Floats:
     """Standard normal numbers, one from each of ``count`` equally likely ranges, shuffled."""
     place = generator.permutation(count) + generator.random(count)
     # The first range reaches down to probability 0, whose quantile is −∞.

@@ -21,7 +21,7 @@ from lcc_rl.data.sources import LoadedEpisodes, episodes_of
 from lcc_rl.data.trajectories import (
     FOOT,
     FRAME,
-    KEYS,
+    SAMPLE_KEYS,
     ReadReport,
     Trajectories,
     assembled,
@@ -103,7 +103,7 @@ def as_recorded(samples: pd.DataFrame) -> Trajectories:
     """
     columns = {str(name): samples[name].to_numpy() for name in samples if name != "time_s"}
     columns["recording"], names = pd.factorize(columns["recording"])
-    ahead = find_leaders(*(columns[key] for key in KEYS))
+    ahead = find_leaders(*(columns[key] for key in SAMPLE_KEYS))
     position = columns["position_m"]
     columns["space_headway_m"] = np.where(ahead >= 0, position[ahead] - position, np.nan)
     for name in columns:

@@ -23,8 +23,8 @@ from lcc_rl.data.leaders import (
     hashed,
     stretch,
 )
-from lcc_rl.data.profiles import Split, join, leader_profiles
-from lcc_rl.data.sources import SHIPPED, NgsimSource
+from lcc_rl.data.profiles import Split, joined, leader_profiles
+from lcc_rl.data.sources import SHIPPED_FILES, NgsimSource
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.envs import load_inputs
 from lcc_rl.errors import ConfigError, DataError
@@ -63,7 +63,7 @@ def test_shipped_cycles_are_the_published_ones() -> None:
     # Duration [s] and distance [km] as the regulations print them.
     published = {"udds": (1369, 11.99), "us06": (600, 12.89), "hwfet": (765, 16.51)}
     published["wltc_3b"] = (1800, 23.27)
-    assert sorted(SHIPPED) == sorted([*published, "drives", "platoons"])
+    assert sorted(SHIPPED_FILES) == sorted([*published, "drives", "platoons"])
     for name, (duration, kilometres) in published.items():
         time, own = read_speed_record(name)
         assert time[-1] == duration
@@ -213,7 +213,7 @@ def test_windows_do_not_overlap_and_keep_what_follows_them() -> None:
     profiles = wavy_profiles(3, 450)
     one, two = profiles.select([0]).windows(100), profiles.select([1, 2]).windows(150)
     torch.testing.assert_close(one.record(1), profiles.record(0)[101:202])
-    both = join([one, two])
+    both = joined([one, two])
     for place in range(len(both)):
         source, at = (one, place) if place < len(one) else (two, place - len(one))
         first, begin, reach = int(both.offsets[place]), int(source.offsets[at]), source.reach[at]

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 import lcc_rl
 from lcc_rl.envs.arrays import ArrayEpisodes
 from lcc_rl.errors import LccError
-from lcc_rl.figures.animation import COLOURS
+from lcc_rl.figures.animation import ROLE_COLOURS
 from lcc_rl.pieces.base import SEED
 
 gymnasium = pytest.importorskip("gymnasium", reason="extra interfaces")
@@ -307,7 +307,7 @@ def test_pictures_show_the_road(overrides, cars) -> None:
     film = env.unwrapped.episodes.films[0]
     assert not np.array_equal(pictures[0], pictures[-1])
     for role, count in cars.items():
-        colour = np.array([int(COLOURS[role][i : i + 2], 16) for i in (1, 3, 5)])
+        colour = np.array([int(ROLE_COLOURS[role][i : i + 2], 16) for i in (1, 3, 5)])
         assert (np.abs(pictures[0].astype(int) - colour).sum(-1) < 12).sum() > 20 * count, role
     assert len(film.moments) == 6
 

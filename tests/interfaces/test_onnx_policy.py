@@ -27,7 +27,7 @@ from lcc_rl.evaluation.named import controller_of, is_policy
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.evaluation.strategies import driven_by, trained
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.interfaces.driver import Driver, Measured, entries
+from lcc_rl.interfaces.driver import Driver, Measured, state_of
 from lcc_rl.interfaces.exported import ExportedPolicy, Remembering
 from lcc_rl.interfaces.onnx_policy import OnnxPolicy, Program
 from lcc_rl.pieces import Action, Observation
@@ -103,7 +103,7 @@ def test_a_program_remembers_what_it_returned(tmp_path) -> None:
     torch.testing.assert_close(kept, data["vehicles", "gap"][:, :, :1].cumsum(1))
     torch.testing.assert_close(data["next", "command", "automated"], gaps)
     # Alike where another simulator measures, such as SUMO.
-    driver, measured = Driver(path, 0.1), entries([Measured(*[1.0] * 9)] * 2)
+    driver, measured = Driver(path, 0.1), state_of([Measured(*[1.0] * 9)] * 2)
     measured |= {key: torch.zeros(2, 1, dtype=torch.int64) for key in (SEED, STEP)}
     kept = driver.begin(measured)
     for step in range(1, 4):

@@ -25,7 +25,7 @@ from lcc_rl.evaluation.rollout import play
 from lcc_rl.evaluation.strategies import by_people, driven_by, trained
 from lcc_rl.functional.pattern import parse_string
 from lcc_rl.interfaces.export import export
-from lcc_rl.interfaces.ring_page import TASK, filter_data, ring_page
+from lcc_rl.interfaces.ring_page import RING_TASK, filter_data, ring_page
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.base import SEED
 from lcc_rl.results.policies import load_policy
@@ -96,7 +96,7 @@ def browser(tmp_path_factory):
 def driven(policy: str, driver: str, start: int, string: str) -> tuple[torch.Tensor, float]:
     """Positions of all cars after each step of the package [m], and the fuel of all [g]."""
     settings = [f"scenario.horizon={STEPS}", f"scenario.string={string}"]
-    cfg, actor = load("evaluate", [*TASK, *settings]), None
+    cfg, actor = load("evaluate", [*RING_TASK, *settings]), None
     human, inputs = cfg.scenario.controllers["human"], load_inputs(cfg)
     human = human.changed(wiener=LOUDER * human.made().wiener)
     cfg.scenario.controllers["human"] = human

@@ -12,7 +12,7 @@ from helpers import POPULATION, compose, composed, followed_profiles, wavy_profi
 
 from lcc_rl.commands.evaluation import strategies_of
 from lcc_rl.config import load
-from lcc_rl.data.profiles import at_step, from_records, join, leader_profiles
+from lcc_rl.data.profiles import at_step, from_records, joined, leader_profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import Inputs
 from lcc_rl.errors import ConfigError
@@ -127,8 +127,8 @@ def test_followers_stay_beside_their_leaders() -> None:
         np.testing.assert_allclose(own[:, 1], expected["gap_m"], rtol=1e-6)
     slower = at_step(profiles, 0.2)
     np.testing.assert_allclose(slower.follower(1), profiles.follower(1)[::2], rtol=1e-6)
-    assert join([profiles, slower]).followers.shape == (4 * 300, 2)
-    assert join([profiles, wavy_profiles()]).followers is None
+    assert joined([profiles, slower]).followers.shape == (4 * 300, 2)
+    assert joined([profiles, wavy_profiles()]).followers is None
 
 
 @pytest.mark.parametrize(

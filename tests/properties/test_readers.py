@@ -20,7 +20,7 @@ from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.sources import EpisodesSource
-from lcc_rl.data.speed_records import COLUMNS as COLUMNS_OF_DRIVES
+from lcc_rl.data.speed_records import DRIVE_COLUMNS as COLUMNS_OF_DRIVES
 from lcc_rl.data.speed_records import read_drives
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.errors import DataError, LccError

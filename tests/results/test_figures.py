@@ -21,8 +21,8 @@ from lcc_rl.data.leaders import Case, stretch
 from lcc_rl.drivers.population import load_drivers
 from lcc_rl.figures import evaluation as run_figures
 from lcc_rl.figures.calibration import calibration_figure, joint_figure
-from lcc_rl.figures.drawing import COLUMN, PAGE, colour, save
-from lcc_rl.figures.platoon import PARENTS, jerks, record_figure, switching, velocities
+from lcc_rl.figures.drawing import COLUMN_WIDTH, PAGE_WIDTH, colour, save
+from lcc_rl.figures.platoon import WINNER_COLOURS, jerks, record_figure, switching, velocities
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.figures.training import learning_curve, training_figure
 from lcc_rl.results.report import report, windows_for
@@ -81,7 +81,7 @@ FIGURES = {
     ),
     "sample_episode": (lambda: run_figures.sample_episode(steps(), "alcc"), ["gap ahead [m]"]),
     "human_energy": (
-        lambda: run_figures.human_energy(Means.of(episodes()), "reference"),
+        lambda: run_figures.human_energy_figure(Means.of(episodes()), "reference"),
         ["of 3 drivers", "+17.5 %", "kJ"],
     ),
     "improvement": (
@@ -113,7 +113,7 @@ def test_a_figure_fits_a_paper_and_says_what_it_shows(name, tmp_path) -> None:
     written = texts(figure)
     for words in expected:
         assert words in written, written
-    assert figure.get_size_inches()[0] in (COLUMN, PAGE)
+    assert figure.get_size_inches()[0] in (COLUMN_WIDTH, PAGE_WIDTH)
     assert not re.search(r"(^|[^\w.])-\d", written), "a minus is no hyphen"
     ticks = {
         label
@@ -143,7 +143,7 @@ def test_one_seed_is_said_and_of_one_window_no_interval_drawn() -> None:
     frame = frame[(frame["training_seed"] != 1).fillna(True) & (frame["profile_id"] == 0)]
     for figure in (
         run_figures.paired_improvement(Means.of(frame), "alcc", "reference"),
-        run_figures.human_energy(Means.of(frame), "alcc"),
+        run_figures.human_energy_figure(Means.of(frame), "alcc"),
         alcc.generalization_figure(Means.of(frame).windows),
     ):
         assert "1 training seed" in (found := texts(figure)) or "1 seed" in found
@@ -211,7 +211,7 @@ def test_switching_has_the_colour_of_the_controller_that_drives() -> None:
     figure = switching(pd.DataFrame(rows), "case 1")
     figure.canvas.draw()
     image = np.asarray(figure.canvas.buffer_rgba())[..., :3] / 255.0
-    colours = np.array([to_rgb(hue) for hue in PARENTS.values()])
+    colours = np.array([to_rgb(hue) for hue in WINNER_COLOURS.values()])
     centres = [(0.2 * t + 0.1, f + 1) for f in range(3) for t in range(4)]
     places = figure.axes[0].transData.transform(centres).astype(int)
     drawn = np.array([image[len(image) - y, x] for x, y in places])
@@ -289,7 +289,7 @@ def test_drivers_that_are_alike_make_a_histogram() -> None:
     alike = episodes()
     column = "hdv_path_energy_kj"
     alike[column] = 300.0 + 1e-12 * np.arange(len(alike))
-    run_figures.human_energy(Means.of(alike), "reference")
+    run_figures.human_energy_figure(Means.of(alike), "reference")
 
 
 def test_the_human_behind_is_behind_the_car_at_its_place() -> None:

@@ -10,8 +10,8 @@ from lcc_rl.results.fronts import (
     ENERGY,
     FLEET,
     FLOW,
+    LONG_SHARE,
     NET,
-    SHARE,
     compare_fronts,
     energy_at,
     points,
@@ -134,7 +134,7 @@ def fronts(saved: float = 0.05, noise: float = 0.0) -> pd.DataFrame:
             for seed in range(3):
                 energy = factor * (level - 1000.0 * share) + noise * generator.standard_normal(12)
                 rows += [(*kind, limit, seed, w, x, share) for w, x in enumerate(energy)]
-    names = ["variant", "policy", "limit", "training_seed", "profile_id", ENERGY, SHARE]
+    names = ["variant", "policy", "limit", "training_seed", "profile_id", ENERGY, LONG_SHARE]
     return pd.DataFrame(rows, columns=names)
 
 
@@ -147,7 +147,7 @@ def test_fronts_are_read_at_the_same_share_not_at_the_same_limit() -> None:
     # Every window saves as much: nothing is left to chance.
     assert (found.low, found.value, found.high) == pytest.approx((0.05, 0.05, 0.05))
     table = points(fronts()).set_index(["policy", "limit"])
-    assert table.loc[("idm", 0.02), SHARE] == pytest.approx(0.01)
+    assert table.loc[("idm", 0.02), LONG_SHARE] == pytest.approx(0.01)
     nothing = saving_at(fronts(0.0, 2.0), NETWORK, RULE, 0.012)
     assert -0.03 < nothing.low < 0.0 < nothing.high < 0.03
 

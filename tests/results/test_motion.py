@@ -16,9 +16,9 @@ from PIL import Image
 
 from lcc_rl.commands import animate as command
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.figures.animation import COLOURS, LARGEST, animate, frames, page
+from lcc_rl.figures.animation import LARGEST_PAGE, ROLE_COLOURS, animate, frames, page
 from lcc_rl.io.files import write_parquet
-from lcc_rl.results.motion import Motion, motion_of, sample_episodes
+from lcc_rl.results.motion import SampleMotion, motion_of, sample_episodes
 
 OPEN = {"string": "automated human", "road": "open", "circumference": None, "vehicle_length": 5.0}
 RING = {**OPEN, "road": "ring", "circumference": 40.0}
@@ -78,14 +78,16 @@ def test_drawn_places_are_read_and_sample_episodes_are_of_one_seed() -> None:
             wrong()
 
 
-def drifting(vehicles: int = 2, ring: bool = False, seconds: float = 1.2) -> Motion:
+def drifting(vehicles: int = 2, ring: bool = False, seconds: float = 1.2) -> SampleMotion:
     """Vehicles that drift apart, so that every moment looks different."""
     time = 0.1 * np.arange(1, round(10 * seconds) + 1)
     gap = 5.0 + np.outer(time, np.arange(1, vehicles + 1))
     speed = 3.0 + np.arange(vehicles) + np.sin(time)[:, None]
     roles = ("automated", *["human"] * (vehicles - 1))
     around = 500.0 if ring else None
-    return Motion(time, roles, speed, gap, 20.0 * time, None if ring else 2 * time, 5.0, around)
+    return SampleMotion(
+        time, roles, speed, gap, 20.0 * time, None if ring else 2 * time, 5.0, around
+    )
 
 
 def data_of(text: str) -> dict:
@@ -107,7 +109,7 @@ def test_a_page_holds_the_motion_of_all_vehicles_and_needs_nothing_else(subtests
             assert (found["leader"] is None) == (found["circumference"] is not None) == ring
             assert not re.search(r"(src|href)=|https?:|@import", text)
             long = data_of(page(drifting(100, seconds=600.0), "a fleet"))
-            assert len(long["time"]) * 100 <= LARGEST
+            assert len(long["time"]) * 100 <= LARGEST_PAGE
 
 
 @pytest.mark.parametrize("ring", [False, True])
@@ -121,7 +123,7 @@ def test_the_frames_of_a_gif_differ_and_show_each_role(ring, tmp_path) -> None:
     road = slice(0, shown[0].shape[0] // 4)
     assert np.abs(shown[0][road] - shown[1][road]).sum() > 1000
     for role in ("automated", "human", *([] if ring else ["leader"])):
-        near = np.abs(shown[0] - 255 * np.array(to_rgb(COLOURS[role]))).max(-1) < 24
+        near = np.abs(shown[0] - 255 * np.array(to_rgb(ROLE_COLOURS[role]))).max(-1) < 24
         assert near.sum() > 30, role
 
 

@@ -12,9 +12,9 @@ from rich.table import Table
 
 from lcc_rl.energy import as_fleet
 from lcc_rl.errors import ConfigError
-from lcc_rl.evaluation.cases import measure
+from lcc_rl.evaluation.cases import measured_series
 from lcc_rl.results.platoons import case_table
-from lcc_rl.results.render import as_latex, as_markdown, show, terminal
+from lcc_rl.results.render import as_latex, as_markdown, print_table, terminal
 from lcc_rl.results.report import report, summary, windows_for
 from lcc_rl.results.task import Task
 from lcc_rl.studies.hcfs.tables import win_rates
@@ -107,7 +107,7 @@ def series() -> dict[str, torch.Tensor]:
 
 
 def test_measures_of_a_platoon_by_hand() -> None:
-    first, second = measure(series()).to_dict("records")
+    first, second = measured_series(series()).to_dict("records")
     assert (first["speed_error_sum"], second["speed_error_sum"]) == (4.0, 1.5)
     assert (first["jerk_sum"], first["peak_jerk_mps3"]) == (10.0, 6.0)
     assert (first["min_gap_m"], first["collided"], second["collided"]) == (3.0, False, True)
@@ -122,7 +122,7 @@ def test_measures_of_a_platoon_by_hand() -> None:
 
 
 def test_case_table_by_hand() -> None:
-    rows = measure(series()).assign(
+    rows = measured_series(series()).assign(
         strategy="hcfs", training_seed=pd.Series([0, 0], dtype="Int64"), case="case 1", profile="a"
     )
     (row,) = case_table(rows, "case 1").to_dict("records")
@@ -188,7 +188,7 @@ def test_a_score_is_energy_over_distance_and_falling_behind_gains_nothing() -> N
 def test_all_scores_of_a_ring_name_the_damped_episodes_and_their_mean_time(capsys) -> None:
     never = driven("human", 1.0, 1.0).assign(damping_time_s=np.nan)
     own = driven("own", 1.0, 1.0, 1.0).assign(damping_time_s=[30.0, 40.0, np.nan])
-    show(terminal(report(windows_for(pd.concat([never, own])), TASK, MOTOR), full=True))
+    print_table(terminal(report(windows_for(pd.concat([never, own])), TASK, MOTOR), full=True))
     lines = capsys.readouterr().out.splitlines()
     rows = [line.split()[-2:] for line in lines if "calm" in line or "from when on" in line]
     assert rows == [["0%", "67%"], ["–", "35"]]
@@ -198,7 +198,7 @@ def test_a_table_in_a_pipe_is_as_wide_as_its_content_or_as_columns(monkeypatch, 
     table, widths = Table(*(f"measure {number}" for number in range(12))), {}
     for columns in ("", "80"):
         monkeypatch.setenv("COLUMNS", columns) if columns else monkeypatch.delenv("COLUMNS", False)
-        show(table)
+        print_table(table)
         widths[columns] = max(map(len, capsys.readouterr().out.splitlines()))
     assert widths["80"] == 80 < widths[""]
 
@@ -218,7 +218,7 @@ def test_all_scores_name_limits_in_words_and_wrap_names_at_spaces_only(capsys) -
     others = ("follower_stopper", "pi_saturation", "constant", "mpc_far")
     rows = pd.concat(driven(name, 1.0, share_ttc_unsafe=0.001) for name in ("human", *others))
     task = Task(name="mine", limits={**TASK.limits, "share_ttc_unsafe": 0.0005})
-    show(terminal(report(windows_for(rows), task, MOTOR), full=True))
+    print_table(terminal(report(windows_for(rows), task, MOTOR), full=True))
     printed = capsys.readouterr().out
     words = printed.split()
     assert {"FollowerStopper", "saturation", "simulated"} <= set(words)

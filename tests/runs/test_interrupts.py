@@ -27,10 +27,10 @@ from lcc_rl.cli.guard import main_guard
 from lcc_rl.commands import training
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import read_parquet
-from lcc_rl.runs.interrupts import SIGNALS, interruptible, stop_signal
+from lcc_rl.runs.interrupts import ENDING_SIGNALS, interruptible, stop_signal
 
 # SIGINT is heard again below; nohup ignores SIGHUP, for its children, too.
-SENT = [x for x in SIGNALS if x == signal.SIGINT or signal.getsignal(x) != signal.SIG_IGN]
+SENT = [x for x in ENDING_SIGNALS if x == signal.SIGINT or signal.getsignal(x) != signal.SIG_IGN]
 LONGER = ("training.episodes=240", "variant=alcc")
 # A command whose import of the console takes until something is typed.
 IMPORTS = """

@@ -15,7 +15,7 @@ from rich.console import Console
 from lcc_rl.cli.status import main
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
 from lcc_rl.results.runs import load_config
-from lcc_rl.runs.overview import draw
+from lcc_rl.runs.overview import states_table
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import (
     Busy,
@@ -163,7 +163,7 @@ def shown(drawn) -> str:
 def test_names_and_errors_are_whole_on_80_columns() -> None:
     name, error = f"score/{'a' * 60}/highway", "loss_actor became nan in iteration 3; " * 5
     states = [RunState(name, "failed", 3, 3, error=error), RunState("b", "running", 1, 3, 65.0)]
-    text = shown(draw(Path("outputs"), states, 2))
+    text = shown(states_table(Path("outputs"), states, 2))
     assert text.count("became") == 5
     for whole in ("a" * 40, "ETA1:05", "failed3/3"):
         assert whole in text

@@ -162,7 +162,7 @@ def test_random_kills_lose_nothing() -> None:
 def test_a_sweep_on_slurm_without_slurm_is_refused_in_one_line(
     tmp_path, monkeypatch, capsys
 ) -> None:
-    monkeypatch.setattr(sweeps, "make_plan", lambda config: sweeps.Plan(sweeps.MOST_RUNS + 1))
+    monkeypatch.setattr(sweeps, "make_plan", lambda config: sweeps.SweepPlan(sweeps.MOST_RUNS + 1))
     launcher = {"_target_": "hydra_plugins.submitit.SlurmLauncher"}
     parts = {"launcher": launcher, "sweep": {"dir": str(tmp_path / "sweep")}}
     for srun in (None, "/usr/bin/srun"):

@@ -24,10 +24,10 @@ def one(folder: Path, recipe: str = "paper_alcc", **more: Any) -> Study:
 @pytest.mark.slow
 def test_every_run_composes_and_each_ablation_changes_the_recipe(tmp_path) -> None:
     own = one(tmp_path)
-    main = as_plain(study.trainings(own, study.MAIN)["alcc/seed_0"])
+    main = as_plain(study.alcc_trainings(own, study.MAIN)["alcc/seed_0"])
     seen = []
     for name, change in study.ABLATIONS.items():
-        runs = study.trainings(own, change)
+        runs = study.alcc_trainings(own, change)
         assert [f"{x}/seed_0" for x in change.variants] == [*runs]
         assert [cfg.variant for cfg in runs.values()] == [*change.variants]
         cfg = as_plain(runs["alcc/seed_0"])
@@ -35,10 +35,10 @@ def test_every_run_composes_and_each_ablation_changes_the_recipe(tmp_path) -> No
         assert cfg == main or cfg not in seen
         seen.append(cfg)
     quick = one(tmp_path, "quickstart")
-    found = study.trainings(quick, study.ABLATIONS["recipe_paper_alcc"])["alcc/seed_0"]
+    found = study.alcc_trainings(quick, study.ABLATIONS["recipe_paper_alcc"])["alcc/seed_0"]
     assert as_plain(found) == main
     single = study.Change(("split.profile=5",), recipes=("single_profile",))
-    cfg = study.trainings(own, single)["alcc/seed_0"]
+    cfg = study.alcc_trainings(own, single)["alcc/seed_0"]
     assert (cfg.split.made().profile, cfg.scenario.pieces["leader"].made().start) == (5, "first")
     assert cfg.training.episodes == 3000
 
@@ -56,7 +56,7 @@ def test_wrong_settings_come_before_any_work(tmp_path) -> None:
 
 def test_paths_with_any_character_reach_hydra_whole(tmp_path) -> None:
     folder = tmp_path / "it's a, [strange]=folder"
-    cfg = study.trainings(one(folder, "smoke"), study.MAIN)["alcc/seed_0"]
+    cfg = study.alcc_trainings(one(folder, "smoke"), study.MAIN)["alcc/seed_0"]
     assert Path(cfg.data.made().path) == folder / "trajectories.parquet"
 
 
@@ -74,9 +74,9 @@ def test_a_study_of_one_file_divides_it_by_vehicle(tmp_path, monkeypatch) -> Non
         monkeypatch.setattr(study, name, lambda *arguments: None)
     own = of_one_file(tmp_path, "split.by=vehicle")
     study.run(own, ["main"])
-    assert (own.folder / study.DRIVERS).is_file()
+    assert (own.folder / study.DRIVERS_FILE).is_file()
     change = study.ABLATIONS["one_training_profile"]
-    single = study.trainings(own, change)["alcc/seed_0"]
+    single = study.alcc_trainings(own, change)["alcc/seed_0"]
     assert single.split.settings["held_out"].settings["by"] == "vehicle"
     assert single.split.settings["profile"] == 0
 

@@ -15,7 +15,7 @@ ENERGY, SPEED = "leader path energy [kJ]", "leader speed [m/s]"
 
 
 def test_headline_by_hand() -> None:
-    table = alcc_tables.headline(windows()).set_index(["strategy", "against"])
+    table = alcc_tables.headline_rows(windows()).set_index(["strategy", "against"])
     idm = 100.0 + 50.0 + SHIFT
     reference = 85.0 + 50.0 + SHIFT
     alcc = 86.0 + 40.0 + SHIFT + 20.0 / 3
@@ -121,7 +121,7 @@ def test_generalization_has_every_profile_and_the_papers_four() -> None:
     row = paper_tables.generalization_row(windows())
     assert row["profiles"].tolist() == [2, 2, 4]
     assert row.loc[2, "median_pct"] == pytest.approx((7.00 + 8.04) / 2)
-    headline = alcc_tables.headline(windows()).set_index(["strategy", "against"])
+    headline = alcc_tables.headline_rows(windows()).set_index(["strategy", "against"])
     assert row.loc[1, "together_pct"] == headline.loc[("alcc", "reference"), "saving_pct"]
 
 

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lcc_rl.figures.drawing import (
-    COLUMN,
+    COLUMN_WIDTH,
     INK,
-    PAGE,
+    PAGE_WIDTH,
     SOFT,
     colour,
     dots,
@@ -25,7 +25,7 @@ from lcc_rl.figures.drawing import (
     rows_of,
     style,
 )
-from lcc_rl.figures.training import BAND, draw_curves
+from lcc_rl.figures.training import BAND_NOTE, draw_curves
 from lcc_rl.functional.power import motor_power
 from lcc_rl.results.names import in_words
 from lcc_rl.results.render import signed
@@ -33,7 +33,7 @@ from lcc_rl.results.windows import by_driver, savings
 from lcc_rl.studies.alcc.paper_tables import PAPER_GENERALIZATION, generalization
 from lcc_rl.studies.alcc.tables import comparison
 
-TERMS = {
+REWARD_LABELS = {
     "episode_reward": "total reward",
     "reward_safety": "safety (TTC)",
     "reward_efficiency": "efficiency (time gap)",
@@ -53,7 +53,7 @@ def power_map() -> Figure:
     """Electric power of the motor over speed and acceleration (A2; Fig. 2)."""
     speed, acceleration = np.linspace(0.0, 30.0, 151), np.linspace(-3.0, 3.0, 121)
     power = motor_power(torch.tensor(speed), torch.tensor(acceleration)[:, None]).numpy() / 1e3
-    figure = new_figure(COLUMN, 2.7)
+    figure = new_figure(COLUMN_WIDTH, 2.7)
     axis = figure.subplots()
     limit = float(np.abs(power).max())
     shades = np.linspace(-limit, limit, 61)
@@ -75,9 +75,9 @@ def reward_terms(training: pd.DataFrame) -> Figure:
     Args:
         training: rows of training.parquet of one or more runs, with ``variant`` and ``seed``.
     """
-    shown = {name: label for name, label in TERMS.items() if name in training}
+    shown = {name: label for name, label in REWARD_LABELS.items() if name in training}
     lines = -(-len(shown) // 3)
-    figure = new_figure(PAGE, 0.5 + 1.9 * lines)
+    figure = new_figure(PAGE_WIDTH, 0.5 + 1.9 * lines)
     axes = figure.subplots(lines, 3, sharex=True, squeeze=False).ravel()
     for axis, (name, label) in zip(axes, shown.items(), strict=False):
         floor, top = draw_curves(axis, training, name)
@@ -92,7 +92,7 @@ def reward_terms(training: pd.DataFrame) -> Figure:
         "frameon": False,
     }
     figure.legend(handles=axes[0].get_lines(), **look)
-    figure.supxlabel(f"training episodes\n{BAND}", fontsize=8)
+    figure.supxlabel(f"training episodes\n{BAND_NOTE}", fontsize=8)
     figure.supylabel("sum per episode", fontsize=8)
     return figure
 
@@ -105,7 +105,7 @@ def distributions(drivers: pd.DataFrame) -> Figure:
     whiskers the 5th to 95th percentile; a diamond marks the mean.
     """
     names = list(dict.fromkeys(drivers["strategy"]))
-    figure = new_figure(PAGE, 0.8 + 0.42 * len(names))
+    figure = new_figure(PAGE_WIDTH, 0.8 + 0.42 * len(names))
     axes = figure.subplots(1, 2)
     titles = {"cav": "controlled car (CAV)", "hdv": "human driver (HDV)"}
     for axis, (vehicle, title) in zip(axes, titles.items(), strict=True):
@@ -140,7 +140,7 @@ def generalization_figure(
 ) -> Figure:
     """Path energy of both vehicles on every held-out window, and its saving (Fig. 12)."""
     table = generalization(windows, strategy, baseline).sort_values("path_saving_pct")
-    figure = new_figure(PAGE, 4.4)
+    figure = new_figure(PAGE_WIDTH, 4.4)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
     _energies_by_profile(above, windows, table["profile_id"].tolist(), (baseline, strategy))
     values, places = table["path_saving_pct"].to_numpy(float), np.arange(len(table))
@@ -204,7 +204,7 @@ def comparison_figure(windows: pd.DataFrame) -> Figure:
     """
     table = comparison(windows)
     names, strategies = (list(dict.fromkeys(table[name])) for name in ("ablation", "strategy"))
-    figure = new_figure(PAGE, 1.0 + 0.32 * len(names))
+    figure = new_figure(PAGE_WIDTH, 1.0 + 0.32 * len(names))
     axes = figure.subplots(1, len(PANELS), sharey=True, width_ratios=(2, 1, 1))
     for axis, (column, (label, line)) in zip(axes, PANELS.items(), strict=True):
         for strategy, offset in zip(strategies, _abreast(len(strategies), 0.18), strict=True):

@@ -10,10 +10,10 @@ import pandas as pd
 
 from lcc_rl.results.bootstrap import share_saved
 from lcc_rl.results.windows import Means, by_driver, driver_savings, per_seed, savings
-from lcc_rl.studies.alcc.tables import KINDS
+from lcc_rl.studies.alcc.tables import ENERGY_KINDS
 
-PAPER, OURS = "paper", "this study"
-NAMES = {"path_": "path energy", "": "as drawn"}  # of the keys of KINDS
+PAPER_ROW, STUDY_ROW = "paper", "this study"
+ENERGY_WORDS = {"path_": "path energy", "": "as drawn"}  # of the keys of KINDS
 # Wang et al., arXiv 2210.02147: Table IV, Fig. 9 and the generalization experiment.
 # CAV, HDV and total energy [kJ].
 PAPER_TABLE_IV = {
@@ -52,7 +52,9 @@ def table_iv(
         total energy [kJ], and the total saved [%], of the path and as drawn. The paper's are as
         drawn.
     """
-    columns = [f"{vehicle}_{x}" for vehicle in ("cav", "hdv", "total") for x in KINDS.values()]
+    columns = [
+        f"{vehicle}_{x}" for vehicle in ("cav", "hdv", "total") for x in ENERGY_KINDS.values()
+    ]
     energies = {column: by_driver(drivers, column) for column in columns}
     saved = driver_savings(drivers, "total_energy_kj", strategy, baseline)
     chosen: dict[str, Any] = {"mean": None, "best": saved.idxmax(), "worst": saved.idxmin()}
@@ -60,15 +62,15 @@ def table_iv(
     for label, driver in chosen.items():
         own = {x: t.mean() if driver is None else t.loc[driver] for x, t in energies.items()}
         for name in (baseline, strategy):
-            row: dict[str, object] = {"driver": label, "strategy": name, "from": OURS}
+            row: dict[str, object] = {"driver": label, "strategy": name, "from": STUDY_ROW}
             row |= {column: energy[name] for column, energy in own.items()}
-            for kind, column in KINDS.items():
+            for kind, column in ENERGY_KINDS.items():
                 energy = own[f"total_{column}"]
                 share = 100.0 * share_saved(energy[strategy], energy[baseline])
                 row[f"{kind}saving_pct"] = share if name == strategy else np.nan
             rows.append(row)
             if (label, name) in PAPER_TABLE_IV:
-                row = {"driver": label, "strategy": name, "from": PAPER}
+                row = {"driver": label, "strategy": name, "from": PAPER_ROW}
                 keys = ("cav_energy_kj", "hdv_energy_kj", "total_energy_kj")
                 row |= dict(zip(keys, PAPER_TABLE_IV[label, name], strict=True))
                 row["saving_pct"] = PAPER_IMPROVEMENT[label] if name == strategy else np.nan
@@ -79,16 +81,19 @@ def table_iv(
 def holistic(means: Means, strategy: str = "alcc", baseline: str = "reference") -> pd.DataFrame:
     """Saving of the total energy per driver beside the paper's (Fig. 10): one row each."""
     rows = []
-    for kind, column in KINDS.items():
+    for kind, column in ENERGY_KINDS.items():
         found = savings(means.windows, f"total_{column}", strategy, baseline)
         saved = 100.0 * driver_savings(means.drivers, f"total_{column}", strategy, baseline)
-        row = {"from": f"{OURS}, {NAMES[kind]}", **found.columns("mean_saving_pct", 100.0)}
+        row = {
+            "from": f"{STUDY_ROW}, {ENERGY_WORDS[kind]}",
+            **found.columns("mean_saving_pct", 100.0),
+        }
         row |= {"best_driver_pct": saved.max(), "worst_driver_pct": saved.min()}
         row |= {"drivers_worse_off": f"{int((saved < 0).sum())} of {len(saved)}"}
         rows.append(row)
     columns = ("mean_saving_pct", "best_driver_pct", "worst_driver_pct")
     paper = dict(zip(columns, PAPER_IMPROVEMENT.values(), strict=True))
-    rows.append({"from": PAPER, **paper, "drivers_worse_off": "{} of {}".format(*PAPER_WORSE)})
+    rows.append({"from": PAPER_ROW, **paper, "drivers_worse_off": "{} of {}".format(*PAPER_WORSE)})
     return pd.DataFrame(rows)
 
 
@@ -108,7 +113,7 @@ def generalization(
         row: dict[str, object] = {"profile_id": profile, "profile": part["profile"].iloc[0]}
         energy = per_seed(part, path)
         row |= {f"{name}_path_energy_kj": energy[name].mean() for name in (baseline, strategy)}
-        for kind, column in KINDS.items():
+        for kind, column in ENERGY_KINDS.items():
             found = savings(part, f"total_{column}", strategy, baseline)
             row |= found.columns(f"{kind}saving_pct", 100.0)
         against = savings(part, path, strategy, "idm")
@@ -128,11 +133,14 @@ def generalization_row(
     """
     table = generalization(windows, strategy, baseline)
     rows = []
-    for kind, column in KINDS.items():
+    for kind, column in ENERGY_KINDS.items():
         together = savings(windows, f"total_{column}", strategy, baseline)
-        row = {"from": f"{OURS}, {NAMES[kind]}", **together.columns("together_pct", 100.0)}
+        row = {
+            "from": f"{STUDY_ROW}, {ENERGY_WORDS[kind]}",
+            **together.columns("together_pct", 100.0),
+        }
         rows.append(row | _spread(table[f"{kind}saving_pct"]))
-    return pd.DataFrame([*rows, {"from": PAPER, **_spread(pd.Series(PAPER_GENERALIZATION))}])
+    return pd.DataFrame([*rows, {"from": PAPER_ROW, **_spread(pd.Series(PAPER_GENERALIZATION))}])
 
 
 def _spread(values: pd.Series) -> dict[str, float]:
@@ -149,14 +157,14 @@ def human_energy(means: Means) -> pd.DataFrame:
     """
     rows: list[dict[str, object]] = []
     for strategy in per_seed(means.windows, "total_energy_kj"):
-        for kind, column in KINDS.items():
+        for kind, column in ENERGY_KINDS.items():
             found = savings(means.windows, f"hdv_{column}", strategy, "direct")
             energy = by_driver(means.drivers, f"hdv_{column}")
             saved = 100.0 * share_saved(energy[strategy], energy["direct"])
             rows.append(
                 {
                     "behind": strategy,
-                    "energy": NAMES[kind],
+                    "energy": ENERGY_WORDS[kind],
                     "scenario_A_kj": energy[strategy].mean(),
                     "scenario_B_kj": energy["direct"].mean(),
                     **found.columns("saving_pct", 100.0),
@@ -165,7 +173,7 @@ def human_energy(means: Means) -> pd.DataFrame:
                     "drivers_better_off": f"{int((saved > 0).sum())} of {len(saved)}",
                 }
             )
-    rows.append({"behind": f"alcc {PAPER}", "energy": NAMES[""], **PAPER_HUMAN})
+    rows.append({"behind": f"alcc {PAPER_ROW}", "energy": ENERGY_WORDS[""], **PAPER_HUMAN})
     return _with_its_decimals(rows)
 
 

@@ -18,15 +18,15 @@ from lcc_rl.results.report import sample_of
 from lcc_rl.results.runs import EPISODES, STEPS
 from lcc_rl.results.windows import LEADER_COLUMNS, WINDOWS, Means
 from lcc_rl.studies.alcc import figures, paper_tables, tables
-from lcc_rl.studies.alcc.study import ABLATIONS, DRIVERS, EVALUATION
+from lcc_rl.studies.alcc.study import ABLATIONS, DRIVERS_FILE, EVALUATION_FOLDER
 from lcc_rl.studies.results import StudyResults
 
-TITLE = "Adaptive Leading Cruise Control: the study"
+ALCC_TITLE = "Adaptive Leading Cruise Control: the study"
 CURVES = "training.parquet"  # learning curves of the main trainings, if these are not there
 ITSELF = "this study"
-BOTH = {"alcc", "reference"}
+ALCC_PAIR = {"alcc", "reference"}
 TUNED = ("idm_acc", "acc")
-SHARES = [
+SHARE_COLUMNS = [
     f"{which}_{name}"
     for name in ("unsafe_ttc_pct", tables.LONG)
     for which in ("mean", "worst_seed")
@@ -46,15 +46,17 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
         ResultsError: if there is no evaluation in the folder, or a file cannot be read.
     """
     found = StudyResults(folder, formats)
-    if not any(map(_finished, folder.glob(f"**/{EVALUATION}"))):
-        raise ResultsError(f"{folder}: no {EVALUATION}/{EPISODES}; lcc-rl reproduce alcc makes it")
-    main = Means.read(folder / EVALUATION) if _finished(folder / EVALUATION) else None
+    if not any(map(_finished, folder.glob(f"**/{EVALUATION_FOLDER}"))):
+        raise ResultsError(
+            f"{folder}: no {EVALUATION_FOLDER}/{EPISODES}; lcc-rl reproduce alcc makes it"
+        )
+    main = Means.read(folder / EVALUATION_FOLDER) if _finished(folder / EVALUATION_FOLDER) else None
     if main is not None:
         add_main(found, main)
     _learning(found)
     _ablations(found, main)
     _people(found)
-    found.write(TITLE)
+    found.write(ALCC_TITLE)
     return found
 
 
@@ -64,40 +66,40 @@ def narrow(shown: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
         table[~table.iloc[:, 0].isin(TUNED)]
         for table in (shown["energies"], shown["human_energy"], shown["constraints"])
     )
-    human = human[human["energy"] == paper_tables.NAMES[""]]
+    human = human[human["energy"] == paper_tables.ENERGY_WORDS[""]]
     parts = ["strategy", "total_path_energy_kj", "total_path_energy_kj_low"]
-    parts += ["total_path_energy_kj_high", "total_energy_kj", *tables.PARTS]
+    parts += ["total_path_energy_kj_high", "total_energy_kj", *tables.ENERGY_PARTS]
     return {
         "parts": energies.loc[energies["strategy"] != "direct", parts],
         "behind": human.drop(columns=["energy", "least_driver_pct", "most_driver_pct"]),
-        "shares": shares[["strategy", "collisions", *SHARES]],
+        "shares": shares[["strategy", "collisions", *SHARE_COLUMNS]],
     }
 
 
 def add_main(found: StudyResults, means: Means) -> None:
     """Add the tables and figures of the main evaluation."""
     windows, size = means.windows, sample_of(means.windows, means.drivers)
-    found.table("headline", f"Energy of both saved, {size}", tables.headline(windows))
+    found.table("headline", f"Energy of both saved, {size}", tables.headline_rows(windows))
     found.table("energies", f"Energy per episode, {size}", tables.energies(windows))
     if set(LEADER_COLUMNS) <= set(windows):
         caption = "Path energy saved in thirds of the windows, by the leader's energy and speed"
         found.table("strata", caption, tables.strata(windows))
     caption = "Path energy of controlled car and human driver by strategy (Fig. 11)"
     found.figure("distributions", caption, figures.distributions(means.drivers))
-    path = found.folder / EVALUATION / STEPS
+    path = found.folder / EVALUATION_FOLDER / STEPS
     if path.exists() and ((steps := read_parquet(path))["strategy"] == "alcc").any():
         caption = "One held-out episode of the network for all, first seed (Fig. 7)"
         found.figure("sample_episode", caption, run_figures.sample_episode(steps, "alcc"))
     found.table("constraints", f"Safety and efficiency, {size}", tables.constraints(windows))
     found.table("constraints_by_seed", "Every seed", tables.constraints_by_seed(windows))
-    if set(windows["strategy"]) >= BOTH:
+    if set(windows["strategy"]) >= ALCC_PAIR:
         _awareness(found, means)
         _generalization(found, windows)
     table = paper_tables.human_energy(means)
     found.table("human_energy", f"Human driver's energy with and without the car, {size}", table)
-    for name in sorted(BOTH & set(windows["strategy"])):
+    for name in sorted(ALCC_PAIR & set(windows["strategy"])):
         caption = f"Human driver's path energy behind {in_words(name)} (Fig. 9)"
-        found.figure(f"human_energy_{name}", caption, run_figures.human_energy(means, name))
+        found.figure(f"human_energy_{name}", caption, run_figures.human_energy_figure(means, name))
 
 
 def _awareness(found: StudyResults, means: Means) -> None:
@@ -132,7 +134,7 @@ def _learning(found: StudyResults) -> None:
 def _ablations(found: StudyResults, main: Means | None) -> None:
     means = {
         path.parent.name: Means.read(path)
-        for path in found.folder.glob(f"ablations/*/{EVALUATION}")
+        for path in found.folder.glob(f"ablations/*/{EVALUATION_FOLDER}")
         if _finished(path)
     }
     if not means:
@@ -152,8 +154,8 @@ def _ablations(found: StudyResults, main: Means | None) -> None:
 def _people(found: StudyResults) -> None:
     """Add the calibration and the power map."""
     found.figure("power_map", "The motor's power map (A2; Fig. 2)", figures.power_map())
-    if (found.folder / DRIVERS).exists():
-        drivers = read_parquet(found.folder / DRIVERS)
+    if (found.folder / DRIVERS_FILE).exists():
+        drivers = read_parquet(found.folder / DRIVERS_FILE)
         found.figure("calibration", "Calibration (Fig. 4)", calibration_figure(drivers))
         caption = "Joint distribution of desired speed and time gap (Fig. 5)"
         found.figure("joint_distribution", caption, joint_figure(drivers))

@@ -20,13 +20,13 @@ from lcc_rl.config.schemas import EvaluateConfig, PipelineConfig, TrainConfig
 from lcc_rl.errors import unknown_name
 from lcc_rl.studies.study import Study
 
-TRAIN, EVALUATION = "train", "evaluation"
-DRIVERS = Path("calibration/drivers.parquet")
-PARTS = ("main", "ablations")
+TRAIN, EVALUATION_FOLDER = "train", "evaluation"
+DRIVERS_FILE = Path("calibration/drivers.parquet")
+STUDY_PARTS = ("main", "ablations")
 OF_CALIBRATION = ("data", "calibration")  # overrides that only the calibration takes
 # Overrides that the calibration does not take.
 OF_TRAINING = ("drivers", "split", "scenario", "reward", "agent", "training", "evaluation")
-VARIANTS = ("alcc", "reference")
+STUDY_VARIANTS = ("alcc", "reference")
 CONTROL = "own_energy"  # weighs its own energy as much as alcc weighs that of all
 GAMMAS = (0.9, 0.95, 0.99, 0.995)
 RECIPES = ("quickstart", "paper_alcc")  # length and batches of DDPG's training
@@ -39,17 +39,17 @@ class Change:
     """The overrides, variants and recipes of one series of trainings."""
 
     overrides: tuple[str, ...] = ()
-    variants: tuple[str, ...] = VARIANTS
+    variants: tuple[str, ...] = STUDY_VARIANTS
     recipes: tuple[str, ...] = ()
 
 
 # One profile for training; evaluation is on what the study's own split holds out.
-SINGLE = "split=single"
+SINGLE_SPLIT = "split=single"
 ONE_PROFILE = (
-    SINGLE,
+    SINGLE_SPLIT,
     "split.held_out={_target_: lcc_rl.data.profiles.Split, by: recording, evaluation_share: 0.34}",
 )
-MAIN = Change(variants=(*VARIANTS, CONTROL))
+MAIN = Change(variants=(*STUDY_VARIANTS, CONTROL))
 ABLATIONS = {
     "no_safety": Change(("reward.terms.safety.weight=0",)),
     "no_efficiency": Change(("reward.terms.efficiency.weight=0",)),
@@ -81,7 +81,7 @@ def default_recipe(overrides: Iterable[str]) -> str | None:
     return None if any(key_of(item) == "agent" for item in overrides) else "paper_alcc"
 
 
-def settings(study: Study, entry: str, variant: str, change: Change, *own: str) -> Any:
+def settings_of_run(study: Study, entry: str, variant: str, change: Change, *own: str) -> Any:
     """Compose a run: recipe, the study's inputs, the user's overrides, its change, its own."""
     given = {root_key(item) for item in study.overrides}
     shared = [
@@ -90,11 +90,11 @@ def settings(study: Study, entry: str, variant: str, change: Change, *own: str) 
         if root_key(item) not in OF_CALIBRATION or key_of(item).startswith("data.plausible")
     ]
     users, changed = known_settings(shared, entry), change.overrides
-    if SINGLE in changed:  # the user's split is then that of ``held_out``
+    if SINGLE_SPLIT in changed:  # the user's split is then that of ``held_out``
         moved = [x for x in users if key_of(x).startswith("split.")]
         users = [x for x in users if x not in moved]
         changed = (*changed, *(x.replace("split.", "split.held_out.", 1) for x in moved))
-    drivers = ("drivers=calibrated", f"drivers.path={quoted(study.folder / DRIVERS)}")
+    drivers = ("drivers=calibrated", f"drivers.path={quoted(study.folder / DRIVERS_FILE)}")
     words = [
         f"experiment=[{','.join([*filter(None, [study.recipe]), *change.recipes])}]",
         f"variant={variant}",
@@ -108,16 +108,16 @@ def settings(study: Study, entry: str, variant: str, change: Change, *own: str) 
     return load(entry, words)
 
 
-def trainings(study: Study, change: Change) -> dict[str, TrainConfig]:
+def alcc_trainings(study: Study, change: Change) -> dict[str, TrainConfig]:
     """Return a training per seed and variant, all variants of a seed first, by their folders."""
     return {
-        f"{variant}/seed_{seed}": settings(study, "train", variant, change, f"seed={seed}")
+        f"{variant}/seed_{seed}": settings_of_run(study, "train", variant, change, f"seed={seed}")
         for seed in range(study.seeds)
         for variant in change.variants
     }
 
 
-def run(study: Study, parts: Sequence[str] = PARTS, ablations: Sequence[str] = ()) -> None:
+def run(study: Study, parts: Sequence[str] = STUDY_PARTS, ablations: Sequence[str] = ()) -> None:
     """Calibrate, train and evaluate; finished runs are skipped.
 
     Args:
@@ -130,7 +130,7 @@ def run(study: Study, parts: Sequence[str] = PARTS, ablations: Sequence[str] = (
         LccError: one clear error for wrong settings, data or files.
     """
     series = {
-        folder: (change, trainings(study, change))
+        folder: (change, alcc_trainings(study, change))
         for folder, change in _series(study, parts, ablations).items()
     }
     calibration = _calibration(study, next(iter(series.values()))[1])
@@ -138,21 +138,21 @@ def run(study: Study, parts: Sequence[str] = PARTS, ablations: Sequence[str] = (
     calibrate_once(calibration, study.folder)
     for folder, (change, runs) in series.items():
         train_all(runs, folder, study.jobs)
-        cfg: EvaluateConfig = settings(study, "evaluate", "alcc", change)
+        cfg: EvaluateConfig = settings_of_run(study, "evaluate", "alcc", change)
         cfg.compare = [str(folder)]
         place = study.folder if change is MAIN else folder
-        complete(with_inputs(cfg), place / EVALUATION)
+        complete(with_inputs(cfg), place / EVALUATION_FOLDER)
 
 
 def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dict[Path, Change]:
     """Return the series of trainings of the parts by their folders."""
     for part in parts:
-        if part not in PARTS:
-            raise unknown_name("part", part, PARTS)
+        if part not in STUDY_PARTS:
+            raise unknown_name("part", part, STUDY_PARTS)
     found = {study.folder / TRAIN: MAIN} if "main" in parts else {}
     if "ablations" in parts:
         # Ablations that change nothing are left out, and of short runs those that train long.
-        gamma = settings(study, "train", "alcc", MAIN).agent.made().gamma
+        gamma = settings_of_run(study, "train", "alcc", MAIN).agent.made().gamma
         left_out = {f"gamma_{gamma:g}", f"recipe_{study.recipe}"}
         if study.recipe in (None, SMOKE):
             left_out |= set(OF_DDPG)

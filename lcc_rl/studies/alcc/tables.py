@@ -14,16 +14,16 @@ import pandas as pd
 from lcc_rl.results.bootstrap import NOTHING, mean, share_saved
 from lcc_rl.results.measures import PATH
 from lcc_rl.results.names import heading
-from lcc_rl.results.render import MISSING
+from lcc_rl.results.render import DASH
 from lcc_rl.results.report import UNTRAINED
 from lcc_rl.results.windows import LEADER_COLUMNS, SOURCE, by_source, per_seed, savings
 
-PARTS = ("total_steady_energy_kj", "total_acceleration_loss_kj")
-BASELINES = ("idm", "human", "recorded", "idm_acc_filtered", "idm_acc", "rule", "reference")
-COMPARED = (*BASELINES, "own_energy")
+ENERGY_PARTS = ("total_steady_energy_kj", "total_acceleration_loss_kj")
+COMPARED_WITH = ("idm", "human", "recorded", "idm_acc_filtered", "idm_acc", "rule", "reference")
+COMPARED = (*COMPARED_WITH, "own_energy")
 # Prefix of a saving, and of which energy: the path's, which excludes what the motion stores and so
 # what ending slower saves; and as drawn (A2).
-KINDS = {"path_": "path_energy_kj", "": "energy_kj"}
+ENERGY_KINDS = {"path_": "path_energy_kj", "": "energy_kj"}
 TERCILES = ("lower", "middle", "upper")
 LONG, MOVING = "long_time_gap_pct", "long_time_gap_above_1_mps_pct"
 SHARES = {
@@ -31,7 +31,7 @@ SHARES = {
     LONG: "share_time_gap_long",
     MOVING: "share_time_gap_long_moving",
 }
-LIMITS = {"unsafe_ttc_pct": 0.1, LONG: 1.0}  # share of time [%], for every seed
+SHARE_LIMITS = {"unsafe_ttc_pct": 0.1, LONG: 1.0}  # share of time [%], for every seed
 
 
 def energies(windows: pd.DataFrame) -> pd.DataFrame:
@@ -43,27 +43,27 @@ def energies(windows: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for strategy, part in windows.groupby("strategy", sort=False):
         row: dict[str, object] = {"strategy": strategy, "seeds": _seeds(part)}
-        for column in (f"total_{name}" for name in KINDS.values()):
+        for column in (f"total_{name}" for name in ENERGY_KINDS.values()):
             row |= mean(part.groupby("training_seed", dropna=False)[column].mean()).columns(column)
-        for column in (*PARTS, "cav_energy_kj", "hdv_energy_kj"):
+        for column in (*ENERGY_PARTS, "cav_energy_kj", "hdv_energy_kj"):
             row[column] = part[column].mean()
         rows.append(row)
     return pd.DataFrame(rows)
 
 
-def headline(windows: pd.DataFrame) -> pd.DataFrame:
+def headline_rows(windows: pd.DataFrame) -> pd.DataFrame:
     """Savings of the total energy, of its path and as drawn, by trained strategy and baseline.
 
     The share saved [%] and that of the worst seed.
     """
-    columns = [f"total_{column}" for column in KINDS.values()]
+    columns = [f"total_{column}" for column in ENERGY_KINDS.values()]
     seeds = {column: per_seed(windows, column) for column in columns}
     rows = []
     for strategy in (name for name in seeds[columns[0]] if name not in UNTRAINED):
         for baseline in (x for x in COMPARED if x in seeds[columns[0]] and x != strategy):
             row: dict[str, object] = {"strategy": strategy, "against": baseline}
             row["seeds"] = _seeds(windows[windows["strategy"] == strategy])
-            for kind, column in zip(KINDS, columns, strict=True):
+            for kind, column in zip(ENERGY_KINDS, columns, strict=True):
                 share = savings(windows, column, strategy, baseline)
                 row |= share.columns(f"{kind}saving_pct", 100.0)
                 worst = share_saved(seeds[column][strategy].max(), seeds[column][baseline].mean())
@@ -118,7 +118,7 @@ def _thirds(windows: pd.DataFrame) -> Iterator[tuple[str, str, float, float, pd.
 
 def _seeds(rows: pd.DataFrame) -> str:
     """Return the number of training seeds; a dash for a strategy without training."""
-    return str(rows["training_seed"].nunique() or MISSING)
+    return str(rows["training_seed"].nunique() or DASH)
 
 
 def constraints(windows: pd.DataFrame) -> pd.DataFrame:
@@ -138,7 +138,7 @@ def constraints(windows: pd.DataFrame) -> pd.DataFrame:
             values = 100.0 * part.groupby("training_seed", dropna=False)[column].mean()
             row[f"mean_{name}"], row[f"worst_seed_{name}"] = values.mean(), values.max()
             row[f"worst_episode_{name}"] = 100.0 * part[f"worst_{column}"].max()
-            kept = kept and values.max() <= LIMITS.get(name, np.inf)
+            kept = kept and values.max() <= SHARE_LIMITS.get(name, np.inf)
         row["least_ttc_s"], row["least_gap_m"] = part["min_ttc_s"].min(), part["min_gap_m"].min()
         rows.append(row | {"within_limits": bool(kept)})
     return pd.DataFrame(rows)

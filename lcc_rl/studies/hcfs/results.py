@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from lcc_rl.evaluation.cases import WINDOWS
+from lcc_rl.evaluation.cases import WINDOW_CASES
 from lcc_rl.figures import platoon
 from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
@@ -19,20 +19,20 @@ from lcc_rl.studies.hcfs.tables import LEARNED
 from lcc_rl.studies.results import StudyResults
 
 LENGTHS = "lengths.parquet"  # rows of the windows of studies with trainings of several lengths
-SOURCES = "sources.parquet"  # rows of the windows of other sources of leaders
-TITLE = "Hybrid Car-Following Strategy: the study"
+SOURCES_FILE = "sources.parquet"  # rows of the windows of other sources of leaders
+HCFS_TITLE = "Hybrid Car-Following Strategy: the study"
 # The paper's table and figures of each case: speeds, jerk, and who drives.
 CASES = {
     "case 1": ("Table IV", 4, 5, 6),
     "case 2": ("Table V", 7, 8, 9),
     "case 3": ("Table VI", 10, 11, 12),
 }
-RULES = ("cacc path", "cacc paper_like", "cacc tuned")
-HYBRIDS = ("hcfs", "hcfs oracle", "hcfs untuned")
-PARENTS = ("cacc tuned", LEARNED)
-STRATEGIES = (*RULES, LEARNED, *HYBRIDS, "deadbeat")
+CACC_ROWS = ("cacc path", "cacc paper_like", "cacc tuned")
+HYBRID_ROWS = ("hcfs", "hcfs oracle", "hcfs untuned")
+PARENT_ROWS = ("cacc tuned", LEARNED)
+STRATEGIES = (*CACC_ROWS, LEARNED, *HYBRID_ROWS, "deadbeat")
 IN_CASES = ("cacc paper_like", "cacc tuned", LEARNED, "hcfs", "hcfs untuned", "deadbeat")
-WHOLE = ("cacc tuned", LEARNED, "hcfs", "hcfs literal", "deadbeat")
+WHOLE_ROWS = ("cacc tuned", LEARNED, "hcfs", "hcfs literal", "deadbeat")
 
 
 def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
@@ -52,13 +52,13 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     for case in CASES:
         _case(found, episodes, steps, case)
     found.table("table_iv", "Table IV as printed, on another record", tables.printed())
-    found.table("weights", "Σ reward from Σ|e_v| and Σ|jerk| of Table IV", tables.weights())
-    whole = tables.whole_records(episodes, WHOLE)
+    found.table("weights", "Σ reward from Σ|e_v| and Σ|jerk| of Table IV", tables.weight_table())
+    whole = tables.whole_records(episodes, WHOLE_ROWS)
     found.table("whole", "Σ reward over whole records (least … most of the trainings)", whole)
-    gains = tables.whole_gains(episodes, PARENTS)
+    gains = tables.whole_gains(episodes, PARENT_ROWS)
     found.table("whole_gains", "HCFS against its parents over whole records", gains)
-    if (folder / SOURCES).exists():  # only where platoons drove behind other leaders, too
-        runs = read_parquet(folder / SOURCES)
+    if (folder / SOURCES_FILE).exists():  # only where platoons drove behind other leaders, too
+        runs = read_parquet(folder / SOURCES_FILE)
         shown = tables.sources(runs, ("cacc tuned", "hcfs", "hcfs first"))
         found.table("sources", "Windows of other sources of leaders", shown)
         found.table("sources_in_full", "The same of all strategies", tables.sources(runs))
@@ -67,7 +67,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
         found.table("lengths", "Σ reward per window by the length of the training", lengths)
     curve = learning_curve(read_parquet(folder / TRAINING))
     found.figure("learning_curve", "Learning curve of the DDPG parent", curve)
-    found.write(TITLE)
+    found.write(HCFS_TITLE)
     return found
 
 
@@ -79,7 +79,7 @@ def _windows(found: StudyResults, episodes: pd.DataFrame) -> None:
     found.table("windows", "Σ reward per window", tables.windows(episodes, STRATEGIES))
     found.table("win_rates", "HCFS (rule: CACC tuned) against every other", gained)
     found.table("win_rates_untuned", "HCFS with the CACC of Table IV", untuned)
-    found.table("windows_in_full", "Held-out windows: means", case_table(episodes, WINDOWS))
+    found.table("windows_in_full", "Held-out windows: means", case_table(episodes, WINDOW_CASES))
     found.table("cases", "Σ reward in the cases of the paper", cases)
 
 

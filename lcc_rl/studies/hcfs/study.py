@@ -33,7 +33,7 @@ from lcc_rl.studies.study import Study
 log = logging.getLogger("lcc_rl")
 
 RECIPE = "paper_hcfs"
-BASELINES = "baselines"  # folder of the evaluation of what is not trained
+BASELINES_FOLDER = "baselines"  # folder of the evaluation of what is not trained
 UNTUNED = "paper_like"
 TRAINING = "training.parquet"
 # A second whole record beside the default leader's.
@@ -73,7 +73,7 @@ def run(study: Study) -> None:
     prepare_torch(cfg)
     inputs = load_inputs(cfg)
     target = study.folder / "evaluation"
-    _evaluate(baselines(cfg), cfg, inputs, target / BASELINES)
+    _evaluate(baselines(cfg), cfg, inputs, target / BASELINES_FOLDER)
     done = [place / name for name in runs]
     for folder in done:
         own = evaluation(study, f"policy={quoted(folder)}")
@@ -89,9 +89,9 @@ def keep(folder: Path, trainings: Sequence[Path]) -> None:
     """Write the page's tables: a row per run, the first training's cases over time, and curves."""
     root = folder / "evaluation"
     seeds = [root / path.name for path in trainings]
-    found = [read_parquet(path / EPISODES) for path in (root / BASELINES, *seeds)]
+    found = [read_parquet(path / EPISODES) for path in (root / BASELINES_FOLDER, *seeds)]
     write_parquet(per_run(pd.concat(found, ignore_index=True)), folder / EPISODES)
-    found = [read_parquet(path / STEPS) for path in (root / BASELINES, *seeds[:1])]
+    found = [read_parquet(path / STEPS) for path in (root / BASELINES_FOLDER, *seeds[:1])]
     write_parquet(rounded(pd.concat(found, ignore_index=True)), folder / STEPS)
     found = [
         read_parquet(path / TRAINING)[["episodes", "episode_reward"]].assign(

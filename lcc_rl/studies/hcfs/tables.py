@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import torch
 
-from lcc_rl.data.leaders import WHOLE
-from lcc_rl.evaluation.cases import WINDOWS
+from lcc_rl.data.leaders import WHOLE_RECORD
+from lcc_rl.evaluation.cases import WINDOW_CASES
 from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.results import bootstrap
 from lcc_rl.results.platoons import COUNTS, case_table
@@ -23,7 +23,7 @@ TABLE_IV = {
     "HCFS": (25.26, 0.04, 192.19, -9.64),
 }
 CASE_3 = {"CACC": -4.78, "DDPG": -5.81, "HCFS": -1.90}  # Σ reward in Table VI
-NAMES = {  # of strategies, for readers
+STRATEGY_WORDS = {  # of strategies, for readers
     "cacc path": "CACC, PATH gains",
     "cacc paper_like": "CACC, fitted to Table IV",
     "cacc tuned": "CACC, tuned",
@@ -45,7 +45,7 @@ GAINED = {
 RUN = ["strategy", "training_seed", "case", "profile", "run_id"]
 SUMS = ["speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "reward", "frames"]
 SUMS += ["collided", *COUNTS]
-LARGEST = ["max_gap_error_m", "peak_jerk_mps3", "energy_ratio"]
+LARGEST_COLUMNS = ["max_gap_error_m", "peak_jerk_mps3", "energy_ratio"]
 # What is kept of runs behind other sources of leaders, and of which strategies.
 COMPARED_BY = ["reward", "jerk_sum", "min_gap_m", "max_gap_error_m", "energy_ratio"]
 COMPARED_BY += ["energy_kj_per_km"]
@@ -63,7 +63,7 @@ LEADERS = {  # sources of leaders, for readers
 
 def per_run(episodes: pd.DataFrame) -> pd.DataFrame:
     """Sum the rows of the vehicles of each run; :func:`case_table` reads the result alike."""
-    how = {**dict.fromkeys(SUMS, "sum"), **dict.fromkeys(LARGEST, "max")}
+    how = {**dict.fromkeys(SUMS, "sum"), **dict.fromkeys(LARGEST_COLUMNS, "max")}
     how |= {"min_gap_m": "min", "learned_share": "mean", "energy_kj_per_km": "mean"}
     how |= {DRIVE: "first"} if DRIVE in episodes else {}
     return episodes.groupby(RUN, sort=False, dropna=False, as_index=False).agg(how)
@@ -81,7 +81,7 @@ def printed() -> pd.DataFrame:
     return pd.DataFrame([(name, *row) for name, row in TABLE_IV.items()], columns=columns)
 
 
-def weights() -> pd.DataFrame:
+def weight_table() -> pd.DataFrame:
     """Compare the rewards printed in Table IV with those of its sums of errors and jerks."""
     reward = PlatoonReward()
     rows = [
@@ -92,7 +92,9 @@ def weights() -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns)
 
 
-def per_seed(episodes: pd.DataFrame, strategy: str, case: str, of: str = "reward") -> pd.DataFrame:
+def reward_per_seed(
+    episodes: pd.DataFrame, strategy: str, case: str, of: str = "reward"
+) -> pd.DataFrame:
     """Return a sum of every run, ``[runs × seeds]``; one column where nothing was learned.
 
     The index names the run's window and its drive; of rows without drives each window is one.
@@ -104,7 +106,7 @@ def per_seed(episodes: pd.DataFrame, strategy: str, case: str, of: str = "reward
     )
 
 
-def crossed(runs: pd.DataFrame) -> bootstrap.Estimate:
+def crossed_rewards(runs: pd.DataFrame) -> bootstrap.Estimate:
     """Return the mean of a table of :func:`per_seed` with its interval over drives and seeds."""
     return bootstrap.crossed(runs, drives=_drives(runs))
 
@@ -117,7 +119,7 @@ def win_rates(
     episodes: pd.DataFrame,
     of: str = "hcfs",
     against: Sequence[str] | None = None,
-    case: str = WINDOWS,
+    case: str = WINDOW_CASES,
 ) -> pd.DataFrame:
     """Compare the strategy ``of`` with others, all by default, on the same windows.
 
@@ -127,11 +129,11 @@ def win_rates(
         with 95 % intervals over drives and seeds. Trained strategies are compared seed by seed;
         ``seeds_ahead`` counts the seeds with a positive difference.
     """
-    own = per_seed(episodes, of, case)
+    own = reward_per_seed(episodes, of, case)
     names = [n for n in dict.fromkeys(episodes["strategy"]) if n != of]
     rows = []
     for name in names if against is None else against:
-        other = per_seed(episodes, name, case)
+        other = reward_per_seed(episodes, name, case)
         if len(other.columns) == 1:
             other = pd.concat([other.iloc[:, 0]] * len(own.columns), axis=1, keys=own.columns)
         shared = own.columns.intersection(other.columns)
@@ -139,8 +141,8 @@ def win_rates(
         wins = (difference > 1e-6) + 0.5 * (difference.abs() <= 1e-6)
         row: dict[str, object] = {"strategy": of, "against": name}
         row |= {"trainings": len(shared), "windows": len(difference)}
-        row |= crossed(wins).columns("wins_pct", 100.0)
-        row |= crossed(difference).columns("reward_gain")
+        row |= crossed_rewards(wins).columns("wins_pct", 100.0)
+        row |= crossed_rewards(difference).columns("reward_gain")
         # Rewards are negative: the share of the loss that is saved.
         both = -own[shared], -other[shared]
         gain = bootstrap.saving(*both, paired=True, drives=_drives(own))
@@ -154,14 +156,14 @@ def windows(episodes: pd.DataFrame, strategies: Sequence[str], of: str = "hcfs")
 
     Intervals are over windows and, where something was learned, seeds.
     """
-    table = case_table(episodes, WINDOWS).set_index("strategy").loc[list(strategies)]
+    table = case_table(episodes, WINDOW_CASES).set_index("strategy").loc[list(strategies)]
     against = win_rates(episodes, of, [s for s in strategies if s != of]).set_index("against")
     rows = [
         {
-            "strategy": NAMES[name],
+            "strategy": STRATEGY_WORDS[name],
             "Σ abs e_v_mps": table.at[name, "speed_error_sum_mps"],
             "Σ abs jerk_mps3": table.at[name, "jerk_sum_mps3"],
-            **crossed(per_seed(episodes, name, WINDOWS)).columns("Σ reward"),
+            **crossed_rewards(reward_per_seed(episodes, name, WINDOW_CASES)).columns("Σ reward"),
         }
         for name in strategies
     ]
@@ -173,7 +175,7 @@ def whole_gains(episodes: pd.DataFrame, parents: Sequence[str]) -> pd.DataFrame:
     """Return what HCFS gains on its parents over whole records, with intervals over seeds."""
     return pd.DataFrame(
         [
-            {"record": record, "against": NAMES[str(row["against"])]}
+            {"record": record, "against": STRATEGY_WORDS[str(row["against"])]}
             | {new: row[old] for old, new in GAINED.items() if old.startswith("gain")}
             | {"seeds ahead": row["seeds_ahead"]}
             for case, record in _records(episodes).items()
@@ -184,8 +186,8 @@ def whole_gains(episodes: pd.DataFrame, parents: Sequence[str]) -> pd.DataFrame:
 
 def _records(episodes: pd.DataFrame) -> dict[str, str]:
     """Return the cases that are whole records, and the records' names."""
-    cases = (c for c in map(str, dict.fromkeys(episodes["case"])) if c.startswith(WHOLE))
-    return {case: case.removeprefix(WHOLE).strip().upper() for case in cases}
+    cases = (c for c in map(str, dict.fromkeys(episodes["case"])) if c.startswith(WHOLE_RECORD))
+    return {case: case.removeprefix(WHOLE_RECORD).strip().upper() for case in cases}
 
 
 def over_cases(episodes: pd.DataFrame, cases: Sequence[str], like: Sequence[str]) -> pd.DataFrame:
@@ -193,7 +195,7 @@ def over_cases(episodes: pd.DataFrame, cases: Sequence[str], like: Sequence[str]
     tables = {case: case_table(episodes, case).set_index("strategy") for case in cases}
     rows = []
     for name in like:
-        row: dict[str, object] = {"strategy": NAMES[name]}
+        row: dict[str, object] = {"strategy": STRATEGY_WORDS[name]}
         for case, table in tables.items():
             row |= {f"{case}{end}": table.at[name, f"reward{end}"] for end in ("", "_low", "_high")}
         rows.append(row)
@@ -215,8 +217,8 @@ def lengths(rewards_by_length: pd.DataFrame) -> pd.DataFrame:
             {
                 "episodes of training": episodes,
                 "trainings": parent["trainings"],
-                **crossed(per_seed(group, LEARNED, WINDOWS)).columns("DDPG"),
-                **crossed(per_seed(group, "hcfs", WINDOWS)).columns("HCFS"),
+                **crossed_rewards(reward_per_seed(group, LEARNED, WINDOW_CASES)).columns("DDPG"),
+                **crossed_rewards(reward_per_seed(group, "hcfs", WINDOW_CASES)).columns("HCFS"),
                 **{new: parent[old] for old, new in GAINED.items() if old.startswith("gain")},
             }
         )
@@ -239,7 +241,7 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
     named = runs["source"].map(LEADERS).fillna(runs["source"])
     for source, group in runs.groupby(named, sort=False):
         spent = {
-            name: per_seed(group, name, WINDOWS, "energy_kj_per_km")
+            name: reward_per_seed(group, name, WINDOW_CASES, "energy_kj_per_km")
             for name in strategies
             if name in set(group["strategy"])
         }
@@ -247,8 +249,8 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
             own = group[group["strategy"] == name]
             saved = bootstrap.saving(energy, spent[strategies[0]], drives=_drives(energy))
             above = f"{(own['energy_ratio'] > 1.0).sum()} of {len(own)}"
-            row: dict[str, object] = {"leaders": source, "strategy": NAMES[name]}
-            row |= crossed(per_seed(group, name, WINDOWS)).columns("Σ reward")
+            row: dict[str, object] = {"leaders": source, "strategy": STRATEGY_WORDS[name]}
+            row |= crossed_rewards(reward_per_seed(group, name, WINDOW_CASES)).columns("Σ reward")
             row |= {"gap error_m": own["max_gap_error_m"].max()}
             row |= {"string ratio, above 1": f"{own['energy_ratio'].max():.2f}, {above}"}
             rows.append(row | saved.columns("energy saved_pct", 100.0))
@@ -266,7 +268,7 @@ def whole_records(episodes: pd.DataFrame, strategies: Sequence[str]) -> pd.DataF
                 rows.append(
                     {
                         "record": record,
-                        "strategy": NAMES[name],
+                        "strategy": STRATEGY_WORDS[name],
                         "Σ reward": runs["reward"].mean(),
                         "Σ reward_low": runs["reward"].min() if many else np.nan,
                         "Σ reward_high": runs["reward"].max() if many else np.nan,
