@@ -33,7 +33,7 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
-from lcc_rl.errors import LARGEST, LARGEST_SIZE, ConfigError, LccError, unknown_name
+from lcc_rl.errors import LARGEST, LARGEST_SIZE, LAST_SEED, ConfigError, LccError, unknown_name
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
@@ -42,6 +42,7 @@ Speed = Annotated[float, Field(ge=0.0, le=100.0)]  # of a vehicle [m/s]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 Count = Annotated[int, Field(ge=1, le=LARGEST_SIZE)]
 Whole = Annotated[int, Field(ge=0)]
+Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
 Million = Annotated[int, Field(ge=1, le=1_000_000)]
 MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a command
 Parallel = Annotated[int, Field(ge=1, le=MOST_PARALLEL)]

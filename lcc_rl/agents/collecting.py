@@ -28,7 +28,7 @@ LEARNED_FROM = {
 }
 
 # Steps of an environment from which on compiling it, which takes 5 to 10 s, pays for itself.
-WORTH_COMPILING = 40_000
+COMPILED_TRAINING_STEPS = 40_000
 
 
 class CollectingLoop(TrainingLoop[AgentT]):
@@ -72,7 +72,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
         """
         if self.settings.compiled is not None:
             return self.settings.compiled
-        return self.iterations * self.horizon >= WORTH_COMPILING
+        return self.iterations * self.horizon >= COMPILED_TRAINING_STEPS
 
     def _iterate(self, collector: BaseCollector) -> dict[str, float]:
         """Play one batch of episodes, learning after every segment of them."""

@@ -23,7 +23,7 @@ from lcc_rl.pieces.rewards import RewardTerm
 log = logging.getLogger("lcc_rl")
 
 # Iterations from which on compiling the simulator pays for itself.
-WORTH_COMPILING = 100
+COMPILED_ITERATIONS = 100
 
 
 class GradientLoop(TrainingLoop[Any]):
@@ -54,7 +54,9 @@ class GradientLoop(TrainingLoop[Any]):
         if compiled is None:
             compiled = self.settings.compiled
         if compiled is None:
-            compiled = self.iterations >= WORTH_COMPILING  # of the whole: resuming changes nothing
+            compiled = (
+                self.iterations >= COMPILED_ITERATIONS
+            )  # of the whole: resuming changes nothing
         return self._rollout(compiled)
 
     def _rollout(self, compiled: bool = False) -> DifferentiableRollout:

@@ -17,11 +17,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lcc_rl.config.words import RECORDED
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError
 
 log = logging.getLogger("lcc_rl")
-RECORDED = "recorded"
 LEAST = 1e-3  # a limit of zero is approached as if it were this share
 
 

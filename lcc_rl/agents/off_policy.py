@@ -21,7 +21,7 @@ from lcc_rl.agents.actor import GaussianExploration, make_actor, seeded_mlp
 from lcc_rl.agents.agent import Agent, Fraction, Scene, anneal, derived_seed
 from lcc_rl.agents.fused import ActorCritic
 from lcc_rl.agents.replay import ReplayLoop
-from lcc_rl.agents.vectors import join, take_step, vector_adam, views
+from lcc_rl.agents.vectors import as_vector, take_step, vector_adam, views
 from lcc_rl.errors import ConfigError
 from lcc_rl.settings import Count, NonNegative, Positive, Settings, Share, Whole, given_as
 
@@ -153,7 +153,7 @@ class OffPolicy(Agent):
     ) -> None:
         """Let all that is learned live in one vector, as do its gradients and the targets."""
         everything = [tensor for network in networks.values() for tensor in network]
-        vector = join(everything)
+        vector = as_vector(everything)
         self.slopes = torch.zeros_like(vector)
         for parameter, slope in zip(everything, views(self.slopes, everything), strict=True):
             parameter.grad = slope
@@ -164,7 +164,7 @@ class OffPolicy(Agent):
             alone = zip(sizes, *parts, strict=True)
             groups = {n: (own, slope, [len(own)], [rates[n]]) for n, own, slope in alone}
         self.optimizers = {name: vector_adam(*group) for name, group in groups.items()}
-        target = join([tensor for network in targets.values() for tensor in network])
+        target = as_vector([tensor for network in targets.values() for tensor in network])
         behind = target.split([sizes[name] for name in targets])
         ahead = dict(zip(sizes, parts[0], strict=True))
         self.targets = {n: (own, ahead[n]) for n, own in zip(targets, behind, strict=True)}

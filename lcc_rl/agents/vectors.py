@@ -15,7 +15,7 @@ def views(vector: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
     return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
 
-def join(tensors: Sequence[Tensor]) -> Tensor:
+def as_vector(tensors: Sequence[Tensor]) -> Tensor:
     """Move tensors into one vector, of which they become views, and return it."""
     vector = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
     for tensor, view in zip(tensors, views(vector, tensors), strict=True):

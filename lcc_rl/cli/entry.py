@@ -30,7 +30,7 @@ from lcc_rl.config import (
     explained,
     is_sweep,
     parsed,
-    root_key,
+    top_key,
 )
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, input_error
@@ -229,7 +229,7 @@ def resumed_folder(cfg: StudyConfig, own: Sequence[str]) -> Path:
     """
     if cfg.resume is None:
         return run_folder()
-    others = [item for item in HydraConfig.get().overrides.task if root_key(item) not in own]
+    others = [item for item in HydraConfig.get().overrides.task if top_key(item) not in own]
     if others:
         raise ConfigError(
             f"a resumed run keeps the settings it was started with; remove {' '.join(others)}"

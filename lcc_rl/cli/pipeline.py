@@ -5,7 +5,7 @@ from __future__ import annotations
 from hydra.core.hydra_config import HydraConfig
 
 from lcc_rl.cli.entry import entry_point, resumed_folder
-from lcc_rl.config import root_key
+from lcc_rl.config import top_key
 from lcc_rl.config.schemas import PipelineConfig
 from lcc_rl.runs.output import headlines
 
@@ -17,7 +17,7 @@ def main(cfg: PipelineConfig) -> None:
 
     folder = resumed_folder(cfg, ("resume", "trust"))
     typed, chosen = HydraConfig.get().overrides.task, HydraConfig.get().runtime.choices
-    own = [] if any(root_key(item) == "experiment" for item in typed) else ["experiment"]
+    own = [] if any(top_key(item) == "experiment" for item in typed) else ["experiment"]
     with headlines():  # the parts are composed of what was typed, and of the default
         run(cfg, folder, [*(f"{key}={chosen[key]}" for key in own), *typed])
 

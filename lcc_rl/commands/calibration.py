@@ -33,7 +33,7 @@ from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import Phases
 from lcc_rl.runs.states import claim
 
-ERROR_COLUMNS = (
+ERROR_HEADINGS = (
     *(("rmspe", "RMSPE [%]"), ("gap_rmse_m", "gap RMSE [m]")),
     ("gap_nrmse", "gap NRMSE [%]"),
 )
@@ -124,8 +124,8 @@ def _summary(drivers: pd.DataFrame) -> Table:
     table = Table("", *modes, title="calibrated drivers, mean ± standard deviation", **PLAIN)
     parts = {mode: drivers[drivers["mode"] == mode] for mode in modes}
     table.add_row("fitted", *map(count_records, parts.values()))
-    errors = [(column, column, label) for column, label in ERROR_COLUMNS]
-    errors += [(column + OUT, column, f"{label}, held out") for column, label in ERROR_COLUMNS]
+    errors = [(column, column, label) for column, label in ERROR_HEADINGS]
+    errors += [(column + OUT, column, f"{label}, held out") for column, label in ERROR_HEADINGS]
     for column, kind, label in errors:
         if column in drivers:
             scale = 1.0 if kind.endswith("_m") else 100.0

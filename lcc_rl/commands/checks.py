@@ -30,8 +30,8 @@ from lcc_rl.runs.loggers import Silent
 
 MESSAGES = "communication"  # the piece by which connected vehicles hear of each other
 MEASURED = {"episodes": ("ttc", "time_gap", "power"), "vehicles": (MESSAGES,)}
-MOMENTS = 24  # that a step of a training keeps of every entry, its gradients included
-RECORD = 4096  # bytes of an iteration's row in the record
+KEPT_MOMENTS = 24  # that a step of a training keeps of every entry, its gradients included
+RECORD_BYTES = 4096  # bytes of an iteration's row in the record
 
 
 def check_settings(cfg: TrainConfig, folder: Path) -> None:
@@ -91,14 +91,14 @@ def training_bytes(cfg: StudyConfig, moment: TensorDictBase) -> dict[str, float]
     settings, agent = cfg.training, cfg.agent.settings
     count, vehicles = settings.environments, moment[OBSERVATION].shape[-2]
     transition = 4 * (2 * moment[OBSERVATION].shape[-1] + 2)  # before, after, action and reward
-    needs = {f"training.episodes={settings.episodes}": settings.episodes / count * RECORD}
+    needs = {f"training.episodes={settings.episodes}": settings.episodes / count * RECORD_BYTES}
     if "buffer_size" in agent:
-        played = MOMENTS * moment.bytes() + 2 * cfg.scenario.horizon * vehicles * transition
+        played = KEPT_MOMENTS * moment.bytes() + 2 * cfg.scenario.horizon * vehicles * transition
         learned = 2 * transition + 16 * sum(agent["hidden"])
         needs[f"agent.buffer_size={agent['buffer_size']}"] = agent["buffer_size"] * transition
         needs[f"agent.batch_size={agent['batch_size']}"] = agent["batch_size"] * learned
     else:
-        played = MOMENTS * moment.bytes() * settings.segment
+        played = KEPT_MOMENTS * moment.bytes() * settings.segment
     return {f"training.environments={count}": count * played, **needs}
 
 

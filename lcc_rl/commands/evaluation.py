@@ -22,14 +22,14 @@ from lcc_rl.commands.checks import (
 from lcc_rl.config import identity, with_inputs
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
-from lcc_rl.config.words import FILTERED
+from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store
 from lcc_rl.evaluation.fit import check_policy, other_traffic
-from lcc_rl.evaluation.named import DIRECT, RECORDED, controller_of, is_policy, label_of
+from lcc_rl.evaluation.named import DIRECT, controller_of, is_policy, is_shipped, label_of
 from lcc_rl.evaluation.strategies import (
     POLICY,
     Strategy,
@@ -153,7 +153,8 @@ def draw(rows: Rows, cfg: EvaluateConfig, folder: Path) -> None:
     # Here: a training, which draws nothing, need not load matplotlib.
     from lcc_rl.figures.evaluation import write_figures
 
-    write_figures(folder, cfg.evaluation.rows, list(reports(rows, cfg)))
+    own = [name for name in rows["strategy"].unique() if not is_shipped(name)]
+    write_figures(folder, cfg.evaluation.rows, list(reports(rows, cfg)), own)
 
 
 def task_of(cfg: StudyConfig) -> Task | None:

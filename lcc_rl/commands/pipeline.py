@@ -20,7 +20,7 @@ from lcc_rl import results
 from lcc_rl.agents import Analytic
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.checks import check_measured, check_settings
-from lcc_rl.config import NOT_IDENTITY, load, root_key, with_inputs
+from lcc_rl.config import NOT_IDENTITY, load, top_key, with_inputs
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import (
     KINDS,
@@ -120,11 +120,11 @@ def composed_part(
 ) -> tuple[dict[str, TrainConfig], EvaluateConfig]:
     """Compose every part of a job: its trainings by variant, and the evaluation."""
     for item in overrides:
-        if root_key(item) == "variant":
+        if top_key(item) == "variant":
             raise ConfigError(
                 f"{item} has no effect on lcc-rl run, which trains several: use variants=[…]"
             )
-    shared = [item for item in overrides if root_key(item) not in JOB_OPTIONS]
+    shared = [item for item in overrides if top_key(item) not in JOB_OPTIONS]
     names = cfg.variants or NETWORKS
     trainings = {name: load("train", [*shared, f"variant={name}"]) for name in names}
     if cfg.variants is None and trainings[names[-1]].agent.kind is Analytic:
@@ -290,4 +290,4 @@ def _finished(folder: Path, cfg: TrainConfig) -> bool:
 def known_settings(overrides: list[str], entry: str) -> list[str]:
     """Keep the overrides that an entry point has settings for."""
     known = {"experiment", *KINDS[entry].__dataclass_fields__}
-    return [item for item in overrides if root_key(item) in known]
+    return [item for item in overrides if top_key(item) in known]

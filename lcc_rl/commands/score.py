@@ -30,10 +30,10 @@ from rich.console import Console
 
 from lcc_rl.commands.checks import check_evaluation, check_installed
 from lcc_rl.commands.evaluation import evaluate_and_write, task_of
-from lcc_rl.config import check_overrides, choices, identity, load, root_key
+from lcc_rl.config import check_overrides, choices, identity, load, top_key
 from lcc_rl.config.inputs import compared_files
 from lcc_rl.config.schemas import EvaluateConfig
-from lcc_rl.config.words import FILTERED
+from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.drivers.population import fixed
 from lcc_rl.envs import build_env, load_inputs
@@ -42,7 +42,6 @@ from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, requir
 from lcc_rl.evaluation.episodes import any_leader
 from lcc_rl.evaluation.named import (
     DIRECT,
-    RECORDED,
     controller_of,
     is_policy,
     is_shipped,
@@ -157,7 +156,7 @@ def roads(
     people = HUMAN in own.scenario.vehicles.names and own.drivers.kind is not fixed
     left = () if people else ("drivers",)
     return {
-        name: load("evaluate", [*words, *(word for word in of if root_key(word) not in left)])
+        name: load("evaluate", [*words, *(word for word in of if top_key(word) not in left)])
         for name, of in given.items()
     }
 
@@ -287,11 +286,11 @@ def _source(given: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     )
     for word in words:
         require(
-            "=" in word and root_key(word) in OF_A_SOURCE,
+            "=" in word and top_key(word) in OF_A_SOURCE,
             f"--source {name}: expected settings of {', '.join(OF_A_SOURCE)}, got {word}; others "
             "stand before it",
         )
-    people = () if any(root_key(word) == "drivers" for word in words) else ("drivers=highway",)
+    people = () if any(top_key(word) == "drivers" for word in words) else ("drivers=highway",)
     return name, (*people, *words)
 
 

@@ -20,7 +20,7 @@ from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
 from lcc_rl.evaluation.cases import WINDOW_CASES, check_cases
 from lcc_rl.evaluation.fit import check_policy
-from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
+from lcc_rl.evaluation.strategies import POLICY, Strategy, deployed, rule, with_weights
 from lcc_rl.io.files import Rows, as_rows
 from lcc_rl.results.platoons import case_table
 from lcc_rl.results.policies import load_policy, save_policy
@@ -32,7 +32,7 @@ from lcc_rl.runs.states import working
 
 log = logging.getLogger("lcc_rl")
 
-POLICIES, POLICY, LAST, CHECKPOINT = "policies", "policy.pt", "policy_last.pt", "checkpoint.pt"
+POLICIES, LAST, CHECKPOINT = "policies", "policy_last.pt", "checkpoint.pt"
 RECORD = "training.parquet"
 
 

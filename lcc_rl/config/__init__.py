@@ -16,7 +16,7 @@ from lcc_rl.config.compose import (
     parsed,
     with_inputs,
 )
-from lcc_rl.config.words import check_overrides, key_of, quoted, root_key
+from lcc_rl.config.words import check_overrides, key_of, quoted, top_key
 
 __all__ = [
     "HYDRA_ERRORS",
@@ -35,6 +35,6 @@ __all__ = [
     "own_file",
     "parsed",
     "quoted",
-    "root_key",
+    "top_key",
     "with_inputs",
 ]

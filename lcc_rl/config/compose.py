@@ -41,7 +41,7 @@ EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "swe
 NEEDED = ("data", "split", "drivers", "observation", "calibration")  # of commands that have them
 NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =
 # Hydra's keys are without quotes.
-NAMES = (
+NAMES_HINT = (
     "; names before a colon have no quotes but letters, digits, spaces and _-+./%*@?|, and begin "
     "with a letter; lcc_rl.compare takes any"
 )
@@ -267,7 +267,7 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         if not equals:
             return ConfigError(f"{key}: settings are written key=value; -h shows the help")
         typed = next((word for word in overrides if key_of(word) == key), f"{key}={value}")
-        names = NAMES if key == "compare" and "{" in value else ""
+        names = NAMES_HINT if key == "compare" and "{" in value else ""
         return ConfigError(
             f"{typed}: cannot be read as a setting. Brackets must be closed, and text "
             f"with spaces, commas or signs needs quotes within quotes: \"{key}='…'\"{names}"

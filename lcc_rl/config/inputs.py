@@ -24,15 +24,15 @@ from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.settings import TARGET, find_target
 
-Inputs = dict[str, dict[str, str]]
+FileHashes = dict[str, dict[str, str]]
 NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
-NAMES = ("compare", "policy")  # sections that name policies, controllers and classes
+NAMING_SECTIONS = ("compare", "policy")  # sections that name policies, controllers and classes
 OURS = "lcc_rl."
 PLACES = ("stdlib", "platstdlib", "purelib", "platlib")  # of what is installed
 INSTALLED = [Path(sysconfig.get_path(x)) for x in PLACES] + [Path(__file__).parents[1]]
 
 
-def inputs_of(content: Mapping[str, Any]) -> Inputs:
+def inputs_of(content: Mapping[str, Any]) -> FileHashes:
     """Return hashes of the files that a configuration names, as they are now.
 
     These are what ``path`` of any node names, a file, several, a folder or a pattern; policies and
@@ -46,10 +46,10 @@ def inputs_of(content: Mapping[str, Any]) -> Inputs:
         By section of the configuration, the first part of a setting's key, the hash of each file
         by its path as given, of a module by its name.
     """
-    found: Inputs = {}
+    found: FileHashes = {}
     for key, holder, value in settings_at(content):
         section, last = key.partition(".")[0], key.rpartition(".")[2]
-        named = section in NAMES and (holder is content or holder is content[section])
+        named = section in NAMING_SECTIONS and (holder is content or holder is content[section])
         for name in value if isinstance(value, list) else [value]:
             if section in NOT_READ or not isinstance(name, str):
                 continue

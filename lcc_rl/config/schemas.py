@@ -14,7 +14,7 @@ import yaml
 from pydantic import AfterValidator, Field
 
 from lcc_rl.config.nodes import Node, as_nodes, as_plain, check_nodes, check_numbers
-from lcc_rl.errors import LAST_SEED, ConfigError
+from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import VehicleString, parse_string
 from lcc_rl.settings import (
     TARGET,
@@ -23,12 +23,12 @@ from lcc_rl.settings import (
     NonNegative,
     Parallel,
     Positive,
+    Seed,
     Settings,
     Speed,
     parse,
 )
 
-Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
 Device = Annotated[str, Field(pattern=r"^(cpu|cuda)(:\d+)?$")]
 # Each names a folder in the job's.
 Variants = Annotated[list[Annotated[str, Field(pattern=r"^\w[\w.-]*$")]], Field(min_length=1)]

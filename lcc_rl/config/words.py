@@ -7,7 +7,8 @@ from pathlib import Path
 
 from lcc_rl.errors import ConfigError
 
-FILTERED = "_filtered"  # ends the names of those who drive behind the safety filter
+FILTERED = "_filtered"  # ends the names of controllers behind the safety filter
+RECORDED = "recorded"  # the first vehicle drives, or a limit is kept, as the driver recorded there
 
 
 def key_of(override: str) -> str:
@@ -20,7 +21,7 @@ def quoted(path: str | Path) -> str:
     return "'" + str(path).replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
-def root_key(override: str) -> str:
+def top_key(override: str) -> str:
     """Return the top-level key that an override changes."""
     return key_of(override).split(".")[0].split("@")[0]
 
@@ -39,7 +40,7 @@ def check_overrides(words: Sequence[str], given: Collection[str], reason: str) -
     if any(word.startswith("-") or ("=" not in word and word[:1] != "~") for word in words):
         raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")
     for word in words:
-        if root_key(word) in given:
+        if top_key(word) in given:
             raise ConfigError(f"{word}: {reason}")
-        if root_key(word) == "hydra":
+        if top_key(word) == "hydra":
             raise ConfigError(f"{word} has no effect: this command chooses the folders itself")

@@ -35,7 +35,7 @@ from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, chec
 
 LISTED = 8  # names in a line
 WHOLE_RECORD = "full length"  # a case that is a whole record, before the record's name
-Nodes = Mapping[str, Mapping[str, Any] | None]
+StretchNodes = Mapping[str, Mapping[str, Any] | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,10 +139,10 @@ def stretch(
 class RecordLeaders(Settings):
     """Leaders that drive speed records or drive cycles from files."""
 
-    training: Nodes  # stretches by name, see Stretch
-    held_out: Nodes  # stretches that windows for evaluation are cut from
-    cases: Nodes = Field(default_factory=dict)  # ``case_1`` for "case 1", see CaseSettings
-    full_length: Nodes | None = None  # stretches driven from end to end
+    training: StretchNodes  # stretches by name, see Stretch
+    held_out: StretchNodes  # stretches that windows for evaluation are cut from
+    cases: StretchNodes = Field(default_factory=dict)  # ``case_1`` for "case 1", see CaseSettings
+    full_length: StretchNodes | None = None  # stretches driven from end to end
     # Evaluation windows whose total speed change is below this are left out [m/s].
     least_variation: NonNegative = 2.0
     path: str | None = None  # of stretches that name none
@@ -188,7 +188,7 @@ class RecordLeaders(Settings):
         )
         return replace(leaders, cases=tuple(cases), full_length=tuple(full_length))
 
-    def _stretches(self, group: str, nodes: Nodes, time_step: float) -> list[Profiles]:
+    def _stretches(self, group: str, nodes: StretchNodes, time_step: float) -> list[Profiles]:
         parts = []
         for name, node in nodes.items():
             x = self._parsed(Stretch, node, f"leader.{group}.{name}")

@@ -15,6 +15,7 @@ from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import build_pieces, world_of
 from lcc_rl.envs.inputs import Inputs
 from lcc_rl.evaluation.rollout import play, reset_options
+from lcc_rl.evaluation.rows import INDEX
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import REWARD
@@ -24,7 +25,6 @@ from lcc_rl.results.windows import DRIVE, SOURCE
 WINDOW_CASES = "windows"
 TRACKING_ERRORS = ("gap_error", "speed_error", "leader_speed_error")
 CASE_ENTRIES = ("speed", "gap", "acceleration", "jerk", "power", *TRACKING_ERRORS)
-INDEX = (AUTOMATED, "index")
 CASE_KEYS = [("leader", "speed"), *(("vehicles", name) for name in CASE_ENTRIES), REWARD]
 CASE_KEYS += [INDEX, WINNER, *COUNTERS]
 CaseSeries = dict[str, Tensor]  # ``[time, runs, vehicles]``

@@ -39,7 +39,7 @@ from lcc_rl.pieces.features import CLASS
 from lcc_rl.results.measures import FASTER
 
 # Steps of a strategy from which on compiling saves more than the 3 to 6 s that it takes.
-WORTH_COMPILING = 20_000_000
+COMPILED_STEPS = 20_000_000
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class Episodes:
         self.cfg = after_humans(any_leader(strategy.cfg), strategy.cfg.evaluation.humans_first)
         self.begun = self.cfg.scenario.horizon - strategy.cfg.scenario.horizon
         if compiled is None:
-            compiled = len(plan) * self.cfg.scenario.horizon >= WORTH_COMPILING
+            compiled = len(plan) * self.cfg.scenario.horizon >= COMPILED_STEPS
         env = build_env(
             self.cfg, inputs.evaluation, inputs.population, plan.size, 0, device, nominal=True
         )

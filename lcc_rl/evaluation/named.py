@@ -33,7 +33,6 @@ BASELINES: dict[str, tuple[str, dict[str, Any]]] = {
 GAINS = ("path", "paper_like", "tuned")  # files of conf/gains
 OF_CACC = tuple(f"cacc {name}" for name in GAINS)
 DIRECT = "direct"  # a string without automated vehicles
-RECORDED = "recorded"  # the first vehicle driven as the one recorded behind the leader
 PEOPLE = "human"  # automated vehicles driven as the scenario's human drivers drive
 # Controllers that need a policy's action, or the communication of a platoon.
 NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")

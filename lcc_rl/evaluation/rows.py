@@ -13,9 +13,9 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from lcc_rl.config.words import RECORDED
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.energy import Fleet, as_fleet
-from lcc_rl.evaluation import named
 from lcc_rl.evaluation.metrics import (
     KILO,
     energy_measures,
@@ -191,7 +191,7 @@ def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:
     controllers = strategy.cfg.scenario.controllers
     own = controllers.get(AUTOMATED) if strategy.cfg.scenario.vehicles.count(AUTOMATED) else None
     given = None if own is None else own.settings.get("desired_speed")
-    if strategy.name == named.RECORDED:
+    if strategy.name == RECORDED:
         given = np.nan
     drivers = episodes["desired_speed_mps"].to_numpy()
     return drivers if given is None else np.full_like(drivers, given)

@@ -21,13 +21,12 @@ from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import NOT_IDENTITY, load
 from lcc_rl.config.nodes import Node, as_plain
 from lcc_rl.config.schemas import StudyConfig
-from lcc_rl.config.words import FILTERED
+from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.errors import ConfigError, ResultsError, require
 from lcc_rl.evaluation.fit import check_action, check_scenario, check_width
 from lcc_rl.evaluation.named import (
     DIRECT,
     PEOPLE,
-    RECORDED,
     controller_of,
     label_of,
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from textwrap import fill, shorten
 from typing import Any
@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from lcc_rl.config.words import FILTERED
-from lcc_rl.evaluation.named import is_shipped
 from lcc_rl.figures.drawing import (
     COLUMN_WIDTH,
     INK,
@@ -51,7 +50,10 @@ VEHICLE_STYLES = {
 
 
 def write_figures(
-    folder: str | Path, rows: str = "episodes", reports: Sequence[Report] = ()
+    folder: str | Path,
+    rows: str = "episodes",
+    reports: Sequence[Report] = (),
+    own: Collection[str] = (),
 ) -> list[Path]:
     """Draw the figures of an evaluation into its folder ``figures``.
 
@@ -60,6 +62,7 @@ def write_figures(
         rows: what a row of episodes.parquet is of, ``episodes`` or ``vehicles``.
         reports: those that the evaluation printed; of a single one, ``overview`` shows the
             savings.
+        own: strategies that are controllers of the user's own.
 
     Returns:
         The figures' paths.
@@ -71,7 +74,7 @@ def write_figures(
     steps, cfg = read_parquet(folder / "steps.parquet"), stored_config(folder)
     found: Iterable[tuple[str, Figure]]
     if rows == "episodes":
-        found = study_figures(read_parquet(folder / "episodes.parquet"), steps, cfg, reports)
+        found = study_figures(read_parquet(folder / "episodes.parquet"), steps, cfg, reports, own)
     else:
         bound = float((cfg.get("deployed") or {}).get("jerk_bound", 30.0))
         found = platoon_figures(steps, bound)
@@ -91,6 +94,7 @@ def study_figures(
     steps: pd.DataFrame,
     cfg: Mapping[str, Any],
     reports: Sequence[Report] = (),
+    own: Collection[str] = (),
 ) -> Iterator[tuple[str, Figure]]:
     """Yield name and figure of all that an evaluation with a row per episode shows.
 
@@ -100,23 +104,23 @@ def study_figures(
         episodes: rows of episodes.parquet.
         steps: rows of steps.parquet; it may have none.
         cfg: the evaluation's configuration.
-        reports: as in :func:`write_figures`.
+        reports, own: as in :func:`write_figures`.
     """
     means, names = Means.of(episodes).per_km(), list(dict.fromkeys(episodes["strategy"]))
     many = episodes["driver_id"].nunique() > 2
     cars = [name for name in names if name != "direct"]
     seeds = episodes.groupby("strategy")["training_seed"].count()
-    own = [name for name in cars if name != RULE and (seeds[name] or not is_shipped(name))]
+    shown = [name for name in cars if name != RULE and (seeds[name] or name in own)]
     # Human drivers, networks, the user's own controllers, the others; last what comes unasked.
     order = sorted(
-        names, key=lambda x: (x != "human", not seeds[x], x not in own, x.endswith(FILTERED))
+        names, key=lambda x: (x != "human", not seeds[x], x not in shown, x.endswith(FILTERED))
     )
     diagram = space_time(steps, order, cfg) if len(steps) else None
     if diagram is not None:
         yield "space_time", diagram
     if len(steps) and cars and len(reports) == 1 and "saved_pct" in reports[0].short:
-        yield "overview", overview(episodes, steps, (own or cars)[-1], reports[0])
-    for name in own:
+        yield "overview", overview(episodes, steps, (shown or cars)[-1], reports[0])
+    for name in shown:
         if len(steps) and (steps["strategy"] == name).any():
             yield f"episode {name}", sample_episode(steps, name)
         if "direct" in names:

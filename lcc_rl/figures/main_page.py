@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from lcc_rl.agents.limits import RECORDED
 from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config.words import RECORDED
 from lcc_rl.figures.drawing import in_file
 from lcc_rl.figures.page import Page
 from lcc_rl.results.names import in_words

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pandas as pd
 
 from lcc_rl.config.words import FILTERED
+from lcc_rl.functional.pattern import HUMAN
 
 # A column's unit by the end of its name.
 SUFFIX_UNITS = {
@@ -17,7 +18,7 @@ SUFFIX_UNITS = {
 }
 SUFFIX_UNITS |= {"m": "m", "s": "s", "vph": "1/h", "g_per_km": "g/km"}
 INITIALS = ("cav", "hdv", "ttc", "sd")
-HUMAN, NETWORK = "human", "alcc"
+NETWORK = "alcc"
 FILTER_ALONE = "constant_filtered"
 # Who learns, or has several gains: further words of a name, if any, say which.
 SEVERAL = {

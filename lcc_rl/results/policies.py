@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import torch
 from pydantic import AfterValidator, Field
@@ -17,13 +17,12 @@ from lcc_rl.io.settings import parse_yaml
 from lcc_rl.io.tensors import check_like, read_torch, write_torch
 from lcc_rl.results.trust import trusted
 from lcc_rl.runs.states import CONFIG, no_run, run_folders
-from lcc_rl.settings import Settings, parse
+from lcc_rl.settings import S, Settings, parse
 
 PRETRAINED = "pretrained"
 SHIPPED_POLICIES = Path(str(files("lcc_rl.assets"))) / PRETRAINED
 # Variants that build on the policy of another one.
 BUILDS_ON = {"hcfs": "ddpg"}
-S = TypeVar("S", bound=Settings)
 
 
 def read_checked(path: str | Path, kind: type[S], what: str) -> S:

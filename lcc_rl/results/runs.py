@@ -15,11 +15,10 @@ from lcc_rl.errors import LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.results.trust import trusted
-from lcc_rl.runs.states import no_run
+from lcc_rl.runs.states import CONFIG, no_run
 
 log = logging.getLogger("lcc_rl")
 
-CONFIG = "config.yaml"
 EPISODES = "episodes.parquet"  # a run's last file: with it the run is finished
 STEPS = "steps.parquet"
 PARTS, FINAL = ".parts", "evaluation"  # of a job of lcc-rl run: its parts' settings; its last part

@@ -13,6 +13,7 @@ import pandas as pd
 from lcc_rl.commands.evaluation import complete
 from lcc_rl.config import load
 from lcc_rl.figures.space_time import space_time
+from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.names import in_words
 from lcc_rl.results.render import signed
@@ -20,7 +21,6 @@ from lcc_rl.results.runs import EPISODES, STEPS, stored_config
 from lcc_rl.studies.results import StudyResults
 
 RING_EVALUATION = "evaluation"
-HUMAN = "human"
 RIVALS = ("follower_stopper", "pi_saturation")
 SETTINGS = (
     "variant=alcc",

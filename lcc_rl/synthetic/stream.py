@@ -28,14 +28,13 @@ from lcc_rl.data.trajectories import (
     find_leaders,
 )
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
-from lcc_rl.errors import LAST_SEED, ConfigError
-from lcc_rl.settings import Settings, Share, given_as
+from lcc_rl.errors import ConfigError
+from lcc_rl.settings import Seed, Settings, Share, given_as
 from lcc_rl.synthetic.lane import Stream, drive_platoons
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
 Duration = Annotated[float, Field(ge=1.0, le=36_000.0)]
 Range = Annotated[tuple[Duration, Duration], Field(strict=False)]
-Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
 FIRST_START = datetime(2005, 1, 1, 12, tzinfo=UTC)
 
 

@@ -9,6 +9,7 @@ import pandas as pd
 
 from lcc_rl import results
 from lcc_rl.errors import ResultsError
+from lcc_rl.evaluation.named import TUNED
 from lcc_rl.figures import evaluation as run_figures
 from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.training import learning_curve
@@ -25,7 +26,6 @@ ALCC_TITLE = "Adaptive Leading Cruise Control: the study"
 CURVES = "training.parquet"  # learning curves of the main trainings, if these are not there
 ITSELF = "this study"
 ALCC_PAIR = {"alcc", "reference"}
-TUNED = ("idm_acc", "acc")
 SHARE_COLUMNS = [
     f"{which}_{name}"
     for name in ("unsafe_ttc_pct", tables.LONG)

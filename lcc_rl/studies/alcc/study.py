@@ -15,7 +15,7 @@ from lcc_rl.commands.pipeline import (
     read_once,
     train_all,
 )
-from lcc_rl.config import key_of, load, quoted, root_key, with_inputs
+from lcc_rl.config import key_of, load, quoted, top_key, with_inputs
 from lcc_rl.config.schemas import EvaluateConfig, PipelineConfig, TrainConfig
 from lcc_rl.errors import unknown_name
 from lcc_rl.studies.study import Study
@@ -83,11 +83,11 @@ def default_recipe(overrides: Iterable[str]) -> str | None:
 
 def settings_of_run(study: Study, entry: str, variant: str, change: Change, *own: str) -> Any:
     """Compose a run: recipe, the study's inputs, the user's overrides, its change, its own."""
-    given = {root_key(item) for item in study.overrides}
+    given = {top_key(item) for item in study.overrides}
     shared = [
         item
         for item in study.overrides
-        if root_key(item) not in OF_CALIBRATION or key_of(item).startswith("data.plausible")
+        if top_key(item) not in OF_CALIBRATION or key_of(item).startswith("data.plausible")
     ]
     users, changed = known_settings(shared, entry), change.overrides
     if SINGLE_SPLIT in changed:  # the user's split is then that of ``held_out``
@@ -164,7 +164,7 @@ def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dic
 
 def _calibration(study: Study, runs: dict[str, TrainConfig]) -> PipelineConfig:
     """Return the settings of the calibration, whose data are divided as those of a training."""
-    own = [item for item in study.overrides if root_key(item) not in OF_TRAINING]
+    own = [item for item in study.overrides if top_key(item) not in OF_TRAINING]
     cfg: PipelineConfig = load("pipeline", ["~experiment", "calibration=both", *own])
     first = next(iter(runs.values()))
     cfg.split, cfg.scenario = first.split, first.scenario

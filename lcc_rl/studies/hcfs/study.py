@@ -12,7 +12,7 @@ import pandas as pd
 
 from lcc_rl.commands.evaluation import evaluate_and_write, made_by
 from lcc_rl.commands.pipeline import known_settings, train_all
-from lcc_rl.config import identity, load, quoted, root_key, with_inputs
+from lcc_rl.config import identity, load, quoted, top_key, with_inputs
 from lcc_rl.config.schemas import StudyConfig, TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.evaluation.fit import check_policy
@@ -53,7 +53,7 @@ def trainings(study: Study) -> dict[str, TrainConfig]:
 def evaluation(study: Study, *own: str) -> StudyConfig:
     """Return the configuration of an evaluation of the hybrid."""
     shared = known_settings(list(study.overrides), "evaluate")
-    more = () if any(root_key(item) == "leader" for item in study.overrides) else (WLTC,)
+    more = () if any(top_key(item) == "leader" for item in study.overrides) else (WLTC,)
     words = [f"experiment={study.recipe}", "variant=hcfs", *more, *shared, *own]
     cfg: StudyConfig = load("evaluate", words)
     return cfg
