@@ -115,7 +115,7 @@ def test_drivers_keep_the_names_of_the_data(cfg, tmp_path):
     columns = "{vehicle: id, time: t, speed: v, leader: ahead, gap: gap}"
     path = f"data.path={tmp_path / 'named.csv'}"
     named = load("calibrate", ["data=table", path, f"data.columns={columns}"])
-    cfg.data, cfg.calibration["modes"] = named.data, ["local"]
+    cfg.data, cfg.calibration = named.data, cfg.calibration.changed(modes=["local"])
     calibration.run(cfg, tmp_path / "run", Console(file=io.StringIO()))
     drivers = pd.read_parquet(tmp_path / "run" / "drivers.parquet")
     assert drivers["follower"].tolist() == ["BMW", "Ford"]

@@ -167,7 +167,7 @@ def test_the_overview_has_the_savings_of_the_table_and_colours_are_on_the_image(
         assert f"{energy:.1f} kJ/km" in texts(figure)
     assert "path energy per km saved" in texts(figure)
     image = pixels(figure, tmp_path / "x.png")
-    assert all(count(image, run_figures.VEHICLES[name][1]) > 50 for name in ("cav", "hdv"))
+    assert all(count(image, run_figures.VEHICLE_STYLES[name][1]) > 50 for name in ("cav", "hdv"))
     legend = figure.axes[0].get_legend()  # it covers no data
     assert legend.get_window_extent().y0 >= figure.axes[0].get_window_extent().y1 - 1.0
     image = pixels(
