@@ -14,7 +14,7 @@ import lcc_rl.conf
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import identity, load
-from lcc_rl.config.nodes import as_plain, settings_at, with_defaults
+from lcc_rl.config.nodes import as_plain, settings_at, with_defaults, without_defaults
 from lcc_rl.config.schemas import as_text, parse_config
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
@@ -141,6 +141,19 @@ def test_identity_sees_values_and_no_order_or_place() -> None:
     assert identity(load("train", ["seed=1"])) != base
     same = ["trust=[mine]", "logger=rows", "logger.where=/x", "training.keep_every=5"]
     assert identity(load("train", same)) == base
+
+
+def test_a_setting_at_its_default_does_not_count_where_only_changes_do() -> None:
+    place = "scenario.controllers.automated"
+    cfg, default, other = (
+        load("train", ["variant=idm", *(f"{place}.{word}" for word in words)])
+        for words in ((), ("wiener=0",), ("wiener=0.1",))
+    )
+    own = {TARGET: "lcc_rl.pieces.IDM", "noise": 0.0, "desired_speed": 25.0, "time_gap": 1.2}
+    drivers = without_defaults(cfg)["scenario"]["controllers"]
+    assert drivers == {"automated": own, "human": {TARGET: "lcc_rl.pieces.IDM"}}
+    assert identity(default, changed=True) == identity(cfg, changed=True)
+    assert identity(other, changed=True) != identity(cfg, changed=True)
 
 
 def test_a_recipe_for_learners_leaves_no_agent_where_nothing_learns() -> None:

@@ -177,8 +177,9 @@ def play_source(who: Scored, source: str, cfg: EvaluateConfig, folder: Path) -> 
     save_config(cfg, folder)
     evaluate_and_write([*against, strategy], cfg, inputs, folder, quiet=True)
     rows = read_parquet(folder / EPISODES)
-    # Whom nobody is compared with here, and what "data" is the hash of.
-    settings = identity(cfg, "evaluation.behind_filter", "inputs.data", "inputs.leader")
+    # Which other controllers are shown does not count, and "data" is the hash of what files hold.
+    unused = ("evaluation.behind_filter", "inputs.data", "inputs.leader")
+    settings = identity(cfg, *unused, changed=True)
     hashes = {"data": hash_of(inputs.evaluation), "settings": settings}
     table = summary(windows_for(rows), task, build_energy(cfg))
     drivers = rows["driver_id"].nunique()

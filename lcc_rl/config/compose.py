@@ -22,7 +22,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from lcc_rl.config.inputs import inputs_of
-from lcc_rl.config.nodes import as_nodes, as_plain, settings_of, takes_action, with_defaults
+from lcc_rl.config.nodes import (
+    as_nodes,
+    as_plain,
+    settings_of,
+    takes_action,
+    with_defaults,
+    without_defaults,
+)
 from lcc_rl.config.schemas import AUTO, KINDS, SECTIONS, parse_config
 from lcc_rl.config.unused import check_used
 from lcc_rl.config.words import key_of
@@ -319,14 +326,15 @@ def config_hash(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def identity(cfg: Any, *unused: str) -> str:
+def identity(cfg: Any, *unused: str, changed: bool = False) -> str:
     """Return the hash of everything in a configuration that determines the results.
 
     Args:
         cfg: the configuration.
         *unused: further keys of settings that do not.
+        changed: only what differs from the defaults of the classes counts.
     """
-    content = as_plain(cfg, places=False)
+    content = without_defaults(cfg) if changed else as_plain(cfg, places=False)
     for key in (*NOT_IDENTITY, *unused):
         *path, last = key.split(".")
         node = content

@@ -174,6 +174,25 @@ def as_plain(value: Any, places: bool = True) -> Any:
     return [as_plain(item, places) for item in value] if isinstance(value, list) else value
 
 
+def without_defaults(value: Any) -> Any:
+    """Return settings as plain containers without those that have the default of their class.
+
+    A setting that a later version adds, and whose default changes nothing, is not in them.
+    """
+    if isinstance(value, Node):
+        own = defaults(value.kind) if has_settings(value.kind) else {}
+        value = value.settings
+    elif isinstance(value, Settings):
+        own, value = defaults(type(value)), values(value)
+    elif isinstance(value, Mapping):
+        own = {}
+    else:
+        return [without_defaults(item) for item in value] if isinstance(value, list) else value
+    missing = object()
+    kept = {key: x for key, x in value.items() if as_plain(x) != own.get(key, missing)}
+    return {key: without_defaults(item) for key, item in kept.items()}
+
+
 def nodes_in(value: Any) -> Iterator[Node]:
     """Yield the nodes in a configuration or a part of one, each before those nested in it."""
     if isinstance(value, Node):
