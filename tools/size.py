@@ -27,12 +27,12 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # Above these make lint fails; what is built next may take the difference to what there is.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 38_600, "code": 25_000},
-    "tests": {"lines": 19_700},
-    "conf": {"yaml": 135},
+    "lcc_rl + tools": {"lines": 40_200, "code": 26_200},
+    "tests": {"lines": 20_300},
+    "conf": {"yaml": 136},
 }
 CASES = 1_100  # that a run of all quick tests collects, see tests/tools/test_size.py
-STRUCTURE = {"names in several modules": 175, "floors": 12, "circles": 0}
+STRUCTURE = {"names in several modules": 60, "floors": 10, "circles": 0}
 
 
 def tracked() -> list[str]:
