@@ -1,4 +1,4 @@
-"""Results of runs: parquet files, tables, figures and the page."""
+"""Results of runs: windows, intervals and tables from parquet files."""
 
 from lcc_rl.results.loading import load
 

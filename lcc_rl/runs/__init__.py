@@ -1,1 +1,1 @@
-"""Command line, sweeps, states of runs, progress and loggers."""
+"""States of runs, sweeps, progress, checkpoints and loggers."""
