@@ -1,9 +1,11 @@
 """Compare energy models with measurements: python tools/measured_energy.py --bench … --electric …
 
-Two tables with a row per sample are read. Fuel on an engine bench: setting, position, sample,
+Three tables with a row per sample are read. Fuel on an engine bench: setting, position, sample,
 time_s, speed_mps, fuel_g_per_s. Battery of an electric car: trip, time_s, speed_mps, elevation_m,
-battery_v, battery_a (discharge negative), heating_kw, aircon_kw. Every run becomes a row of
-outputs/reference/measured_energy.parquet, from which --draw alone draws docs/figures/measured.png.
+battery_v, battery_a (discharge negative), heating_kw, aircon_kw. Fuel on a chassis dynamometer:
+test, time_s, speed_mps, fuel_ccps. Every run, of the dynamometer every range of speeds of a test,
+becomes a row of outputs/reference/measured_energy.parquet, from which --draw alone draws
+docs/figures/measured.png.
 """
 
 from __future__ import annotations
@@ -43,6 +45,8 @@ WARM = 15.0  # ambient temperature above which a trip counts as summer [°C]
 SEASONS = {"summer": "#d55e00", "winter": "#0072b2"}
 LABELS = {"summer": "summer", "winter": "winter, with the heating"}
 RUN = ["setting", "position", "sample"]
+PETROL = 0.745  # [g/cm³]
+RANGES = {"below 10 m/s": 10.0, "10 to 21 m/s": 21.0, "above 21 m/s": np.inf}  # their ends
 Array = NDArray[np.float64]
 
 
@@ -105,10 +109,32 @@ def of_trips(trips: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows).assign(kind="battery")
 
 
+def of_dynamometer(tests: pd.DataFrame) -> pd.DataFrame:
+    """Return a row per test and range of speeds: distance, measured and modelled fuel [g]."""
+    models = {name: CirclesFuel(vehicle=name) for name in FUELS}
+    rows = []
+    for test, run in tests.groupby("test", observed=True):
+        speed, acceleration, step = motion(run)
+        fuel = PETROL * run["fuel_ccps"].to_numpy(float)
+        place = np.searchsorted([*RANGES.values()], speed, side="right")
+        for number, name in enumerate(RANGES):
+            own = place == number
+            row = {"setting": name, "trip": str(test), "measured": float(fuel[own].sum()) * step}
+            row["distance_m"] = float(speed[own].sum()) * step
+            for vehicle, model in models.items():
+                drawn = energy_of(model, speed[own], acceleration[own], step)
+                row[vehicle] = drawn / model.heating_value
+            rows.append(row)
+    return pd.DataFrame(rows).assign(kind="dynamometer")
+
+
 def agreement(rows: pd.DataFrame, model: str) -> tuple[float, float]:
-    """Return level and correlation of runs: modelled over measured in total, and r of both."""
-    level = rows[model].sum() / rows["measured"].sum()
-    return float(level), float(np.corrcoef(rows[model], rows["measured"])[0, 1])
+    """Return level and correlation of runs: modelled over measured in total, and r of both.
+
+    Below three runs r says nothing and is NaN.
+    """
+    level = float(rows[model].sum() / rows["measured"].sum())
+    return level, rows[model].corr(rows["measured"]) if len(rows) > 2 else np.nan
 
 
 def along(bench: pd.DataFrame, column: str) -> float:
@@ -152,13 +178,14 @@ def _dots(
 def lines(table: pd.DataFrame) -> list[str]:
     """Return the agreement of every model with all runs of its kind and with each setting."""
     found = []
-    for kind, models in {"bench": [*FUELS], "battery": [ELECTRIC, f"{ELECTRIC}_bare"]}.items():
+    electric = [ELECTRIC, f"{ELECTRIC}_bare"]
+    for kind, models in {"bench": [*FUELS], "dynamometer": [*FUELS], "battery": electric}.items():
         whole = table[table["kind"] == kind]
         for setting, rows in [("all", whole), *whole.groupby("setting")]:
             for model in models:
                 level, together = agreement(rows, model)
                 runs = f"{kind}, {setting}, {model}: {len(rows)} runs"
-                found.append(f"{runs}, level {level:.3f}, r {together:.3f}")
+                found.append(f"{runs}, level {level:.3f}" + f", r {together:.3f}" * (len(rows) > 2))
             if kind == "bench" and setting != "all":
                 cars = ", ".join(f"{name} {along(rows, name):.3f}" for name in ["measured", *FUELS])
                 found.append(f"last over first car, {setting}: {cars}")
@@ -170,14 +197,19 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--bench", type=Path, help="table of the engine bench")
     parser.add_argument("--electric", type=Path, help="table of the electric car")
+    parser.add_argument("--dynamometer", type=Path, help="table of the dynamometer, .csv")
     parser.add_argument("--draw", action="store_true", help="only draw what was kept")
     parser.add_argument("--kept", type=Path, default=KEPT, help="table of runs")
     parser.add_argument("--figure", type=Path, default=DRAWN, help="where to draw")
     options = parser.parse_args(words)
     if not options.draw:
-        if options.bench is None or options.electric is None:
-            parser.error("give --bench and --electric, or --draw")
-        parts = (of_bench(read_parquet(options.bench)), of_trips(read_parquet(options.electric)))
+        if None in (options.bench, options.electric, options.dynamometer):
+            parser.error("give --bench, --electric and --dynamometer, or --draw")
+        parts = (
+            of_bench(read_parquet(options.bench)),
+            of_trips(read_parquet(options.electric)),
+            of_dynamometer(pd.read_csv(options.dynamometer)),
+        )
         write_parquet(pd.concat(parts, ignore_index=True), options.kept)
     table = read_parquet(options.kept)
     print(*lines(table), sep="\n")
