@@ -27,8 +27,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # Above these make lint fails; what is built next may take the difference to what there is.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 40_200, "code": 26_200},
-    "tests": {"lines": 20_300},
+    "lcc_rl + tools": {"lines": 40_100, "code": 26_100},
+    "tests": {"lines": 20_200},
     "conf": {"yaml": 136},
 }
 CASES = 1_100  # that a run of all quick tests collects, see tests/tools/test_size.py
