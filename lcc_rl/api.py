@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +116,7 @@ def learn(
 
 
 def compare(
-    strategies: Sequence[Any] | Mapping[str, Any],
+    strategies: Any,
     variant: str = "alcc",
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
@@ -123,10 +124,10 @@ def compare(
     """Evaluate policies and controllers on the same held-out windows, beside the baselines.
 
     Args:
-        strategies: runs, run folders, policy files, ``"pretrained/alcc"``; controllers as names,
-            objects, classes, plain functions of named entries (:class:`lcc_rl.pieces.Law`) or yaml
-            files; or these by the names of their rows. A name that ends in ``_filtered`` means
-            behind the safety filter.
+        strategies: one or several: runs, run folders, policy files, ``"pretrained/alcc"``;
+            controllers as names, objects, classes, plain functions of named entries
+            (:class:`lcc_rl.pieces.Law`) or yaml files; or these by the names of their rows. A name
+            that ends in ``_filtered`` means behind the safety filter.
         variant: whose scenario and data they meet.
         overrides: further settings, ``["evaluation.drivers=12"]``.
         folder: where the files go, figures among them; by default a new one below
@@ -144,8 +145,10 @@ def compare(
     """
     target = _folder("evaluate", variant, folder)
     cfg = load("evaluate", [f"variant={variant}", *overrides])
+    if isinstance(strategies, (str, PathLike)) or not isinstance(strategies, Iterable):
+        strategies = [strategies]
     if isinstance(strategies, Mapping):
-        cfg.compare = {name: setting_of(who) for name, who in strategies.items()}
+        cfg.compare = {x: setting_of(who, f"compare.{x}") for x, who in strategies.items()}
     else:
         cfg.compare = [setting_of(who) for who in strategies]
     rows = evaluation.run(cfg, target, own=False, quiet=True)

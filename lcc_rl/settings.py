@@ -21,7 +21,7 @@ import re
 from collections.abc import Callable, Mapping
 from functools import wraps
 from importlib import import_module
-from typing import Annotated, Any, TypeVar, dataclass_transform
+from typing import Annotated, Any, TypeVar, dataclass_transform, get_args, get_origin
 
 from pydantic import (
     AfterValidator,
@@ -100,18 +100,39 @@ def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
 
     Args:
         kind: the class.
-        given: its settings by name.
+        given: its settings by name; a list may stand for a tuple, a mapping for an object that has
+            settings itself.
         where: their place in the configuration, for messages.
 
     Raises:
         ConfigError: naming the first setting that is unknown or wrong.
     """
+    wanted = {name: field.annotation for name, field in kind.__pydantic_fields__.items()}  # type: ignore[attr-defined]
+    own = {
+        key: _as_declared(wanted.get(key), value, f"{where}.{key}")
+        for key, value in given.items()
+        if value != "???"
+    }
     try:
-        return kind(**{key: value for key, value in given.items() if value != "???"})
+        return kind(**own)
     except RefusedSetting as error:
         if error.__cause__ is None:  # its place is named already
             raise
         raise refused(error.__cause__, kind, where) from None
+
+
+def _as_declared(annotation: Any, value: Any, where: str) -> Any:
+    """Return a list as a tuple, or a mapping as an object, if the annotation says so."""
+    for one in (annotation, *get_args(annotation)) if isinstance(value, (list, Mapping)) else ():
+        origin = get_origin(one) or one
+        if isinstance(value, list) and origin is tuple:
+            return tuple(value)
+        if isinstance(value, Mapping) and inspect.isclass(origin):
+            if issubclass(origin, Settings):
+                return parse(origin, value, where)
+            if dataclasses.is_dataclass(origin):
+                return origin(**value)
+    return value
 
 
 class RefusedSetting(ConfigError):
@@ -156,9 +177,9 @@ def checked(function: Callable[..., R]) -> Callable[..., R]:
     return checking
 
 
-def values(settings: Settings) -> dict[str, Any]:
+def values(settings: Any) -> dict[str, Any]:
     """Return the settings of an object by name."""
-    names = (field.name for field in dataclasses.fields(settings))  # type: ignore[arg-type]
+    names = (field.name for field in dataclasses.fields(settings))
     return {name: getattr(settings, name) for name in names}
 
 
@@ -174,7 +195,7 @@ def defaults(kind: type[Settings]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, Settings):
+    if dataclasses.is_dataclass(value):
         value = values(value)
     if isinstance(value, Mapping):
         return {name: _plain(held) for name, held in value.items()}

@@ -170,6 +170,10 @@ def test_a_node_is_made_once_copied_as_it_is_and_stored_by_its_settings() -> Non
     there = pickle.loads(pickle.dumps(cfg))
     assert as_plain(there) == as_plain(cfg)
     assert there.scenario.controllers["automated"] == driver
+    with pytest.raises(AttributeError, match=r"does not change; use changed\(time_gap=…\)"):
+        driver.time_gap = 1.5
+    with pytest.raises(TypeError):
+        driver.settings["time_gap"] = 1.5
     other = driver.changed(time_gap=1.5)
     assert (other.made().time_gap, driver.made().time_gap) == (1.5, 1.2)
     with pytest.raises(ConfigError, match=rf"^{AUTO}.time_gap must be greater than 0, got -1"):

@@ -38,7 +38,7 @@ class Gaussian(nn.Module):
 
 
 class OnPolicyLoop(CollectingLoop[Any]):
-    """Learns from each segment once; arguments as of :class:`TrainingLoop`."""
+    """Learns from each segment once; arguments as of :class:`lcc_rl.agents.loop.TrainingLoop`."""
 
     advice = "Lower agent.learning_rate or agent.clip"
 
@@ -102,7 +102,8 @@ class PPO(Agent):
         """Learn from trajectories.
 
         Args:
-            data: transitions as of :data:`LEARNED_FROM`, ``[trajectories, steps]``.
+            data: transitions, ``[trajectories, steps]``, as of
+                :data:`lcc_rl.agents.collecting.LEARNED_FROM`.
 
         Returns:
             The means of ``loss_actor`` and ``loss_value``, and the standard deviation ``sigma``.

@@ -16,7 +16,10 @@ from lcc_rl.io.tensors import check_like
 
 
 class ReplayLoop(CollectingLoop[Any]):
-    """Trains an off-policy agent and keeps its record; arguments as of :class:`TrainingLoop`."""
+    """Trains an off-policy agent and keeps its record.
+
+    Arguments as of :class:`lcc_rl.agents.loop.TrainingLoop`.
+    """
 
     advice = "Lower agent.critic_lr or agent.actor_lr"
 

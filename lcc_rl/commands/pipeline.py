@@ -54,6 +54,7 @@ from lcc_rl.results.runs import (
     resumed_config,
     save_config,
 )
+from lcc_rl.results.trust import own_modules
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import tell
 from lcc_rl.runs.precision import prepare_torch
@@ -132,6 +133,9 @@ def composed_part(
     final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={names[-1]}"])
     for part in (*trainings.values(), final):
         part.data = cfg.data
+    # It reads the policies of these trainings, whose classes the same command names.
+    own = (module for part in trainings.values() for module in own_modules(part))
+    final.trust = list(dict.fromkeys([*final.trust, *own]))
     return trainings, final
 
 

@@ -23,6 +23,7 @@ from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from lcc_rl.config.inputs import inputs_of
 from lcc_rl.config.nodes import (
+    MISSING,
     as_nodes,
     as_plain,
     settings_of,
@@ -90,6 +91,8 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
     Raises:
         ConfigError: if an override is unknown, of the wrong type or out of range.
     """
+    if entry not in KINDS:
+        raise unknown_name("command", entry, KINDS)
     if isinstance(overrides, str):
         raise ConfigError(f"expected a list of settings, got the text {overrides!r}")
     return parsed(composed(entry, overrides), entry, overrides)
@@ -175,6 +178,9 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         sweep: the runs of a sweep share what was typed, so a setting that one of them uses may be
             given to another.
     """
+    for item in overrides:
+        if item.endswith(f"={MISSING}"):
+            raise ConfigError(f"{item.removeprefix('++')}: expected a value")
     try:
         # Settings may refer to the default of a class.
         whole = OmegaConf.create(with_defaults(OmegaConf.to_container(cfg, resolve=False)))

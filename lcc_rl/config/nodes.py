@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import is_dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Self
 
 from lcc_rl.errors import LARGEST, ConfigError, LccError, require, unknown_name
 from lcc_rl.settings import TARGET, Settings, defaults, find_target, parse, values
 
 MISSING = "???"
+STORED = (str, int, float, type(None), list, Mapping)
 CALLED = ("__call__",)  # what a node that is used as a function makes
 
 
@@ -30,8 +33,14 @@ class Node:
         where: their place in the configuration, for messages.
     """
 
+    settings: Mapping[str, Any]
+    where: str
+
     def __init__(self, settings: Mapping[str, Any], where: str) -> None:
-        self.settings, self.where = settings, where
+        vars(self).update(settings=MappingProxyType(dict(settings)), where=where)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"{self.where}: a node does not change; use changed({name}=…)")
 
     @classmethod
     def of(cls, settings: Mapping[str, Any], where: str) -> Self:
@@ -40,6 +49,12 @@ class Node:
         Raises:
             ConfigError: naming the setting at fault.
         """
+        for key, _, value in settings_at(as_plain(settings), where):
+            if not isinstance(value, STORED):
+                raise ConfigError(
+                    f"{key} is {value!r}, which a configuration cannot store; expected numbers, "
+                    "texts, lists, mappings or objects of settings"
+                )
         node = as_nodes(with_defaults(settings, where), where)
         if not isinstance(node, cls):
             raise ConfigError(f"{where}: expected {TARGET}: module.Class, got {settings!r}")
@@ -59,7 +74,7 @@ class Node:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.settings, self.where)
+        return type(self), (dict(self.settings), self.where)
 
     def __repr__(self) -> str:
         return repr(as_plain(self))
@@ -109,9 +124,15 @@ class Node:
         return self._made()
 
     def _made(self) -> Any:
-        held = {key: x for key, x in self.settings.items() if not str(key).startswith("_")}
+        own = defaults(self.kind) if has_settings(self.kind) else {}
+        given = {
+            key: value
+            for key, value in self.settings.items()
+            # A default need not be what its annotation says, and may be any object.
+            if not (str(key).startswith("_") or (key in own and _same(as_plain(value), own[key])))
+        }
         try:
-            given = {key: _objects(value) for key, value in held.items()}
+            given = {key: _objects(value) for key, value in given.items()}
             if has_settings(self.kind):
                 return parse(self.kind, given, self.where)
             self._check_names()
@@ -130,6 +151,10 @@ class Node:
             if key not in (known or ()) and not str(key).startswith("_"):
                 what = f"setting of {self.where} ({self.kind.__name__})"
                 raise unknown_name(what, key, known or ())
+
+
+def _same(one: Any, other: Any) -> bool:
+    return type(one) is type(other) and bool(one == other)
 
 
 def _objects(value: Any) -> Any:
@@ -167,11 +192,11 @@ def as_plain(value: Any, places: bool = True) -> Any:
         hidden = () if places else value.places
         found = {key: as_plain(item, places) for key, item in value.settings.items()}
         return found | dict.fromkeys(hidden)
-    if isinstance(value, Settings):
+    if is_dataclass(value) and not isinstance(value, type):
         value = values(value)
     if isinstance(value, Mapping):
         return {key: as_plain(item, places) for key, item in value.items()}
-    return [as_plain(item, places) for item in value] if isinstance(value, list) else value
+    return [as_plain(x, places) for x in value] if isinstance(value, (list, tuple)) else value
 
 
 def without_defaults(value: Any) -> Any:
@@ -243,6 +268,9 @@ def with_defaults(value: Any, where: str = "") -> Any:
         key: with_defaults(item, f"{where}.{key}".removeprefix(".")) for key, item in value.items()
     }
     kind: Any = find_target(str(found[TARGET]), where) if TARGET in found else None
+    for key in found if kind is not None else ():
+        if str(key).startswith("_") and key != TARGET:
+            raise ConfigError(f"{where}.{key} has no effect: a node has {TARGET} and settings")
     if has_settings(kind):
         for key, default in defaults(kind).items():
             own = found.setdefault(key, default)

@@ -341,7 +341,7 @@ class Block:
         self.row, self.cells = self.row[mask], self.cells.filter(pa.array(mask))
 
     def values(self, column: Column, name: str, scale: float = 1.0) -> NDArray:
-        """Return the values of a column in SI, see :func:`checked`."""
+        """Return the values of a column in SI, see :func:`checked_cells`."""
 
         def fault(row: int, words: str) -> DataError:
             return self.file.fault(int(self.row[row]), column.key, words)

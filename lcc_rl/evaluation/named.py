@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import re
 from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
@@ -20,6 +19,7 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.pieces.controllers import Controller, Law
 from lcc_rl.results.policies import PRETRAINED
+from lcc_rl.results.trust import DOTTED, YAML
 from lcc_rl.settings import TARGET, find_target, path_of, values
 
 # Cruise controls with tuned constants. Behind the safety filter they have constants of their own.
@@ -36,9 +36,8 @@ DIRECT = "direct"  # a string without automated vehicles
 PEOPLE = "human"  # automated vehicles driven as the scenario's human drivers drive
 # Controllers that need a policy's action, or the communication of a platoon.
 NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
-YAML, MODULE = (".yaml", ".yml"), ".py"
+MODULE = ".py"
 ONNX, ONNX_POLICY = ".onnx", "lcc_rl.interfaces.onnx_policy.OnnxPolicy"
-DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")  # my_pieces.PID
 OTHER_WORDS = (
     "<module.Class>",
     "<controller.yaml>",
@@ -63,11 +62,12 @@ def is_shipped(name: str) -> bool:
     return name.removesuffix(FILTERED) in {DIRECT, PEOPLE, *OF_CACC, *BASELINES, *_files()}
 
 
-def setting_of(who: Any) -> str | Node:
+def setting_of(who: Any, where: str = "compare") -> str | Node:
     """Return what a configuration calls a policy or a controller that a program names.
 
     Args:
         who: a name; a path, such as a run's; a node; or a controller as object, class or function.
+        where: its place in the configuration, for messages.
 
     Raises:
         ConfigError: if a class or function is not at the top of a module.
@@ -77,7 +77,7 @@ def setting_of(who: Any) -> str | Node:
     if isinstance(who, Controller):
         who = {TARGET: path_of(type(who)), **values(who)}
     if isinstance(who, Mapping):
-        return Node.of(who, "compare")
+        return Node.of(who, where)
     if isinstance(who, PathLike):
         return fspath(who)
     return path_of(who) if callable(who) else str(who)

@@ -130,7 +130,7 @@ def jerks(steps: pd.DataFrame, case: str, bound: float) -> Figure:
 
 
 def shown(steps: pd.DataFrame) -> list[str]:
-    """Return the strategies of :data:`SHOWN` that there are; all if there is none of them."""
+    """Return those of :data:`PANEL_STRATEGIES` that there are; all strategies if there is none."""
     names = list(dict.fromkeys(steps["strategy"]))
     return [name for name in PANEL_STRATEGIES if name in names] or names
 

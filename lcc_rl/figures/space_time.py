@@ -37,7 +37,7 @@ def space_time(
 
     Args:
         steps: rows of steps.parquet.
-        names: the strategies to show; the first :data:`WIDEST` that drive the whole string.
+        names: the strategies to show; the first :data:`MOST_PANELS` that drive the whole string.
         cfg: the evaluation's configuration.
         every: rows between the points of a line.
 

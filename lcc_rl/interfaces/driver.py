@@ -147,7 +147,7 @@ class Driver:
         """Return the memories of vehicles that are driven for the first time.
 
         Args:
-            measured: the entries :data:`MEASURED`, one row per vehicle.
+            measured: the entries :data:`MEASURED_KEYS`, one row per vehicle.
         """
         start = TensorDict(batch_size=measured[STEP].shape[:1])
         for key, value in measured.items():
@@ -161,7 +161,7 @@ class Driver:
         """Return accelerations ``[vehicles]`` [m/s²] and the memories after this step.
 
         Args:
-            measured: the entries :data:`MEASURED`, one row per vehicle; see :func:`entries`.
+            measured: the entries :data:`MEASURED_KEYS`, one row per vehicle; see :func:`state_of`.
             kept: memories of the step before, or of :meth:`begin`.
         """
         reached = dict(measured)

@@ -2,7 +2,7 @@
 
 A program has the input ``state``, ``[batch, inputs]``, and the output ``acceleration``,
 ``[batch, 1]`` [m/s²], in single precision for any batch. Its metadata hold under ``lcc_rl`` a JSON
-text with the name and the unit of every input, in order (:data:`MEASURED`), and the output's unit::
+text with name and unit of every input, in order (:data:`INPUT_UNITS`), and the output's unit::
 
     {"inputs": [{"name": "self.gap", "unit": "m"}], "output": "acceleration [m/s²]"}
 

@@ -10,7 +10,7 @@ it reads (:mod:`lcc_rl.pieces.views`) and its law::
             return 0.1 * (gap - self.distance) + 0.5 * relative_speed
 
 and ``scenario.controllers.automated._target_=mymodule.KeepDistance`` on the command line. Any
-controller drives any role, and is a policy by :class:`lcc_rl.agents.ControllerPolicy`.
+controller drives any role, and is a policy by :class:`lcc_rl.agents.controller.ControllerPolicy`.
 """
 
 from __future__ import annotations

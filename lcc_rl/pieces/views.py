@@ -69,6 +69,9 @@ class Views:
         self.string, self.behind = string, behind
         if isinstance(names, str):
             raise ConfigError(f"reads must be a tuple of names such as self.gap, got {names!r}")
+        for name in names:
+            if not isinstance(name, (str, tuple)):
+                raise ConfigError(f"reads must hold names such as self.gap, got {name!r}")
         # Only roles have places; what all vehicles see alike needs none.
         self.drawn = string.drawn and role in string.names
         self.places, self.role = string.places(role), role

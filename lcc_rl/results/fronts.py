@@ -32,7 +32,7 @@ def front(windows: pd.DataFrame, kind: Sequence[str], columns: Sequence[str]) ->
     """Return columns of one kind of controller by limit, window and seed.
 
     Args:
-        windows: columns :data:`KINDS`, ``limit`` (or what else is varied along a front),
+        windows: columns :data:`FRONT_KINDS`, ``limit`` (or what else is varied along a front),
             ``training_seed``, ``profile_id`` and ``columns``; a row per training and window.
         kind: variant and policy.
         columns: which.

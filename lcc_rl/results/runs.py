@@ -38,7 +38,7 @@ def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:
     Args:
         cfg: the settings.
         folder: the folder.
-        *but: settings and sections that may differ.
+        *but: settings and sections that may differ, beside ``trust``.
 
     Raises:
         ResultsError: naming what is there and the settings that differ.
@@ -50,7 +50,7 @@ def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:
     if not kept:
         return
     keys = differing(dict(flatten(stored)), dict(flatten(as_plain(cfg))))
-    keys = [key for key in keys if not any(f"{key}.".startswith(f"{x}.") for x in but)]
+    keys = [key for key in keys if not any(f"{key}.".startswith(f"{x}.") for x in (*but, "trust"))]
     if keys:
         names = ", ".join(keys[:3]) + (", …" if len(keys) > 3 else "")
         raise ResultsError(

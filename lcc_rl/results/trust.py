@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from lcc_rl.config.nodes import as_nodes, as_plain, nodes_in, settings_at, with_defaults
 from lcc_rl.config.schemas import parse_config
+from lcc_rl.config.words import FILTERED
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.settings import TARGET, find_target
 
 # Packages whose classes a stored configuration may name, and the one whose functions it may.
 ROOMS = "agents data drivers energy evaluation functional pieces runs.loggers synthetic"
 REGISTRY = tuple(f"lcc_rl.{room}" for room in ROOMS.split())
 FUNCTIONS = "lcc_rl.drivers.population"
+YAML = (".yaml", ".yml")
+DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")  # my_pieces.PID
 RETIRED = ("objective",)  # settings of earlier versions that changed no row
 
 
@@ -57,8 +63,9 @@ def trusted(
 def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] = ()) -> None:
     """Check that a stored configuration names no code outside :data:`REGISTRY`.
 
-    Building a node imports and calls what it and its ``law`` name. Functions of the registry may
-    write files; only those that make a population may be named.
+    Building a node imports and calls what it, its ``law`` and its ``model`` name, and so does a
+    controller that ``compare`` names by its path or file. Functions of the registry may write
+    files; only those that make a population may be named.
 
     Args:
         content: the configuration as plain containers.
@@ -68,9 +75,9 @@ def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] =
     Raises:
         ResultsError: naming the target.
     """
-    for key, _, value in settings_at(content):
-        module = str(value).rpartition(".")[0]
-        if key.rpartition(".")[2] not in (TARGET, "law") or value is None or module in trust:
+    for key, value in _named(content):
+        module = value.rpartition(".")[0]
+        if module in trust:
             continue
         try:
             found = find_target(str(value), where) if _within_registry(module) else None
@@ -80,9 +87,29 @@ def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] =
         home = str(getattr(found, "__module__", ""))
         if not _within_registry(home) or not (inspect.isclass(found) or home == FUNCTIONS):
             raise ResultsError(
-                f"{where}: {key} names {value!r}, which is not part of lcc_rl; if you trust it, "
-                f"add trust=[{module}] (to lcc-rl export: --trust {module})"
+                f"{where}: {key} names {value!r}, which is no class of lcc_rl that may be stored; "
+                f"if you trust it, add trust=[{module}], or --trust {module} to commands with flags"
             )
+
+
+def _named(content: Any) -> Iterator[tuple[str, str]]:
+    """Yield the keys and dotted paths of all classes and functions that settings name."""
+    for key, _, value in settings_at(content):
+        last, dotted = key.rpartition(".")[2], "." in str(value)
+        if last == TARGET or (last == "law" and value) or (last == "model" and dotted):
+            yield key, str(value)
+        elif key.partition(".")[0] == "compare" and isinstance(value, str):
+            path = Path(value.removesuffix(FILTERED))
+            if path.suffix in YAML and path.is_file():
+                yield from _named(parse_yaml(read_text(path), str(path)))
+            elif DOTTED.fullmatch(str(path)) and not path.exists():
+                yield key, str(path)
+
+
+def own_modules(cfg: Any) -> list[str]:
+    """Return the modules outside :data:`REGISTRY` that a configuration names, sorted."""
+    modules = {value.rpartition(".")[0] for _, value in _named(as_plain(cfg))}
+    return sorted(module for module in modules if not _within_registry(module))
 
 
 def _within_registry(module: str) -> bool:

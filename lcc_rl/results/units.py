@@ -12,11 +12,11 @@ ENERGY_UNITS = (*ELECTRIC, "g/km", "L/100km", "mpg")
 
 
 def in_unit(kj_per_km: float, unit: str, energy: Fleet) -> float:
-    """Convert energy per distance [kJ/km] to one of :data:`UNITS`.
+    """Convert energy per distance [kJ/km] to one of :data:`ENERGY_UNITS`.
 
     Args:
         kj_per_km: the energy per distance [kJ/km].
-        unit: one of :data:`UNITS`.
+        unit: one of :data:`ENERGY_UNITS`.
         energy: the energy models, which know their fuel.
 
     Raises:
@@ -34,7 +34,7 @@ def in_unit(kj_per_km: float, unit: str, energy: Fleet) -> float:
 
 
 def check_unit(unit: str, energy: Fleet) -> None:
-    """Check that a unit is known and means something for all vehicles, see :func:`per_distance`."""
+    """Check that a unit is known and means something for all vehicles, see :func:`in_unit`."""
     if unit not in ENERGY_UNITS:
         raise unknown_name("unit (task.unit)", unit, ENERGY_UNITS)
     if unit not in ELECTRIC and not burns_one_fuel(energy):

@@ -88,7 +88,7 @@ def run_name(*, _root_: DictConfig) -> str:
     mark, sweep = _mark(_root_), Path(_root_.hydra.sweep.dir)
     for folder in sorted(sweep.glob(f"*{mark}")):
         return folder.name
-    typed, varied = result_overrides(_root_.hydra.overrides.task), read_plan(sweep).varied
+    typed, varied = result_overrides(words_of(_root_)), read_plan(sweep).varied
     # A comma would part two values where a setting names the folder.
     shown = "+".join(item.lstrip("+") for item in typed if key_of(item) in varied)
     text = re.sub(r"[^\w.=+~-]+", "-", shown).strip("-")[:LONGEST_NAME]
@@ -98,11 +98,17 @@ def run_name(*, _root_: DictConfig) -> str:
 def _mark(root: DictConfig) -> str:
     """Return a short hash of a run's settings; of what was typed if its job will refuse them."""
     settings = OmegaConf.masked_copy(root, [str(key) for key in root if key != "hydra"])
-    typed = [str(item) for item in root.hydra.overrides.task]
+    typed = words_of(root)
     try:
         return identity(parsed(settings, root.hydra.job.config_name, typed, True), "inputs")[:8]
     except LccError:
         return hashlib.sha256(json.dumps(typed).encode()).hexdigest()[:8]
+
+
+def words_of(config: DictConfig) -> list[str]:
+    """Return what was typed, in which a reference such as ``${seed}`` is a text like any other."""
+    typed: Any = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
+    return [str(item) for item in typed]
 
 
 def result_overrides(typed: Sequence[str]) -> list[str]:
@@ -226,7 +232,7 @@ class SweepPlan:
 
 def make_plan(config: DictConfig) -> SweepPlan:
     """Return the plan of a sweep's configuration."""
-    typed = [str(item) for item in config.hydra.overrides.task]
+    typed = words_of(config)
     params = config.hydra.sweeper.get("params") or {}
     typed += [f"{key}={value}" for key, value in params.items()]
     parsed = OverridesParser.create().parse_overrides(result_overrides(typed))

@@ -19,9 +19,12 @@ from helpers import POPULATION, check_refused, wavy_profiles
 from lcc_rl.agents.factory import build_agent, make_trainer
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.commands import evaluation
+from lcc_rl.commands.pipeline import composed_part
+from lcc_rl.config import load
 from lcc_rl.data.sources import NgsimSource
 from lcc_rl.errors import DataError, ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.pieces import SafetyReward
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.runs import load_config
 
@@ -59,6 +62,9 @@ TARGET = "reward.terms.safety._target_"
 FOREIGN: list[tuple[dict[str, object] | str, str]] = [
     ({TARGET: "os.system"}, rf"{TARGET} names 'os.system'"),
     ({"drivers.law": "os.system"}, "drivers.law names 'os.system'"),
+    ({"calibration": {"model": "evil.Model"}}, r"calibration\.model names 'evil\.Model'"),
+    ({"compare": ["idm", "evil.drive_filtered"]}, r"compare\.1 names 'evil\.drive'.*trust="),
+    ({"compare": {"a": {"_target_": "evil.Drive"}}}, r"compare\.a\._target_ names 'evil\.Drive'"),
     ({TARGET: "mine.Comfort"}, "names 'mine.Comfort'.*trust="),
     ({TARGET: "lcc_rl.config.import_module"}, TARGET),
     ({"seed": "${oc.env:SECRET}"}, "seed refers to"),
@@ -106,6 +112,17 @@ def test_ones_own_module_can_be_trusted_by_name_but_not_by_the_folder(
     assert load_config(run, ["comforts"]).trust == ["comforts"]
     with pytest.raises(ResultsError, match=r"trust=\[comforts\]"):
         load_config(run, ["other"])
+
+
+class Comfort(SafetyReward):
+    """A piece of one's own."""
+
+
+def test_the_main_job_trusts_what_its_own_command_names() -> None:
+    own = f"+reward.terms.comfort={{_target_: {__name__}.Comfort}}"
+    trainings, final = composed_part(load("pipeline", [own]), [own])
+    assert final.trust == [__name__]
+    assert all("comfort" in part.reward.terms for part in trainings.values())
 
 
 # -- weights ---------------------------------------------------------------------------------------

@@ -30,6 +30,8 @@ WRONG = {
     "scenario.controllers.human.parameters={a: 1}": "drivers=fixed drivers.acceleration",
     "agent=dddpg": "agent 'dddpg'.*'ddpg'.* agent/dddpg.yaml, needs --config-dir",
     "reward.terms.safety.wieght=1": "reward.terms.safety .*'weight'",
+    "agent._partial_=true": "agent._partial_ has no effect",
+    "agent.gamma=???": r"^agent\.gamma=\?\?\?: expected a value",
     # types
     "seed=abc": "seed must be .* integer",
     "scenario.pieces.ttc=5": "ttc: expected a node",

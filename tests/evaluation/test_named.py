@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
+import yaml
 from commands import NO_AGENT, UNTRAINED, run_command
 from helpers import POPULATION, check_refused, compose, wavy_profiles
 
 import lcc_rl
 from lcc_rl.commands import evaluation
 from lcc_rl.config import load
-from lcc_rl.config.nodes import Node
+from lcc_rl.config.nodes import Node, as_plain
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.envs import build_env
-from lcc_rl.errors import LccError
+from lcc_rl.errors import ConfigError, LccError
 from lcc_rl.evaluation.named import controller_of, label_of, setting_of
 from lcc_rl.evaluation.strategies import baseline
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet
 from lcc_rl.pieces import ConstantAcceleration, Controller, Law
 from lcc_rl.results.policies import load_policy
-from lcc_rl.settings import TARGET, Positive
+from lcc_rl.settings import TARGET, Positive, Settings
 
 
 class Steady(Controller):
@@ -276,6 +279,53 @@ def test_what_a_controller_remembers_is_its_roles_entry_from_zero_on() -> None:
         assert torch.equal(data["next", "command", role][..., 0, 0], 0.01 * (found - 1.0))
         first = data["vehicles", "speed"][:, :1, int(role == "human"), 0]
         assert (data["next", role, "first_speed"][..., 0, 0] == first).all()
+
+
+class Band(Settings):
+    high: Positive = 1.3
+
+
+@dataclass(frozen=True)
+class Lead:
+    time: float = 1.4
+
+
+class Shaped(Controller):
+    """Has settings of every kind."""
+
+    gains: tuple[float, float] = (0.2, 0.8)
+    band: Band = Band()
+    lead: Lead = Lead()
+    table: dict[str, float] = None  # no default that its annotation allows
+    place: Path | None = None
+
+    reads = ("self.gap", "self.speed", "self.relative_speed")
+
+    def command(self, gap, speed, relative_speed):
+        wanted = gap - self.lead.time * self.band.high * speed
+        return self.gains[0] * wanted + self.gains[1] * relative_speed
+
+
+def test_settings_of_own_controllers_are_of_any_kind_that_files_can_hold() -> None:
+    path = f"{__name__}.Shaped"
+    given = {TARGET: path, "gains": [0.3, 0.8], "band": {"high": 1.5}, "lead": {"time": 1.0}}
+    own = Shaped(gains=(0.3, 0.8), band=Band(high=1.5), lead=Lead(1.0))
+    for who, shape in (
+        (Shaped, (0.2, 1.3, 1.4)),
+        (path, (0.2, 1.3, 1.4)),
+        (Shaped(), (0.2, 1.3, 1.4)),
+        (given, (0.3, 1.5, 1.0)),
+        (own, (0.3, 1.5, 1.0)),
+    ):
+        node = controller_of(setting_of(who))
+        found = controller_of(Node.of(yaml.safe_load(yaml.safe_dump(as_plain(node))), "x")).made()
+        assert (found.gains[0], found.band.high, found.lead.time) == shape, who
+    with pytest.raises(ConfigError, match=r"^compare\.mine\.place is .* cannot store"):
+        setting_of(Shaped(place=Path("x")), "compare.mine")
+    with pytest.raises(ConfigError, match=r"^compare\.mine\.band\.high must be greater than 0"):
+        setting_of({**given, "band": {"high": -1.0}}, "compare.mine")
+    with pytest.raises(ConfigError, match=r"^compare\.mine\.gains\[1\] must be a valid number"):
+        setting_of({**given, "gains": [0.3, "a"]}, "compare.mine")
 
 
 class Hard(Controller):

@@ -101,6 +101,12 @@ def test_runs_of_a_sweep_over_two_settings_are_named_without_quotes(tmp_path) ->
     assert load("evaluate", [f"policy='{tmp_path}/a=1,b=2_3f'"]).policy == f"{tmp_path}/a=1,b=2_3f"
 
 
+def test_what_was_typed_may_refer_to_settings() -> None:
+    typed = ["seed=${agent.gamma},1", "agent.gamma=0.9"]
+    config = OmegaConf.create({"hydra": {"overrides": {"task": typed}, "sweeper": {}}})
+    assert sweeps.make_plan(config) == sweeps.SweepPlan(2, ["seed"])
+
+
 def test_a_sweep_of_nothing_is_one_line(tmp_path) -> None:
     done = run_command("lcc_rl.cli.train", *SWEEP, "seed=range(0)", cwd=tmp_path)
     assert done.returncode == 2

@@ -122,7 +122,7 @@ def run(study: Study, parts: Sequence[str] = STUDY_PARTS, ablations: Sequence[st
 
     Args:
         study: the settings.
-        parts: some of :data:`PARTS`.
+        parts: some of :data:`STUDY_PARTS`.
         ablations: names of :data:`ABLATIONS` or further ones as ``name:override``, e.g.
             ``early:reward.terms.safety.threshold=6``; empty for all.
 

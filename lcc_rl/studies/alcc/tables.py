@@ -126,7 +126,7 @@ def constraints(windows: pd.DataFrame) -> pd.DataFrame:
 
     Collisions in all episodes; shares of time with TTC < 4 s and time gap > 2.5 s [%] in the mean
     over seeds, of the worst seed and of the worst episode; the least TTC [s] and gap [m]; and
-    whether every seed is within :data:`LIMITS`.
+    whether every seed is within :data:`SHARE_LIMITS`.
     """
     rows = []
     for strategy in per_seed(windows, "total_energy_kj"):

@@ -107,7 +107,7 @@ def reward_per_seed(
 
 
 def crossed_rewards(runs: pd.DataFrame) -> bootstrap.Estimate:
-    """Return the mean of a table of :func:`per_seed` with its interval over drives and seeds."""
+    """Return the mean of :func:`reward_per_seed` with its interval over drives and seeds."""
     return bootstrap.crossed(runs, drives=_drives(runs))
 
 
