@@ -32,6 +32,7 @@ from pydantic import (
     validate_call,
 )
 from pydantic.dataclasses import dataclass
+from pydantic.fields import FieldInfo
 
 from lcc_rl.errors import LARGEST, LARGEST_SIZE, LAST_SEED, ConfigError, LccError, unknown_name
 
@@ -187,7 +188,10 @@ def defaults(kind: type[Settings]) -> dict[str, Any]:
     """Return the defaults of a class's settings by name, as plain containers."""
     found = {}
     for field in dataclasses.fields(kind):  # type: ignore[arg-type]
-        if field.default is not dataclasses.MISSING:
+        if isinstance(field.default, FieldInfo):
+            if not field.default.is_required():
+                found[field.name] = _plain(field.default.get_default(call_default_factory=True))
+        elif field.default is not dataclasses.MISSING:
             found[field.name] = _plain(field.default)
         elif field.default_factory is not dataclasses.MISSING:
             found[field.name] = _plain(field.default_factory())

@@ -156,6 +156,13 @@ def test_a_setting_at_its_default_does_not_count_where_only_changes_do() -> None
     assert identity(other, changed=True) != identity(cfg, changed=True)
 
 
+def test_a_class_of_ones_own_replaces_the_choice_of_a_group() -> None:
+    cfg = load("train", ["energy={_target_: lcc_rl.energy.CirclesFuel, vehicle: Compact}"])
+    assert cfg.energy.made().vehicle == "Compact"
+    drives = "leader={_target_: lcc_rl.data.leaders.DriveLeaders, path: x.csv}"
+    assert load("train", [drives]).leader.made().columns["speed"] == "speed_mps"
+
+
 def test_a_recipe_for_learners_leaves_no_agent_where_nothing_learns() -> None:
     assert load("train", ["experiment=quickstart", "variant=idm"]).agent is None
     assert load("train", ["variant=idm", "agent=none"]).agent is None

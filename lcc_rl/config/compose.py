@@ -136,7 +136,7 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
         elif key in ("compare", "policy", "resume"):  # a sweep's folders are named seed=0_…
             quoted = "'" in value or '"' in value
             found.append(f"++{key}{equals}{value if quoted else NAMED.sub(QUOTED, value)}")
-        elif key[:1] in "+~" or not equals or not _is_setting(key):
+        elif key[:1] in "+~" or not equals or not (_is_setting(key) or value.startswith("{")):
             found.append(item)
         else:
             found.append(f"++{item}")
