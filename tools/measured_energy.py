@@ -66,18 +66,21 @@ def energy_of(model: EnergyModel, speed: Array, acceleration: Array, step: float
     return float(power.sum()) * step
 
 
+def fuels_of(speed: Array, acceleration: Array, step: float) -> dict[str, float]:
+    """Return the fuel that each model burns on a run [g]."""
+    models = {name: CirclesFuel(vehicle=name) for name in FUELS}
+    run = (speed, acceleration, step)
+    return {name: energy_of(model, *run) / model.heating_value for name, model in models.items()}
+
+
 def of_bench(bench: pd.DataFrame) -> pd.DataFrame:
     """Return a row per run on the bench: distance, and measured and modelled fuel [g]."""
-    models = {name: CirclesFuel(vehicle=name) for name in FUELS}
     rows = []
     for key, run in bench.groupby(RUN, observed=True):
         speed, acceleration, step = motion(run)
         row = dict(zip(RUN, key, strict=True)) | {"distance_m": float(speed.sum()) * step}
         row["measured"] = float(run["fuel_g_per_s"].sum()) * step
-        for name, model in models.items():
-            drawn = energy_of(model, speed, acceleration, step)
-            row[name] = drawn / model.heating_value
-        rows.append(row)
+        rows.append(row | fuels_of(speed, acceleration, step))
     return pd.DataFrame(rows).assign(kind="bench")
 
 
@@ -111,7 +114,6 @@ def of_trips(trips: pd.DataFrame) -> pd.DataFrame:
 
 def of_dynamometer(tests: pd.DataFrame) -> pd.DataFrame:
     """Return a row per test and range of speeds: distance, measured and modelled fuel [g]."""
-    models = {name: CirclesFuel(vehicle=name) for name in FUELS}
     rows = []
     for test, run in tests.groupby("test", observed=True):
         speed, acceleration, step = motion(run)
@@ -121,10 +123,7 @@ def of_dynamometer(tests: pd.DataFrame) -> pd.DataFrame:
             own = place == number
             row = {"setting": name, "trip": str(test), "measured": float(fuel[own].sum()) * step}
             row["distance_m"] = float(speed[own].sum()) * step
-            for vehicle, model in models.items():
-                drawn = energy_of(model, speed[own], acceleration[own], step)
-                row[vehicle] = drawn / model.heating_value
-            rows.append(row)
+            rows.append(row | fuels_of(speed[own], acceleration[own], step))
     return pd.DataFrame(rows).assign(kind="dynamometer")
 
 

@@ -40,28 +40,21 @@ EXAMPLES = {
         ("lcc-rl train drivers=calibrated drivers.path=drivers.parquet", "then"),
     ),
 }
-TRAFFIC_OPTIONS = ("data", "data.path", "drivers", "scenario.string", "scenario.horizon")
+TRAFFIC = ("data", "data.path", "drivers", "scenario.string", "scenario.horizon")
 OPTIONS = {
     "pipeline": (
-        *(
-            "experiment",
-            "agent",
-            *TRAFFIC_OPTIONS[:2],
-            "calibration",
-            "variants",
-            "scenario.string",
-        ),
+        *("experiment", "agent", *TRAFFIC[:2], "calibration", "variants", "scenario.string"),
         *("evaluation.drivers", "seed", "jobs", "figure_formats", "resume"),
     ),
     "train": (
-        *("variant", "task", "experiment", "agent", *TRAFFIC_OPTIONS),
+        *("variant", "task", "experiment", "agent", *TRAFFIC),
         *("training.episodes", "seed", "resume"),
     ),
     "evaluate": (
-        *("variant", "task", "policy", "compare", "filter", *TRAFFIC_OPTIONS),
+        *("variant", "task", "policy", "compare", "filter", *TRAFFIC),
         *("evaluation.drivers", "table"),
     ),
-    "calibrate": ("calibration", *TRAFFIC_OPTIONS[:2], "seed", "threads", "figure_formats"),
+    "calibrate": ("calibration", *TRAFFIC[:2], "seed", "threads", "figure_formats"),
 }
 TOTAL_WIDTH, NAME_WIDTH, DEFAULT_WIDTH = 80, 21, 16
 

@@ -136,18 +136,19 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
         elif key in ("compare", "policy", "resume"):  # a sweep's folders are named seed=0_…
             quoted = "'" in value or '"' in value
             found.append(f"++{key}{equals}{value if quoted else NAMED.sub(QUOTED, value)}")
-        elif key[:1] in "+~" or not equals or not (_is_setting(key) or value.startswith("{")):
+        elif key[:1] in "+~" or not equals or not _is_setting(key, value):
             found.append(item)
         else:
             found.append(f"++{item}")
     return found
 
 
-def _is_setting(key: str) -> bool:
-    """Whether a key names a setting of this package and not a group of files."""
+def _is_setting(key: str, value: str) -> bool:
+    """Whether a setting of this package is typed, such as a node, and not a file of a group."""
     if key.startswith("hydra") or "/" in key or "@" in key:
         return False
-    return key.partition(".")[0] in _top_level() and key not in _groups()
+    own = key.partition(".")[0] in _top_level()
+    return own and (key not in _groups() or value.startswith("{"))
 
 
 def choices(group: str) -> list[str]:
@@ -254,7 +255,7 @@ def leave_out_foreign(content: dict[str, Any], overrides: Sequence[str]) -> None
         if not isinstance(node, dict) or TARGET not in node:
             continue
         known = settings_of(find_target(str(node[TARGET]), place))
-        for key in [key for key in node if known is not None and not key.startswith("_")]:
+        for key in [key for key in node if known is not None and key != TARGET]:
             if key not in (known or ()) and f"{place}.{key}" not in typed:
                 del node[key]
 

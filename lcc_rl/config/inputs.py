@@ -19,7 +19,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 
 from lcc_rl.config.nodes import settings_at
-from lcc_rl.config.words import FILTERED
+from lcc_rl.config.words import FILTERED, YAML
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.settings import TARGET, find_target
@@ -96,7 +96,7 @@ def compared_files(name: str) -> Iterator[Path]:
                     yield from compared_files(str(file))
     else:
         yield path
-        if path.suffix in (".yaml", ".yml"):
+        if path.suffix in YAML:
             for key, holder, value in settings_at(parse_yaml(read_text(path), str(path))):
                 yield from _files(key.rpartition(".")[2], False, holder, str(value))
 

@@ -129,7 +129,7 @@ class Node:
             key: value
             for key, value in self.settings.items()
             # A default need not be what its annotation says, and may be any object.
-            if not (str(key).startswith("_") or (key in own and _same(as_plain(value), own[key])))
+            if not (key == TARGET or (key in own and _same(as_plain(value), own[key])))
         }
         try:
             given = {key: _objects(value) for key, value in given.items()}
@@ -148,7 +148,7 @@ class Node:
     def _check_names(self) -> None:
         known = settings_of(self.kind)
         for key in self.settings if known is not None else ():
-            if key not in (known or ()) and not str(key).startswith("_"):
+            if key not in (known or ()) and key != TARGET:
                 what = f"setting of {self.where} ({self.kind.__name__})"
                 raise unknown_name(what, key, known or ())
 

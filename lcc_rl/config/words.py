@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from lcc_rl.errors import ConfigError
 
+YAML = (".yaml", ".yml")  # files that hold a controller
+DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")  # a class or function: my_pieces.PID
 FILTERED = "_filtered"  # ends the names of controllers behind the safety filter
 RECORDED = "recorded"  # the first vehicle drives, or a limit is kept, as the driver recorded there
 

@@ -13,13 +13,12 @@ from typing import Any, TypeGuard
 from lcc_rl.config import choices, load, own_file
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import AUTO
-from lcc_rl.config.words import FILTERED
+from lcc_rl.config.words import DOTTED, FILTERED, YAML
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.pieces.controllers import Controller, Law
 from lcc_rl.results.policies import PRETRAINED
-from lcc_rl.results.trust import DOTTED, YAML
 from lcc_rl.settings import TARGET, find_target, path_of, values
 
 # Cruise controls with tuned constants. Behind the safety filter they have constants of their own.

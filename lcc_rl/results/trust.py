@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import inspect
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from lcc_rl.config.nodes import as_nodes, as_plain, nodes_in, settings_at, with_defaults
 from lcc_rl.config.schemas import parse_config
-from lcc_rl.config.words import FILTERED
+from lcc_rl.config.words import DOTTED, FILTERED, YAML
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.settings import TARGET, find_target
@@ -19,8 +18,6 @@ from lcc_rl.settings import TARGET, find_target
 ROOMS = "agents data drivers energy evaluation functional pieces runs.loggers synthetic"
 REGISTRY = tuple(f"lcc_rl.{room}" for room in ROOMS.split())
 FUNCTIONS = "lcc_rl.drivers.population"
-YAML = (".yaml", ".yml")
-DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")  # my_pieces.PID
 RETIRED = ("objective",)  # settings of earlier versions that changed no row
 
 
