@@ -256,6 +256,9 @@ def settings_of(target: Any) -> list[str] | None:
 def with_defaults(value: Any, where: str = "") -> Any:
     """Return a setting in which every mapping with ``_target_`` holds the defaults of its class.
 
+    A class lists as ``LATER`` the settings that a later version added, and whose default changes
+    nothing: they are held only if they are given, so that the hashes of stored runs stay.
+
     Args:
         value: a setting as plain containers; references to other settings may be unresolved.
         where: its place in the configuration, for messages.
@@ -272,7 +275,10 @@ def with_defaults(value: Any, where: str = "") -> Any:
         if str(key).startswith("_") and key != TARGET:
             raise ConfigError(f"{where}.{key} has no effect: a node has {TARGET} and settings")
     if has_settings(kind):
+        later = getattr(kind, "LATER", ())
         for key, default in defaults(kind).items():
+            if key in later and key not in found:
+                continue
             own = found.setdefault(key, default)
             if isinstance(own, Mapping) and isinstance(default, Mapping):
                 found[key] = {**default, **own}
