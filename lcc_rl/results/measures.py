@@ -125,7 +125,7 @@ MEASURES = [
     Measure("mean_speed_mps", "mean speed [m/s]"),
     Measure(SPEED_STD, "deviation of a speed in time [m/s]", score=SPEED_STD),
     Measure(FINAL_SPREAD, "spread of speeds at the end [m/s]", score=FINAL_SPREAD),
-    Measure(FLOW, "flow [vehicles/h]", "{:.0f}"),
+    Measure(FLOW, "flow [vehicles/h]", "{:.0f}", limit="flow\n≥ {:.0f}\n[1/h]"),
     Measure("string_ratio", "string ratio", score="string_ratio"),
     Measure("damped", "episodes that end calm", "{:.0%}"),
     Measure(DAMPING, "  from when on, mean [s]", "{:.0f}", of="damped_s", per="damped"),
