@@ -21,14 +21,11 @@ from torch import Tensor
 
 from lcc_rl.drivers.genetic import Progress
 from lcc_rl.drivers.observed import Observed
-from lcc_rl.energy import PaperMotor
+from lcc_rl.energy import AVERAGES, PaperMotor
 from lcc_rl.errors import Concern
 from lcc_rl.functional.driver_models import DriverConstants, NoiseStep, Reaction, follow
 from lcc_rl.functional.laws import LAWS
 
-# Moving averages of the speeds before their energy is computed; the first one counts for the choice
-# of a reaction: shorter ones leave the noise of records, longer ones take what drivers do [s].
-SMOOTHINGS = (1.1, 3.1)
 FREQUENCIES = (0.04, 0.26)  # frequencies compared; above them the records are smoothed [Hz]
 SPECTRUM_WINDOW = 20.0  # part of a record whose spectrum is taken; parts overlap by half [s]
 LONG_GAP = 2.5  # time gap above which a driver is far behind, above 1 m/s [s]
@@ -62,13 +59,14 @@ def measure_motion(
         time_step: [s].
 
     Returns:
-        A row per driver: mean gap_m and long_gap_share of the time; for each of :data:`SMOOTHINGS`,
+        A row per driver: mean gap_m and long_gap_share of the time; for each of
+        :data:`lcc_rl.energy.AVERAGES`,
         such as 1.1 s, energy_1.1s_j, its part lost_1.1s_j and distance_1.1s_m; and for each
         frequency within :data:`FREQUENCIES`, such as 0.1 Hz, density_0.1hz of the acceleration
         [m²/s⁴/Hz], NaN for records shorter than :data:`SPECTRUM_WINDOW`.
     """
     table: dict[str, _Array] = {}
-    for smoothing in SMOOTHINGS:
+    for smoothing in AVERAGES:
         found = _energies(speed, samples, time_step, smoothing)
         units = {"energy": "j", "lost": "j", "distance": "m"}
         table |= {f"{x}_{smoothing}s_{unit}": found[x] for x, unit in units.items()}
@@ -194,7 +192,7 @@ def growth(
         motion = _follow(who, leader, (leader[0], gap), reactions, shape, generator, step)
         collided |= [bool(((gaps <= 0.0) & inside).any()) for _, gaps in motion]
         if car in (0, CARS - 1):
-            each = [_energies(x, observed.samples, step, SMOOTHINGS[0]) for x, _ in motion]
+            each = [_energies(x, observed.samples, step, AVERAGES[0]) for x, _ in motion]
             energies.append([one["energy"].sum() / one["distance"].sum() for one in each])
         leader = torch.from_numpy(np.stack([speed for speed, _ in motion], 1))
     grown = np.log(np.divide(energies[1], energies[0]))
@@ -264,13 +262,13 @@ def _people(observed: Observed, drivers: pd.DataFrame) -> People:
 
 
 def ratios(
-    twins: pd.DataFrame, records: pd.DataFrame, smoothing: float = SMOOTHINGS[0]
+    twins: pd.DataFrame, records: pd.DataFrame, smoothing: float = AVERAGES[0]
 ) -> dict[str, float]:
     """Compare drivers with the recorded ones, as ratios of sums over them.
 
     Args:
         twins, records: what was measured of both, see :func:`measure_motion`; the same drivers.
-        smoothing: one of :data:`SMOOTHINGS` [s].
+        smoothing: one of :data:`lcc_rl.energy.AVERAGES` [s].
 
     Returns:
         ``energy`` and ``lost`` (to accelerating) per distance, ``distance``, and ``spectrum``: the
@@ -404,7 +402,7 @@ def compare_twins(
 def accelerate(observed: Observed) -> bool:
     """Whether drivers lose a measurable part of their energy to accelerating."""
     records = measure_recorded(observed)
-    lost, energy = (records[f"{x}_{SMOOTHINGS[0]}s_j"].sum() for x in ("lost", "energy"))
+    lost, energy = (records[f"{x}_{AVERAGES[0]}s_j"].sum() for x in ("lost", "energy"))
     return bool(lost > LEAST_LOST * energy)
 
 
@@ -415,14 +413,14 @@ def _together(found: Mapping[str, pd.DataFrame], observed: Observed) -> pd.DataF
 
 
 def _line(who: str, found: Mapping[str, pd.DataFrame], one_step: float) -> str:
-    each = [ratios(found[who], found[RECORDED_DRIVERS], smoothing=width) for width in SMOOTHINGS]
+    each = [ratios(found[who], found[RECORDED_DRIVERS], smoothing=width) for width in AVERAGES]
     energies = ", ".join(f"{one['energy']:.3f}" for one in each)
     losses = ", ".join(f"{one['lost']:.2f}" for one in each)
     own, theirs = (found[x].mean(numeric_only=True) for x in (who, RECORDED_DRIVERS))
     return (
         f"drivers {who}: RMSPE {100 * own.rmspe:.1f} %; {energies} of the recorded energy per km, "
-        f"{losses} of what accelerating loses (speeds smoothed over {SMOOTHINGS[0]}, "
-        f"{SMOOTHINGS[1]} s); "
+        f"{losses} of what accelerating loses (speeds smoothed over {AVERAGES[0]}, "
+        f"{AVERAGES[1]} s); "
         f"spectrum off by a factor {np.exp(each[0]['spectrum']):.2f}, one-step error "
         f"{one_step:.2f} m/s²; distance {each[0]['distance']:.3f} of the recorded one, gap "
         f"{own.gap_m:.1f} m against {theirs.gap_m:.1f} m, long time gaps "
