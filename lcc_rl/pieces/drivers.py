@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -11,7 +11,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.driver_models import DriverConstants, NoiseStep, Reaction
+from lcc_rl.functional.driver_models import (
+    GAP_NOISE_TIME,
+    DriverConstants,
+    NoiseStep,
+    Reaction,
+)
 from lcc_rl.functional.gipps import GippsConstants
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.layout import join
@@ -51,7 +56,10 @@ class Drivers(Controller):
     # Standard deviation of a smooth noise of the acceleration, see
     # lcc_rl.functional.driver_models.NoiseStep [m/s²]; None: of the population.
     acceleration_noise: NonNegative | None = None
+    # The same of a noise of the logarithm of the perceived gap.
+    gap_noise: NonNegative | None = None
 
+    LATER = ("gap_noise",)
     name = HUMAN
     known = (
         Entry("role.driver", "–", "id of each vehicle's driver in the population", option=True),
@@ -65,6 +73,7 @@ class Drivers(Controller):
         "role.motion_history", "m/s, m, m/s", "past (speed, gap, relative speed), latest first"
     )
     latest = Entry("role.acceleration_noise", "m/s²", "noise of the acceleration, latest first", 2)
+    gap_latest = Entry("role.gap_noise", "–", "noise of ln of the seen gap, latest first", 2)
     law: ClassVar[type[DriverConstants]] = IDMConstants
     tells_gap: ClassVar[bool] = False  # whether the equilibrium gap is written
     further: ClassVar[tuple[str, ...]] = ()  # entries of the role that acceleration reads, too
@@ -77,14 +86,17 @@ class Drivers(Controller):
         role = self.name
         speeds, time_gaps, self.drivers = self.described(world, f"scenario.controllers.{role}")
         reaction = self.reaction(world)
-        late, spread = self.delay, self.acceleration_noise
+        late, spread, sight = self.delay, self.acceleration_noise, self.gap_noise
         what = "the reaction delay of drivers"
         self.late = world.late(reaction.delay, what) if late is None else late
         self.noise_spread = reaction.noise if spread is None else spread
+        self.gap_spread = reaction.gap_noise if sight is None else sight
         self.noise_step = NoiseStep.of(world.time_step)
+        self.gap_noise_step = NoiseStep.of(world.time_step, GAP_NOISE_TIME)
         self.starts = self.tells_gap and not world.string.ring
         memory = [self.history.wide(3 * self.late)] * (self.late > 0)
         memory += [self.latest] * (self.noise_spread > 0)
+        memory += [self.gap_latest] * (self.gap_spread > 0)
         names = [*MOTION_READS, f"{role}.desired_speed", f"{role}.desired_time_gap", "episode.seed"]
         names += ["episode.step", *(f"{role}.{name}" for name in self.further)]
         self.declare(world, names, keeps=self.known[: 3 + self.starts], remembers=memory)
@@ -94,9 +106,10 @@ class Drivers(Controller):
         self.time_gap_factors = world.deviations(self.time_gap_range)
         self.noise_stream = stream_id(f"{stream_name(role)}.noise")
         self.wiener_stream = stream_id(f"{stream_name(role)}.wiener")
-        self.noise_streams = [
-            stream_id(f"{stream_name(role)}.acceleration_noise{end}") for end in ("", ".before")
-        ]
+        self.noise_streams, self.gap_noise_streams = (
+            [stream_id(f"{stream_name(role)}.{what}{end}") for end in ("", ".before")]
+            for what in ("acceleration_noise", "gap_noise")
+        )
         self.driver_stream = stream_id(f"{stream_name(role)}.driver")
         self.register_buffer("desired_speeds", speeds)
         self.register_buffer("time_gaps", time_gaps)
@@ -129,9 +142,15 @@ class Drivers(Controller):
         """Return the commands, then the history and the noise where they are kept."""
         motion = (speed, gap, relative_speed)
         kept: list[Tensor] = []
+        noise = sight = None
+        if self.gap_spread:
+            *more, before = more  # type: ignore[assignment]
+            how = self.gap_spread, self.gap_noise_step, self.gap_noise_streams
+            kept.insert(0, sight := self._noise_of(before, seed, step, *how))
         if self.noise_spread:
             *more, before = more  # type: ignore[assignment]
-            kept.append(self._noise_of(before, seed, step))
+            how = self.noise_spread, self.noise_step, self.noise_streams
+            kept.insert(0, noise := self._noise_of(before, seed, step, *how))
         if self.late:
             *more, history = more  # type: ignore[assignment]
             now = join(motion, -1)
@@ -139,6 +158,8 @@ class Drivers(Controller):
             past = torch.where(step == 0, now.repeat(*[1] * (now.ndim - 1), self.late), history)
             motion = past[..., -3:].split(1, -1)
             kept.insert(0, join([now, past[..., :-3]], -1))
+        if sight is not None:
+            motion = (motion[0], motion[1] * sight[..., :1].exp(), motion[2])
         command = self.acceleration(*motion, desired_speed, time_gap, *more)
         if self.noise:
             draw = uniform(seed, step, self.noise_stream + self.index)
@@ -146,19 +167,24 @@ class Drivers(Controller):
         if self.wiener:
             spread = between(self.spreads, seed, WIENER_STREAM)
             command = command + spread * normal(seed, step, self.wiener_stream + self.index)
-        if self.noise_spread:
-            command = command + kept[-1][..., :1]
+        if noise is not None:
+            command = command + noise[..., :1]
         return (command, *kept) if kept else command
 
-    def _noise_of(self, before: Tensor, seed: Tensor, step: Tensor) -> Tensor:
-        """Return the latest two values of the noise from those before [m/s²]."""
-        drawn, further = (
-            self.noise_spread * normal(seed, step, stream + self.index)
-            for stream in self.noise_streams
-        )
-        first = join(self.noise_step.start(drawn, further), -1)
+    def _noise_of(
+        self,
+        before: Tensor,
+        seed: Tensor,
+        step: Tensor,
+        spread: float,
+        noise_step: NoiseStep,
+        streams: Sequence[int],
+    ) -> Tensor:
+        """Return the latest two values of a noise from those before."""
+        drawn, further = (spread * normal(seed, step, stream + self.index) for stream in streams)
+        first = join(noise_step.start(drawn, further), -1)
         latest, last = before.split(1, -1)
-        later = join([self.noise_step.next(latest, last, drawn), latest], -1)
+        later = join([noise_step.next(latest, last, drawn), latest], -1)
         return torch.where(step == 0, first, later)
 
     def acceleration(
