@@ -18,7 +18,7 @@ from lcc_rl.functional.braking import (
     safe_acceleration,
     safe_command,
 )
-from lcc_rl.functional.layout import join
+from lcc_rl.functional.layout import batch_innermost, join
 from lcc_rl.functional.sensing import Agreement, brought_up
 from lcc_rl.pieces.actuation import ACTUATION, Actuation
 from lcc_rl.pieces.base import Entry, RoleTransform
@@ -176,7 +176,8 @@ class CBFFilter(RoleTransform):
         known = (wanted + speed + gap + ahead + ahead_acceleration).isfinite()
         kept, relative = self.kept(memories, wanted), ahead - speed
         with torch.no_grad():  # what is measured agrees in a simulator: there is no slope
-            agreed = torch.where(known, self.agreement.next(agreed, gap, relative), 0.0)
+            agreed = self.agreement.next(agreed, gap, relative)
+            agreed = batch_innermost(torch.where(known, agreed, 0.0))
             differs = self.agreement.difference(agreed, relative)
         nearer = (ahead + differs.clamp(max=0.0)).clamp(min=0.0)
         measured = PairState(speed, gap, nearer, kept[0][..., :1])
