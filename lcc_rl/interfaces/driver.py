@@ -24,11 +24,13 @@ from lcc_rl.functional.string import entries_ahead
 from lcc_rl.interfaces.exported import ExportedPolicy, exported_policy
 from lcc_rl.pieces import Controller, ObservationMemory
 from lcc_rl.pieces.base import SEED, STEP, Key, State, StepTransform
+from lcc_rl.pieces.cbf import REMEMBERS
 from lcc_rl.pieces.world import World
 from lcc_rl.results.policies import load_policy
 
 # Each driven vehicle is an episode of its own: who is ahead leads, who is behind follows.
 STRING = VehicleString((AUTOMATED, HUMAN))
+AGREEMENT = (AUTOMATED, "agreement")  # what the safety filter of a policy remembers
 COMMAND_KEY = ("command", AUTOMATED)
 PRESENT_KEY = ("behind", "present")
 MEASURED_KEYS: tuple[Key, ...] = (
@@ -104,6 +106,7 @@ class Driver:
         self.pieces = pieces
         self.kept = [key for piece in pieces for key in (*piece.targets, *piece.constants)]
         self.kept = [key for key in self.kept if key != COMMAND_KEY]
+        self.kept += [AGREEMENT] * (self.module is not None and self.module.safety is not None)
         self._check()
 
     def _policy(self, name: str, trust: Sequence[str]) -> list[StepTransform]:
@@ -154,6 +157,8 @@ class Driver:
             start.set(key, value)
         for piece in self.pieces:
             piece.begin(TensorDict(batch_size=start.batch_size), start)
+        if AGREEMENT in self.kept:
+            start.set(AGREEMENT, torch.zeros(*start.batch_size, 1, REMEMBERS))
         return {key: start.get(key) for key in self.kept}
 
     @torch.no_grad()
@@ -167,11 +172,16 @@ class Driver:
         reached = dict(measured)
         for piece in self.pieces:
             piece.derive({**measured, **kept}, reached)
-        after = {key: reached[key] for key in self.kept}
         if self.module is None:
-            return reached[COMMAND_KEY].flatten(), after
-        columns = [value(reached, name) for name in self.module.names]
-        return self.module(torch.stack(columns, -1)).flatten(), after
+            command = reached[COMMAND_KEY]
+        else:
+            state = torch.stack([value(reached, name) for name in self.module.names], -1)
+            if AGREEMENT in self.kept:
+                command, agreed = self.module(state, kept[AGREEMENT].flatten(1))
+                reached[AGREEMENT] = agreed.unsqueeze(1)
+            else:
+                command = self.module(state)
+        return command.flatten(), {key: reached[key] for key in self.kept}
 
 
 def place(name: str) -> tuple[Key, int]:

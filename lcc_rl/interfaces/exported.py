@@ -18,7 +18,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import with_weights
 from lcc_rl.pieces import Action, CBFFilter, Observation
 from lcc_rl.pieces.base import ROLE, Piece, declared
-from lcc_rl.pieces.cbf import FILTER_READS
+from lcc_rl.pieces.cbf import FILTER_READS, REMEMBERS
 from lcc_rl.pieces.knowledge import ObservationMemory
 from lcc_rl.pieces.views import VEHICLES
 from lcc_rl.results.policies import load_policy
@@ -41,6 +41,8 @@ class Input(NamedTuple):
 
 class ExportedPolicy(nn.Module):
     """From measurements ``[batch, inputs]`` to accelerations ``[batch, 1]`` [m/s²].
+
+    A safety filter takes and returns its memory, too, see :meth:`forward`.
 
     Args:
         network: from the scaled observation to actions in [−1, 1].
@@ -77,8 +79,13 @@ class ExportedPolicy(nn.Module):
         difference = first - others[0] if others else first
         return difference * others[1] if len(others) > 1 else difference
 
-    def forward(self, state: Tensor) -> Tensor:
-        """Return the acceleration to command."""
+    def forward(self, state: Tensor, agreed: Tensor | None = None) -> Any:
+        """Return the acceleration to command, and the filter's memory where there is one.
+
+        Args:
+            state: the measurements that :attr:`names` names, ``[batch, inputs]``.
+            agreed: the filter's memory of the step before, ``[batch, 3]``; zeros begin anew.
+        """
         rows = []
         for value, *bases in self.columns:
             seen = self._value(state, value)
@@ -88,39 +95,52 @@ class ExportedPolicy(nn.Module):
         if self.safety is None:
             return command
         measured = (self._value(state, self._places(name)) for name in FILTER_READS)
-        filtered: Tensor = self.safety.filtered(command, *measured)
-        return filtered
+        return self.safety.filtered(command, *measured, agreed)
 
 
 class Remembering(nn.Module):
     """A policy with its memory: ``state``, ``memory`` to ``acceleration``, ``next_memory``.
 
-    A memory of zeros begins anew; the first number of ``next_memory`` is one.
+    It remembers what the observation and the safety filter do. A memory of zeros begins anew.
     """
 
     def __init__(self, policy: ExportedPolicy) -> None:
         super().__init__()
         self.policy, memory = policy, policy.memory
-        self.repeat = memory.depth if memory.stacked else memory.repeat
-        self.width = 1 + memory.counted * self.repeat
-        flat = [base for name in memory.sources for base in DERIVED_INPUTS.get(name, (name,))]
+        flat: list[str] = []
+        self.widths = (0, REMEMBERS * (policy.safety is not None))
+        if memory is not None:
+            self.repeat = memory.depth if memory.stacked else memory.repeat
+            self.widths = (1 + memory.counted * self.repeat, self.widths[1])
+            flat = [base for name in memory.sources for base in DERIVED_INPUTS.get(name, (name,))]
+        self.width = sum(self.widths)
         names = [name for name in policy.names if not name.startswith(REMEMBERED)]
         self.names = list(dict.fromkeys([*names, *flat]))
 
     def forward(self, state: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the acceleration to command, and the memory of the next step."""
         measured = dict(zip(self.names, state.split(1, -1), strict=True))
+        seen, agreed = memory.split(self.widths, -1)
+        if self.policy.memory is not None:
+            seen = self._remember(measured, seen)
+        given = torch.cat([measured[name] for name in self.policy.names], -1)
+        if self.policy.safety is None:
+            return self.policy(given), seen
+        acceleration, agreed = self.policy(given, agreed)
+        return acceleration, torch.cat([seen, agreed], -1)
+
+    def _remember(self, measured: dict[str, Tensor], memory: Tensor) -> Tensor:
+        """Add what the observation remembers to what is measured; return its memory."""
         pairs = (
             [measured[x] for x in DERIVED_INPUTS.get(name, (name,))]
             for name in self.policy.memory.sources
         )
         now = torch.cat([one - other[0] if other else one for one, *other in pairs], -1)
-        begun, kept = memory.split((1, self.width - 1), -1)
+        begun, kept = memory.split((1, memory.shape[-1] - 1), -1)
         kept = torch.where(begun > 0.0, kept, now.repeat_interleave(self.repeat, -1))
         entries, kept = self.policy.memory.remember(kept, now)
         measured |= {f"{REMEMBERED}{n}": x for n, x in enumerate(entries.split(1, -1))}
-        acceleration = self.policy(torch.cat([measured[name] for name in self.policy.names], -1))
-        return acceleration, torch.cat([torch.ones_like(begun), kept], -1)
+        return torch.cat([torch.ones_like(begun), kept], -1)
 
 
 def described_input(name: str) -> Input:
@@ -155,6 +175,8 @@ def exported_policy(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPo
     assert isinstance(learned, TensorDictModule)
     (observation,), (action,) = found.values()
     memory = next((p for p in pieces if isinstance(p, ObservationMemory)), None)
+    if not any(name.startswith(REMEMBERED) for column in observation.columns() for name in column):
+        memory = None
     module = ExportedPolicy(learned.module, observation, action, safety, memory)
     return module.eval().requires_grad_(False)
 
@@ -162,5 +184,5 @@ def exported_policy(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPo
 def program(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPolicy | Remembering:
     """Return the module that a program is made of; arguments as for :func:`exported_policy`."""
     module = exported_policy(policy, trust)
-    remembers = any(name.startswith(REMEMBERED) for name in module.names)
+    remembers = module.safety is not None or module.memory is not None
     return Remembering(module) if remembers else module
