@@ -32,8 +32,18 @@ def read(table: Any, place: Any) -> Any:
     return table[place]
 
 
+@numba.njit
+def layer(weights: Any, bias: Any, inputs: Any) -> Any:
+    """Return ``bias`` and the sum of the rows of ``weights``, each times one of the inputs."""
+    found = bias.copy()
+    for place, value in enumerate(inputs):
+        found += value * weights[place]
+    return found
+
+
 SCOPE = {
     "pick": pick,
+    "layer": layer,
     "read": read,
     "ndtri": ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(
         get_cython_function_address("scipy.special.cython_special", "ndtri")

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 MOST_STATEMENTS = 4000  # numba takes 2 to 4 s for each thousand
@@ -30,6 +31,7 @@ ARITHMETIC = {
     "sin": "np.sin({0})",
     "atanh": "np.arctanh({0})",
     "tanh": "np.tanh({0})",
+    "relu": "pick({0} < 0, f32(0), {0})",
     "special_ndtri": "f32(ndtri({0}))",
     "pow": "{0} ** {1}",
     "lerp": "{0} + {2} * ({1} - {0})",
@@ -53,7 +55,7 @@ COMPARISONS = {
     "eq": "{0} == {1}",
     "ne": "{0} != {1}",
 }
-METHODS = ("bitwise_not", "clamp", "index", "searchsorted", "where")  # methods of Recorder
+METHODS = ("addmm", "bitwise_not", "clamp", "index", "searchsorted", "where")  # methods of Recorder
 REDUCTIONS = {"sum": "add", "any": "logical_or", "all": "logical_and"}
 # They move entries, whatever these are, and are applied to the numbers of the variables.
 MOVES = {
@@ -65,8 +67,26 @@ MOVES = {
 SHAPES = {"zeros_like", "ones_like", "full_like", "empty_like", "new_zeros", "new_ones", "new_full"}
 
 
+TAKING = (Tensor.numpy, Tensor.__array__, Tensor.tolist)  # methods that leave tensors
+
+
 class Untranslatable(Exception):
     """An operation has no counterpart on single numbers."""
+
+
+class TensorsOnly(TorchFunctionMode):
+    """Refuses that numbers are taken out of what a recorder knows: it would see constants."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        super().__init__()
+        self.recorder = recorder
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        if func in TAKING and self.recorder.of(args[0]) is not None:
+            raise Untranslatable(f"numbers are taken out of tensors by {func.__name__}")
+        return func(*args, **(kwargs or {}))
 
 
 class Recorder(TorchDispatchMode):
@@ -75,13 +95,17 @@ class Recorder(TorchDispatchMode):
     Every entry of a tensor that depends on the inputs is a variable; of such a tensor the numbers
     of its variables are kept, in a tensor of the same shape. All other tensors are constants.
 
+    Args:
+        most: statements from which on the function counts as untranslatable.
+
     Attributes:
         statements: the expression of each variable, and the variables that it reads.
         tables: constants that are read at a place that depends on the inputs.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, most: int = MOST_STATEMENTS) -> None:
         super().__init__()
+        self.most = most
         self.statements: list[tuple[str, tuple[int, ...]]] = []
         self.known: dict[tuple[str, tuple[int, ...]], int] = {}
         self.variables: dict[int, tuple[Tensor, Tensor]] = {}  # by the id of the tensor
@@ -102,8 +126,8 @@ class Recorder(TorchDispatchMode):
         if statement not in self.known:
             self.known[statement] = len(self.statements)
             self.statements.append(statement)
-            if len(self.statements) > MOST_STATEMENTS:
-                raise Untranslatable(f"it takes more than {MOST_STATEMENTS} statements")
+            if len(self.statements) > self.most:
+                raise Untranslatable(f"it takes more than {self.most} statements")
         return self.known[statement]
 
     def needed(self, results: Iterable[int]) -> list[int]:
@@ -198,6 +222,18 @@ class Recorder(TorchDispatchMode):
         parts = variables.flatten(0, len(dims) - 1).unbind(0)
         formula = ARITHMETIC[REDUCTIONS[name]]
         return reduce(lambda *two: self._stated(formula, two), parts).reshape(result.shape)
+
+    def _addmm(self, result: Tensor, bias: Tensor, value: Tensor, weight: Tensor) -> Tensor:
+        """Record a layer of a network: each row is one array of numbers."""
+        if self.of(bias) is not None or self.of(weight) is not None:
+            raise Untranslatable("weights that depend on the inputs")
+        tables = f"{self._table(weight.contiguous())}, {self._table(bias)}"
+        rows = []
+        for row in self.numbers(value, result.dtype).tolist():
+            numbers = "".join(f"{{{place}}}, " for place in range(len(row)))
+            array = self.variable(f"layer({tables}, ({numbers}))", tuple(row))
+            rows.append([self.variable(f"{{0}}[{place}]", (array,)) for place in range(len(bias))])
+        return torch.tensor(rows, dtype=torch.int64)
 
     def _bitwise_not(self, result: Tensor, value: Tensor) -> Tensor:
         return self._each("bitwise_xor", result.dtype, value, -1)

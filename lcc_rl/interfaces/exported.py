@@ -1,126 +1,187 @@
-"""Trained policies as modules of plain tensors, from measurements to accelerations."""
+"""Policies and rules as programs of plain tensors: from what a vehicle measures to accelerations.
+
+A program consists of pieces of the environment in their order: what a policy remembers and
+observes, the controller, the safety filter. :mod:`.export` writes it to files, :mod:`.driver` runs
+it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from pydantic import InstanceOf
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import constant_profiles
-from lcc_rl.envs.step import pieces_of
+from lcc_rl.envs.step import pieces_of, read_before
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import with_weights
-from lcc_rl.pieces import Action, CBFFilter, Observation
-from lcc_rl.pieces.base import ROLE, Piece, declared
-from lcc_rl.pieces.cbf import FILTER_READS
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
+from lcc_rl.pieces import Action, CBFFilter, Controller, Observation
+from lcc_rl.pieces.base import (
+    OBSERVATION,
+    ROLE,
+    SEED,
+    STEP,
+    Key,
+    Piece,
+    State,
+    StepTransform,
+    declared,
+    next_key,
+)
 from lcc_rl.pieces.knowledge import ObservationMemory
-from lcc_rl.pieces.views import VEHICLES
+from lcc_rl.pieces.views import BEHIND, VEHICLES
+from lcc_rl.pieces.world import World
 from lcc_rl.results.policies import load_policy
+from lcc_rl.settings import Positive, values
 
 # Entries computed inside from other measurements: v_ahead − v.
 DERIVED_INPUTS = {
     "self.relative_speed": ("ahead.speed", "self.speed"),
     "behind.relative_speed": ("self.speed", "behind.speed"),
 }
-BEHIND_PRESENT, REMEMBERED = "behind.present", "memory.entries."
+BEHIND_PRESENT, MEMORY = "behind.present", "memory"
+COMMAND_KEY = ("command", AUTOMATED)
 
 
 class Input(NamedTuple):
-    """A column of an exported policy's input: its name, unit and meaning."""
+    """A column of a program's input: its name, unit and meaning."""
 
     name: str
     unit: str
     meaning: str
 
 
-class ExportedPolicy(nn.Module):
+class NetworkController(Controller):
+    """Commands the action of a network, in [−1, 1], times the largest acceleration."""
+
+    network: InstanceOf[nn.Module]  # from the scaled observation to actions
+    max_acceleration: Positive  # of action 1, in both directions [m/s²]
+
+    reads = (next_key(OBSERVATION),)
+
+    def setup(self, world: World) -> None:
+        """Read the observation."""
+        self.declare(world)
+        self.layers = self.network  # as a part of this module
+
+    def command(self, observation: Tensor) -> Tensor:
+        """Return the commands."""
+        return self.max_acceleration * self.layers(observation.flatten(1)).unsqueeze(1)
+
+
+class DrivingProgram(nn.Module):
     """From measurements ``[batch, inputs]`` to accelerations ``[batch, 1]`` [m/s²].
 
-    Args:
-        network: from the scaled observation to actions in [−1, 1].
-        observation: the piece that gathers and scales measurements.
-        action: the piece that turns actions into accelerations.
-        safety: the safety filter, or None.
-        memory: the piece that remembers what the columns ``memory.entries.…`` hold, or None.
-    """
+    A program that remembers takes and returns its memory, ``[batch, width]``, too. Where its first
+    number is zero, a vehicle begins anew.
 
-    constants: Tensor
+    Args:
+        controller: what drives.
+        safety: the safety filter, or None.
+        seeing: what acts before the controller: a policy's memory and its observation.
+
+    All are bound to :func:`measuring`.
+
+    Attributes:
+        names: the inputs, such as ``"self.gap"``.
+        inputs: the inputs that each entry is made of.
+        kept: shape and type of the entries that are remembered, without the batch.
+        width: numbers of the memory, 0 if nothing is remembered.
+    """
 
     def __init__(
-        self, network: nn.Module, observation: Observation, action: Action, safety: Any, memory: Any
+        self, controller: Controller, safety: CBFFilter | None = None, seeing: Sequence[Piece] = ()
     ) -> None:
         super().__init__()
-        self.network, self.largest, self.safety = network, action.max_acceleration, safety
-        self.memory = memory
-        self.register_buffer("constants", observation.factors.clone())
-        seen = observation.columns()
-        needed = [name for column in seen for name in column]
-        needed += FILTER_READS if safety is not None else ()
-        flat = [base for name in needed for base in DERIVED_INPUTS.get(name, (name,))]
-        self.names = list(dict.fromkeys(flat))
-        self.columns = [[self._places(name) for name in column] for column in seen]
+        self.controller, self.safety, self.seeing = controller, safety, list(seeing)
+        self.pieces: list[Piece] = [*seeing, controller, *([] if safety is None else [safety])]
+        self.parts = nn.ModuleList(self.pieces)  # as a module knows its parts
+        inner = [*seeing[::-1], *self.pieces[len(seeing) :]]  # the observation's inputs come first
+        needs = [key for piece in inner for _, key in piece.needs]
+        before = read_before(self.pieces)
+        written: set[Key] = {SEED, STEP}
+        self.kept: dict[Key, Any] = {
+            key: ((1,), torch.int64) for key in (SEED, STEP) if key in needs
+        }
+        for piece in self.pieces:
+            written |= set(piece.entries)
+            own = piece.specs(torch.Size([]), None, [x for x in piece.entries if x in before])
+            self.kept |= {key: (tuple(spec.shape), spec.dtype) for key, spec in own.items()}
+        self.sizes = [math.prod(shape) for shape, _ in self.kept.values()]
+        self.width = 1 + sum(self.sizes) if self.kept else 0
+        self.inputs = {key: self._inputs(".".join(key)) for key in needs if key not in written}
+        self.names = list(dict.fromkeys(name for names in self.inputs.values() for name in names))
 
-    def _places(self, name: str) -> tuple[int, ...]:
-        bases = DERIVED_INPUTS.get(name, (name,))
-        if name == "behind.relative_speed" and BEHIND_PRESENT in self.names:
-            bases = (*bases, BEHIND_PRESENT)
-        return tuple(self.names.index(base) for base in bases)
+    def _inputs(self, name: str) -> tuple[str, ...]:
+        """Return the inputs that an entry is made of; several numbers are an input each."""
+        columns = [x for p in self.seeing if isinstance(p, Observation) for x, *_ in p.columns()]
+        several = tuple(column for column in columns if column.startswith(f"{name}."))
+        return several or DERIVED_INPUTS.get(name, (name,))
 
-    def _value(self, state: Tensor, places: tuple[int, ...]) -> Tensor:
-        first, *others = (state[:, place : place + 1] for place in places)
-        difference = first - others[0] if others else first
-        return difference * others[1] if len(others) > 1 else difference
-
-    def forward(self, state: Tensor) -> Tensor:
-        """Return the acceleration to command."""
-        rows = []
-        for value, *bases in self.columns:
-            seen = self._value(state, value)
-            rows.append(seen - self._value(state, bases[0]) if bases else seen)
-        action = self.network(torch.cat(rows, -1) * self.constants)
-        command = action.clamp(-1.0, 1.0) * self.largest
-        if self.safety is None:
+    def forward(self, state: Tensor, memory: Tensor | None = None) -> Any:
+        """Return the accelerations to command and, if there is one, the memory after the step."""
+        reached = self.measured(state)
+        before = reached | ({} if memory is None else self._remembered(reached, memory))
+        for piece in self.pieces:
+            piece.derive(before, reached)
+        command = reached[COMMAND_KEY].flatten(1)
+        if memory is None:
             return command
-        measured = (self._value(state, self._places(name)) for name in FILTER_READS)
-        filtered: Tensor = self.safety.filtered(command, *measured)
-        return filtered
+        reached |= clock_after(before)
+        kept = [reached[key].flatten(1).to(memory.dtype) for key in self.kept]
+        return command, torch.cat([torch.ones_like(command), *kept], 1)
+
+    def measured(self, state: Tensor) -> State:
+        """Return the entries that are measured, ``[batch, 1, width]``."""
+        columns = dict(zip(self.names, state.unsqueeze(1).split(1, -1), strict=True))
+        found = {}
+        for key, names in self.inputs.items():
+            value = torch.cat([columns[name] for name in names], -1)
+            if names == DERIVED_INPUTS.get(".".join(key)):
+                value = columns[names[0]] - columns[names[1]]
+                if key[0] == BEHIND and BEHIND_PRESENT in columns:  # zero where there is nobody
+                    value = value * columns[BEHIND_PRESENT]
+            found[key] = value
+        return found
+
+    def begin(self, measured: State, seeds: Tensor) -> State:
+        """Return what vehicles remember that begin now.
+
+        Args:
+            measured: entries of :meth:`measured`.
+            seeds: a seed for each vehicle, ``[batch, 1]``, int64.
+        """
+        start = TensorDict()  # without batch dimensions, whose number an export would take as fixed
+        for key, value in {**measured, SEED: seeds, STEP: torch.zeros_like(seeds)}.items():
+            start.set(key, value)
+        for piece in self.pieces:
+            if isinstance(piece, StepTransform):
+                piece.begin(TensorDict(), start)
+        return {key: start.get(key).expand(seeds.shape[0], *self.kept[key][0]) for key in self.kept}
+
+    def _remembered(self, measured: State, memory: Tensor) -> State:
+        begun, *given = memory.split([1, *self.sizes], -1)
+        first = self.begin(measured, torch.zeros_like(begun, dtype=torch.int64))
+        found: State = {}
+        for (key, (shape, dtype)), value in zip(self.kept.items(), given, strict=True):
+            later, rows = value.reshape(-1, *shape).to(dtype), begun.reshape(-1, *[1] * len(shape))
+            found[key] = torch.where(rows > 0.0, later, first[key])
+        return found
 
 
-class Remembering(nn.Module):
-    """A policy with its memory: ``state``, ``memory`` to ``acceleration``, ``next_memory``.
-
-    A memory of zeros begins anew; the first number of ``next_memory`` is one.
-    """
-
-    def __init__(self, policy: ExportedPolicy) -> None:
-        super().__init__()
-        self.policy, memory = policy, policy.memory
-        self.repeat = memory.depth if memory.stacked else memory.repeat
-        self.width = 1 + memory.counted * self.repeat
-        flat = [base for name in memory.sources for base in DERIVED_INPUTS.get(name, (name,))]
-        names = [name for name in policy.names if not name.startswith(REMEMBERED)]
-        self.names = list(dict.fromkeys([*names, *flat]))
-
-    def forward(self, state: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the acceleration to command, and the memory of the next step."""
-        measured = dict(zip(self.names, state.split(1, -1), strict=True))
-        pairs = (
-            [measured[x] for x in DERIVED_INPUTS.get(name, (name,))]
-            for name in self.policy.memory.sources
-        )
-        now = torch.cat([one - other[0] if other else one for one, *other in pairs], -1)
-        begun, kept = memory.split((1, self.width - 1), -1)
-        kept = torch.where(begun > 0.0, kept, now.repeat_interleave(self.repeat, -1))
-        entries, kept = self.policy.memory.remember(kept, now)
-        measured |= {f"{REMEMBERED}{n}": x for n, x in enumerate(entries.split(1, -1))}
-        acceleration = self.policy(torch.cat([measured[name] for name in self.policy.names], -1))
-        return acceleration, torch.cat([torch.ones_like(begun), kept], -1)
+def clock_after(before: Mapping[Key, Any]) -> dict[Key, Any]:
+    """Return seed and step after a step, where they are kept."""
+    return {key: before[key] + (key == STEP) for key in (SEED, STEP) if key in before}
 
 
 def described_input(name: str) -> Input:
@@ -134,19 +195,41 @@ def described_input(name: str) -> Input:
     return Input(name, "–", f"{entry} ({whose.get(view, view)})")
 
 
-def exported_policy(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPolicy:
-    """Build the policy that is exported; arguments as for ``lcc_rl.interfaces.export.export``."""
+def measuring(time_step: float, behind: bool = True, filtered: bool = False) -> World:
+    """Return the world of a vehicle that measures itself and its neighbours.
+
+    Args:
+        time_step: duration of a step [s].
+        behind: whether there always is a vehicle behind.
+        filtered: whether a safety filter changes its commands.
+    """
+    string = VehicleString((AUTOMATED, HUMAN)[: 1 + behind], ring=True, measured=True)
+    return World(string, time_step, population=bootstrap(), filtered=[AUTOMATED] * filtered)
+
+
+def program(
+    policy: str | Path, trust: Sequence[str] = (), safety: CBFFilter | None = None
+) -> DrivingProgram:
+    """Build the program of a trained policy.
+
+    Args:
+        policy: a run folder, a policy file, or ``pretrained/<name>``.
+        trust: modules outside this package that the policy may name.
+        safety: the filter behind which it drives; None: its own.
+
+    Raises:
+        ConfigError: if no network drives, or its filter knows the faults of a scenario.
+        ResultsError: if the policy cannot be read.
+    """
     weights, cfg = load_policy(policy, trust=trust)
-    population = bootstrap()
-    scenario = cfg.scenario
+    population, scenario = bootstrap(), cfg.scenario
     leader = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["constant"])
-    env = build_env(cfg, leader, population)
-    pieces = pieces_of(env)
+    pieces = pieces_of(build_env(cfg, leader, population))
     found = {kind: [p for p in pieces if isinstance(p, kind)] for kind in (Observation, Action)}
     if not all(found.values()):
         raise ConfigError(f"{policy}: no network drives its vehicles; nothing to export")
-    safety = next((p for p in pieces if isinstance(p, CBFFilter)), None)
-    if safety is not None and safety.memories:
+    safety = safety or next((p for p in pieces if isinstance(p, CBFFilter)), None)
+    if safety is not None and any(vars(safety).get("remembers", {}).values()):
         raise ConfigError(
             f"{policy}: its filter remembers commands or measurements, an exported policy nothing; "
             "only without delays, lag and drop-outs can it be exported"
@@ -154,13 +237,24 @@ def exported_policy(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPo
     learned = with_weights(cfg, weights, cfg.seed, str(policy), population).policy
     assert isinstance(learned, TensorDictModule)
     (observation,), (action,) = found.values()
-    memory = next((p for p in pieces if isinstance(p, ObservationMemory)), None)
-    module = ExportedPolicy(learned.module, observation, action, safety, memory)
-    return module.eval().requires_grad_(False)
+    seen = BEHIND_PRESENT not in observation.names
+    world = measuring(scenario.time_step, seen, safety is not None)
+    observes = [x for x in observation.seen if x.startswith(f"{MEMORY}.")]
+    memory = [p for p in pieces if isinstance(p, ObservationMemory) and observes]
+    return driving(
+        NetworkController(network=learned.module, max_acceleration=action.max_acceleration),
+        world,
+        safety,
+        [*memory, observation],
+    )
 
 
-def program(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPolicy | Remembering:
-    """Return the module that a program is made of; arguments as for :func:`exported_policy`."""
-    module = exported_policy(policy, trust)
-    remembers = any(name.startswith(REMEMBERED) for name in module.names)
-    return Remembering(module) if remembers else module
+def driving(
+    controller: Controller, world: World, safety: CBFFilter | None, seeing: Sequence[Piece] = ()
+) -> DrivingProgram:
+    """Return the program of a controller in a world of :func:`measuring`."""
+    if safety is not None:  # where it is used, it acts from the start
+        safety = type(safety)(**values(safety) | {"from_s": 0.0}).bind(world, AUTOMATED)
+    seeing = [piece.bind(world) for piece in seeing]
+    made = DrivingProgram(controller.bind(world, AUTOMATED), safety, seeing)
+    return made.eval().requires_grad_(False)

@@ -14,16 +14,16 @@ from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.interfaces.export import main
-from lcc_rl.interfaces.exported import ExportedPolicy, exported_policy
+from lcc_rl.interfaces.exported import DrivingProgram, program
 from lcc_rl.results.policies import load_policy
 
 
 @pytest.fixture(scope="module")
-def module() -> ExportedPolicy:
-    return exported_policy("pretrained/i80-follow")
+def module() -> DrivingProgram:
+    return program("pretrained/i80-follow")
 
 
-def states(module: ExportedPolicy, count: int = 256) -> torch.Tensor:
+def states(module: DrivingProgram, count: int = 256) -> torch.Tensor:
     chance = torch.Generator().manual_seed(0)
     return 20.0 * torch.rand(count, len(module.names), generator=chance)
 
@@ -64,8 +64,8 @@ def test_the_filter_is_inside(module) -> None:
 def test_a_pytorch_program_computes_the_same_and_says_what_it_reads(module, tmp_path) -> None:
     path = lcc_rl.export("pretrained/i80-follow", tmp_path / "policy.pt2")
     about = {"lcc_rl": ""}
-    program = torch.export.load(path, extra_files=about).module()
-    torch.testing.assert_close(program(states(module)), module(states(module)))
+    loaded = torch.export.load(path, extra_files=about).module()
+    torch.testing.assert_close(loaded(states(module)), module(states(module)))
     assert [item["name"] for item in json.loads(about["lcc_rl"])["inputs"]] == module.names
     with pytest.raises(ResultsError, match="is already there"):
         lcc_rl.export("pretrained/i80-follow", path)
