@@ -35,28 +35,23 @@ class Rowwise:
         function: maps tensors ``[n, width]`` to tensors ``[n, width]``; rows do not mix.
         examples: a row of each argument, ``[1, width]``.
         what: its name in the line of the log that says that it is not translated.
-        most: statements from which on it is not.
-        make: from its source to machine code.
-
     Attributes:
         translated: whether it runs as machine code.
+        most: statements from which on it does not.
+        make: from a source to machine code.
     """
 
-    def __init__(
-        self,
-        function: TensorFunction,
-        examples: Sequence[Tensor],
-        what: str,
-        most: int = MOST_STATEMENTS,
-        make: Callable[[str], Callable[..., None]] = compiled,
-    ) -> None:
+    most = MOST_STATEMENTS
+    make = staticmethod(compiled)
+
+    def __init__(self, function: TensorFunction, examples: Sequence[Tensor], what: str) -> None:
         self.function = function
         with torch.no_grad():
             results = function(*examples)
         self.widths = [(x.shape[-1], x.numpy().dtype) for x in results]
         try:
-            source, self.tables = translated(function, examples, most)
-            self.kernel = make(source)
+            source, self.tables = translated(function, examples, self.most)
+            self.kernel = self.make(source)
             self.translated = True
             self(*(x.numpy() for x in examples))
         except (Untranslatable, NumbaError) as error:

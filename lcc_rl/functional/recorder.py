@@ -95,9 +95,6 @@ class Recorder(TorchDispatchMode):
     Every entry of a tensor that depends on the inputs is a variable; of such a tensor the numbers
     of its variables are kept, in a tensor of the same shape. All other tensors are constants.
 
-    Args:
-        most: statements from which on the function counts as untranslatable.
-
     Attributes:
         statements: the expression of each variable, and the variables that it reads.
         tables: constants that are read at a place that depends on the inputs.

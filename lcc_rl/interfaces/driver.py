@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -30,14 +30,13 @@ from lcc_rl.interfaces.exported import (
     BEHIND_PRESENT,
     COMMAND_KEY,
     DrivingProgram,
-    clock_after,
     described_input,
     driving,
     measuring,
     program,
 )
 from lcc_rl.pieces import CBFFilter, Controller, Piece
-from lcc_rl.pieces.base import Key, State
+from lcc_rl.pieces.base import STEP, Key, State
 
 # Own motion, that of the vehicle ahead and of the one behind.
 MEASURED = (
@@ -45,7 +44,6 @@ MEASURED = (
     *("behind.speed", "behind.gap", "behind.acceleration", BEHIND_PRESENT),
 )
 KNOWN = set(MEASURED)
-MOST = 600  # statements of a piece; numba takes a second or two
 
 
 class Driver:
@@ -105,11 +103,10 @@ class Driver:
 
     def _rule(self, who: Any, safety: CBFFilter | None) -> DrivingProgram:
         if safety is None and isinstance(who, str) and who.endswith(FILTERED):
-            node = load("evaluate", ["variant=idm", "+filter=cbf"]).scenario.filters[AUTOMATED]
-            safety = node.made(CBFFilter)
+            filters = load("evaluate", ["variant=idm", "+filter=cbf"]).scenario.filters
+            safety = filters[AUTOMATED].made(CBFFilter)
         node = controller_of(who, safety is not None and safety.time_gap is not None)
-        world = measuring(self.time_step, filtered=safety is not None)
-        return driving(node.made(Controller), world, safety)
+        return driving([node.made(Controller)], safety, measuring(self.time_step))
 
     def _check(self) -> None:
         for name in self.names:
@@ -123,10 +120,9 @@ class Driver:
             check_step(piece, before, reached)
 
     def _example(self, count: int) -> tuple[State, State]:
-        """Return entries of cars that begin, and of those the measured ones."""
+        """Return all entries of cars that begin, and those measured."""
         reached = self.program.measured(torch.ones(count, len(self.names)))
-        kept = self.program.begin(reached, torch.zeros(count, 1).long())
-        return reached | kept, reached
+        return reached | self.program.begin(reached, torch.zeros(count, 1).long()), reached
 
     def reset(self, cars: Sequence[Hashable] | None = None) -> None:
         """Let cars begin anew: what they remember begins with their next measurement.
@@ -169,10 +165,10 @@ class Driver:
             reached.update(zip(piece.targets, found, strict=True))
         command = reached[COMMAND_KEY][:, 0]
         if not np.isfinite(command).all():
-            place = int(np.flatnonzero(~np.isfinite(command))[0])
-            what = f"the command of {self.cars[place]} is {command[place]}"
-            raise Diverged(f"{self.name}: {what}")
-        reached.update(clock_after(before))
+            car = self.cars[int(np.isfinite(command).argmin())]
+            lost = command[~np.isfinite(command)][0]
+            raise Diverged(f"{self.name}: the command of {car} is {lost}")
+        reached[STEP] = self.kept[STEP] + 1
         self.kept = {key: reached.get(key, value) for key, value in self.kept.items()}
         return float(command[0]) if alone else command
 
@@ -180,19 +176,16 @@ class Driver:
         """Take the cars of a step: bring what they remember into their order."""
         if cars == self.cars:
             return
-        count = len(state)
-        if len(cars) != count or len(set(cars)) != count:
-            raise ConfigError(
-                f"cars must be {count} different ids, as many as measured, got {cars}"
-            )
+        words = f"cars must be {len(state)} different ids, as many as measured, got {cars}"
+        require(len(cars) == len(set(cars)) == len(state), words)
         places = {car: place for place, car in enumerate(self.cars)}
         stay = [row for row, car in enumerate(cars) if car in places]
         new = [row for row, car in enumerate(cars) if car not in places]
         seeds = self.seed + self.begun + torch.arange(len(new)).unsqueeze(-1)
         begun = self.program.begin(self.program.measured(torch.from_numpy(state[new])), seeds)
         order = np.argsort(np.array([*stay, *new], int))
-        for key in self.program.kept:
-            first = begun[key].flatten(1).numpy()
+        for key, entry in begun.items():
+            first = entry.flatten(1).numpy()
             old = self.kept.get(key, first[:0])[[places[cars[row]] for row in stay]]
             self.kept[key] = np.concatenate([old, first])[order]
         self.cars, self.begun = cars, self.begun + len(new)
@@ -225,29 +218,33 @@ class Driver:
         found, absent = dict(measured), measured.keys().isdisjoint(self.behind)
         present = found.setdefault(BEHIND_PRESENT, float(not absent))
         for name in () if np.all(present) else self.behind:
-            own = measured.get("self." + name.partition(".")[2], 0.0)
-            nobody = 0.0 if BEHIND_PRESENT in self.names else own
+            entry = name.partition(".")[2]
+            zero = BEHIND_PRESENT in self.names or entry == "acceleration"
+            nobody = 0.0 if zero else measured[f"self.{entry}"]
             found[name] = nobody if absent else np.where(present, found[name], nobody)
         return found
 
     @cached_property
-    def _measure(self) -> Rowwise:
+    def _measure(self) -> Rows:
         """From what is given to the entries that are measured."""
-        given = torch.ones(1, len(self.names))
-        return _rows(lambda x: _flat(self.program.measured(x).values()), [given], "measuring")
+        examples = [torch.ones(1, len(self.names))]
+        return Rows(lambda x: _flat(self.program.measured(x).values()), examples, "measuring")
 
     @cached_property
-    def _rows(self) -> list[tuple[Piece, Rowwise]]:
-        """The pieces by rows: as machine code where it can be translated, a network by tensors."""
+    def _rows(self) -> list[tuple[Piece, Rows]]:
+        """The pieces and how they compute rows."""
         (before, reached), found = self._example(1), []
         for piece in self.program.pieces:
             entries = piece._entries(before, reached)
-            found.append((piece, _rows(_by_rows(piece, entries), _flat(entries), piece.title)))
+            found.append((piece, Rows(_by_rows(piece, entries), _flat(entries), piece.title)))
             piece.derive(before, reached)
         return found
 
 
-_rows = partial(Rowwise, most=MOST, make=kept)  # machine code that later processes find
+class Rows(Rowwise):
+    """As machine code that later processes find, unless it would take long to compile."""
+
+    most, make = 600, staticmethod(kept)
 
 
 def _flat(entries: Iterable[Tensor]) -> list[Tensor]:
@@ -259,8 +256,7 @@ def _by_rows(piece: Piece, examples: Sequence[Tensor]) -> TensorFunction:
     shapes = [entry.shape[1:] for entry in examples]
 
     def compute(*rows: Tensor) -> list[Tensor]:
-        shaped = [x.reshape(-1, *shape) for x, shape in zip(rows, shapes, strict=True)]
-        found = piece.computed(shaped)
+        found = piece.computed([x.reshape(-1, *s) for x, s in zip(rows, shapes, strict=True)])
         return _flat([found] if isinstance(found, Tensor) else found)
 
     return compute

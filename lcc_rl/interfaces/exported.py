@@ -7,8 +7,8 @@ it.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +33,7 @@ from lcc_rl.pieces.base import (
     STEP,
     Key,
     Piece,
+    RoleTransform,
     State,
     StepTransform,
     declared,
@@ -49,7 +50,7 @@ DERIVED_INPUTS = {
     "self.relative_speed": ("ahead.speed", "self.speed"),
     "behind.relative_speed": ("self.speed", "behind.speed"),
 }
-BEHIND_PRESENT, MEMORY = "behind.present", "memory"
+BEHIND_PRESENT = "behind.present"
 COMMAND_KEY = ("command", AUTOMATED)
 
 
@@ -86,46 +87,38 @@ class DrivingProgram(nn.Module):
     number is zero, a vehicle begins anew.
 
     Args:
-        controller: what drives.
-        safety: the safety filter, or None.
-        seeing: what acts before the controller: a policy's memory and its observation.
-
-    All are bound to :func:`measuring`.
+        pieces: a policy's memory and observation, the controller, the safety filter, in this order
+            and bound to :func:`measuring`.
 
     Attributes:
         names: the inputs, such as ``"self.gap"``.
         inputs: the inputs that each entry is made of.
-        kept: shape and type of the entries that are remembered, without the batch.
-        width: numbers of the memory, 0 if nothing is remembered.
+        kept: the entries that are remembered, but for seed and step: their specs.
     """
 
-    def __init__(
-        self, controller: Controller, safety: CBFFilter | None = None, seeing: Sequence[Piece] = ()
-    ) -> None:
+    def __init__(self, pieces: Sequence[Piece]) -> None:
         super().__init__()
-        self.controller, self.safety, self.seeing = controller, safety, list(seeing)
-        self.pieces: list[Piece] = [*seeing, controller, *([] if safety is None else [safety])]
-        self.parts = nn.ModuleList(self.pieces)  # as a module knows its parts
-        inner = [*seeing[::-1], *self.pieces[len(seeing) :]]  # the observation's inputs come first
-        needs = [key for piece in inner for _, key in piece.needs]
-        before = read_before(self.pieces)
-        written: set[Key] = {SEED, STEP}
-        self.kept: dict[Key, Any] = {
-            key: ((1,), torch.int64) for key in (SEED, STEP) if key in needs
-        }
-        for piece in self.pieces:
-            written |= set(piece.entries)
-            own = piece.specs(torch.Size([]), None, [x for x in piece.entries if x in before])
-            self.kept |= {key: (tuple(spec.shape), spec.dtype) for key, spec in own.items()}
-        self.sizes = [math.prod(shape) for shape, _ in self.kept.values()]
+        self.pieces, self.parts = list(pieces), nn.ModuleList(pieces)
+        self.controller = next(p for p in pieces if isinstance(p, Controller))
+        self.safety = next((p for p in pieces if isinstance(p, CBFFilter)), None)
+        self.observation = next((p for p in pieces if isinstance(p, Observation)), None)
+        before, written = read_before(pieces), {SEED, STEP}.union(*(p.entries for p in pieces))
+        self.kept: dict[Key, Any] = {}
+        for piece in pieces:
+            own = [key for key in piece.entries if key in before]
+            self.kept |= piece.specs(torch.Size([]), None, own)
+        self.sizes = [spec.shape.numel() for spec in self.kept.values()]
         self.width = 1 + sum(self.sizes) if self.kept else 0
-        self.inputs = {key: self._inputs(".".join(key)) for key in needs if key not in written}
+        # The observation's inputs come first.
+        inner = sorted(pieces, key=lambda piece: isinstance(piece, ObservationMemory))
+        needs = [key for piece in inner for _, key in piece.needs if key not in written]
+        self.inputs = {key: self._inputs(".".join(key)) for key in needs}
         self.names = list(dict.fromkeys(name for names in self.inputs.values() for name in names))
 
     def _inputs(self, name: str) -> tuple[str, ...]:
         """Return the inputs that an entry is made of; several numbers are an input each."""
-        columns = [x for p in self.seeing if isinstance(p, Observation) for x, *_ in p.columns()]
-        several = tuple(column for column in columns if column.startswith(f"{name}."))
+        columns = [] if self.observation is None else self.observation.columns()
+        several = tuple(column for column, *_ in columns if column.startswith(f"{name}."))
         return several or DERIVED_INPUTS.get(name, (name,))
 
     def forward(self, state: Tensor, memory: Tensor | None = None) -> Any:
@@ -137,7 +130,6 @@ class DrivingProgram(nn.Module):
         command = reached[COMMAND_KEY].flatten(1)
         if memory is None:
             return command
-        reached |= clock_after(before)
         kept = [reached[key].flatten(1).to(memory.dtype) for key in self.kept]
         return command, torch.cat([torch.ones_like(command), *kept], 1)
 
@@ -155,33 +147,31 @@ class DrivingProgram(nn.Module):
         return found
 
     def begin(self, measured: State, seeds: Tensor) -> State:
-        """Return what vehicles remember that begin now.
+        """Return what vehicles remember that begin now, their seed and step among it.
 
         Args:
             measured: entries of :meth:`measured`.
             seeds: a seed for each vehicle, ``[batch, 1]``, int64.
         """
+        clock: State = {SEED: seeds, STEP: torch.zeros_like(seeds)}
         start = TensorDict()  # without batch dimensions, whose number an export would take as fixed
-        for key, value in {**measured, SEED: seeds, STEP: torch.zeros_like(seeds)}.items():
+        for key, value in {**measured, **clock}.items():
             start.set(key, value)
         for piece in self.pieces:
             if isinstance(piece, StepTransform):
                 piece.begin(TensorDict(), start)
-        return {key: start.get(key).expand(seeds.shape[0], *self.kept[key][0]) for key in self.kept}
+        count = seeds.shape[0]
+        return clock | {k: start.get(k).expand(count, *x.shape) for k, x in self.kept.items()}
 
     def _remembered(self, measured: State, memory: Tensor) -> State:
         begun, *given = memory.split([1, *self.sizes], -1)
         first = self.begin(measured, torch.zeros_like(begun, dtype=torch.int64))
-        found: State = {}
-        for (key, (shape, dtype)), value in zip(self.kept.items(), given, strict=True):
-            later, rows = value.reshape(-1, *shape).to(dtype), begun.reshape(-1, *[1] * len(shape))
-            found[key] = torch.where(rows > 0.0, later, first[key])
-        return found
-
-
-def clock_after(before: Mapping[Key, Any]) -> dict[Key, Any]:
-    """Return seed and step after a step, where they are kept."""
-    return {key: before[key] + (key == STEP) for key in (SEED, STEP) if key in before}
+        for (key, spec), value in zip(self.kept.items(), given, strict=True):
+            rows = begun.reshape(-1, *[1] * len(spec.shape)) > 0.0
+            first[key] = torch.where(
+                rows, value.reshape(-1, *spec.shape).to(spec.dtype), first[key]
+            )
+        return first
 
 
 def described_input(name: str) -> Input:
@@ -195,16 +185,15 @@ def described_input(name: str) -> Input:
     return Input(name, "–", f"{entry} ({whose.get(view, view)})")
 
 
-def measuring(time_step: float, behind: bool = True, filtered: bool = False) -> World:
+def measuring(time_step: float, behind: bool = True) -> World:
     """Return the world of a vehicle that measures itself and its neighbours.
 
     Args:
         time_step: duration of a step [s].
         behind: whether there always is a vehicle behind.
-        filtered: whether a safety filter changes its commands.
     """
     string = VehicleString((AUTOMATED, HUMAN)[: 1 + behind], ring=True, measured=True)
-    return World(string, time_step, population=bootstrap(), filtered=[AUTOMATED] * filtered)
+    return World(string, time_step, population=bootstrap())
 
 
 def program(
@@ -237,24 +226,25 @@ def program(
     learned = with_weights(cfg, weights, cfg.seed, str(policy), population).policy
     assert isinstance(learned, TensorDictModule)
     (observation,), (action,) = found.values()
-    seen = BEHIND_PRESENT not in observation.names
-    world = measuring(scenario.time_step, seen, safety is not None)
-    observes = [x for x in observation.seen if x.startswith(f"{MEMORY}.")]
-    memory = [p for p in pieces if isinstance(p, ObservationMemory) and observes]
-    return driving(
-        NetworkController(network=learned.module, max_acceleration=action.max_acceleration),
-        world,
-        safety,
-        [*memory, observation],
-    )
+    world = measuring(scenario.time_step, BEHIND_PRESENT not in observation.names)
+    remembers = any(name.startswith("memory.") for name in observation.seen)
+    memory = [p for p in pieces if isinstance(p, ObservationMemory) and remembers]
+    largest = action.max_acceleration
+    network = NetworkController(network=learned.module, max_acceleration=largest)
+    return driving([*memory, observation, network], safety, world)
 
 
-def driving(
-    controller: Controller, world: World, safety: CBFFilter | None, seeing: Sequence[Piece] = ()
-) -> DrivingProgram:
-    """Return the program of a controller in a world of :func:`measuring`."""
-    if safety is not None:  # where it is used, it acts from the start
-        safety = type(safety)(**values(safety) | {"from_s": 0.0}).bind(world, AUTOMATED)
-    seeing = [piece.bind(world) for piece in seeing]
-    made = DrivingProgram(controller.bind(world, AUTOMATED), safety, seeing)
-    return made.eval().requires_grad_(False)
+def driving(pieces: Sequence[Piece], safety: CBFFilter | None, world: World) -> DrivingProgram:
+    """Return the program of a controller and what acts before it, behind a filter or without one.
+
+    Args:
+        pieces: these, in order; they are bound to the world.
+        safety: the filter, likewise; it acts from the start.
+        world: of :func:`measuring`.
+    """
+    if safety is not None:
+        world = replace(world, filtered=[AUTOMATED])
+        pieces = [*pieces, type(safety)(**values(safety) | {"from_s": 0.0})]
+    roles = [AUTOMATED if isinstance(piece, RoleTransform) else None for piece in pieces]
+    bound = [piece.bind(world, role) for piece, role in zip(pieces, roles, strict=True)]
+    return DrivingProgram(bound).eval().requires_grad_(False)

@@ -31,6 +31,7 @@ from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.cbf import SLOWEST
 from lcc_rl.pieces.controllers import stream_name
 from lcc_rl.pieces.drivers import DriverModel
+from lcc_rl.pieces.knowledge import ObservationMemory
 from lcc_rl.settings import values
 
 RING_TASK = ("variant=alcc", "task=ring-22")
@@ -96,8 +97,8 @@ def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict
     controller = program.controller
     if not isinstance(controller, NetworkController):
         raise ConfigError(f"{policy}: a rule; a page needs a policy")
-    observation: Any = program.seeing[-1]
-    memory: list[Any] = program.seeing[:-1]
+    observation: Any = program.observation
+    memory = [piece for piece in program.pieces if isinstance(piece, ObservationMemory)]
     layers = [x for x in controller.layers.modules() if not list(x.children())]
     kept = [(name, time) for x in memory for name in x.sources for time in x.seconds]
     names = list(dict.fromkeys(name for column in observation.columns() for name in column))

@@ -157,7 +157,7 @@ def test_it_remembers_as_the_piece_does(kind) -> None:
     seen, action, memory = (next(p for p in pieces if isinstance(p, k)) for k in kinds)
     network = torch.nn.Linear(len(seen.factors), 1)
     controller = NetworkController(network=network, max_acceleration=action.max_acceleration)
-    driver = driving(controller, measuring(0.1), None, [memory, seen])
+    driver = driving([memory, seen, controller], None, measuring(0.1))
     kept = torch.zeros(3, driver.width)
 
     whose = {"self": ("vehicles", 0), "ahead": ("leader", 0), "behind": ("vehicles", 1)}

@@ -218,7 +218,7 @@ def test_bad_input_is_one_clear_error(tmp_path) -> None:
     start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
     cases = [
         ("follow_stopper", "Did you mean 'follower_stopper'"),
-        ({"_target_": "lcc_rl.pieces.CACC"}, "vehicles.gap_error, which is not measured"),
+        ({"_target_": "lcc_rl.pieces.CACC"}, "CACC reads self.gap_error, which is not measured"),
         (nobody_knows, r"nobody_knows.*: the command of own is nan at 0\.1 s"),
         (alone, r"alone writes .* \[\] .* expected \[1, 1\] .* per vehicle"),
     ]
