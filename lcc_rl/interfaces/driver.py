@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -196,18 +197,20 @@ class Driver:
             raise unknown_name("measurement", str(min(unknown, key=str)), MEASURED)
         try:
             measured = self._completed(measured) if self.behind else measured
-            columns = [measured[name] for name in self.names]
-            state = np.array(columns, np.float32)
+            columns = [np.asarray(measured[name], np.float32) for name in self.names]
+            shape = max((column.shape for column in columns), key=len)
+            require(len(shape) < 2, f"measured has arrays {list(shape)}, expected one dimension")
+            state = np.empty((math.prod(shape), len(columns)), np.float32)
+            for place, column in enumerate(columns):
+                state[:, place] = column
         except KeyError as error:
             name, unit, meaning = described_input(error.args[0])
             words = f"{self.name} reads {name}, which is not given: {meaning} [{unit}]"
             raise ConfigError(words) from error
-        except ValueError:  # some are numbers, others arrays
-            state = np.array(np.broadcast_arrays(*columns), np.float32)
-        if state.ndim == 1:
-            return state.reshape(1, -1), True
-        require(state.ndim == 2, "measured must be numbers, or arrays of one dimension")
-        return np.ascontiguousarray(state.T), False
+        except ValueError as error:
+            words = f"measured must hold numbers, or arrays of one length: {error}"
+            raise ConfigError(words) from error
+        return state, not shape
 
     def _completed(self, measured: Mapping[str, Any]) -> dict[str, Any]:
         """Return measurements with those of a vehicle behind, also where there is none.
@@ -256,7 +259,7 @@ def _by_rows(piece: Piece, examples: Sequence[Tensor]) -> TensorFunction:
     shapes = [entry.shape[1:] for entry in examples]
 
     def compute(*rows: Tensor) -> list[Tensor]:
-        found = piece.computed([x.reshape(-1, *s) for x, s in zip(rows, shapes, strict=True)])
+        found = piece._seen(*(x.view(-1, *s) for x, s in zip(rows, shapes, strict=True)))
         return _flat([found] if isinstance(found, Tensor) else found)
 
     return compute
