@@ -14,7 +14,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import DriverConstants, NoiseStep, Reaction
 from lcc_rl.functional.gipps import GippsConstants
 from lcc_rl.functional.idm import IDMConstants
-from lcc_rl.functional.layout import join
+from lcc_rl.functional.layout import join, reverse
 from lcc_rl.functional.ovm import FVDMConstants, OVMConstants
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.functional.random import between, choose, normal, stream_id, uniform
@@ -25,8 +25,11 @@ from lcc_rl.pieces.views import MOTION_READS
 from lcc_rl.pieces.world import MOST_LATE, World
 from lcc_rl.settings import Factors, NonNegative, Positive, Share
 
+Delay = Annotated[int, Field(ge=0, le=MOST_LATE)]
 # Draws that all drivers of an episode share.
-WIENER_STREAM, TIME_GAP_STREAM = stream_id("drivers.wiener"), stream_id("drivers.time_gap")
+WIENER_STREAM, TIME_GAP_STREAM, DELAY_STREAM, NOISE_STREAM = (
+    stream_id(f"drivers.{name}") for name in ("wiener", "time_gap", "delay", "noise")
+)
 LONGEST_TIME_GAP = 1000.0  # time gap up to which an equilibrium gap is written [s]
 
 
@@ -47,7 +50,12 @@ class Drivers(Controller):
     time_gap_range: Factors = (1.0, 1.0)
     # Steps by which speed, gap and relative speed are old when the driver reacts; until then,
     # those at the start of the episode. None: the reaction delay of the population.
-    delay: Annotated[int, Field(ge=0, le=MOST_LATE)] | None = None
+    delay: Delay | None = None
+    # Steps from which and to which every episode of training draws its delay; evaluation takes
+    # delay, as does a training without a range.
+    delay_range: tuple[Delay, Delay] | None = None
+    # Factors of the noise of the acceleration in an episode of training; evaluation takes 1.
+    acceleration_noise_range: Factors = (1.0, 1.0)
     # Standard deviation of a smooth noise of the acceleration, see
     # lcc_rl.functional.driver_models.NoiseStep [m/s²]; None: of the population.
     acceleration_noise: NonNegative | None = None
@@ -72,6 +80,11 @@ class Drivers(Controller):
     time_gaps: ClassVar[Tensor]
     index: ClassVar[Tensor]
 
+    def validate(self) -> None:
+        soonest, latest = self.delay_range or (0, 0)
+        if soonest > latest:
+            raise ValueError(f"delay_range must not fall, got {list(self.delay_range or ())}")
+
     def setup(self, world: World) -> None:
         """Take the drivers, and choose what is read and written by the settings."""
         role = self.name
@@ -79,7 +92,10 @@ class Drivers(Controller):
         reaction = self.reaction(world)
         late, spread = self.delay, self.acceleration_noise
         what = "the reaction delay of drivers"
-        self.late = world.late(reaction.delay, what) if late is None else late
+        late = world.late(reaction.delay, what) if late is None else late
+        # The least and the largest delay; drivers remember as far back as the largest.
+        drawn = world.nominal or self.delay_range is None
+        self.soonest, self.late = (late, late) if drawn else self.delay_range  # type: ignore[misc]
         self.noise_spread = reaction.noise if spread is None else spread
         self.noise_step = NoiseStep.of(world.time_step)
         self.starts = self.tells_gap and not world.string.ring
@@ -91,6 +107,7 @@ class Drivers(Controller):
         self.limits = None  # drives as a person, in automated vehicles, too
         walk = self.wiener / world.time_step**0.5
         self.spreads = tuple(walk * factor for factor in world.deviations(self.wiener_range))
+        self.noise_factors = world.deviations(self.acceleration_noise_range)
         self.time_gap_factors = world.deviations(self.time_gap_range)
         self.noise_stream = stream_id(f"{stream_name(role)}.noise")
         self.wiener_stream = stream_id(f"{stream_name(role)}.wiener")
@@ -137,8 +154,9 @@ class Drivers(Controller):
             now = join(motion, -1)
             # Before the first step nothing else was ever seen.
             past = torch.where(step == 0, now.repeat(*[1] * (now.ndim - 1), self.late), history)
-            motion = past[..., -3:].split(1, -1)
-            kept.insert(0, join([now, past[..., :-3]], -1))
+            seen = join([now, past], -1)
+            motion = self._then(seen, seed).split(1, -1)
+            kept.insert(0, seen[..., :-3])
         command = self.acceleration(*motion, desired_speed, time_gap, *more)
         if self.noise:
             draw = uniform(seed, step, self.noise_stream + self.index)
@@ -147,8 +165,19 @@ class Drivers(Controller):
             spread = between(self.spreads, seed, WIENER_STREAM)
             command = command + spread * normal(seed, step, self.wiener_stream + self.index)
         if self.noise_spread:
-            command = command + kept[-1][..., :1]
+            factor = between(self.noise_factors, seed, NOISE_STREAM)
+            command = command + factor * kept[-1][..., :1]
         return (command, *kept) if kept else command
+
+    def _then(self, seen: Tensor, seed: Tensor) -> Tensor:
+        """Return what the drivers react to, of the motion seen from the present back."""
+        if self.soonest == self.late:
+            return seen[..., -3:]
+        span = self.late - self.soonest + 1
+        late = self.soonest + (span * uniform(seed, 0, DELAY_STREAM)).long()
+        columns = 3 * late + torch.arange(3, device=seen.device)
+        columns = columns.expand(*seen.shape[:-1], 3)
+        return reverse(reverse(seen).gather(0, reverse(columns)))
 
     def _noise_of(self, before: Tensor, seed: Tensor, step: Tensor) -> Tensor:
         """Return the latest two values of the noise from those before [m/s²]."""
@@ -222,6 +251,7 @@ class DriverModel(Drivers):
     parameters: Annotated[InstanceOf[DriverConstants] | None, BeforeValidator(_made)] = None
 
     def validate(self) -> None:
+        super().validate()
         if (self.desired_speed is None) != (self.time_gap is None):
             raise ValueError("desired_speed and time_gap belong together: give both or none")
 

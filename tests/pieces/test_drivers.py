@@ -175,3 +175,19 @@ def test_a_handover_passes_on_what_a_late_driver_remembers() -> None:
         "scenario.horizon=20",
     )
     check_env_specs(build_env(cfg, steady(), POPULATION, 2))
+
+
+def test_every_episode_of_training_draws_its_delay() -> None:
+    def played(nominal: bool, *more: str, batch: int = 64) -> torch.Tensor:
+        cfg = human("human", QUIET, *(f"scenario.controllers.human.{x}" for x in more))
+        env = build_env(cfg, wavy_profiles(), POPULATION, batch, 0, nominal=nominal)
+        return env.rollout(12, break_when_any_done=False)["vehicles", "speed"]
+
+    known = torch.stack([played(False, f"delay={late}") for late in range(4)])
+    drawn = played(False, "delay_range=[0,3]")
+    equal = ((known - drawn).abs() < 1e-5).flatten(2).all(-1)
+    assert (equal.sum(0) == 1).all()
+    assert (equal.sum(1) > 5).all()
+    assert torch.equal(played(True, "delay_range=[1,3]", "delay=2"), played(True, "delay=2"))
+    with pytest.raises(ConfigError, match=r"delay_range must not fall, got \[3, 1\]"):
+        played(False, "delay_range=[3,1]")
