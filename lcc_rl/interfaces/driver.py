@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -22,22 +22,20 @@ from torch import Tensor
 from lcc_rl.config import load
 from lcc_rl.config.words import FILTERED
 from lcc_rl.envs.checks import BATCH, check_step
-from lcc_rl.envs.rowwise import Array, Rowwise, TensorFunction
+from lcc_rl.envs.rowwise import Array, Rowwise
 from lcc_rl.errors import ConfigError, Diverged, require, unknown_name
 from lcc_rl.evaluation.named import controller_of, is_policy, label_of, setting_of
 from lcc_rl.functional.machine_code import kept
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.interfaces.exported import (
     BEHIND_PRESENT,
-    COMMAND_KEY,
     DrivingProgram,
     described_input,
     driving,
     measuring,
     program,
 )
-from lcc_rl.pieces import CBFFilter, Controller, Piece
-from lcc_rl.pieces.base import STEP, Key, State
+from lcc_rl.pieces import CBFFilter, Controller
 
 # Own motion, that of the vehicle ahead and of the one behind.
 MEASURED = (
@@ -116,14 +114,12 @@ class Driver:
                 raise ConfigError(
                     f"{self.name} reads {name}, which is not measured here, only {known}"
                 )
-        before, reached = self._example(BATCH)
-        for piece in self.program.pieces:
-            check_step(piece, before, reached)
+        self.program.step(*self._examples(BATCH), apply=check_step)  # type: ignore[misc]
 
-    def _example(self, count: int) -> tuple[State, State]:
-        """Return all entries of cars that begin, and those measured."""
-        reached = self.program.measured(torch.ones(count, len(self.names)))
-        return reached | self.program.begin(reached, torch.zeros(count, 1).long()), reached
+    def _examples(self, count: int) -> list[Tensor]:
+        """Return measurements, and the memory of cars that begin, if there is one."""
+        state, seeds = torch.ones(count, len(self.names)), torch.zeros(count, 1).long()
+        return [state, self.program.begin(state.double(), seeds)] if self.program.width else [state]
 
     def reset(self, cars: Sequence[Hashable] | None = None) -> None:
         """Let cars begin anew: what they remember begins with their next measurement.
@@ -133,12 +129,10 @@ class Driver:
         """
         if cars is None:
             self.cars: Sequence[Any] = ()
-            self.kept: dict[Key, Array] = {}
-            self.begun = 0
+            self.memory, self.begun = np.zeros((0, self.program.width)), 0
             return
         stay = [place for place, car in enumerate(self.cars) if car not in cars]
-        self.cars = [self.cars[place] for place in stay]
-        self.kept = {key: value[stay] for key, value in self.kept.items()}
+        self.cars, self.memory = [self.cars[place] for place in stay], self.memory[stay]
 
     def step(self, measured: Mapping[str, Any], cars: Sequence[Hashable] | None = None) -> Any:
         """Return the acceleration of each car for the step that begins [m/s²].
@@ -159,19 +153,14 @@ class Driver:
         """
         state, alone = self._state(measured)
         self._admit(range(len(state)) if cars is None else list(cars), state)
-        reached = dict(zip(self.program.inputs, self._measure(state), strict=True))
-        before = {**reached, **self.kept}
-        for piece, rows in self._rows:
-            found = rows(*[(reached if late else before)[key] for late, key in piece.needs])
-            reached.update(zip(piece.targets, found, strict=True))
-        command = reached[COMMAND_KEY][:, 0]
+        command, *memory = self._rows(state, *[self.memory] * (self.program.width > 0))
         if not np.isfinite(command).all():
-            car = self.cars[int(np.isfinite(command).argmin())]
-            lost = command[~np.isfinite(command)][0]
-            raise Diverged(f"{self.name}: the command of {car} is {lost}")
-        reached[STEP] = self.kept[STEP] + 1
-        self.kept = {key: reached.get(key, value) for key, value in self.kept.items()}
-        return float(command[0]) if alone else command
+            place = int(np.isfinite(command).argmin())
+            what = f"the command of {self.cars[place]} is {command[place, 0]}"
+            raise Diverged(f"{self.name}: {what}")
+        if memory:
+            (self.memory,) = memory
+        return float(command[0, 0]) if alone else command[:, 0]
 
     def _admit(self, cars: Sequence[Hashable], state: Array) -> None:
         """Take the cars of a step: bring what they remember into their order."""
@@ -182,13 +171,13 @@ class Driver:
         places = {car: place for place, car in enumerate(self.cars)}
         stay = [row for row, car in enumerate(cars) if car in places]
         new = [row for row, car in enumerate(cars) if car not in places]
-        seeds = self.seed + self.begun + torch.arange(len(new)).unsqueeze(-1)
-        begun = self.program.begin(self.program.measured(torch.from_numpy(state[new])), seeds)
-        order = np.argsort(np.array([*stay, *new], int))
-        for key, entry in begun.items():
-            first = entry.flatten(1).numpy()
-            old = self.kept.get(key, first[:0])[[places[cars[row]] for row in stay]]
-            self.kept[key] = np.concatenate([old, first])[order]
+        if self.program.width:
+            memory = np.zeros((len(state), self.program.width))
+            memory[stay] = self.memory[[places[cars[row]] for row in stay]]
+            given = torch.from_numpy(state[new]).double()
+            seeds = self.seed + self.begun + torch.arange(len(new)).unsqueeze(-1)
+            memory[new] = self.program.begin(given, seeds).numpy()
+            self.memory = memory
         self.cars, self.begun = cars, self.begun + len(new)
 
     def _state(self, measured: Mapping[str, Any]) -> tuple[Array, bool]:
@@ -228,38 +217,12 @@ class Driver:
         return found
 
     @cached_property
-    def _measure(self) -> Rows:
-        """From what is given to the entries that are measured."""
-        examples = [torch.ones(1, len(self.names))]
-        return Rows(lambda x: _flat(self.program.measured(x).values()), examples, "measuring")
-
-    @cached_property
-    def _rows(self) -> list[tuple[Piece, Rows]]:
-        """The pieces and how they compute rows."""
-        (before, reached), found = self._example(1), []
-        for piece in self.program.pieces:
-            entries = piece._entries(before, reached)
-            found.append((piece, Rows(_by_rows(piece, entries), _flat(entries), piece.title)))
-            piece.derive(before, reached)
-        return found
+    def _rows(self) -> Rows:
+        """The program, once it is needed."""
+        return Rows(self.program.step, self._examples(1), self.name)
 
 
 class Rows(Rowwise):
-    """As machine code that later processes find, unless it would take long to compile."""
+    """As machine code that later processes find, unless that would take long to compile."""
 
-    most, make = 600, staticmethod(kept)
-
-
-def _flat(entries: Iterable[Tensor]) -> list[Tensor]:
-    return [entry.flatten(1) for entry in entries]
-
-
-def _by_rows(piece: Piece, examples: Sequence[Tensor]) -> TensorFunction:
-    """Return what a piece computes as a function of rows, ``[n, width]``."""
-    shapes = [entry.shape[1:] for entry in examples]
-
-    def compute(*rows: Tensor) -> list[Tensor]:
-        found = piece._seen(*(x.view(-1, *s) for x, s in zip(rows, shapes, strict=True)))
-        return _flat([found] if isinstance(found, Tensor) else found)
-
-    return compute
+    most, make = 1000, staticmethod(kept)

@@ -17,6 +17,7 @@ from pydantic import InstanceOf
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.data import Unbounded
 
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
@@ -93,7 +94,8 @@ class DrivingProgram(nn.Module):
     Attributes:
         names: the inputs, such as ``"self.gap"``.
         inputs: the inputs that each entry is made of.
-        kept: the entries that are remembered, but for seed and step: their specs.
+        kept: the entries that are remembered: their specs.
+        width: how many numbers the memory has, 0 if there is none.
     """
 
     def __init__(self, pieces: Sequence[Piece]) -> None:
@@ -102,17 +104,18 @@ class DrivingProgram(nn.Module):
         self.controller = next(p for p in pieces if isinstance(p, Controller))
         self.safety = next((p for p in pieces if isinstance(p, CBFFilter)), None)
         self.observation = next((p for p in pieces if isinstance(p, Observation)), None)
-        before, written = read_before(pieces), {SEED, STEP}.union(*(p.entries for p in pieces))
-        self.kept: dict[Key, Any] = {}
+        # The observation's inputs come first.
+        inner = sorted(pieces, key=lambda piece: isinstance(piece, ObservationMemory))
+        needs = [key for piece in inner for _, key in piece.needs]
+        before, clock = read_before(pieces), [key for key in (SEED, STEP) if key in needs]
+        self.kept: dict[Key, Any] = {key: Unbounded((1,), dtype=torch.int64) for key in clock}
         for piece in pieces:
             own = [key for key in piece.entries if key in before]
             self.kept |= piece.specs(torch.Size([]), None, own)
         self.sizes = [spec.shape.numel() for spec in self.kept.values()]
         self.width = 1 + sum(self.sizes) if self.kept else 0
-        # The observation's inputs come first.
-        inner = sorted(pieces, key=lambda piece: isinstance(piece, ObservationMemory))
-        needs = [key for piece in inner for _, key in piece.needs if key not in written]
-        self.inputs = {key: self._inputs(".".join(key)) for key in needs}
+        written = {SEED, STEP}.union(*(piece.entries for piece in pieces))
+        self.inputs = {key: self._inputs(".".join(key)) for key in needs if key not in written}
         self.names = list(dict.fromkeys(name for names in self.inputs.values() for name in names))
 
     def _inputs(self, name: str) -> tuple[str, ...]:
@@ -123,15 +126,50 @@ class DrivingProgram(nn.Module):
 
     def forward(self, state: Tensor, memory: Tensor | None = None) -> Any:
         """Return the accelerations to command and, if there is one, the memory after the step."""
-        reached = self.measured(state)
-        before = reached | ({} if memory is None else self._remembered(reached, memory))
-        for piece in self.pieces:
-            piece.derive(before, reached)
-        command = reached[COMMAND_KEY].flatten(1)
         if memory is None:
-            return command
-        kept = [reached[key].flatten(1).to(memory.dtype) for key in self.kept]
-        return command, torch.cat([torch.ones_like(command), *kept], 1)
+            return self.step(state)[0]
+        begun = memory[:, :1]
+        seeds = torch.zeros_like(begun, dtype=torch.int64)
+        return self.step(state, torch.where(begun > 0.0, memory, self.begin(state, seeds)))
+
+    def begin(self, state: Tensor, seeds: Tensor) -> Tensor:
+        """Return the memories of vehicles that begin now, from seeds ``[batch, 1]``, int64."""
+        start = TensorDict()  # without batch dimensions, whose number an export would take as fixed
+        clock: State = {SEED: seeds, STEP: torch.zeros_like(seeds)}
+        for key, value in {**self.measured(state), **clock}.items():
+            start.set(key, value)
+        for piece in self.pieces:
+            if isinstance(piece, StepTransform):
+                piece.begin(TensorDict(), start)
+        return self._packed({key: start.get(key) for key in self.kept}, state)
+
+    def step(
+        self, state: Tensor, memory: Tensor | None = None, apply: Any = None
+    ) -> tuple[Tensor, ...]:
+        """Return the accelerations, and the memory after the step if one is given.
+
+        Args:
+            state: measurements, ``[batch, inputs]``.
+            memory: of vehicles that have begun, ``[batch, width]``.
+            apply: what applies a piece to the moments before and after the step; by default it.
+        """
+        reached = self.measured(state)
+        before = dict(reached)
+        if memory is not None:
+            values = memory[:, 1:].split(self.sizes, -1)
+            for (key, spec), value in zip(self.kept.items(), values, strict=True):
+                before[key] = value.reshape(-1, *spec.shape).to(spec.dtype)
+        reached |= {key: before[key] + (key == STEP) for key in (SEED, STEP) if key in before}
+        for piece in self.pieces:
+            apply(piece, before, reached) if apply else piece.derive(before, reached)
+        command = reached[COMMAND_KEY].flatten(1)
+        return (command,) if memory is None else (command, self._packed(reached, memory))
+
+    def _packed(self, entries: State, like: Tensor) -> Tensor:
+        rows = [torch.ones_like(like[:, :1])]
+        for key, spec in self.kept.items():
+            rows.append(entries[key].expand(like.shape[0], *spec.shape).flatten(1).to(like.dtype))
+        return torch.cat(rows, 1)
 
     def measured(self, state: Tensor) -> State:
         """Return the entries that are measured, ``[batch, 1, width]``."""
@@ -145,33 +183,6 @@ class DrivingProgram(nn.Module):
                     value = value * columns[BEHIND_PRESENT]
             found[key] = value
         return found
-
-    def begin(self, measured: State, seeds: Tensor) -> State:
-        """Return what vehicles remember that begin now, their seed and step among it.
-
-        Args:
-            measured: entries of :meth:`measured`.
-            seeds: a seed for each vehicle, ``[batch, 1]``, int64.
-        """
-        clock: State = {SEED: seeds, STEP: torch.zeros_like(seeds)}
-        start = TensorDict()  # without batch dimensions, whose number an export would take as fixed
-        for key, value in {**measured, **clock}.items():
-            start.set(key, value)
-        for piece in self.pieces:
-            if isinstance(piece, StepTransform):
-                piece.begin(TensorDict(), start)
-        count = seeds.shape[0]
-        return clock | {k: start.get(k).expand(count, *x.shape) for k, x in self.kept.items()}
-
-    def _remembered(self, measured: State, memory: Tensor) -> State:
-        begun, *given = memory.split([1, *self.sizes], -1)
-        first = self.begin(measured, torch.zeros_like(begun, dtype=torch.int64))
-        for (key, spec), value in zip(self.kept.items(), given, strict=True):
-            rows = begun.reshape(-1, *[1] * len(spec.shape)) > 0.0
-            first[key] = torch.where(
-                rows, value.reshape(-1, *spec.shape).to(spec.dtype), first[key]
-            )
-        return first
 
 
 def described_input(name: str) -> Input:

@@ -20,7 +20,6 @@ from lcc_rl.pieces.base import SEED
 from lcc_rl.results.policies import load_policy
 
 POLICY = "pretrained/i24-follow5"  # a memory, a filter, the vehicle behind
-MEMORY = ("memory", "entries")
 CARS, STEPS, FIRST = 4, 80, 5
 DRIVERS = (POLICY, "pretrained/i80-follow", "idm_acc_filtered", "pi_saturation", "idm", "mpc")
 VIEWS = {"self": ("vehicles", 0), "ahead": ("leader", 0), "behind": ("vehicles", 1)}
@@ -85,12 +84,12 @@ def test_cars_come_and_go_and_begin_anew() -> None:
         found = driver.step(at(step, measured, present), [f"car{car}" for car in present])
         began = [1, 3] if step >= 20 else []
         anew = fresh.step(at(step, measured, began), began)
-        for car, command, kept in zip(present, found, driver.kept[MEMORY], strict=True):
+        for car, command, kept in zip(present, found, driver.memory, strict=True):
             own, past = (anew, fresh) if car in began else (expected, whole)
             place = list(past.cars).index(car)
             assert command == pytest.approx(own[place], abs=1e-5)
-            np.testing.assert_allclose(kept, past.kept[MEMORY][place], rtol=1e-5)
-    assert (abs(whole.kept[MEMORY][[1, 3]] - fresh.kept[MEMORY]) > 0.01).any(1).all()
+            np.testing.assert_allclose(kept, past.memory[place], rtol=1e-5)
+    assert (abs(whole.memory[[1, 3]] - fresh.memory) > 0.01).any(1).all()
     assert driver.step({name: [] for name in driver.names}, []).shape == (0,)
 
 

@@ -131,8 +131,8 @@ def test_with_nobody_ahead_in_sight_sumo_drives(tmp_path) -> None:
     libsumo.vehicle.setSpeed("lead", 0.0)
     while not bridge.command():
         libsumo.simulationStep()
-    memory, row = bridge.driver.kept["memory", "entries"], bridge._measured("own")
-    assert memory.tolist() == [pytest.approx([row[3]] * 4)]  # the speed ahead: it begins anew
+    memory, ahead = bridge.driver.memory, bridge._measured("own")[3]
+    assert memory[:, 1:5].tolist() == [pytest.approx([ahead] * 4)]  # it has begun anew
     libsumo.vehicle.remove("own")
     libsumo.simulationStep()
     assert not bridge.command()
