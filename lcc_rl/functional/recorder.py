@@ -75,17 +75,13 @@ class Untranslatable(Exception):
 
 
 class TensorsOnly(TorchFunctionMode):
-    """Refuses that numbers are taken out of what a recorder knows: it would see constants."""
-
-    def __init__(self, recorder: Recorder) -> None:
-        super().__init__()
-        self.recorder = recorder
+    """Refuses to take numbers out of tensors, of which a recorder would see constants."""
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
     ) -> Any:
-        if func in TAKING and self.recorder.of(args[0]) is not None:
-            raise Untranslatable(f"numbers are taken out of tensors by {func.__name__}")
+        if func in TAKING:
+            raise Untranslatable(f"it takes numbers out of tensors by {func.__name__}")
         return func(*args, **(kwargs or {}))
 
 
@@ -100,9 +96,8 @@ class Recorder(TorchDispatchMode):
         tables: constants that are read at a place that depends on the inputs.
     """
 
-    def __init__(self, most: int = MOST_STATEMENTS) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.most = most
         self.statements: list[tuple[str, tuple[int, ...]]] = []
         self.known: dict[tuple[str, tuple[int, ...]], int] = {}
         self.variables: dict[int, tuple[Tensor, Tensor]] = {}  # by the id of the tensor
@@ -123,8 +118,8 @@ class Recorder(TorchDispatchMode):
         if statement not in self.known:
             self.known[statement] = len(self.statements)
             self.statements.append(statement)
-            if len(self.statements) > self.most:
-                raise Untranslatable(f"it takes more than {self.most} statements")
+            if len(self.statements) > MOST_STATEMENTS:
+                raise Untranslatable(f"it takes more than {MOST_STATEMENTS} statements")
         return self.known[statement]
 
     def needed(self, results: Iterable[int]) -> list[int]:

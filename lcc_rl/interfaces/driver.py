@@ -27,6 +27,7 @@ from lcc_rl.errors import ConfigError, Diverged, require, unknown_name
 from lcc_rl.evaluation.named import controller_of, is_policy, label_of, setting_of
 from lcc_rl.functional.machine_code import kept
 from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.functional.recorder import Untranslatable
 from lcc_rl.interfaces.exported import (
     BEHIND_PRESENT,
     DrivingProgram,
@@ -43,6 +44,7 @@ MEASURED = (
     *("behind.speed", "behind.gap", "behind.acceleration", BEHIND_PRESENT),
 )
 KNOWN = set(MEASURED)
+WIDEST = 200  # memory in machine code
 
 
 class Driver:
@@ -217,12 +219,12 @@ class Driver:
         return found
 
     @cached_property
-    def _rows(self) -> Rows:
-        """The program, once it is needed."""
-        return Rows(self.program.step, self._examples(1), self.name)
+    def _rows(self) -> Rowwise:
+        """The program by rows, once it is needed."""
+        wide = self.program.width > WIDEST
+        make = _by_tensors if wide else kept
+        return Rowwise(self.program.step, self._examples(1), self.name, make)
 
 
-class Rows(Rowwise):
-    """As machine code that later processes find, unless that would take long to compile."""
-
-    most, make = 1000, staticmethod(kept)
+def _by_tensors(source: str) -> Any:
+    raise Untranslatable(f"machine code for more than {WIDEST} remembered numbers takes minutes")
