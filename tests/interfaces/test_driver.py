@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import POPULATION, check_refused, wavy_profiles
+from page_blocks import ROOT, blocks
 
 from lcc_rl.config import load
 from lcc_rl.envs import build_env
@@ -151,6 +152,14 @@ def test_bad_input_is_one_clear_error() -> None:
     check_refused(Driver("idm_acc", 0.1).step, steps, ConfigError)
     with pytest.raises(Diverged, match="nothing: the command of car7 is nan"):
         Driver(nothing, 0.1).step({"self.gap": [1.0]}, ["car7"])
+
+
+def test_the_example_of_the_page_prints_what_it_shows(capsys) -> None:
+    page = blocks(ROOT / "docs" / "interfaces.md")
+    (place,) = (n for n, block in enumerate(page) if "import Driver" in block.text)
+    assert len([line for line in page[place].text.splitlines() if line.strip()]) <= 25
+    exec(page[place].text, {})
+    assert capsys.readouterr().out == page[place + 1].text
 
 
 @pytest.mark.slow
