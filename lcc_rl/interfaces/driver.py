@@ -1,12 +1,4 @@
-"""Policies and rules that drive vehicles of another simulator by their measurements.
-
-::
-
-    driver = Driver("pretrained/i24-follow5", time_step=0.1)
-    while simulator.runs():
-        measured = {"self.speed": …, "self.gap": …, "ahead.speed": …, "ahead.acceleration": …}
-        simulator.advance(driver.step(measured))
-"""
+"""Policies and rules that drive vehicles of another simulator by their measurements."""
 
 from __future__ import annotations
 
@@ -44,7 +36,7 @@ MEASURED = (
     *("behind.speed", "behind.gap", "behind.acceleration", BEHIND_PRESENT),
 )
 KNOWN = set(MEASURED)
-WIDEST = 200  # memory in machine code
+WIDEST = 200  # numbers remembered in machine code
 
 
 class Driver:
@@ -73,7 +65,7 @@ class Driver:
         >>> driver.names
         ['self.speed', 'self.gap', 'ahead.speed']
         >>> round(driver.step({"self.speed": 12.0, "self.gap": 20.0, "ahead.speed": 13.0}), 2)
-        0.57
+        2.6
     """
 
     def __init__(
@@ -190,7 +182,6 @@ class Driver:
             measured = self._completed(measured) if self.behind else measured
             columns = [np.asarray(measured[name], np.float32) for name in self.names]
             shape = max((column.shape for column in columns), key=len)
-            require(len(shape) < 2, f"measured has arrays {list(shape)}, expected one dimension")
             state = np.empty((math.prod(shape), len(columns)), np.float32)
             for place, column in enumerate(columns):
                 state[:, place] = column
@@ -221,8 +212,7 @@ class Driver:
     @cached_property
     def _rows(self) -> Rowwise:
         """The program by rows, once it is needed."""
-        wide = self.program.width > WIDEST
-        make = _by_tensors if wide else kept
+        make = kept if self.program.width <= WIDEST else _by_tensors
         return Rowwise(self.program.step, self._examples(1), self.name, make)
 
 

@@ -146,12 +146,9 @@ class DrivingProgram(nn.Module):
     def step(
         self, state: Tensor, memory: Tensor | None = None, apply: Any = None
     ) -> tuple[Tensor, ...]:
-        """Return the accelerations, and the memory after the step if one is given.
+        """Return the accelerations and, if there is a memory, that after the step.
 
-        Args:
-            state: measurements, ``[batch, inputs]``.
-            memory: of vehicles that have begun, ``[batch, width]``.
-            apply: what applies a piece to the moments before and after the step; by default it.
+        ``apply(piece, before, reached)`` applies each piece, by default ``piece.derive``.
         """
         reached = self.measured(state)
         before = dict(reached)
@@ -197,11 +194,9 @@ def described_input(name: str) -> Input:
 
 
 def measuring(time_step: float, behind: bool = True) -> World:
-    """Return the world of a vehicle that measures itself and its neighbours.
+    """Return the world of a vehicle that measures its neighbours, by steps of so many seconds.
 
-    Args:
-        time_step: duration of a step [s].
-        behind: whether there always is a vehicle behind.
+    Without ``behind``, there is not always a vehicle behind.
     """
     string = VehicleString((AUTOMATED, HUMAN)[: 1 + behind], ring=True, measured=True)
     return World(string, time_step, population=bootstrap())
@@ -246,12 +241,9 @@ def program(
 
 
 def driving(pieces: Sequence[Piece], safety: CBFFilter | None, world: World) -> DrivingProgram:
-    """Return the program of a controller and what acts before it, behind a filter or without one.
+    """Return the program of pieces and a filter, which acts from the start, in a world.
 
-    Args:
-        pieces: these, in order; they are bound to the world.
-        safety: the filter, likewise; it acts from the start.
-        world: of :func:`measuring`.
+    See :class:`DrivingProgram` and :func:`measuring`; all are bound here.
     """
     if safety is not None:
         world = replace(world, filtered=[AUTOMATED])

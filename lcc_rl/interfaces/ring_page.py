@@ -101,8 +101,8 @@ def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict
     memory = [piece for piece in program.pieces if isinstance(piece, ObservationMemory)]
     layers = [x for x in controller.layers.modules() if not list(x.children())]
     kept = [(name, time) for x in memory for name in x.sources for time in x.seconds]
-    names = list(dict.fromkeys(name for column in observation.columns() for name in column))
-    seen = [*names, *(name for name, _ in kept)]
+    columns = observation.columns()
+    seen = [*(name for column in columns for name in column), *(name for name, _ in kept)]
     strange = [type(x).__name__ for x in layers if not isinstance(x, LAYERS)]
     strange += [name for name in seen if name.partition(".")[0] not in VIEWS]
     strange += ["stacked memory"] if any(x.stacked for x in memory) else []
@@ -111,8 +111,7 @@ def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict
         raise ConfigError(f"{policy}: the page cannot compute its {', '.join(strange)}")
     return {
         "layers": [_layer(layer) for layer in layers],
-        "names": names,
-        "columns": [[[names.index(x)] for x in column] for column in observation.columns()],
+        "columns": columns,
         "scales": observation.factors.tolist(),
         "max_acceleration": controller.max_acceleration,
         "filter": None if program.safety is None else filter_data(program.safety),

@@ -145,7 +145,7 @@ def test_bad_input_is_one_clear_error() -> None:
         (given | {"self.gaps": 1.0}, None, "Did you mean 'self.gap'"),
         (given | {"self.gap": [1.0, 2.0]}, ["a"], "cars must be 2 different"),
         (given, ["a", "a"], "cars must be 1 different ids"),
-        (given | {"self.gap": [[1.0]]}, None, "expected one dimension"),
+        (given | {"self.gap": [[1.0], [2.0]]}, None, "arrays of one length"),
         (given | {"self.gap": [1.0, 2.0], "self.speed": [1.0]}, None, "arrays of one length"),
         (given | {"self.gap": "near"}, None, "measured must hold numbers"),
     ]
