@@ -22,7 +22,7 @@ from lcc_rl.results.policies import load_policy
 
 POLICY = "pretrained/i24-follow5"  # a memory, a filter, the vehicle behind
 CARS, STEPS, FIRST = 4, 80, 5
-DRIVERS = (POLICY, "pretrained/i80-follow", "idm_acc_filtered", "pi_saturation", "idm", "mpc")
+DRIVERS = (POLICY, "pretrained/i24-mixed", "idm_acc_filtered", "pi_saturation", "idm", "mpc")
 VIEWS = {"self": ("vehicles", 0), "ahead": ("leader", 0), "behind": ("vehicles", 1)}
 
 
