@@ -10,6 +10,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import constant_profiles
@@ -134,10 +135,21 @@ def described_input(name: str) -> Input:
     return Input(name, "–", f"{entry} ({whose.get(view, view)})")
 
 
-def exported_policy(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPolicy:
-    """Build the policy that is exported; arguments as for ``lcc_rl.interfaces.export.export``."""
-    weights, cfg = load_policy(policy, trust=trust)
-    population = bootstrap()
+def exported_policy(
+    policy: str | Path | nn.Module, trust: Sequence[str] = (), cfg: StudyConfig | None = None
+) -> ExportedPolicy:
+    """Build the policy that is exported.
+
+    Args:
+        policy: as for ``lcc_rl.interfaces.export.export``; or a network, see
+            :func:`lcc_rl.evaluation.foreign.network_of`.
+        trust: modules outside this package that the policy may name.
+        cfg: the configuration in which a network was trained.
+    """
+    population, weights = bootstrap(), None
+    if not isinstance(policy, nn.Module):
+        weights, cfg = load_policy(policy, trust=trust)
+    assert cfg is not None
     scenario = cfg.scenario
     leader = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["constant"])
     env = build_env(cfg, leader, population)
@@ -151,16 +163,22 @@ def exported_policy(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPo
             f"{policy}: its filter remembers commands or measurements, an exported policy nothing; "
             "only without delays, lag and drop-outs can it be exported"
         )
-    learned = with_weights(cfg, weights, cfg.seed, str(policy), population).policy
-    assert isinstance(learned, TensorDictModule)
+    if isinstance(policy, nn.Module):
+        network = policy
+    else:
+        learned = with_weights(cfg, weights or {}, cfg.seed, str(policy), population).policy
+        assert isinstance(learned, TensorDictModule)
+        network = learned.module
     (observation,), (action,) = found.values()
     memory = next((p for p in pieces if isinstance(p, ObservationMemory)), None)
-    module = ExportedPolicy(learned.module, observation, action, safety, memory)
+    module = ExportedPolicy(network, observation, action, safety, memory)
     return module.eval().requires_grad_(False)
 
 
-def program(policy: str | Path, trust: Sequence[str] = ()) -> ExportedPolicy | Remembering:
+def program(
+    policy: str | Path | nn.Module, trust: Sequence[str] = (), cfg: StudyConfig | None = None
+) -> ExportedPolicy | Remembering:
     """Return the module that a program is made of; arguments as for :func:`exported_policy`."""
-    module = exported_policy(policy, trust)
+    module = exported_policy(policy, trust, cfg)
     remembers = any(name.startswith(REMEMBERED) for name in module.names)
     return Remembering(module) if remembers else module
