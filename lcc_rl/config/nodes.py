@@ -21,6 +21,10 @@ STORED = (str, int, float, type(None), list, Mapping)
 CALLED = ("__call__",)  # what a node that is used as a function makes
 
 
+def _place(kind: type) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
 class Node:
     """An object that a configuration describes: its class, its settings and their place.
 
@@ -106,10 +110,10 @@ class Node:
         """
         made = self._object if has_settings(self.kind) else self._made()
         if isinstance(needed, type):
-            fits, called = isinstance(made, needed), needed.__name__
+            fits, called = isinstance(made, needed), f"a subclass of {_place(needed)}"
         else:
             fits, called = all(hasattr(made, x) for x in needed), f"an object with {needed[0]}"
-        require(fits, f"{self.where}: expected {called}, got {type(made).__name__}")
+        require(fits, f"{self.where}: expected {called}, got {_place(type(made))}")
         return made
 
     def check(self) -> None:
@@ -256,6 +260,9 @@ def settings_of(target: Any) -> list[str] | None:
 def with_defaults(value: Any, where: str = "") -> Any:
     """Return a setting in which every mapping with ``_target_`` holds the defaults of its class.
 
+    A class lists as ``LATER`` the settings that a later version added, and whose default changes
+    nothing: they are held only if they are given, so that the hashes of stored runs stay.
+
     Args:
         value: a setting as plain containers; references to other settings may be unresolved.
         where: its place in the configuration, for messages.
@@ -272,7 +279,10 @@ def with_defaults(value: Any, where: str = "") -> Any:
         if str(key).startswith("_") and key != TARGET:
             raise ConfigError(f"{where}.{key} has no effect: a node has {TARGET} and settings")
     if has_settings(kind):
+        later = getattr(kind, "LATER", ())
         for key, default in defaults(kind).items():
+            if key in later and key not in found:
+                continue
             own = found.setdefault(key, default)
             if isinstance(own, Mapping) and isinstance(default, Mapping):
                 found[key] = {**default, **own}
