@@ -80,7 +80,7 @@ class Driver:
         self.name = who if isinstance(who, str) else label_of(who)
         self.time_step, self.seed = time_step, seed
         if is_policy(who):
-            self.program = program(who, trust, safety)
+            self.program = program(who, trust, safety=safety)
             trained = self.program.controller.time_step
             if abs(trained - time_step) > 1e-9:
                 raise ConfigError(

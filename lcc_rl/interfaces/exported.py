@@ -19,6 +19,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Unbounded
 
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import constant_profiles
@@ -203,21 +204,29 @@ def measuring(time_step: float, behind: bool = True) -> World:
 
 
 def program(
-    policy: str | Path, trust: Sequence[str] = (), safety: CBFFilter | None = None
+    policy: str | Path | nn.Module,
+    trust: Sequence[str] = (),
+    cfg: StudyConfig | None = None,
+    safety: CBFFilter | None = None,
 ) -> DrivingProgram:
     """Build the program of a trained policy.
 
     Args:
-        policy: a run folder, a policy file, or ``pretrained/<name>``.
+        policy: a run folder, a policy file, or ``pretrained/<name>``; or a network, see
+            :func:`lcc_rl.evaluation.foreign.network_of`.
         trust: modules outside this package that the policy may name.
+        cfg: the configuration in which a network was trained.
         safety: the filter behind which it drives; None: its own.
 
     Raises:
         ConfigError: if no network drives, or its filter knows the faults of a scenario.
         ResultsError: if the policy cannot be read.
     """
-    weights, cfg = load_policy(policy, trust=trust)
-    population, scenario = bootstrap(), cfg.scenario
+    population, weights = bootstrap(), None
+    if not isinstance(policy, nn.Module):
+        weights, cfg = load_policy(policy, trust=trust)
+    assert cfg is not None
+    scenario = cfg.scenario
     leader = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["constant"])
     pieces = pieces_of(build_env(cfg, leader, population))
     found = {kind: [p for p in pieces if isinstance(p, kind)] for kind in (Observation, Action)}
@@ -229,14 +238,18 @@ def program(
             f"{policy}: its filter remembers commands or measurements, an exported policy nothing; "
             "only without delays, lag and drop-outs can it be exported"
         )
-    learned = with_weights(cfg, weights, cfg.seed, str(policy), population).policy
-    assert isinstance(learned, TensorDictModule)
+    if isinstance(policy, nn.Module):
+        network = policy
+    else:
+        learned = with_weights(cfg, weights or {}, cfg.seed, str(policy), population).policy
+        assert isinstance(learned, TensorDictModule)
+        network = learned.module
     (observation,), (action,) = found.values()
     world = measuring(scenario.time_step, BEHIND_PRESENT not in observation.names)
     remembers = any(name.startswith("memory.") for name in observation.seen)
     memory = [p for p in pieces if isinstance(p, ObservationMemory) and remembers]
     largest = action.max_acceleration
-    network = NetworkController(network=learned.module, max_acceleration=largest)
+    network = NetworkController(network=network, max_acceleration=largest)
     return driving([*memory, observation, network], safety, world)
 
 
