@@ -30,7 +30,7 @@ def same(docs: Path, *names: str) -> None:
 
 def test_the_pages_hold_the_scores_kept(docs) -> None:
     pages.tasks(REFERENCE, docs)
-    same(docs, "tasks.md", "leaderboard.md")
+    same(docs, "tasks.md", "fleets.md", "leaderboard.md")
 
 
 @pytest.mark.slow
