@@ -64,7 +64,7 @@ class Drivers(Controller):
     # Standard deviation of a smooth noise of the acceleration, see
     # lcc_rl.functional.driver_models.NoiseStep [m/s²]; None: of the population.
     acceleration_noise: NonNegative | None = None
-    # The same of a noise of the logarithm of the perceived gap.
+    # Standard deviation of a smooth noise of ln of the perceived gap; None: of the population.
     gap_noise: NonNegative | None = None
 
     LATER = ("gap_noise",)
