@@ -16,6 +16,7 @@ from rich.console import Console
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.evaluation.foreign import as_given
 from lcc_rl.evaluation.named import setting_of
 from lcc_rl.io.files import Rows, read_parquet
 from lcc_rl.results import render
@@ -126,8 +127,9 @@ def compare(
     Args:
         strategies: one or several: runs, run folders, policy files, ``"pretrained/alcc"``;
             controllers as names, objects, classes, plain functions of named entries
-            (:class:`lcc_rl.pieces.Law`) or yaml files; or these by the names of their rows. A name
-            that ends in ``_filtered`` means behind the safety filter.
+            (:class:`lcc_rl.pieces.Law`) or yaml files; policies of other libraries, see
+            :mod:`lcc_rl.evaluation.foreign`, which read the variant's observation; or these by the
+            names of their rows. A name that ends in ``_filtered`` means behind the safety filter.
         variant: whose scenario and data they meet.
         overrides: further settings, ``["evaluation.drivers=12"]``.
         folder: where the files go, figures among them; by default a new one below
@@ -147,11 +149,16 @@ def compare(
     cfg = load("evaluate", [f"variant={variant}", *overrides])
     if isinstance(strategies, (str, PathLike)) or not isinstance(strategies, Iterable):
         strategies = [strategies]
-    if isinstance(strategies, Mapping):
-        cfg.compare = {x: setting_of(who, f"compare.{x}") for x, who in strategies.items()}
+    named = isinstance(strategies, Mapping)
+    items = strategies.items() if named else [(type(who).__name__, who) for who in strategies]
+    given = [(name, who, as_given(who, name)) for name, who in items]
+    policies = {name: policy for name, _, policy in given if policy is not None}
+    others = [(name, who) for name, who, policy in given if policy is None]
+    if named:
+        cfg.compare = {name: setting_of(who, f"compare.{name}") for name, who in others}
     else:
-        cfg.compare = [setting_of(who) for who in strategies]
-    rows = evaluation.run(cfg, target, own=False, quiet=True)
+        cfg.compare = [setting_of(who) for _, who in others]
+    rows = evaluation.run(cfg, target, own=False, quiet=True, policies=policies)
     if folder is not None:
         evaluation.draw(rows, cfg, target)
     return Run(target, rows, cfg)

@@ -21,7 +21,17 @@ import re
 from collections.abc import Callable, Mapping
 from functools import wraps
 from importlib import import_module
-from typing import Annotated, Any, TypeVar, dataclass_transform, get_args, get_origin
+from types import UnionType
+from typing import (
+    Annotated,
+    Any,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from pydantic import (
     AfterValidator,
@@ -102,7 +112,7 @@ def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
     Args:
         kind: the class.
         given: its settings by name; a list may stand for a tuple, a mapping for an object that has
-            settings itself.
+            settings itself or is a dataclass.
         where: their place in the configuration, for messages.
 
     Raises:
@@ -123,16 +133,26 @@ def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
 
 
 def _as_declared(annotation: Any, value: Any, where: str) -> Any:
-    """Return a list as a tuple, or a mapping as an object, if the annotation says so."""
-    for one in (annotation, *get_args(annotation)) if isinstance(value, (list, Mapping)) else ():
-        origin = get_origin(one) or one
-        if isinstance(value, list) and origin is tuple:
-            return tuple(value)
-        if isinstance(value, Mapping) and inspect.isclass(origin):
-            if issubclass(origin, Settings):
-                return parse(origin, value, where)
-            if dataclasses.is_dataclass(origin):
-                return origin(**value)
+    """Return lists as tuples, and mappings as objects, as deep as the annotation says so."""
+    kind, inner = get_origin(annotation) or annotation, get_args(annotation)
+    if kind is Annotated:
+        return _as_declared(inner[0], value, where)
+    if kind in (Union, UnionType):
+        made = (_as_declared(one, value, where) for one in inner)
+        return next((x for x in made if type(x) is not type(value) or x != value), value)
+    if isinstance(value, list) and inner:
+        each = inner if len(inner) == len(value) and ... not in inner else inner[:1] * len(value)
+        found = [_as_declared(one, x, where) for one, x in zip(each, value, strict=True)]
+        return tuple(found) if kind is tuple else found
+    if not isinstance(value, Mapping) or not inspect.isclass(kind):
+        return value
+    if issubclass(kind, Settings):
+        return parse(kind, value, where)
+    if dataclasses.is_dataclass(kind):
+        hints = get_type_hints(kind)
+        return kind(**{name: _as_declared(hints.get(name), x, where) for name, x in value.items()})
+    if len(inner) == 2:
+        return {key: _as_declared(inner[1], x, f"{where}.{key}") for key, x in value.items()}
     return value
 
 
@@ -203,7 +223,7 @@ def _plain(value: Any) -> Any:
         value = values(value)
     if isinstance(value, Mapping):
         return {name: _plain(held) for name, held in value.items()}
-    return list(value) if isinstance(value, tuple) else value
+    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def given_as(kind: type[Settings]) -> Any:

@@ -194,5 +194,5 @@ def test_a_node_is_made_once_copied_as_it_is_and_stored_by_its_settings() -> Non
     assert (other.made().time_gap, driver.made().time_gap) == (1.5, 1.2)
     with pytest.raises(ConfigError, match=rf"^{AUTO}.time_gap must be greater than 0, got -1"):
         driver.changed(time_gap=-1.0)
-    with pytest.raises(ConfigError, match=r"^drivers: expected Observation, got DriverPopulation"):
+    with pytest.raises(ConfigError, match=r"^drivers: expected .*\.Observation, got .*\.DriverP"):
         drivers.made(Observation)

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
 import pytest
 from commands import UNTRAINED, tiny
-from helpers import POPULATION, compose, wavy_profiles
+from helpers import POPULATION, check_refused, compose, wavy_profiles
 
 from lcc_rl.commands import evaluation
+from lcc_rl.config.nodes import Node, as_plain
 from lcc_rl.envs import build_env
+from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import Controller, Feature, MotorPower, RewardTerm
+from lcc_rl.settings import Positive, Settings, values
 
 
 class DoublePower(MotorPower):
@@ -41,6 +49,79 @@ class Kinetic(Feature):
 
     def compute(self, speed):
         return 0.5 * speed.square()
+
+
+@dataclass(frozen=True)
+class Band:
+    name: str = "wide"
+    ends: tuple[float, float] = (0.0, 1.0)
+
+
+class Part(Settings):
+    times: tuple[Positive, ...] = (1.0,)
+
+
+class Typed(RewardTerm):
+    """Settings of every type that the page on extending lists."""
+
+    ends: tuple[float, float] = (1.0, 2.0)
+    names: tuple[str, ...] | None = None
+    corners: tuple[tuple[float, float], ...] = ((1.0, 2.0),)
+    rows: list[tuple[int, float]] = field(default_factory=lambda: [(1, 2.0)])
+    table: dict[str, tuple[float, float]] = field(default_factory=lambda: {"a": (1.0, 2.0)})
+    sizes: Sequence[int] = (3, 4)
+    kind: Literal["one", "two"] = "one"
+    band: Band = Band()
+    part: Part = Part()
+    parts: tuple[Part, ...] = ()
+
+    reads = ("self.jerk",)
+
+    def reward(self, jerk):
+        return self.ends[0] * jerk
+
+
+GIVEN = {
+    "ends": [3, 4.0],
+    "names": ["x"],
+    "corners": [[1.0, 3.0], [4.0, 5.0]],
+    "rows": [[1, 3.0], [2, 4.0]],
+    "table": {"b": [5.0, 6.0]},
+    "sizes": [7],
+    "band": {"name": "near", "ends": [0.5, 0.7]},
+    "part": {"times": [2.0]},
+    "parts": [{"times": [2.0]}, {}],
+}
+
+
+def test_settings_of_ones_own_may_be_of_these_types_and_are_stored_and_read_again() -> None:
+    plain = Node.of({"_target_": f"{__name__}.Typed", "weight": 1.0}, "t")
+    given = plain.changed(**GIVEN)
+    for node in (plain, given):
+        again = Node.of(json.loads(json.dumps(as_plain(node))), "t")
+        assert as_plain(again) == as_plain(node)
+        object_again = Node.of(values_of(node.made()), "t").made()  # as lcc_rl.compare takes it
+        assert as_plain(values(object_again)) == as_plain(values(node.made()))
+    made = given.made()
+    assert (made.ends, made.names, made.sizes, made.kind) == ((3, 4.0), ("x",), [7], "one")
+    assert (made.corners, made.rows) == (((1.0, 3.0), (4.0, 5.0)), [(1, 3.0), (2, 4.0)])
+    assert made.table == {"a": (1.0, 2.0), "b": (5.0, 6.0)}
+    assert made.band == Band("near", (0.5, 0.7))
+    assert (made.part.times, [one.times for one in made.parts]) == ((2.0,), [(2.0,), (1.0,)])
+    cases = [
+        ({"ends": [1.0]}, r"t\.ends\[1\] "),
+        ({"corners": [[1.0, "x"]]}, r"t\.corners\[0\]\[1\] must be a valid number, got 'x'"),
+        ({"rows": [2.0]}, r"t\.rows\[0\] must be a valid tuple, got 2\.0"),
+        ({"part": {"times": [-1.0]}}, r"t\.part\.times\[0\] must be greater than 0"),
+        ({"part": {"tims": []}}, r"unknown setting of t\.part \(Part\) 'tims'; valid: times"),
+        ({"kind": "three"}, r"t\.kind must be 'one' or 'two'|t\.kind .*'three'"),
+        ({"ends": {1.0, 2.0}}, "which a configuration cannot store"),
+    ]
+    check_refused(lambda settings: plain.changed(**settings), cases, ConfigError)
+
+
+def values_of(made: Typed) -> dict[str, object]:
+    return {"_target_": f"{__name__}.Typed", **values(made)}
 
 
 POWER = f"scenario.pieces.power._target_={__name__}.DoublePower"

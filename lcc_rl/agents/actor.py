@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -15,15 +16,25 @@ from torchrl.modules import MLP
 from lcc_rl.functional.random import normal, stream_id
 from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP
 
+ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "silu": nn.SiLU}
+Activation = Literal["relu", "tanh", "elu", "silu"]
 
-def seeded_mlp(inputs: int, outputs: int, hidden: Sequence[int], seed: int) -> MLP:
-    """Build a ReLU network whose initial weights depend on ``seed`` alone.
+
+def seeded_mlp(
+    inputs: int,
+    outputs: int,
+    hidden: Sequence[int],
+    seed: int,
+    activation: Activation = "relu",
+) -> MLP:
+    """Build a network whose initial weights depend on ``seed`` alone.
 
     Args:
         inputs: entries read.
         outputs: entries written.
         hidden: sizes of the layers between; none for a linear map.
         seed: seed of the weights.
+        activation: between the layers.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -31,19 +42,24 @@ def seeded_mlp(inputs: int, outputs: int, hidden: Sequence[int], seed: int) -> M
             in_features=inputs,
             out_features=outputs,
             num_cells=list(hidden),
-            activation_class=nn.ReLU,
+            activation_class=ACTIVATIONS[activation],
         )
 
 
 def make_actor(
-    observation_size: int, action_size: int, hidden: Sequence[int], seed: int
+    observation_size: int,
+    action_size: int,
+    hidden: Sequence[int],
+    seed: int,
+    activation: Activation = "relu",
 ) -> TensorDictModule:
-    """Build the policy network: ReLU layers and a tanh, so that actions lie in [−1, 1].
+    """Build the policy network, which ends in a tanh, so that actions lie in [−1, 1].
 
     Reads ``"observation"`` ``[*batch, observation_size]``, writes ``"action"``
     ``[*batch, action_size]``.
     """
-    network = nn.Sequential(seeded_mlp(observation_size, action_size, hidden, seed), nn.Tanh())
+    layers = seeded_mlp(observation_size, action_size, hidden, seed, activation)
+    network = nn.Sequential(layers, nn.Tanh())
     return TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
 
 

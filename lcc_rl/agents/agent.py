@@ -7,7 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import torch
 from pydantic import Field
@@ -18,6 +18,7 @@ from lcc_rl.pieces.world import World
 from lcc_rl.settings import Settings, values
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
+Schedule = Literal["cosine", "linear"]  # how learning rates fall
 
 
 @dataclass(frozen=True)
@@ -100,19 +101,24 @@ def derived_seed(*parts: object) -> int:
 
 
 def anneal(
-    optimizers: Iterable[torch.optim.Optimizer], share: float, final_lr_fraction: float
+    optimizers: Iterable[torch.optim.Optimizer],
+    share: float,
+    final_lr_fraction: float,
+    schedule: Schedule = "cosine",
 ) -> float:
-    """Let learning rates fall along half a cosine, from what they are made with to a share of it.
+    """Let learning rates fall from what they are made with to a share of it.
 
     Args:
         optimizers: whose rates to set.
         share: how much of the training is over.
         final_lr_fraction: of the rate at the start, at the end; 1 for a constant rate.
+        schedule: along half a cosine, or a line.
 
     Returns:
         The first rate.
     """
-    factor = final_lr_fraction + (1.0 - final_lr_fraction) * 0.5 * (1.0 + math.cos(math.pi * share))
+    left = 1.0 - share if schedule == "linear" else 0.5 * (1.0 + math.cos(math.pi * share))
+    factor = final_lr_fraction + (1.0 - final_lr_fraction) * left
     groups = [group for optimizer in optimizers for group in optimizer.param_groups]
     for group in groups:
         group["lr"] = factor * group.setdefault("initial_lr", group["lr"])

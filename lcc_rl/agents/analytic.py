@@ -17,8 +17,8 @@ import torch
 from pydantic import Field, InstanceOf
 from torch import Tensor, nn
 
-from lcc_rl.agents.actor import seeded_mlp
-from lcc_rl.agents.agent import Agent, Fraction, Scene, anneal
+from lcc_rl.agents.actor import Activation, seeded_mlp
+from lcc_rl.agents.agent import Agent, Fraction, Scene, Schedule, anneal
 from lcc_rl.agents.gradient import GradientLoop
 from lcc_rl.agents.objective import Objective
 from lcc_rl.agents.rules import make_policy
@@ -38,7 +38,8 @@ class Analytic(Agent):
     # (residual_idm, residual_acc).
     policy: Any = "network"
     constants: dict[str, Positive] | None = None  # of a rule at the start; the others keep theirs
-    hidden: Sequence[Count] = (200, 100, 50)  # ReLU layers of a network
+    hidden: Sequence[Count] = (200, 100, 50)  # layers of a network
+    activation: Activation = "relu"  # between the layers of networks
     # Reward terms that take the place of those of the same name in the objective; their
     # weights multiply the terms' own. Those of terms that the reward lacks are ignored.
     surrogates: dict[str, InstanceOf[RewardTerm] | None] = field(default_factory=dict)
@@ -48,8 +49,9 @@ class Analytic(Agent):
     limit_rate: Positive = 0.1  # largest change of the logarithm of such a price at once
     # Terms of the objective only.
     regularizers: dict[str, InstanceOf[RewardTerm] | None] = field(default_factory=dict)
-    learning_rate: Positive = 3e-3  # of the policy at the start; it falls along half a cosine
+    learning_rate: Positive = 3e-3  # of the policy at the start
     final_lr_fraction: Fraction = 0.05  # of it that is left at the end
+    schedule: Schedule = "cosine"  # how the learning rate falls
     # Gradients longer than this are shortened to it; through 300 steps of traffic they can become
     # arbitrarily long.
     clip_norm: Positive = 1.0
@@ -69,6 +71,7 @@ class Analytic(Agent):
     # Compile the step of the simulator; None: if the training is long enough to pay for it.
     compiled: bool | None = None
 
+    LATER = ("activation", "schedule")
     loop = GradientLoop
 
     def validate(self) -> None:
@@ -84,12 +87,15 @@ class Analytic(Agent):
             scene.seed,
             self.constants,
             scene.max_acceleration,
+            self.activation,
         )
         self.policy = module.to(scene.device)
         size, seed = scene.observation_size, scene.seed + 1
         self.burn_in = scene.world.steps(self.humans_first, "agent.humans_first")
-        self.value = seeded_mlp(size, 1, self.hidden, seed).to(scene.device)
-        self.target = seeded_mlp(size, 1, self.hidden, seed).to(scene.device)
+        self.value, self.target = (
+            seeded_mlp(size, 1, self.hidden, seed, self.activation).to(scene.device)
+            for _ in range(2)
+        )
         self.optimizer = torch.optim.Adam(
             [entry for entry in self.policy.parameters() if entry.requires_grad],
             lr=self.learning_rate,
@@ -103,7 +109,7 @@ class Analytic(Agent):
 
     def anneal(self, share: float) -> float:
         """Set and return the learning rate after this share of the training."""
-        return anneal([self.optimizer], share, self.final_lr_fraction)
+        return anneal([self.optimizer], share, self.final_lr_fraction, self.schedule)
 
     def update(self, rewards: Tensor, running: Tensor, observation: Tensor) -> dict[str, Tensor]:
         """Take one gradient step on the policy, and one on the value where it is learned.

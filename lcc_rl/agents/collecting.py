@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from abc import abstractmethod
+from collections.abc import Mapping
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import nn
 from torchrl.collectors import BaseCollector, Collector
 
 from lcc_rl.agents.actor import shared_policy
@@ -15,6 +17,7 @@ from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.checks import check_batch, check_learner
 from lcc_rl.agents.loop import REPORTED, AgentT, TrainingLoop, episode_statistics
 from lcc_rl.envs import StringCollector
+from lcc_rl.errors import require
 from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD
 
 # What is learned from, as the environment names it and as the losses do.
@@ -34,8 +37,18 @@ COMPILED_TRAINING_STEPS = 40_000
 class CollectingLoop(TrainingLoop[AgentT]):
     """Plays batches of episodes by the agent's policy and its exploration, ``agent.noise``.
 
+    The noise is a module that changes ``("automated", "action")``; None for none.
+
     A subclass says what is learned from a segment; arguments as of :class:`TrainingLoop`.
     """
+
+    def _prepare(self) -> None:
+        noise = getattr(self.agent, "noise", self)
+        require(
+            noise is None or isinstance(noise, TensorDictModuleBase),
+            f"agent: setup of {type(self.agent).__name__} must make noise, the exploration, such "
+            "as GaussianExploration(0.3), or None",
+        )
 
     @abstractmethod
     def learn(self, batch: TensorDictBase, before: int) -> dict[str, float]:
@@ -51,7 +64,8 @@ class CollectingLoop(TrainingLoop[AgentT]):
         return 1.0
 
     def _source(self) -> BaseCollector:
-        self.noise = self.agent.noise.to(self.env.device or "cpu")
+        noise = self.agent.noise or TensorDictModule(nn.Identity(), [ACTION], [ACTION])
+        self.noise = noise.to(self.env.device or "cpu")
         return self._collector(self.settings.segment, self._compiled())
 
     def _collector(self, steps: int, compiled: bool) -> BaseCollector:
@@ -91,6 +105,11 @@ class CollectingLoop(TrainingLoop[AgentT]):
             collected, size = time.perf_counter(), batch.get(("next", *REWARD)).numel()
             before = self.iteration * (self.horizon // steps) + part
             losses.append(self.learn(batch, before * size))
+            require(
+                isinstance(losses[-1], Mapping) and self.watched in losses[-1],
+                f"{type(self).__name__}.learn must return numbers by name, {self.watched!r} among "
+                f"them, got {losses[-1]!r}",
+            )
             check_learner(self.agent.policy, losses[-1], self.advice)
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected

@@ -51,7 +51,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
         identity: hash of the configuration; a checkpoint of another one is refused.
     """
 
-    advice: ClassVar[str]  # what to do when the training diverges
+    advice: ClassVar[str] = "Lower its learning rate"  # what to do when the training diverges
     watched: ClassVar[str] = "loss_value"  # the entry of the record shown as the loss
 
     def __init__(

@@ -12,13 +12,13 @@ import torch
 from pydantic import Field
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.modules import ValueOperator
 from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
 
-from lcc_rl.agents.actor import GaussianExploration, make_actor, seeded_mlp
-from lcc_rl.agents.agent import Agent, Fraction, Scene, anneal, derived_seed
+from lcc_rl.agents.actor import Activation, GaussianExploration, make_actor, seeded_mlp
+from lcc_rl.agents.agent import Agent, Fraction, Scene, Schedule, anneal, derived_seed
 from lcc_rl.agents.fused import ActorCritic
 from lcc_rl.agents.replay import ReplayLoop
 from lcc_rl.agents.vectors import as_vector, take_step, vector_adam, views
@@ -56,7 +56,8 @@ class OffPolicy(Agent):
     """
 
     gamma: Share = 0.9  # discount
-    hidden: Sequence[Count] = (200, 100, 50)  # ReLU layers of policy and Q networks
+    hidden: Sequence[Count] = (200, 100, 50)  # layers of policy and Q networks
+    activation: Activation = "relu"  # between the layers of networks
     actor_lr: Positive = 1e-3  # learning rate of the policy
     critic_lr: Positive = 1e-3  # learning rate of the Q networks
     batch_size: Count = 1024  # transitions per update
@@ -66,9 +67,11 @@ class OffPolicy(Agent):
     # algorithm. Without it some seeds brake fully for ever: where every action leads to the same
     # end, nothing else draws the actor back from the tanh's flat part.
     saturation: NonNegative = 0.001
-    # Share of the learning rates that is left at the end of half a cosine. 1 is the literal
+    # Share of the learning rates that is left at the end of the schedule. 1 is the literal
     # algorithm, whose policy keeps swinging until it stops.
     final_lr_fraction: Fraction = 0.05
+    schedule: Schedule = "cosine"  # how the learning rates fall
+    clip_norm: Positive | None = None  # gradients longer than this are shortened to it
     # Updates per collected transition; the paper is silent. Many more would never end.
     updates_per_transition: Annotated[float, Field(gt=0.0, le=1000.0)] = 0.125
     learning_starts: Whole = 0  # transitions in the buffer before the first update
@@ -76,9 +79,10 @@ class OffPolicy(Agent):
     best_window: Count | None = None
     exploration: given_as(Exploration) = field(default_factory=Exploration)  # type: ignore[valid-type]
     # Compute the gradient as written out, which gives the numbers of TorchRL's loss up to rounding
-    # in less time; False differentiates the loss itself.
+    # in less time; False, and networks without ReLU, differentiate the loss itself.
     fused: bool = True
 
+    LATER = ("activation", "schedule", "clip_norm")
     loop = ReplayLoop
     critics: ClassVar[int] = 1
     joint: ClassVar[bool] = True  # whether one optimizer steps all that is learned at once
@@ -92,21 +96,21 @@ class OffPolicy(Agent):
                 )
 
     def setup(self, scene: Scene) -> None:
-        size, seed, hidden = scene.observation_size, scene.seed, self.hidden
+        size, seed, kind = scene.observation_size, scene.seed, self.activation
         self.count, self.generator = 0, torch.Generator(scene.device)
-        self.policy = make_actor(size, 1, hidden, seed).to(scene.device)
+        self.policy = make_actor(size, 1, self.hidden, seed, kind).to(scene.device)
         self.noise: TensorDictModuleBase = GaussianExploration(0.0)
         keys = ["observation", "action"]
         self.values = [
-            ValueOperator(seeded_mlp(size + 1, 1, hidden, seed + 1 + 2 * number), in_keys=keys).to(
+            ValueOperator(seeded_mlp(size + 1, 1, self.hidden, own, kind), in_keys=keys).to(
                 scene.device
             )
-            for number in range(self.critics)
+            for own in range(seed + 1, seed + 1 + 2 * self.critics, 2)
         ]
 
     def anneal(self, share: float) -> float:
         """Set the learning rates after this share of the training; return the policy's."""
-        return anneal(self.optimizers.values(), share, self.final_lr_fraction)
+        return anneal(self.optimizers.values(), share, self.final_lr_fraction, self.schedule)
 
     @abstractmethod
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -143,7 +147,8 @@ class OffPolicy(Agent):
         targets = {name: leaves(getattr(loss, f"target_{keys[name]}")) for name in delayed}
         self._join(networks, rates, targets)
         parts = networks, targets, self.critics, self.gamma, self.saturation
-        self.written = ActorCritic(*parts) if self.fused else None
+        by_hand = self.fused and self.activation == "relu"
+        self.written = ActorCritic(*parts) if by_hand else None
 
     def _join(
         self,
@@ -195,7 +200,11 @@ class OffPolicy(Agent):
 
     def _step(self, name: str) -> None:
         """Take a step of the named optimizer along the gradients at hand."""
-        take_step(self.optimizers[name])
+        optimizer = self.optimizers[name]
+        if self.clip_norm is not None:
+            weights = [weight for group in optimizer.param_groups for weight in group["params"]]
+            nn.utils.clip_grad_norm_(weights, self.clip_norm)
+        take_step(optimizer)
 
     @torch.no_grad()
     def _follow(self, *names: str) -> None:

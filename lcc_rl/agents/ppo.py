@@ -14,8 +14,8 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from lcc_rl.agents.actor import make_actor, seeded_mlp
-from lcc_rl.agents.agent import Agent, Fraction, Scene, anneal, derived_seed
+from lcc_rl.agents.actor import Activation, make_actor, seeded_mlp
+from lcc_rl.agents.agent import Agent, Fraction, Scene, Schedule, anneal, derived_seed
 from lcc_rl.agents.collecting import CollectingLoop, transitions
 from lcc_rl.agents.sac import SampledAction
 from lcc_rl.pieces.base import REWARD
@@ -56,9 +56,11 @@ class PPO(Agent):
 
     gamma: Share = 0.99  # discount
     td_lambda: Annotated[float, Field(ge=0.0, le=1.0)] = 0.95  # weight of longer returns, per step
-    hidden: Sequence[Count] = (64, 64)  # ReLU layers of policy and value
-    learning_rate: Positive = 1e-3  # of both at the start; it falls along half a cosine
+    hidden: Sequence[Count] = (64, 64)  # layers of policy and value
+    activation: Activation = "relu"  # between the layers of networks
+    learning_rate: Positive = 1e-3  # of both at the start
     final_lr_fraction: Fraction = 0.1  # of it that is left at the end
+    schedule: Schedule = "cosine"  # how the learning rates fall
     clip: Fraction = 0.2  # largest change of the ratio of probabilities that earns anything
     epochs: Count = 10  # passes over the transitions of a segment
     batch_size: Count = 1024  # transitions of a gradient step
@@ -66,12 +68,13 @@ class PPO(Agent):
     sigma: Positive = 0.5  # standard deviation before the tanh at the start
     clip_norm: Positive = 0.5  # gradients longer than this are shortened to it
 
+    LATER = ("activation", "schedule")
     loop = OnPolicyLoop
 
     def setup(self, scene: Scene) -> None:
-        size, device = scene.observation_size, scene.device
+        size, device, kind = scene.observation_size, scene.device, self.activation
         self.count = 0
-        self.policy = make_actor(size, 1, self.hidden, scene.seed).to(device)
+        self.policy = make_actor(size, 1, self.hidden, scene.seed, kind).to(device)
         self.head = head = Gaussian(self.policy.module[0], self.sigma).to(device)
         self.noise = SampledAction(head)
         self.actor = ProbabilisticActor(
@@ -80,7 +83,7 @@ class PPO(Agent):
             distribution_class=TanhNormal,
             return_log_prob=True,
         )
-        value = ValueOperator(seeded_mlp(size, 1, self.hidden, scene.seed + 1)).to(device)
+        value = ValueOperator(seeded_mlp(size, 1, self.hidden, scene.seed + 1, kind)).to(device)
         self.advantage = GAE(gamma=self.gamma, lmbda=self.td_lambda, value_network=value)
         self.loss = ClipPPOLoss(
             self.actor,
@@ -96,7 +99,7 @@ class PPO(Agent):
         self.optimizer = torch.optim.Adam(self.weights, lr=self.learning_rate)
 
     def anneal(self, share: float) -> float:
-        return anneal([self.optimizer], share, self.final_lr_fraction)
+        return anneal([self.optimizer], share, self.final_lr_fraction, self.schedule)
 
     def update(self, data: TensorDictBase) -> dict[str, Tensor]:
         """Learn from trajectories.

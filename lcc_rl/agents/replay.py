@@ -24,6 +24,7 @@ class ReplayLoop(CollectingLoop[Any]):
     advice = "Lower agent.critic_lr or agent.actor_lr"
 
     def _prepare(self) -> None:
+        super()._prepare()
         self.sampler = torch.Generator()
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(self.agent.buffer_size, device=self.env.device or "cpu"),

@@ -13,7 +13,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from lcc_rl.agents.actor import make_actor, seeded_mlp
+from lcc_rl.agents.actor import Activation, make_actor, seeded_mlp
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.pieces.cruise import IDMACC, Cruise, LinearACC
 from lcc_rl.pieces.observation import Observation
@@ -72,16 +72,14 @@ class Residual(nn.Module):
 
     Args:
         rule: the rule.
-        observation_size: entries of the observation.
-        hidden: sizes of the network's ReLU layers.
-        seed: seed of its initial weights.
+        network: from an observation to a number.
     """
 
-    def __init__(self, rule: Rule, observation_size: int, hidden: Sequence[int], seed: int) -> None:
+    def __init__(self, rule: Rule, network: nn.Module) -> None:
         super().__init__()
         self.rule = rule.requires_grad_(False)
-        self.network = seeded_mlp(observation_size, 1, hidden, seed)
-        last = [layer for layer in self.network if isinstance(layer, nn.Linear)][-1]
+        self.network = network
+        last = [layer for layer in network.modules() if isinstance(layer, nn.Linear)][-1]
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
 
@@ -103,6 +101,7 @@ def make_policy(
     seed: int,
     constants: Mapping[str, float] | None,
     max_acceleration: float | None,
+    activation: Activation = "relu",
 ) -> TensorDictModule:
     """Build the policy of an agent.
 
@@ -110,10 +109,11 @@ def make_policy(
         kind: ``"network"``; a rule with learned constants, ``"idm"`` or ``"acc"``; or one below a
             network, ``"residual_idm"`` or ``"residual_acc"``.
         observation: what the policy sees.
-        hidden: sizes of the ReLU layers of a network.
+        hidden: sizes of the layers of a network.
         seed: seed of its initial weights.
         constants: constants of a rule at the start.
         max_acceleration: acceleration of action 1 [m/s²]; None if it is unknown.
+        activation: between the layers of a network.
 
     Returns:
         A module that reads ``"observation"`` ``[*batch, n]`` and writes ``"action"``
@@ -127,7 +127,7 @@ def make_policy(
     if kind == NETWORK_ALONE:
         if constants:
             raise ConfigError("agent.constants belong to a rule: use agent.policy=idm or acc")
-        return make_actor(size, 1, hidden, seed)
+        return make_actor(size, 1, hidden, seed, activation)
     name = kind.removeprefix(RESIDUAL)
     if name not in RULE_KINDS:
         known = (NETWORK_ALONE, *RULE_KINDS, *(RESIDUAL + rule for rule in RULE_KINDS))
@@ -139,5 +139,5 @@ def make_policy(
         )
     module: nn.Module = Rule(RULE_KINDS[name], observation, constants, max_acceleration)
     if kind != name:
-        module = Residual(module, size, hidden, seed)  # type: ignore[arg-type]
+        module = Residual(module, seeded_mlp(size, 1, hidden, seed, activation))  # type: ignore[arg-type]
     return TensorDictModule(module, in_keys=["observation"], out_keys=["action"])

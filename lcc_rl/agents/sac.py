@@ -96,7 +96,7 @@ class SAC(OffPolicy):
     def setup(self, scene: Scene) -> None:
         super().setup(scene)
         size, seed, device = scene.observation_size, scene.seed, scene.device
-        spread = seeded_mlp(size, 1, self.hidden[-1:], seed + 2).to(device)
+        spread = seeded_mlp(size, 1, self.hidden[-1:], seed + 2, self.activation).to(device)
         head = Head(self.policy.module[0], spread)
         self.noise = SampledAction(head)
         actor = ProbabilisticActor(

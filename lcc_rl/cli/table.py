@@ -5,24 +5,30 @@ lcc-rl table outputs/evaluate/<run> --all               # every measure
 lcc-rl table outputs/evaluate/<run> --against idm       # savings against it
 lcc-rl table outputs/evaluate/<run> --format latex      # for booktabs
 lcc-rl table outputs/evaluate/<run> --columns who,saved_pct
+lcc-rl table outputs/train/<sweep> --figure sweep.pdf   # a row for each setting; its seeds joined
 lcc-rl table outputs/alcc/tables/<table>.parquet --format latex
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import pandas as pd
+from pydantic import Field
 
 from lcc_rl.api import Run
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.io.files import as_rows, read_parquet
+from lcc_rl.results.loading import load_sweep
 from lcc_rl.results.names import worded
 from lcc_rl.results.render import as_latex, as_markdown, chosen, for_print
 from lcc_rl.results.report import together
 from lcc_rl.results.runs import EPISODES, FINAL, PARTS, load_config, naming_run
-from lcc_rl.runs.arguments import Arguments
+from lcc_rl.runs.arguments import Arguments, typed
+from lcc_rl.runs.states import CONFIG, run_folders
 
 TABLE_FORMATS: dict[str, Callable[[pd.DataFrame], str]] = {
     "text": as_markdown,
@@ -35,13 +41,15 @@ TABLE_FORMATS: dict[str, Callable[[pd.DataFrame], str]] = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table of a run, or any table that is kept as a parquet file."""
     parser = Arguments(prog="lcc-rl table", description=__doc__)
-    what = "folder of an evaluation, a training or a job; or a parquet file"
+    what = "folder of an evaluation, a training, a job or a sweep; or a parquet file"
     parser.add_argument("run", type=Path, help=what)
     form = "text is that of the run; of --columns and parquet files it is markdown"
     parser.add_argument("--format", choices=TABLE_FORMATS, default="text", help=form)
     parser.add_argument("--all", action="store_true", help="every measure, as table=all shows")
     parser.add_argument("--columns", help="which, by the names of --format csv, with commas")
     parser.add_argument("--against", help="strategy that savings are against")
+    ending = typed(Annotated[str, Field(pattern=r"\.(png|pdf|svg)$")])
+    parser.add_argument("--figure", type=ending, help="draw the table, too: a .png, .pdf or .svg")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
     options = parser.parse_args(arguments)
     names = options.columns.split(",") if options.columns else None
@@ -50,6 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         table = chosen(worded(read_parquet(options.run)), names or [])
     else:
         run = read_run(options.run, options.trust)
+        if options.figure:
+            draw(run, options.against, options.figure)
         with naming_run(run.folder / EPISODES):
             if options.format == "text" and not names:
                 print(run.printed(options.all, options.against))
@@ -65,9 +75,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"% {note}" if options.format == "latex" else f"\n{note}")
 
 
+def draw(run: Run, against: str | None, path: str) -> None:
+    """Draw the table of a run, each training seed as a grey dot."""
+    # Here: tables alone need no matplotlib.
+    from lcc_rl.figures.drawing import save
+    from lcc_rl.figures.evaluation import measures_of
+
+    rows, alone = run.rows, []
+    with naming_run(run.folder / EPISODES):
+        if isinstance(rows, pd.DataFrame):
+            seeds = rows["training_seed"]
+            parts = (rows[seeds.isna() | (seeds == seed)] for seed in seeds.dropna().unique())
+            alone = [together(replace(run, rows=part).reports(against)) for part in parts]
+        figure = measures_of(together(run.reports(against)), alone)
+    save(figure, path)
+
+
 def read_run(folder: Path, trust: Sequence[str]) -> Run:
-    """Return a run as its folder holds it; of a job its last part."""
+    """Return a run as its folder holds it; of a job its last part, of a sweep all runs as one."""
     folder = folder / FINAL if (folder / PARTS).is_dir() else folder
+    if not (folder / CONFIG).is_file() and (runs := run_folders(folder)):
+        return Run(folder, load_sweep(folder), load_config(runs[0], trust))
     cfg = load_config(folder, trust)
     with naming_run(folder / EPISODES):
         return Run(folder, as_rows(folder / EPISODES), cfg)

@@ -23,12 +23,13 @@ from lcc_rl.config import identity, with_inputs
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.config.words import FILTERED, RECORDED
-from lcc_rl.envs import Inputs, load_inputs
+from lcc_rl.envs import Inputs, build_env, load_inputs
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store
 from lcc_rl.evaluation.fit import check_policy, other_traffic
+from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import DIRECT, controller_of, is_policy, is_shipped, label_of
 from lcc_rl.evaluation.strategies import (
     POLICY,
@@ -38,6 +39,7 @@ from lcc_rl.evaluation.strategies import (
     baselines,
     beside_filtered,
     check_distinct,
+    given,
     named_apart,
     no_policy,
     studied,
@@ -79,6 +81,7 @@ def run(
     own: bool = True,
     quiet: bool = False,
     replace: bool = False,
+    policies: Mapping[str, GivenPolicy] | None = None,
 ) -> Rows:
     """Evaluate a policy or rule, those it is compared with, and the baselines.
 
@@ -92,6 +95,7 @@ def run(
         own: evaluate the configuration's own variant, not only what it is compared with.
         quiet: write the rows only: print no table, draw no figures.
         replace: write over an evaluation of other settings.
+        policies: further ones that a program gives, by their names in tables.
 
     Returns:
         The rows of episodes.parquet; of many as a dataset, which is not read yet.
@@ -107,7 +111,7 @@ def run(
     with claim(folder):
         if not replace:
             check_folder(cfg, folder)
-        return _run(cfg, folder, own, quiet, replace)
+        return _run(cfg, folder, own, quiet, replace, policies or {})
 
 
 def made_by(table: Path) -> str | None:
@@ -126,7 +130,14 @@ def complete(cfg: EvaluateConfig, folder: Path) -> None:
     forget(folder)
 
 
-def _run(cfg: EvaluateConfig, folder: Path, own: bool, quiet: bool, replace: bool) -> Rows:
+def _run(
+    cfg: EvaluateConfig,
+    folder: Path,
+    own: bool,
+    quiet: bool,
+    replace: bool,
+    policies: Mapping[str, GivenPolicy],
+) -> Rows:
     prepare_torch(cfg)
     check_measured(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg) and not _nobody_drives(cfg):
@@ -134,7 +145,7 @@ def _run(cfg: EvaluateConfig, folder: Path, own: bool, quiet: bool, replace: boo
     own = own and not only_named(cfg)
     if own:
         check_variant(cfg)
-    strategies, inputs = strategies_of(cfg, own)
+    strategies, inputs = strategies_of(cfg, own, policies)
     check_strategies(strategies, inputs)
     if replace:  # rows of other settings must never stand beside this configuration
         (folder / EPISODES).unlink(missing_ok=True)
@@ -244,12 +255,15 @@ def _nobody_drives(cfg: StudyConfig) -> bool:
     return AUTOMATED not in cfg.scenario.vehicles.names
 
 
-def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[Strategy], Inputs]:
+def strategies_of(
+    cfg: EvaluateConfig, own: bool | None = None, further: Mapping[str, GivenPolicy] | None = None
+) -> tuple[list[Strategy], Inputs]:
     """Build all strategies of an evaluation, and read what they are evaluated on.
 
     Args:
         cfg: configuration of the entry point ``evaluate``.
         own: whether the configuration's own variant is among them; None: as the command decides.
+        further: policies that a program gives, by their names.
     """
     own = not only_named(cfg) if own is None else own
     # Before the data: a missing file should not be noticed after minutes of reading.
@@ -270,6 +284,10 @@ def strategies_of(cfg: EvaluateConfig, own: bool | None = None) -> tuple[list[St
         strategies.append(dataclasses.replace(one, name=name or one.name))
     if own:
         strategies += studied(cfg, policy, inputs.population)
+    for name, given_policy in (further or {}).items():
+        _check_label(name, "a policy", "")
+        env = build_env(cfg, inputs.evaluation, inputs.population, 1, 0, cfg.device, nominal=True)
+        strategies.append(given(cfg, name, given_policy, env.reset()))
     strategies = beside_filtered(cfg, strategies) + strategies
     for strategy in (s for s in strategies if s.policy is not None):
         cases.check_cases(strategy.cfg, inputs)

@@ -21,6 +21,10 @@ STORED = (str, int, float, type(None), list, Mapping)
 CALLED = ("__call__",)  # what a node that is used as a function makes
 
 
+def _place(kind: type) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
 class Node:
     """An object that a configuration describes: its class, its settings and their place.
 
@@ -106,10 +110,10 @@ class Node:
         """
         made = self._object if has_settings(self.kind) else self._made()
         if isinstance(needed, type):
-            fits, called = isinstance(made, needed), needed.__name__
+            fits, called = isinstance(made, needed), f"a subclass of {_place(needed)}"
         else:
             fits, called = all(hasattr(made, x) for x in needed), f"an object with {needed[0]}"
-        require(fits, f"{self.where}: expected {called}, got {type(made).__name__}")
+        require(fits, f"{self.where}: expected {called}, got {_place(type(made))}")
         return made
 
     def check(self) -> None:

@@ -10,11 +10,13 @@ import json
 import logging
 import re
 from collections import Counter
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+from tensordict import TensorDictBase
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
@@ -24,6 +26,7 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.errors import ConfigError, ResultsError, require
 from lcc_rl.evaluation.fit import check_action, check_scenario, check_width
+from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import (
     DIRECT,
     PEOPLE,
@@ -34,7 +37,7 @@ from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces import Observation, Piece, RecordedStart
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.results.runs import differing, flatten
+from lcc_rl.results.runs import flatten, told_apart
 from lcc_rl.settings import TARGET, path_of
 
 log = logging.getLogger("lcc_rl")
@@ -288,6 +291,23 @@ def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Popu
     return replace(strategy, cfg=deployed(other), own=own)
 
 
+def given(cfg: StudyConfig, name: str, policy: GivenPolicy, moment: TensorDictBase) -> Strategy:
+    """Build the strategy of a policy that a program gives, in the scenario under study.
+
+    Args:
+        cfg: the configuration under study, whose observation the policy reads.
+        name: its name in tables.
+        policy: that of another library.
+        moment: the first moment of an episode, at which it is tried.
+
+    Raises:
+        ConfigError: if no policy drives in this scenario, or this one does not.
+    """
+    require(learns(cfg), f"{name} is a policy, and variant {cfg.variant} learns nothing")
+    policy.tried(moment)
+    return Strategy(name, cfg, policy)
+
+
 def with_weights(
     cfg: StudyConfig, weights: Mapping[str, Any], seed: int, path: str, population: Population
 ) -> Strategy:
@@ -355,19 +375,19 @@ def _labels(strategies: Sequence[Strategy], marks: Sequence[tuple[str, int]]) ->
     for one, group in zip(strategies, groups, strict=True):
         places.setdefault(group, _place(one, groups.count(group) > 1))
     apart = Counter((name, place) for (name, _), place in places.items())
+    differences: dict[tuple[str, str], str] = {}
+    for name in {name for name, _ in groups}:
+        texts = list(dict.fromkeys(text for other, (text, _) in places if other == name))
+        words = told_apart([json.loads(text) for text in texts])
+        differences |= {(name, text): word for text, word in zip(texts, words, strict=True)}
     found = []
-    for name, mark in groups:
-        others = {text for other, (text, _) in places if other == name} - {mark[0]}
-        same = apart[name, places[name, mark]] > 1 and others
-        found.append(_difference(mark[0], others) if same else places[name, mark])
+    for one, (name, (text, which)) in zip(strategies, groups, strict=True):
+        place = places[name, (text, which)]
+        if apart[name, place] > 1:  # one folder holds several trainings, or one of them twice
+            twice = (name, (text, 2)) in places or not differences[name, text]
+            place = _place(one, False) if twice else differences[name, text]
+        found.append(place)
     return found
-
-
-def _difference(text: str, others: Collection[str]) -> str:
-    """Return the settings of a training that are not those of all others, as ``key=value``."""
-    own, *rest = (json.loads(x) for x in (text, *others))
-    keys = sorted({key for other in rest for key in differing(own, other)})
-    return ", ".join(f"{key.rpartition('.')[2]}={own.get(key)}" for key in keys)
 
 
 def _place(strategy: Strategy, of_sweep: bool) -> str:

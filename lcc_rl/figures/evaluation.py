@@ -13,6 +13,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from pandas.api.types import is_numeric_dtype
 
 from lcc_rl.config.words import FILTERED
 from lcc_rl.figures.drawing import (
@@ -22,6 +23,7 @@ from lcc_rl.figures.drawing import (
     SOFT,
     colour,
     dots,
+    grid,
     in_file,
     legend_above,
     lines_of,
@@ -180,6 +182,35 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, report:
     style(right, f"{what} saved\nagainst {in_words(against)} [%]")
     size = " × ".join(map(several, sizes, ("window", "driver")))
     right.set_title(f"{size}; lines: 95 % intervals", loc="right", pad=16)
+    return figure
+
+
+@paper
+def measures_of(report: Report, seeds: Sequence[Report] = ()) -> Figure:
+    """Every column of a report's short table but zeros: a dot per strategy, grey ones by seed.
+
+    Args:
+        report: of one or several sources, in ``of``.
+        seeds: the report of each training seed alone.
+    """
+    table = report.short.assign(of=report.short.get("of", ""))
+    names = table[["of", "who"]].to_numpy()
+    labels = [fill(f"{of}: {who}".removeprefix(": "), 28) for of, who in names]
+    places = {tuple(key): place for place, key in enumerate(table[["of", "strategy"]].to_numpy())}
+    shown = [one for one in report.shown if is_numeric_dtype(table[one.key])]
+    shown = [one for one in shown if table[one.key].any()] or shown
+    figure = new_figure(PAGE_WIDTH, 1.0 + 0.17 * len("\n".join(labels).splitlines()))
+    axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    for axis, (key, head) in zip(axes, shown, strict=True):
+        for own in (one.short.assign(of=one.short.get("of", "")) for one in seeds):
+            rows = [places[tuple(x)] for x in own[["of", "strategy"]].to_numpy()]
+            axis.plot(own[key], rows, "o", color=SOFT, markersize=2)
+        bounds = {f"{key}_{end}": table.get(f"{key}_{end}", table[key]) for end in ("low", "high")}
+        dots(axis, range(len(table)), table.assign(**bounds), key, INK)
+        grid(axis, "x")
+        style(axis, head.replace("-\n", ""))
+    axes[0].set_yticks(range(len(labels)), labels)
+    axes[0].invert_yaxis()
     return figure
 
 

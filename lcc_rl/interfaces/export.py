@@ -12,14 +12,18 @@ import logging
 import warnings
 from collections.abc import Sequence
 from io import BytesIO
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from lcc_rl.config import load
+from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.errors import ConfigError, how_to_install, require, unknown_name
+from lcc_rl.evaluation.foreign import network_of
 from lcc_rl.evaluation.named import is_policy, rules
-from lcc_rl.interfaces.exported import Remembering, described_input, program
+from lcc_rl.interfaces.exported import described_input, program
 from lcc_rl.interfaces.onnx_policy import MAKES, TAKES
 from lcc_rl.interfaces.ring_page import ring_page
 from lcc_rl.io.atomic import atomic_path, new_file
@@ -28,7 +32,14 @@ from lcc_rl.runs.arguments import Arguments
 from lcc_rl.version import __version__
 
 
-def export(policy: str | Path, path: str | Path, trust: Sequence[str] = ()) -> Path:
+def export(
+    policy: Any,
+    path: str | Path,
+    trust: Sequence[str] = (),
+    variant: str = "alcc",
+    overrides: Sequence[str] = (),
+    normalize: Any = None,
+) -> Path:
     """Write a trained policy, with its safety filter, for use elsewhere.
 
     The ending chooses the form. ONNX (``.onnx``) and PyTorch's exported program (``.pt2``) take
@@ -39,9 +50,13 @@ def export(policy: str | Path, path: str | Path, trust: Sequence[str] = ()) -> P
     :func:`lcc_rl.interfaces.ring_page.ring_page`.
 
     Args:
-        policy: a run folder, a policy file, or ``pretrained/<name>``.
+        policy: a run folder, a policy file, or ``pretrained/<name>``; or a model of
+            stable-baselines3 or a torch module from observations ``[batch, n]`` to actions
+            ``[batch, 1]``.
         path: the file to write.
         trust: modules outside this package that the policy may name.
+        variant, overrides: of the environment in which a model or module was trained.
+        normalize: ``VecNormalize`` of a model; by default that of its own environment.
 
     Returns:
         The file's path.
@@ -57,44 +72,55 @@ def export(policy: str | Path, path: str | Path, trust: Sequence[str] = ()) -> P
     path = new_file(path, "name")
     if path.suffix not in EXPORTERS:
         raise unknown_name("ending", path.suffix, EXPORTERS)
+    cfg = None
+    if not isinstance(policy, (str, PathLike)):
+        given = policy
+        if (policy := network_of(given, normalize)) is None:
+            kind = type(given).__name__
+            raise ConfigError(f"expected a run, a file, a torch module or a model, got {kind}")
+        cfg = load("train", [f"variant={variant}", *overrides])
     require(
-        is_policy(str(policy)) or str(policy) not in rules(),
+        cfg is not None or is_policy(str(policy)) or str(policy) not in rules(),
         f"{policy} is a rule; only a trained policy can be exported: give a run folder, a policy "
         f"file or {PRETRAINED}/<name>",
     )
-    content = EXPORTERS[path.suffix](policy, trust)
+    content = EXPORTERS[path.suffix](policy, trust, cfg)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path
 
 
-def _program(policy: str | Path, trust: Sequence[str]) -> tuple[Any, str]:
+def _program(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> tuple[Any, str]:
     """Return the exported program, and what is to know about it as JSON."""
-    module = program(policy, trust)
+    module = program(policy, trust, cfg)
     inputs = [described_input(name)._asdict() for name in module.names]
-    own = module.policy if isinstance(module, Remembering) else module
-    about: dict[str, Any] = {"policy": str(policy), "lcc_rl": __version__, "inputs": inputs}
-    about |= {"output": "acceleration [m/s²]", "filter": own.safety is not None}
-    widths = [len(module.names)] + ([module.width] if isinstance(module, Remembering) else [])
+    about: dict[str, Any] = {
+        "policy": str(policy if cfg is None else type(policy).__name__),
+        "lcc_rl": __version__,
+        "inputs": inputs,
+    }
+    about |= {"output": "acceleration [m/s²]", "filter": module.safety is not None}
+    widths = [len(module.names), module.width][: 1 + (module.width > 0)]
     batch = dict(zip(TAKES, [{0: torch.export.Dim("batch", min=1)}] * len(widths), strict=False))
     examples = tuple(torch.ones(2, width) for width in widths)
     made = torch.export.export(module, examples, dynamic_shapes=batch)
     return made, json.dumps(about, ensure_ascii=False)
 
 
-def _as_page(policy: str | Path, trust: Sequence[str]) -> bytes:
+def _as_page(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> bytes:
+    require(cfg is None, "a page (.html) needs a run or a policy file; write .onnx or .pt2")
     return ring_page(policy, trust).encode()
 
 
-def _as_pt2(policy: str | Path, trust: Sequence[str]) -> bytes:
-    made, about = _program(policy, trust)
+def _as_pt2(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> bytes:
+    made, about = _program(policy, trust, cfg)
     buffer = BytesIO()
     torch.export.save(made, buffer, extra_files={"lcc_rl": about})
     return buffer.getvalue()
 
 
-def _as_onnx(policy: str | Path, trust: Sequence[str]) -> bytes:
-    exported, about = _program(policy, trust)
+def _as_onnx(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> bytes:
+    exported, about = _program(policy, trust, cfg)
     count = len(exported.graph_signature.user_inputs)
     try:
         import onnx

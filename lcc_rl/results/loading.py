@@ -18,7 +18,8 @@ import pyarrow as pa
 from pandas.api.types import is_numeric_dtype
 from pyarrow.dataset import Dataset
 
-from lcc_rl.errors import ResultsError, unknown_name
+from lcc_rl.config import NOT_IDENTITY
+from lcc_rl.errors import ResultsError, require, unknown_name
 from lcc_rl.io.atomic import SUBFOLDERS
 from lcc_rl.io.files import (
     Rows,
@@ -28,7 +29,7 @@ from lcc_rl.io.files import (
     texts_of,
     unified,
 )
-from lcc_rl.results.runs import CONFIG, FINAL, PARTS, flatten, read_settings
+from lcc_rl.results.runs import CONFIG, FINAL, PARTS, flatten, read_settings, told_apart
 
 log = logging.getLogger("lcc_rl")
 
@@ -44,6 +45,10 @@ ALWAYS = ("variant", "seed")  # settings that are columns also where all runs ag
 SHARD, SHARDS = "evaluation.shard", "evaluation.shards"
 # Integers of pandas that may be missing.
 NULLABLE = {pa.int64(): pd.Int64Dtype(), pa.int32(): pd.Int32Dtype()}
+# Settings in which the parts and the seeds of one study differ.
+SHARED = tuple(f"{key}." for key in (*NOT_IDENTITY, "seed", SHARD))
+TRAINING = ["strategy", "training_seed"]
+EPISODE = [*TRAINING, "profile_id", "driver_id", "repeat", "case", "run_id", "follower"]
 Runs = dict[Path, dict[str, Any]]  # the settings of each run by its table
 
 
@@ -156,6 +161,47 @@ def load(
     frame.attrs |= {"damaged": dict(damaged)} if damaged else {}
     frame.attrs |= {"missing": missing} if missing else {}
     return frame
+
+
+def load_sweep(root: str | Path) -> pd.DataFrame:
+    """Read the rows of all runs below a folder as those of one evaluation.
+
+    A strategy is named by the settings in which the runs differ (:func:`told_apart`); the seeds of
+    a training share a name. A strategy whose rows are the same in all runs stands once.
+
+    Raises:
+        ConfigError: if the runs meet different leaders, or one training is there twice.
+        ResultsError: as :func:`load`.
+    """
+    root = Path(root)
+    rows = load(root, settings=())
+    names = list(rows["run"].unique())
+    stored = [dict(flatten(read_settings(root / name / CONFIG))) for name in names]
+    settings = [{k: x for k, x in one.items() if not f"{k}.".startswith(SHARED)} for one in stored]
+    labels = dict(zip(names, told_apart(settings), strict=True))
+    rows = rows.assign(run=rows["run"].astype(str), strategy=rows["strategy"].astype(str))
+    for strategy, part in rows.groupby("strategy"):
+        first, *others = (one.drop(columns="run") for _, one in part.groupby("run"))
+        if all(first.reset_index(drop=True).equals(x.reset_index(drop=True)) for x in others):
+            rows = rows.drop(index=part.index.difference(first.index))
+        else:
+            names = [f"{strategy} {labels[run]}".strip() for run in part["run"]]
+            rows.loc[part.index, "strategy"] = names
+    _check_one_study(root, rows)
+    return rows.drop(columns="run").reset_index(drop=True)
+
+
+def _check_one_study(root: Path, rows: pd.DataFrame) -> None:
+    if "leader_speed_mps" in rows:
+        leaders = rows.groupby("profile_id")["leader_speed_mps"].nunique()
+        require(
+            leaders.max() == 1,
+            f"{root}: its runs meet different leaders (profile_id {leaders.idxmax()}); "
+            f"lcc_rl.results.load({str(root)!r}) reads them",
+        )
+    twice = rows[rows.duplicated([key for key in EPISODE if key in rows])]
+    which = [f"{strategy}, seed {seed}" for strategy, seed in twice[TRAINING].to_numpy()[:1]]
+    require(not which, f"{root}: it holds one training twice: {''.join(which)}")
 
 
 def _files(root: Path, name: str, damaged: Damaged) -> list[Path]:

@@ -144,3 +144,29 @@ def flatten(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield from flatten(value, f"{name}.")
         else:
             yield name, str(value) if isinstance(value, list) else value
+
+
+def told_apart(settings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return for each of several flat mappings what tells it from the others, ``key=value, …``.
+
+    As few keys as that needs, each with as many of its last words as no other setting ends in:
+    ``safety.weight=0.5``. Hashes of files are named only where no setting differs.
+    """
+    every = list(dict.fromkeys(key for one in settings for key in one))
+
+    def kinds(keys: Sequence[str]) -> int:
+        return len({tuple(str(one.get(key)) for key in keys) for one in settings})
+
+    chosen = [key for key in every if kinds([key]) > 1]
+    for key in sorted(chosen, key=lambda key: (not key.startswith("inputs."), kinds([key]))):
+        rest = [x for x in chosen if x != key]
+        chosen = rest if kinds(rest) == kinds(chosen) else chosen
+    names = {key: _last_words(key, every) for key in chosen}
+    return [", ".join(f"{names[key]}={one.get(key)}" for key in chosen) for one in settings]
+
+
+def _last_words(key: str, keys: Sequence[str]) -> str:
+    """Return the last words of a dotted key, as many as tell it from all others."""
+    words = key.split(".")
+    ends = (".".join(words[-count:]) for count in range(1, len(words)))
+    return next((end for end in ends if sum(f".{x}".endswith(f".{end}") for x in keys) == 1), key)

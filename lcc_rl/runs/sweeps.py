@@ -284,6 +284,8 @@ def conclude(folder: Path) -> None:
     finished = sum(state.state == "finished" for state in states)
     failed = [state for state in states if state.state == "failed"]
     log.info("%d of %d runs finished, in %s", finished, len(states), folder)
+    if finished > 1 and next(folder.glob("*/episodes.parquet"), None):
+        log.info("side by side: lcc-rl table %s --figure sweep.png", shlex.quote(str(folder)))
     for state in failed:
         log.error("failed: %s: %s", state.name, state.error)
     if failed:

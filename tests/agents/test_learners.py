@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import sys
 from types import ModuleType
+from typing import Any
 
 import pytest
-from helpers import (
-    check_resuming,
-    small_env,
-    small_loop,
-)
+from helpers import check_refused, check_resuming, small_env, small_loop, weights
 from page_blocks import ROOT, blocks
 from tensordict import TensorDict
+from torch import nn
 
 from lcc_rl.agents import PPO, TrainingLoop
 from lcc_rl.agents.agent import Scene
+from lcc_rl.errors import ConfigError
 
 SMALL = (
     *("training.episodes=16", "training.environments=4", "training.checkpoint_every=2"),
@@ -29,13 +28,15 @@ EACH = pytest.mark.parametrize("agent", AGENTS)
 
 
 @pytest.fixture(autouse=True)
-def my_learner(monkeypatch) -> None:
+def my_learner(monkeypatch) -> Any:
     """The module that docs/extend.md tells to write."""
     page = (block.text for block in blocks(ROOT / "docs" / "extend.md"))
     (text,) = (text for text in page if text.startswith("# my_learner.py"))
     module = ModuleType("my_learner")
     monkeypatch.setitem(sys.modules, "my_learner", module)
+    module.text = text
     exec(text, vars(module))
+    return module
 
 
 def make(folder, agent: str, *overrides: str) -> TrainingLoop:
@@ -83,3 +84,41 @@ def test_the_clipped_ratio_is_of_the_policy_that_played() -> None:
     losses = agent.update(TensorDict({**rows, "next": after}, [4, 20]))
     assert losses["loss_actor"].abs() < 1e-5
     assert losses["sigma"] == pytest.approx(0.5, rel=1e-4)
+
+
+# What a learner of one's own has wrong, as what replaces what on the page, and the error.
+WRONG = [
+    ("self.noise = GaussianExploration", "self.sound = abs", "must make noise, the exploration"),
+    ("loop = ReinforceLoop", "loop = dict", "loop must be a class derived .* got <class 'dict'>"),
+    ("lr=self.learning_rate)", "lr=1.0); self.policy = len", "policy must be .* got <built-in fu"),
+    ('"loss_value": returns', '"loss": returns', "must return numbers .* 'loss_value' among them"),
+    ("(Agent)", "(Settings)", "expected a subclass of .*Agent, got my_learner.Reinforce"),
+]
+
+
+def test_what_a_learner_of_ones_own_lacks_is_one_line(tmp_path, my_learner) -> None:
+    def run(old: str, new: str) -> None:
+        text = my_learner.text.replace(old, new)
+        assert text != my_learner.text
+        exec(f"from lcc_rl.settings import Settings\n{text}", vars(my_learner))
+        other = f"seed={len(old)}"  # composed anew: the class is another one
+        small_loop(tmp_path, *AGENTS["own"], *SMALL, other).run()
+
+    check_refused(run, WRONG, ConfigError)
+
+
+@pytest.mark.parametrize("agent", ["ddpg", "td3", "sac", "ppo", "analytic"])
+def test_activation_schedule_and_clipping_are_settings_of_every_learner(tmp_path, agent) -> None:
+    words = (f"agent={agent}", *SMALL, "agent.final_lr_fraction=0.2", "agent.clip_norm=1e-12")
+    words += ("agent.activation=tanh", "agent.schedule=linear")
+    if agent in ("ddpg", "td3", "sac"):
+        words += ("agent.batch_size=16", "agent.saturation=0")
+    loop = small_loop(tmp_path, *words)
+    kinds = [type(layer) for layer in loop.agent.policy.modules()]
+    assert kinds.count(nn.Tanh) == 3
+    assert nn.ReLU not in kinds
+    before = weights(loop)
+    rates = loop.run()["learning_rate"]
+    assert rates.tolist() == pytest.approx([rates[0] * x for x in (1.0, 0.8, 0.6, 0.4)])
+    moved = (weights(loop) - before).abs().max()
+    assert 0.0 < moved < 0.2 * rates[0]  # Adam steps by the whole rate unless gradients vanish

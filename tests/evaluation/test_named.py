@@ -159,7 +159,7 @@ def test_who_cannot_drive_is_told_how() -> None:
         ("my_pid.py", r"my_pid.py is a module: name a class or function in it, my_pid.<Class>"),
         ({"gain": 3}, "expected _target_"),
         ({TARGET: PATH, "gian": 3}, "'gian'.*'gain'"),
-        ({TARGET: "lcc_rl.pieces.TimeGap"}, "expected Controller"),
+        ({TARGET: "lcc_rl.pieces.TimeGap"}, r"expected a subclass of .*\.Controller"),
     ]
     check_refused(controller_of, cases)
 

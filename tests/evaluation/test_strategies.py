@@ -70,7 +70,7 @@ def test_rows_are_told_apart_by_whatever_differs_but_the_seed() -> None:
     assert [one.name for one in named_apart(own)] == ["alcc w0", "alcc w1"]
     swept = [run(s, f"sweep/{w}{s}", f"{weight}={w}") for w in (0.0, 5.0) for s in (0, 1)]
     names = [one.name for one in named_apart(swept)]
-    assert names == ["alcc weight=0.0"] * 2 + ["alcc weight=5.0"] * 2
+    assert names == ["alcc safety.weight=0.0"] * 2 + ["alcc safety.weight=5.0"] * 2
     # The seeds of a training share a row, whatever folders hold them and however they were drawn.
     seeds = [run(s, f"day{s}/run", f"evaluation.drivers={s + 2}", "table=all") for s in (0, 1)]
     assert [one.name for one in named_apart(seeds)] == ["alcc", "alcc"]

@@ -14,26 +14,25 @@ from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.interfaces.export import main
-from lcc_rl.interfaces.exported import ExportedPolicy, exported_policy
-from lcc_rl.pieces.cbf import REMEMBERS
+from lcc_rl.interfaces.exported import DrivingProgram, program
 from lcc_rl.results.policies import load_policy
 
 
 @pytest.fixture(scope="module")
-def module() -> ExportedPolicy:
-    return exported_policy("pretrained/i80-follow")
+def module() -> DrivingProgram:
+    return program("pretrained/i80-follow")
 
 
-def states(module: ExportedPolicy, count: int = 256) -> torch.Tensor:
+def states(module: DrivingProgram, count: int = 256) -> torch.Tensor:
     chance = torch.Generator().manual_seed(0)
     return 20.0 * torch.rand(count, len(module.names), generator=chance)
 
 
-def memories(count: int = 256) -> torch.Tensor:
+def memories(module: DrivingProgram, count: int = 256) -> torch.Tensor:
     """Of filters: gaps of as many metres as are predicted, and what they grow too fast [m/s]."""
     chance = torch.Generator().manual_seed(1)
-    drawn = torch.rand(count, 3, generator=chance)
-    return torch.cat([torch.ones(count, 1), 20.0 * drawn[:, 1:2], drawn[:, 2:] - 0.5], -1)
+    drawn, begun = torch.rand(count, 2, generator=chance), torch.ones(count, module.width - 2)
+    return torch.cat([begun, 20.0 * drawn[:, :1], drawn[:, 1:] - 0.5], -1)
 
 
 def test_it_commands_what_the_vehicle_of_the_environment_obeys(module) -> None:
@@ -49,7 +48,7 @@ def test_it_commands_what_the_vehicle_of_the_environment_obeys(module) -> None:
         return td.set(("automated", "action"), said[-1].view(-1, 1, 1) / 3.0)
 
     said: list[torch.Tensor] = []
-    memory = [torch.zeros(16, REMEMBERS)]
+    memory = [torch.zeros(16, module.width)]
     record, _ = play(env, policy, None, [("command", "automated")])
     obeyed = record["command", "automated"].flatten(1)[-60:]
     # Filtered inside already, the environment's own filter changes nothing.
@@ -66,7 +65,7 @@ def value(td, name: str) -> torch.Tensor:
 def test_the_filter_is_inside(module) -> None:
     near = {"ahead.speed": 0.0, "self.gap": 5.0}
     state = torch.tensor([[near.get(name, 15.0) for name in module.names]])
-    anew = torch.zeros(1, REMEMBERS)
+    anew = torch.zeros(1, module.width)
     assert module(state, anew)[0].item() == -3.0
     assert all(x.isfinite().all() for x in module(torch.full_like(state, torch.nan), anew))
 
@@ -75,9 +74,9 @@ def test_the_filter_is_inside(module) -> None:
 def test_a_pytorch_program_computes_the_same_and_says_what_it_reads(module, tmp_path) -> None:
     path = lcc_rl.export("pretrained/i80-follow", tmp_path / "policy.pt2")
     about = {"lcc_rl": ""}
-    program = torch.export.load(path, extra_files=about).module()
-    given = (states(module), memories())
-    torch.testing.assert_close(program(*given), module(*given))
+    loaded = torch.export.load(path, extra_files=about).module()
+    given = (states(module), memories(module))
+    torch.testing.assert_close(loaded(*given), module(*given))
     assert [item["name"] for item in json.loads(about["lcc_rl"])["inputs"]] == module.names
     with pytest.raises(ResultsError, match="is already there"):
         lcc_rl.export("pretrained/i80-follow", path)
@@ -89,7 +88,7 @@ def test_onnxruntime_computes_the_same(module, tmp_path) -> None:
     pytest.importorskip("onnxscript", reason="extra interfaces")
     path = lcc_rl.export("pretrained/i80-follow", tmp_path / "policy.onnx")
     session = runtime.InferenceSession(path)
-    state, memory = states(module), memories()
+    state, memory = states(module), memories(module)
     found = session.run(None, {"state": state.numpy(), "memory": memory.numpy()})
     for one, other in zip(found, module(state, memory), strict=True):
         np.testing.assert_allclose(one, other.numpy(), atol=1e-5)

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 import lcc_rl
 from lcc_rl.envs.arrays import ArrayEpisodes
-from lcc_rl.errors import LccError
+from lcc_rl.errors import ConfigError, LccError
 from lcc_rl.figures.animation import ROLE_COLOURS
 from lcc_rl.pieces.base import SEED
 
@@ -21,6 +21,7 @@ gymnasium = pytest.importorskip("gymnasium", reason="extra interfaces")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 import lcc_rl.interfaces.gym  # noqa: E402
+from lcc_rl.evaluation.foreign import network_of  # noqa: E402
 
 DATA = ["data.platoons=2", "data.recordings=2", "data.duration_s=[32,40]"]
 SHORT = [*DATA, "scenario.horizon=20"]
@@ -364,3 +365,34 @@ def test_stable_baselines3_learns_on_it_by_name(sb3) -> None:
     assert sb3.PPO("MlpPolicy", NAME, n_steps=20, device="cpu").observation_space.shape == (7,)
     ddpg = sb3.DDPG("MlpPolicy", NAME, learning_starts=10, seed=0, device="cpu")
     ddpg.learn(20)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_models_of_stable_baselines3_are_compared_and_exported(sb3, tmp_path) -> None:
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    pytest.importorskip("onnxruntime", reason="extra interfaces")
+    words = [*SHORT, "evaluation.baselines=[]", "evaluation.profiles=2", "evaluation.drivers=2"]
+    for kind, more in (
+        *((name, {"n_steps": 20}) for name in ("PPO", "A2C")),
+        *((name, {"learning_starts": 10}) for name in ("SAC", "TD3", "DDPG")),
+    ):
+        env = VecNormalize(make_vec_env(NAME, 2, env_kwargs={"overrides": SHORT}), clip_obs=2.0)
+        model = getattr(sb3, kind)("MlpPolicy", env, device="cpu", seed=0, **more)
+        model.learn(60)
+        seen = 10.0 * np.random.default_rng(0).normal(size=(50, 7)).astype(np.float32)
+        action, _ = model.predict(env.normalize_obs(seen), deterministic=True)
+        network = network_of(model)
+        np.testing.assert_allclose(network(torch.as_tensor(seen)).detach(), action, atol=1e-5)
+        if kind == "PPO":
+            alone = network_of(model.load(model.save(tmp_path / "m") or tmp_path / "m"), env)
+            assert torch.equal(alone(torch.as_tensor(seen)), network(torch.as_tensor(seen)))
+            file = lcc_rl.export(model, tmp_path / "ppo.onnx", overrides=SHORT)
+            rows = lcc_rl.compare({"model": model, "file": file}, overrides=words).rows
+            energy = rows.groupby("strategy")["total_path_energy_kj"].mean()
+            assert energy["model"] == pytest.approx(energy["file"], rel=1e-5)
+    cases = [("acc", "acc is a rule"), (object(), "expected a run, a file, a torch module or a")]
+    check_refused(lambda who: lcc_rl.export(who, tmp_path / "x.onnx"), cases, ConfigError)
+    with pytest.raises(ConfigError, match="needs a run or a policy file"):
+        lcc_rl.export(model, tmp_path / "x.html")

@@ -19,6 +19,8 @@ from lcc_rl.cli.status import main as status
 from lcc_rl.commands import animate
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.results.loading import load_sweep
+from lcc_rl.results.runs import told_apart
 
 TABLE = "episodes.parquet"
 
@@ -72,6 +74,53 @@ def test_a_job_counts_each_episode_once(tmp_path) -> None:
     assert set(results.load(tmp_path, "training")["run"]) == {"alcc"}
     (tmp_path / "evaluation" / TABLE).unlink()
     assert set(results.load(tmp_path)["run"]) == {"alcc"}  # stopped before its end
+
+
+def test_what_tells_runs_apart_is_few_settings_by_their_last_words() -> None:
+    weights = [{"a.weight": w, "b.weight": 1.0, "gamma": 0.9, "inputs.data": w} for w in (0, 1)]
+    for settings, expected in (
+        (weights, ["a.weight=0", "a.weight=1"]),
+        # Of settings that change together the one with most values is enough.
+        ([{"rate": r, "kind": r > 1} for r in (1, 2, 3)], ["rate=1", "rate=2", "rate=3"]),
+        (
+            [{"a.gamma": g, "a.rate": r, "c": 0} for g in (0, 1) for r in (2, 3)],
+            [f"gamma={g}, rate={r}" for g in (0, 1) for r in (2, 3)],
+        ),
+        ([{"inputs.data": "x"}, {"inputs.data": "y"}], ["data=x", "data=y"]),
+        ([{"seed": 0}, {"seed": 0, "other.seed": 1}], ["other.seed=None", "other.seed=1"]),
+        ([{"seed": 0}, {"seed": 0}], ["", ""]),
+    ):
+        assert told_apart(settings) == expected
+
+
+def sweep_of(root: Path, *runs: dict[str, object], **columns: object) -> pd.DataFrame:
+    """Read a sweep over weights and seeds; the controllers that learn nothing are the same."""
+    for place, settings in enumerate(runs):
+        folder = made(root / str(place), **settings)
+        seed, weight = settings["seed"], settings.get("w", float("table" in settings))
+        rows = pd.DataFrame({"strategy": ["idm", "alcc"], "training_seed": [None, seed]})
+        rows = rows.assign(profile_id=0, leader_speed_mps=9.0, energy_kj=[5.0, weight], **columns)
+        rows = rows.astype({"training_seed": "Int64"})
+        if "leader" in settings:
+            rows["leader_speed_mps"] = settings["leader"]
+        write_parquet(rows, folder / TABLE)
+    return load_sweep(root)
+
+
+def test_the_runs_of_a_sweep_are_read_as_one_evaluation(tmp_path) -> None:
+    grid = [{"w": w, "seed": seed} for w in (0.5, 2.0) for seed in (0, 1)]
+    rows = sweep_of(tmp_path / "grid", *grid)
+    names = ["idm", *["alcc w=0.5"] * 2, *["alcc w=2.0"] * 2]
+    assert rows["strategy"].tolist() == names
+    assert rows["training_seed"].tolist() == [pd.NA, 0, 1, 0, 1]
+    assert sweep_of(tmp_path / "seeds", *grid[:2])["strategy"].tolist() == ["idm", "alcc", "alcc"]
+    refusals = [
+        ([{"seed": 0}, {"seed": 0, "table": "all"}], "one training twice: alcc, seed 0"),
+        ([{"seed": 0}, {"seed": 1, "leader": 8.0}], r"meet different leaders .*results\.load"),
+    ]
+    for place, (runs, words) in enumerate(refusals):
+        with pytest.raises(ConfigError, match=words):
+            sweep_of(tmp_path / f"wrong{place}", *runs)
 
 
 def test_an_unknown_setting_is_refused_with_the_nearest(tmp_path) -> None:

@@ -18,6 +18,7 @@ from helpers import slow_but
 from omegaconf import OmegaConf
 
 from lcc_rl import results
+from lcc_rl.cli.table import main as table_main
 from lcc_rl.config import load
 from lcc_rl.envs import inputs
 from lcc_rl.runs import sweeps
@@ -76,18 +77,32 @@ def test_a_sweep_that_is_interrupted_names_the_way_to_resume(tmp_path, monkeypat
     assert len(list(tmp_path.rglob("train.log"))) == 1  # the second run has not begun
 
 
-def test_a_sweep_is_read_as_one_table(tmp_path) -> None:
+def test_a_sweep_is_read_as_one_table(tmp_path, capsys) -> None:
     inputs._loaded.clear()  # what other sweeps of this process have read
-    words = [*TINY, "variant=alcc", "seed=0,1", "sweep=mine"]
+    words = [*TINY, "variant=alcc", "seed=0,1", "reward.terms.safety.weight=0,2", "sweep=mine"]
     done = run_command("lcc_rl.cli.train", "-m", *words, cwd=tmp_path, check=True)
-    assert done.stdout.count(inputs.SHARED) == 1  # by the second run
+    assert done.stdout.count(inputs.SHARED) == 3  # by all runs but the first
+    assert "side by side: lcc-rl table outputs/train/mine --figure" in done.stdout
     folder = tmp_path / "outputs" / "train" / "mine"
     frame = results.load(folder, settings=["seed", "agent.gamma", "reward.*"])
-    assert frame.groupby("seed")["run"].nunique().tolist() == [1, 1]
+    assert frame.groupby("seed")["run"].nunique().tolist() == [2, 2]
     assert {"agent.gamma", "reward.terms.safety.weight"} <= set(frame)
     rows = results.load(folder, "training")
-    assert len(rows) == 2 * 3
+    assert len(rows) == 4 * 3
     assert rows.groupby("seed")["episode_reward"].first().nunique() == 2
+    # Rows are named by what differs, seeds share one: in its table and figure, beside others.
+    names = [f"network, for all (safety.weight={weight})" for weight in (0, 2)]
+    for end in (".png", ".pdf"):
+        figure = tmp_path / f"sweep{end}"
+        table_main([str(folder), "--format=csv", "--figure", str(figure)])
+        lines = capsys.readouterr().out.splitlines()[1:]
+        assert {line.split(",")[0] for line in lines} == {
+            f"alcc safety.weight={weight}" for weight in (0, 2)
+        }
+        assert figure.stat().st_size > 5000
+    words = [*TINY, "variant=alcc", f"compare=[{folder}]", "evaluation.baselines=[human]"]
+    told = run_command("lcc_rl.cli.evaluate", *words, cwd=tmp_path, check=True)
+    assert all(told.stdout.count(f"{name}: the policy of") == 2 for name in names)
 
 
 def test_runs_of_a_sweep_over_two_settings_are_named_without_quotes(tmp_path) -> None:
@@ -131,9 +146,8 @@ def on_terminal(cwd: Path, *words: str) -> str:
 @pytest.mark.slow
 def test_on_a_terminal_a_sweep_is_one_table(tmp_path) -> None:
     shown = on_terminal(tmp_path, *SWEEP, f"{GAP}=1.2,1.3,-1", "sweep=mine")
-    table, _, end = shown.rpartition("┘")
+    table, _, end = shown.rpartition("3 runs: 2 finished, 1 failed")
     assert "waiting" in table
-    assert "3 runs: 2 finished, 1 failed" in end
     assert f"failed: {GAP}=-1_" in end
     # Log lines stay in the files, also Hydra's own between two runs.
     assert "synthetic stream" not in shown

@@ -1,0 +1,112 @@
+"""Policies that other libraries trained: by their keys, with memory, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from commands import NO_AGENT
+from helpers import check_refused
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.envs.transforms import CatFrames
+from torchrl.modules import GRUModule, NormalParamExtractor, ProbabilisticActor, TanhNormal
+
+import lcc_rl
+from lcc_rl.errors import ConfigError
+
+ROOT, GROUP = (["observation"], ["action"]), (["automated", "observation"], ["automated", "action"])
+SMALL = [*NO_AGENT, "evaluation.baselines=[]"]
+WIDTH = 7
+
+
+class Lagged(nn.Module):
+    """A network of what was observed a step before, which it remembers."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, observation: Tensor, begins: Tensor, before: Tensor | None = None):
+        before = observation if before is None else before
+        assert begins.shape == (*observation.shape[:-1], 1)
+        return self.network(before), observation
+
+
+def networks() -> tuple[nn.Sequential, dict[str, nn.Module]]:
+    torch.manual_seed(0)
+    linear = nn.Linear(WIDTH, 1)
+    network = nn.Sequential(linear, nn.Tanh())
+    mean = nn.Linear(WIDTH, 2)  # before the tanh, and a wide distribution
+    last, earlier = nn.Linear(2 * WIDTH, 1), nn.Linear(2 * WIDTH, 1)
+    with torch.no_grad():
+        mean.weight.copy_(torch.cat([linear.weight, torch.zeros(1, WIDTH)]))
+        mean.bias.copy_(torch.cat([linear.bias, torch.ones(1)]))
+        for one, part in ((last, slice(WIDTH, None)), (earlier, slice(WIDTH))):
+            one.weight.zero_()[:, part] = linear.weight
+            one.bias.copy_(linear.bias)
+    spread = TensorDictModule(
+        nn.Sequential(mean, NormalParamExtractor()), ["observation"], ["loc", "scale"]
+    )
+    frames = CatFrames(N=2, dim=-1, in_keys=["observation"], out_keys=["frames"])
+    return network, {
+        "root": TensorDictModule(network, *ROOT),
+        "group": TensorDictModule(network, [tuple(GROUP[0])], [tuple(GROUP[1])]),
+        "drawn": ProbabilisticActor(
+            spread, in_keys=["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True
+        ),
+        "last frame": TensorDictSequential(
+            frames, TensorDictModule(nn.Sequential(last, nn.Tanh()), ["frames"], ["action"])
+        ),
+        "earlier frame": TensorDictSequential(
+            frames, TensorDictModule(nn.Sequential(earlier, nn.Tanh()), ["frames"], ["action"])
+        ),
+        "lagged": TensorDictModule(
+            Lagged(network),
+            ["observation", "is_init", "before"],
+            ["action", ("next", "before")],
+        ),
+    }
+
+
+@pytest.mark.parametrize("string", ["automated human", "automated human automated human"])
+def test_a_policy_of_any_keys_drives_as_its_network_does(tmp_path, string) -> None:
+    network, modules = networks()
+    modules["drawn"].train()
+    words = [*SMALL, f"scenario.string='{string}'"]
+    found = lcc_rl.compare({"plain": network, **modules}, "alcc", words, tmp_path / "run")
+    rows = {
+        str(name): part.drop(columns=["strategy", "training_seed"]).to_numpy(object)[:, 5:]
+        for name, part in found.rows.groupby("strategy")
+    }
+    rows = {name: torch.tensor(part.astype(float)).nan_to_num() for name, part in rows.items()}
+    for name in ("root", "group", "drawn", "last frame"):
+        torch.testing.assert_close(rows[name], rows["plain"], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(rows["earlier frame"], rows["lagged"], rtol=1e-4, atol=1e-4)
+    assert (rows["lagged"] - rows["plain"]).abs().max() > 1e-2
+    assert modules["drawn"].training
+    assert list((tmp_path / "run" / "figures").glob("*.png"))
+
+
+def test_a_recurrent_policy_of_torchrl_drives() -> None:
+    torch.manual_seed(0)
+    keys = {"in_keys": ["observation", "rs"], "out_keys": ["seen", ("next", "rs")]}
+    policy = TensorDictSequential(
+        GRUModule(input_size=WIDTH, hidden_size=4, **keys),
+        TensorDictModule(nn.Linear(4, 1), ["seen"], ["action"]),
+    )
+    found = lcc_rl.compare([policy], overrides=SMALL)
+    assert set(found.rows["strategy"]) == {"TensorDictSequential"}
+
+
+def test_what_is_no_policy_of_these_keys_is_refused_in_a_line() -> None:
+    network = networks()[0]
+    cases = [
+        ({"x": nn.Linear(5, 1)}, "x is given observations of 7 numbers, and fails: mat1 and mat2"),
+        ({"x": nn.Linear(WIDTH, 2)}, r"x is given .* shape '\[1, 1, 1\]' is invalid"),
+        ({"x": TensorDictModule(network, ["obs"], ["action"])}, r"x reads \['obs'\] and writes"),
+        ({"x": TensorDictModule(network, ["observation"], ["act"])}, r"writes \['act'\]: expected"),
+        ({"alcc": network}, "a policy alcc, which stands for 'network, for all': choose another"),
+    ]
+    check_refused(lambda who: lcc_rl.compare(who, overrides=SMALL), cases, ConfigError)
+    with pytest.raises(ConfigError, match="x is a policy, and variant idm learns nothing"):
+        lcc_rl.compare({"x": network}, "idm", [*NO_AGENT])
