@@ -64,7 +64,7 @@ class Drivers(Controller):
     acceleration_noise: NonNegative | None = None
     # That from which and to which every episode of training draws its noise, likewise [m/s²].
     acceleration_noise_range: tuple[NonNegative, NonNegative] | None = None
-    # The same of a noise of the logarithm of the perceived gap.
+    # Standard deviation of a smooth noise of ln of the perceived gap; None: of the population.
     gap_noise: NonNegative | None = None
 
     LATER = ("delay_range", "acceleration_noise_range", "gap_noise")
