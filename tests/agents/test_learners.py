@@ -29,8 +29,8 @@ EACH = pytest.mark.parametrize("agent", AGENTS)
 
 @pytest.fixture(autouse=True)
 def my_learner(monkeypatch) -> Any:
-    """The module that docs/extend.md tells to write."""
-    page = (block.text for block in blocks(ROOT / "docs" / "extend.md"))
+    """The module that docs/learners.md tells to write."""
+    page = (block.text for block in blocks(ROOT / "docs" / "learners.md"))
     (text,) = (text for text in page if text.startswith("# my_learner.py"))
     module = ModuleType("my_learner")
     monkeypatch.setitem(sys.modules, "my_learner", module)
