@@ -90,7 +90,7 @@ def test_the_clipped_ratio_is_of_the_policy_that_played() -> None:
 WRONG = [
     ("self.noise = GaussianExploration", "self.sound = abs", "must make noise, the exploration"),
     ("loop = ReinforceLoop", "loop = dict", "loop must be a class derived .* got <class 'dict'>"),
-    ("lr=self.learning_rate)", "lr=1.0); self.policy = len", "policy must be .* got <built-in fu"),
+    ("lr=self.learning_rate)", "lr=1.0); self.policy = len", "policy must be .* got builtin"),
     ('"loss_value": returns', '"loss": returns', "must return numbers .* 'loss_value' among them"),
     ("(Agent)", "(Settings)", "expected a subclass of .*Agent, got my_learner.Reinforce"),
 ]
