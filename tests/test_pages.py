@@ -64,6 +64,7 @@ ENOUGH = {
     "batch_size=1024": "batch_size=4",
     "num_envs=64": "num_envs=2",
     "batch_size=64": "batch_size=4",
+    '"evaluation.drivers=24"': repr([LENGTH, *WINDOWS, *DATA])[1:-1],
     "19200,": "80,",
     "768000": "160",
     '1.2]"]': f'1.2]", *{list(DATA)}]',

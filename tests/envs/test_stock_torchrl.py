@@ -170,7 +170,7 @@ def test_two_workers_train_as_the_page_says(tmp_path) -> None:
         (text,) = (text for text in PAGE if text.startswith(f"# {name}.py"))
         for much, little in small.items():
             text = text.replace(much, little)
-        text = text.replace("policy})", f"policy}}, overrides={[*DATA, 'experiment=smoke']})")
+        text = text.replace('"evaluation.drivers=24"', repr([*DATA, "experiment=smoke"])[1:-1])
         (tmp_path / f"{name}.py").write_text(text)
     words = [sys.executable, "two_workers.py"]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
