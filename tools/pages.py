@@ -16,6 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import averaged
 import fleets
 import measured_energy
 import numpy as np
@@ -99,16 +100,18 @@ def study(name: str, reference: Path, docs: Path) -> None:
 
 
 def tasks(reference: Path, docs: Path) -> None:
-    """Write the tables of docs/tasks.md and docs/leaderboard.md."""
-    kept = {path.stem: read_parquet(path) for path in sorted((reference / "tasks").glob("*"))}
-    parts = [task_table(name, table) for name, table in kept.items() if "score_name" in table]
-    fronts = fleets.fronts(kept["fleets_fronts"])
+    """Write the tables of docs/tasks.md, docs/leaderboard.md and docs/limits.md."""
+    tables = {path.stem: read_parquet(path) for path in sorted((reference / "tasks").glob("*"))}
+    parts = [task_table(name, table) for name, table in tables.items() if "score_name" in table]
+    fronts = fleets.fronts(tables["fleets_fronts"])
     fill(docs / "tasks.md", {"fleets": fronts, "tasks": "\n\n".join(parts)})
     files = sorted((reference / "scores").glob("*.json"))
     documents = {path.name: read_json(path) for path in files}
     with naming_run(reference / "scores"):
         table = board.leaderboard(documents)
     fill(docs / "leaderboard.md", {"board": table})
+    kept = read_parquet(reference / "averaged.parquet")
+    fill(docs / "limits.md", {"averaged": averaged.averaged(kept)})
 
 
 def learners(reference: Path, docs: Path) -> None:
@@ -169,6 +172,8 @@ def measured(measure: Measure, value: float) -> str:
     """Return a value of a limited measure with its unit."""
     if measure.key.startswith(IS_SHARE):
         return f"{measure.scale * value:.2f} %"
+    if measure.key == FLOW:
+        return f"{value:,.0f} 1/h"
     return f"{value:.0f} m" if measure.key.endswith("_m") else f"{value:.2f} s"
 
 

@@ -28,8 +28,8 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # Above these make lint fails; what is built next may take the difference to what there is.
 CEILINGS = {
     "lcc_rl + tools": {"lines": 40_100, "code": 26_100},
-    "tests": {"lines": 20_200},
-    "conf": {"yaml": 136},
+    "tests": {"lines": 21_500},
+    "conf": {"yaml": 142},
 }
 CASES = 1_100  # that a run of all quick tests collects, see tests/tools/test_size.py
 STRUCTURE = {"names in several modules": 60, "floors": 10, "circles": 0}

@@ -269,6 +269,8 @@ def strategies_of(
     rivals, paths = compared(cfg)
     policy, policies = _read_policies(cfg, paths)
     check_installed(cfg, list(rivals.values()))
+    for asked in [] if RECORDED in {*rivals, *cfg.evaluation.baselines} else _held_as_recorded(cfg):
+        raise ConfigError(f"{asked}: add {RECORDED} to evaluation.baselines")
     if own and learns(cfg) and cfg.policy is None:
         raise no_policy(cfg)
     inputs = load_inputs(cfg)
@@ -321,13 +323,18 @@ def _read_policies(
 def _rules(cfg: EvaluateConfig, rivals: Mapping[str, Any], inputs: Inputs) -> list[Strategy]:
     """Return the baselines and named controllers; nobody drives as recorded where nobody was."""
     lacking = _lacking_record(cfg, inputs)
-    require(
-        not lacking or RECORDED not in rivals,
-        f"compare={RECORDED}: {lacking}; use trajectories of several vehicles",
-    )
+    for asked in [f"compare={RECORDED}"] * (RECORDED in rivals) + _held_as_recorded(cfg):
+        require(not lacking, f"{asked}: {lacking}; use trajectories of several vehicles")
     if lacking and RECORDED in cfg.evaluation.baselines:
         log.warning("%s is left out: %s", RECORDED, lacking)
     return [one for one in baselines(cfg, rivals) if not lacking or one.name != RECORDED]
+
+
+def _held_as_recorded(cfg: EvaluateConfig) -> list[str]:
+    """Return the limits of the task that are those of the recorded drivers."""
+    task = task_of(cfg)
+    limits = task.limits if task else {}
+    return [f"task.limits.{key}={RECORDED}" for key, bound in limits.items() if bound == RECORDED]
 
 
 def _lacking_record(cfg: EvaluateConfig, inputs: Inputs) -> str:

@@ -16,18 +16,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.grid import places
-from lcc_rl.data.plausible import Plausible
-from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files
+from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource, find_files
 from lcc_rl.data.table_source import labels, to_trajectories
 from lcc_rl.data.tables import Column, TableFile
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
-from lcc_rl.settings import Settings
 
 
-class OpenAccSource(Settings):
+class OpenAccSource(TrajectorySource):
     """Episodes of native OpenACC files; each is a recording, in which car i follows car i − 1.
 
     A blank cell divides the trajectory of its car. Positions are derived from speeds and gaps:
@@ -36,8 +33,6 @@ class OpenAccSource(Settings):
 
     path: str | Sequence[str]  # a file, several files, or a pattern
     driver: Literal["human", "acc"] | None = None  # only followers of whom Driver<i> says so
-    criteria: Criteria | None = None  # None for the defaults
-    plausible: Plausible | None = None  # None for the defaults
 
     def load(self) -> LoadedEpisodes:
         """Read and extract.
@@ -54,7 +49,7 @@ class OpenAccSource(Settings):
         ]
         place = partial(places, files=files)
         trajectories = to_trajectories(pd.concat(cars, ignore_index=True), place, report)
-        return episodes_of(trajectories, self.criteria, self.plausible, place=place)
+        return self.extracted(trajectories, place=place)
 
 
 def _cars(table: TableFile, driver: str | None, report: ReadReport) -> pd.DataFrame:

@@ -1,4 +1,7 @@
-"""Smoothing of trajectories: positions are smoothed, then differentiated.
+"""Smoothing of recorded motion: positions of trajectories, or averages of whole episodes.
+
+Positions are smoothed, then differentiated, by :class:`SavitzkyGolay`. :func:`averaged` takes a
+moving average of the episodes of any source, as energies that no noise of a sensor decides need.
 
 Raw NGSIM speeds and accelerations are noisy and disagree with the positions. Per stretch without a
 missing frame the positions are smoothed, speed and acceleration are their derivatives, and space
@@ -16,10 +19,13 @@ from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
+import pandas as pd
 from pydantic import Field
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import savgol_filter
 
 from lcc_rl.arrays import Floats
+from lcc_rl.data.episodes import MOTION_COLUMNS
 from lcc_rl.data.grid import stretches
 from lcc_rl.data.trajectories import FRAME, Trajectories, find_leaders
 from lcc_rl.errors import ConfigError, DataError
@@ -110,3 +116,35 @@ class SavitzkyGolay(Settings):
             savgol_filter(position, self.window, deriv=order, **settings) for order in range(3)
         )
         return smoothed, speed, acceleration
+
+
+def averaged(episodes: pd.DataFrame, seconds: float, source: str) -> tuple[pd.DataFrame, str]:
+    """Return centred moving averages of the motion of episodes, and a line on what was left out.
+
+    Speeds, gaps and positions have the same average, so that a gap still changes as the speeds
+    say. Rows whose window is not whole are left out.
+
+    Args:
+        episodes: see :data:`lcc_rl.data.episodes.SCHEMA`; not changed.
+        seconds: width of the window; an odd number of frames is taken, at least this long [s].
+        source: the file or files, for messages.
+
+    Raises:
+        DataError: if no episode is long enough.
+    """
+    width = round(seconds / FRAME) | 1
+    starts, lengths = stretches(episodes["episode"].to_numpy())
+    place = np.arange(len(episodes)) - np.repeat(starts, lengths)
+    inner = np.minimum(place, np.repeat(lengths, lengths) - 1 - place) >= width // 2
+    if not inner.any():
+        longest = FRAME * lengths.max()
+        raise DataError(
+            f"{source}: the longest episode has {longest:.1f} s, data.average_s={seconds:g}"
+        )
+    motion = uniform_filter1d(episodes[MOTION_COLUMNS].to_numpy(np.float64), width, axis=0)[inner]
+    columns = dict(zip(MOTION_COLUMNS, motion.astype(np.float32).T, strict=True))
+    line = (
+        f"averaged over {width * FRAME:.1f} s: left out {int((~inner).sum()):,} rows at the ends "
+        f"of episodes, {int((lengths < width).sum()):,} episodes entirely"
+    )
+    return episodes[inner].reset_index(drop=True).assign(**columns), line

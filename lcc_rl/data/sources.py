@@ -8,9 +8,10 @@ from functools import partial
 from glob import escape, glob, has_magic
 from os.path import expanduser
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import pandas as pd
+from pydantic import Field
 
 import lcc_rl.assets
 from lcc_rl.data.car_following import Criteria, extract
@@ -24,6 +25,7 @@ from lcc_rl.data.episodes import (
 from lcc_rl.data.grid import Places, places
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible
+from lcc_rl.data.smoothing import averaged
 from lcc_rl.data.tables import SI, Column, Names, check_map
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import DataError
@@ -57,15 +59,72 @@ class LoadedEpisodes:
         return self
 
 
-class NgsimSource(Settings):
+class Source(Settings):
+    """Base of sources of recorded episodes: what is done with any of them."""
+
+    LATER = ("average_s",)
+
+    plausible: Plausible | None = None  # None for the defaults
+    # Width of a moving average of speeds, gaps and positions, see
+    # :func:`lcc_rl.data.smoothing.averaged`; 0 for none [s].
+    average_s: Annotated[float, Field(ge=0.0, lt=600.0)] = 0.0
+
+    def select(
+        self,
+        episodes: pd.DataFrame,
+        source: str,
+        lines: list[str],
+        remedy: str = "",
+        place: Places = places,
+        units: Mapping[str, str] | None = None,
+    ) -> LoadedEpisodes:
+        """Return the plausible episodes, averaged; see :meth:`Plausible.select`."""
+        thresholds = self.plausible or Plausible()
+        kept, said = thresholds.select(episodes, source, place, remedy=remedy, units=units)
+        if self.average_s:
+            kept, line = averaged(kept, self.average_s, source)
+            said.append(line)
+        return LoadedEpisodes(kept, [*lines, *said])
+
+
+class TrajectorySource(Source):
+    """Base of sources whose episodes are extracted from trajectories."""
+
+    criteria: Criteria | None = None  # None for the defaults
+
+    def extracted(
+        self, trajectories: Trajectories, remedy: str = "", place: Places = places
+    ) -> LoadedEpisodes:
+        """Extract episodes; positions that no file gives are derived from speeds and gaps.
+
+        Args:
+            trajectories: samples and report.
+            remedy: what a user may do about implausible accelerations.
+            place: makes of an episode table what describes its samples to the user.
+
+        Raises:
+            DataError: naming the files, if there is none, or too many are implausible.
+        """
+        report, source = trajectories.report, trajectories.report.source
+        try:
+            episodes, extraction = extract(trajectories, self.criteria or Criteria(), place)
+        except DataError as error:
+            raise DataError(f"{source}: {error}") from error
+        lines = [*report.lines(), *extraction.lines()]
+        if not trajectories.samples["position_m"].to_numpy().any():
+            derive_positions(episodes)
+            lines.append(DERIVED_POSITIONS)
+        loaded = self.select(episodes, source, lines, remedy, place, report.units)
+        return replace(loaded, vehicles=report.names)
+
+
+class NgsimSource(TrajectorySource):
     """Episodes extracted from NGSIM files of any published layout."""
 
     path: str | Path | Sequence[str]  # a file, several, or a pattern such as data/*.csv.gz
     location: str | None = None  # keep only i-80, us-101 … of a file that has several
     smoothing: Callable | None = None  # of the trajectories, see lcc_rl.data.smoothing
-    criteria: Criteria | None = None  # None for the defaults
     units: Literal["feet", "metres"] = "feet"
-    plausible: Plausible | None = None  # None for the defaults
 
     def load(self) -> LoadedEpisodes:
         """Read, smooth where asked, and extract.
@@ -79,10 +138,10 @@ class NgsimSource(Settings):
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
         remedy = "" if self.smoothing else f", smooth it ({SMOOTHING})"
-        return episodes_of(trajectories, self.criteria, self.plausible, remedy)
+        return self.extracted(trajectories, remedy)
 
 
-class EpisodesSource(Settings):
+class EpisodesSource(Source):
     """Episodes from tables of pairs: a row per pair and moment, at any rate and with holes."""
 
     path: str | Sequence[str]  # a file, several, or a pattern; each is a recording
@@ -91,7 +150,6 @@ class EpisodesSource(Settings):
     # ``leader_position`` (front bumpers) and ``leader_length``; others as the package writes them.
     columns: Mapping[str, str | None] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)  # such as {gap: ft}; else SI
-    plausible: Plausible | None = None  # None for the defaults
 
     def validate(self) -> None:
         check_map(PAIR_FIELDS, self.columns, self.units, "data")
@@ -111,38 +169,7 @@ class EpisodesSource(Settings):
         source += read_as(PAIR_FIELDS, named, self.units)
         units = units_of(PAIR_FIELDS, EPISODE_NAMES, self.units)
         place = partial(places, files=files, columns=self.columns)
-        return _plausible(self.plausible, episodes, source, lines, place=place, units=units)
-
-
-def episodes_of(
-    trajectories: Trajectories,
-    criteria: Criteria | None,
-    plausible: Plausible | None,
-    remedy: str = "",
-    place: Places = places,
-) -> LoadedEpisodes:
-    """Extract episodes; positions that no file gives are derived from speeds and gaps.
-
-    Args:
-        trajectories: samples and report.
-        criteria, plausible: None for the defaults.
-        remedy: what a user may do about implausible accelerations.
-        place: makes of an episode table what describes its samples to the user.
-
-    Raises:
-        DataError: naming the files, if there is none, or too many are implausible.
-    """
-    report, source = trajectories.report, trajectories.report.source
-    try:
-        episodes, extraction = extract(trajectories, criteria or Criteria(), place)
-    except DataError as error:
-        raise DataError(f"{source}: {error}") from error
-    lines = [*report.lines(), *extraction.lines()]
-    if not trajectories.samples["position_m"].to_numpy().any():
-        derive_positions(episodes)
-        lines.append(DERIVED_POSITIONS)
-    loaded = _plausible(plausible, episodes, source, lines, remedy, place, report.units)
-    return replace(loaded, vehicles=report.names)
+        return self.select(episodes, source, lines, place=place, units=units)
 
 
 def read_as(columns: Iterable[Column], names: Names, units: Mapping[str, str]) -> str:
@@ -164,20 +191,6 @@ def units_of(columns: Iterable[Column], names: Names, units: Mapping[str, str]) 
     """Return the units of measured columns that have a name, by key; see :func:`read_as`."""
     found = [x for x in columns if x.quantity in SI and names.get(x.key)]
     return {x.key: units.get(x.key, SI[x.quantity]) for x in found}
-
-
-def _plausible(
-    limits: Plausible | None,
-    episodes: pd.DataFrame,
-    source: str,
-    lines: list[str],
-    remedy: str = "",
-    place: Places = places,
-    units: Mapping[str, str] | None = None,
-) -> LoadedEpisodes:
-    thresholds = limits or Plausible()
-    kept, said = thresholds.select(episodes, source, place, remedy=remedy, units=units)
-    return LoadedEpisodes(kept, [*lines, *said])
 
 
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:

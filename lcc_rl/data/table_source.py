@@ -12,10 +12,9 @@ from pydantic import Field
 
 from lcc_rl.arrays import Integers
 from lcc_rl.data.agreement import LEAST_WAY
-from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.grid import Places, continuous, on_grid, places
-from lcc_rl.data.plausible import SMOOTHING, Plausible
-from lcc_rl.data.sources import LoadedEpisodes, episodes_of, find_files, read_as, units_of
+from lcc_rl.data.plausible import SMOOTHING
+from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource, find_files, read_as, units_of
 from lcc_rl.data.tables import Column, TableFile, check_map, whole_numbers
 from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import (
@@ -27,7 +26,7 @@ from lcc_rl.data.trajectories import (
     listed,
 )
 from lcc_rl.errors import ConfigError, DataError
-from lcc_rl.settings import Positive, Settings
+from lcc_rl.settings import Positive
 
 TABLE_FIELDS = (
     Column("vehicle", "text", blank=True),
@@ -52,7 +51,7 @@ AGREE = (0.8, 1.25)  # way by positions over way by speeds
 JUMP = 10.0  # m between samples, more than driven: positions begin anew
 
 
-class TableSource(Settings):
+class TableSource(TrajectorySource):
     """Episodes extracted from trajectories in CSV or parquet tables; each file is a recording.
 
     The vehicle ahead is named by the column ``leader``, or is the nearest one on the lane. The gap
@@ -68,8 +67,6 @@ class TableSource(Settings):
     units: Mapping[str, str] = Field(default_factory=dict)  # such as {speed: km/h}; else SI
     vehicle_length: Positive | None = None  # of vehicles whose length no column gives [m]
     smoothing: Callable | None = None  # of positions, see lcc_rl.data.smoothing
-    criteria: Criteria | None = None  # None for the defaults
-    plausible: Plausible | None = None  # None for the defaults
 
     def validate(self) -> None:
         self.columns = {**TABLE_COLUMNS, **self.columns}
@@ -104,7 +101,7 @@ class TableSource(Settings):
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
         remedy = f", smooth it ({SMOOTHING})" if self.columns.get("position") else ""
-        return episodes_of(trajectories, self.criteria, self.plausible, remedy, place)
+        return self.extracted(trajectories, remedy, place)
 
     def _rows(self, report: ReadReport) -> pd.DataFrame:
         """Rows of all files in SI."""

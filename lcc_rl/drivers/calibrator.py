@@ -73,6 +73,8 @@ class Calibrator(Settings):
     The mode ``local`` fits (v0, T), ``global`` all parameters of the model.
     """
 
+    LATER = ("perception",)
+
     modes: Annotated[Sequence[Mode], Field(min_length=1)] = ("local",)
     model: str = DEFAULT_MODEL  # idm, ovm, fvdm, gipps or the dotted path of a class of your own
     objective: FitMeasure = "speed_rmspe"  # see lcc_rl.drivers.fit_error.FitError
@@ -87,6 +89,7 @@ class Calibrator(Settings):
     # Choose a reaction delay and a noise of the acceleration that all drivers share, so that they
     # need the energy of the recorded ones; see lcc_rl.drivers.twins.
     reaction: bool = False
+    perception: bool = False  # also try noises of the perceived gap, and weigh rough leaders
     choose_constants: bool = False  # local: choose them by the mean error of all drivers first
     selection: given_as(Selection) = field(default_factory=Selection)  # type: ignore[valid-type]
     local_genetic: given_as(GeneticSettings) = field(  # type: ignore[valid-type]
@@ -97,6 +100,8 @@ class Calibrator(Settings):
     )
 
     def validate(self) -> None:
+        if self.perception and not self.reaction:
+            raise ConfigError("perception chooses a part of the reaction: set reaction=true, too")
         law = find_law(self.model)
         given = {name: x for name, x in self.constants.items() if x is not None}
         for name in given:
@@ -146,7 +151,9 @@ class Calibrator(Settings):
         parts, twins, report = [], [], list(observed.report)
         for mode in dict.fromkeys(self.modes):
             drivers, lines = _Fit(self, mode, observed, seed, device, progress).drivers()
-            reaction, measured, more = compare_twins(observed, drivers, self.reaction, progress)
+            reaction, measured, more = compare_twins(
+                observed, drivers, self.reaction, progress, self.perception
+            )
             twins.append(measured.assign(mode=mode))
             if self.reaction:
                 own = {REACTION[name][0]: value for name, value in vars(reaction).items()}

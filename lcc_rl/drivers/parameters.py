@@ -20,6 +20,7 @@ from lcc_rl.settings import Number
 REACTION = {
     "delay": ("reaction_delay_s", 0.0, 3.0),
     "noise": ("acceleration_noise_mps2", 0.0, 3.0),
+    "gap_noise": ("gap_noise", 0.0, 1.0),
 }
 DEFAULT_MODEL = "idm"
 MODEL = "model"  # the column that names a driver's model; a table without it is of the IDM

@@ -41,7 +41,7 @@ class DriverPopulation:
         ids: the drivers' identities, one per driver.
         at_bound: which desired speeds lie on a calibration bound, ``[drivers]``.
         models: the model of every driver; None: the IDM of all.
-        reaction: delay and noise, which the drivers share.
+        reaction: delay and noises, which the drivers share.
         mode: the calibration of which they are, ``local`` or ``global``, where known.
         own: further parameters by name, ``[drivers]``, where drivers have other models; NaN
             where a driver's model lacks one.
@@ -138,6 +138,7 @@ def bootstrap(
     least_speed: Positive | None = None,
     reaction_delay: NonNegative | None = None,
     acceleration_noise: NonNegative | None = None,
+    gap_noise: NonNegative | None = None,
     law: str | None = None,
 ) -> DriverPopulation:
     """Population of the calibrated drivers themselves, the empirical joint distribution.
@@ -150,6 +151,7 @@ def bootstrap(
         reaction_delay: of all drivers [s]; None: as the table says, 0 where it says nothing.
         acceleration_noise: standard deviation [m/s²], likewise; see
             :class:`lcc_rl.functional.driver_models.Reaction`.
+        gap_noise: standard deviation of the perceived gap's logarithm, likewise.
         law: dotted path of a driver model of your own that drivers of the table have.
 
     Raises:
@@ -159,7 +161,7 @@ def bootstrap(
         find_law(law)
     table = load_drivers(path, mode)
     found = replace(from_table(table), mode=mode_of(table))
-    given = {"delay": reaction_delay, "noise": acceleration_noise}
+    given = {"delay": reaction_delay, "noise": acceleration_noise, "gap_noise": gap_noise}
     changes = {name: value for name, value in given.items() if value is not None}
     found = replace(found, reaction=replace(found.reaction, **changes))
     if least_speed is None:
@@ -236,6 +238,7 @@ def fixed(
     min_gap: float = 2.0,
     reaction_delay: NonNegative = 0.0,
     acceleration_noise: NonNegative = 0.0,
+    gap_noise: NonNegative = 0.0,
 ) -> DriverPopulation:
     """Population of one given driver.
 
@@ -247,6 +250,7 @@ def fixed(
         min_gap: s0 [m].
         reaction_delay: [s].
         acceleration_noise: standard deviation [m/s²].
+        gap_noise: standard deviation of the perceived gap's logarithm.
     """
     return DriverPopulation(
         desired_speed=torch.tensor([float(desired_speed)]),
@@ -254,5 +258,5 @@ def fixed(
         constants=IDMConstants(acceleration, deceleration, min_gap),
         ids=("fixed",),
         at_bound=torch.zeros(1, dtype=torch.bool),
-        reaction=Reaction(reaction_delay, acceleration_noise),
+        reaction=Reaction(reaction_delay, acceleration_noise, gap_noise),
     )

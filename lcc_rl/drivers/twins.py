@@ -5,12 +5,14 @@ because it punishes every acceleration at the wrong moment. Energy is compared b
 calibrated driver behind its own recorded leader. The reaction that the fit leaves out is a delay
 and a noise that all drivers share. It is chosen by the spectrum of the acceleration, by the energy
 spent on accelerating, and so that energy does not grow along a string of such drivers. With a
-delay alone the first driver fits, but its successors amplify its motion until they collide.
+delay alone the first driver fits, but its successors amplify its motion until they collide. A noise
+of the perceived gap is chosen with them where asked for: that of the acceleration makes drivers too
+lively behind calm leaders and too calm behind rough ones, where leaders differ much.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,14 +23,17 @@ from torch import Tensor
 
 from lcc_rl.drivers.genetic import Progress
 from lcc_rl.drivers.observed import Observed
-from lcc_rl.energy import PaperMotor
+from lcc_rl.energy import AVERAGES, PaperMotor
 from lcc_rl.errors import Concern
-from lcc_rl.functional.driver_models import DriverConstants, NoiseStep, Reaction, follow
+from lcc_rl.functional.driver_models import (
+    GAP_NOISE_TIME,
+    DriverConstants,
+    NoiseStep,
+    Reaction,
+    follow,
+)
 from lcc_rl.functional.laws import LAWS
 
-# Moving averages of the speeds before their energy is computed; the first one counts for the choice
-# of a reaction: shorter ones leave the noise of records, longer ones take what drivers do [s].
-SMOOTHINGS = (1.1, 3.1)
 FREQUENCIES = (0.04, 0.26)  # frequencies compared; above them the records are smoothed [Hz]
 SPECTRUM_WINDOW = 20.0  # part of a record whose spectrum is taken; parts overlap by half [s]
 LONG_GAP = 2.5  # time gap above which a driver is far behind, above 1 m/s [s]
@@ -37,7 +42,10 @@ AT_ONCE = 20_000  # trajectories side by side; more would only take memory
 DRIVER_FOLDS = 5  # each fold is evaluated with the reaction chosen on the other folds
 DELAYS = tuple(round(0.1 * number, 1) for number in range(10))  # among which is chosen [s]
 NOISES = tuple(round(0.05 * number, 2) for number in range(13))  # likewise [m/s²]
-TOLERANCES = {"lost": 0.05, "spectrum": 0.2, "growth": 0.05}  # relative; see choose_reaction
+GAP_NOISES = tuple(round(0.1 * number, 1) for number in range(1, 7))  # likewise, beside none
+# Relative; see choose_reaction.
+TOLERANCES = {"lost": 0.05, "spectrum": 0.2, "growth": 0.05, "slope": 0.1}
+LEADER_LOST, LEADER_WAY = "leader_lost_1.1s_j", "leader_distance_1.1s_m"
 CARS = 5  # cars in the string over which energy must not grow
 HELD = "the recorded drivers hold their speeds"
 LEAST_LOST = 1e-6  # share of the energy that drivers in traffic lose at least to accelerating
@@ -62,13 +70,14 @@ def measure_motion(
         time_step: [s].
 
     Returns:
-        A row per driver: mean gap_m and long_gap_share of the time; for each of :data:`SMOOTHINGS`,
+        A row per driver: mean gap_m and long_gap_share of the time; for each of
+        :data:`lcc_rl.energy.AVERAGES`,
         such as 1.1 s, energy_1.1s_j, its part lost_1.1s_j and distance_1.1s_m; and for each
         frequency within :data:`FREQUENCIES`, such as 0.1 Hz, density_0.1hz of the acceleration
         [m²/s⁴/Hz], NaN for records shorter than :data:`SPECTRUM_WINDOW`.
     """
     table: dict[str, _Array] = {}
-    for smoothing in SMOOTHINGS:
+    for smoothing in AVERAGES:
         found = _energies(speed, samples, time_step, smoothing)
         units = {"energy": "j", "lost": "j", "distance": "m"}
         table |= {f"{x}_{smoothing}s_{unit}": found[x] for x, unit in units.items()}
@@ -130,10 +139,12 @@ def densities(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def measure_recorded(observed: Observed) -> pd.DataFrame:
-    """Measure the recorded drivers."""
-    series = (observed.follower_speed, observed.gaps)
-    speed, gap = (x.double().cpu().numpy()[:, None] for x in series)
-    return measure_motion(speed, gap, observed.samples, observed.time_step)
+    """Measure the recorded drivers, and what their leaders lose to accelerating [J] on what way."""
+    series = (observed.follower_speed, observed.gaps, observed.leader_speed)
+    speed, gap, leader = (x.double().cpu().numpy()[:, None] for x in series)
+    table = measure_motion(speed, gap, observed.samples, observed.time_step)
+    ahead = _energies(leader, observed.samples, observed.time_step, AVERAGES[0])
+    return table.assign(**{LEADER_LOST: ahead["lost"], LEADER_WAY: ahead["distance"]})
 
 
 def drive_twins(
@@ -194,7 +205,7 @@ def growth(
         motion = _follow(who, leader, (leader[0], gap), reactions, shape, generator, step)
         collided |= [bool(((gaps <= 0.0) & inside).any()) for _, gaps in motion]
         if car in (0, CARS - 1):
-            each = [_energies(x, observed.samples, step, SMOOTHINGS[0]) for x, _ in motion]
+            each = [_energies(x, observed.samples, step, AVERAGES[0]) for x, _ in motion]
             energies.append([one["energy"].sum() / one["distance"].sum() for one in each])
         leader = torch.from_numpy(np.stack([speed for speed, _ in motion], 1))
     grown = np.log(np.divide(energies[1], energies[0]))
@@ -215,23 +226,32 @@ def _follow(
     The leader's speed is ``[time, …]``, broadcast to ``shape``: reactions, draws, drivers.
     """
     law, own = who
-    level = torch.tensor([one.noise for one in reactions]).double().view(-1, 1, 1)
-    noise_step = NoiseStep.of(step)
+    level, gap_level = (
+        torch.tensor(x).double().view(-1, 1, 1)
+        for x in ([one.noise for one in reactions], [one.gap_noise for one in reactions])
+    )
 
-    def draw() -> Tensor:
-        return torch.randn(shape[1:], generator=generator, dtype=torch.float64)
+    def noises(noise_step: NoiseStep) -> Iterator[Tensor]:
+        def draw() -> Tensor:
+            return torch.randn(shape[1:], generator=generator, dtype=torch.float64)
 
-    noise, last = noise_step.start(draw(), draw())
+        noise, last = noise_step.start(draw(), draw())
+        while True:
+            yield noise
+            noise, last = noise_step.next(noise, last, draw()), noise
+
+    own_noise, gap_noise = noises(NoiseStep.of(step)), noises(NoiseStep.of(step, GAP_NOISE_TIME))
 
     def strayed(_: int, command: Tensor) -> Tensor:
-        nonlocal noise, last
-        command = command + level * noise
-        noise, last = noise_step.next(noise, last, draw()), noise
-        return command
+        return command + level * next(own_noise)
+
+    def seen(gap: Tensor) -> Tensor:
+        return gap * (gap_level * next(gap_noise)).exp()
 
     speed, gap = (x.expand(shape) for x in start)
     late = round(reactions[0].delay / step)
-    driven = follow(law, leader, speed, gap, own, step, late, strayed)
+    sight = seen if gap_level.any() else None
+    driven = follow(law, leader, speed, gap, own, step, late, strayed, sight)
     motion = [(speed, gap), *((speed, gap) for speed, gap, _ in driven)]
     speeds, gaps = (torch.stack(x, 1).numpy() for x in zip(*motion, strict=True))
     return list(zip(speeds, gaps, strict=True))
@@ -264,32 +284,50 @@ def _people(observed: Observed, drivers: pd.DataFrame) -> People:
 
 
 def ratios(
-    twins: pd.DataFrame, records: pd.DataFrame, smoothing: float = SMOOTHINGS[0]
+    twins: pd.DataFrame, records: pd.DataFrame, smoothing: float = AVERAGES[0]
 ) -> dict[str, float]:
     """Compare drivers with the recorded ones, as ratios of sums over them.
 
     Args:
         twins, records: what was measured of both, see :func:`measure_motion`; the same drivers.
-        smoothing: one of :data:`SMOOTHINGS` [s].
+        smoothing: one of :data:`lcc_rl.energy.AVERAGES` [s].
 
     Returns:
-        ``energy`` and ``lost`` (to accelerating) per distance, ``distance``, and ``spectrum``: the
-        root of the mean square of the logarithm of the ratio of both densities, 0 if all records
-        are too short.
+        ``energy`` and ``lost`` (to accelerating) per distance, ``distance``, ``lost_1`` to
+        ``lost_3`` behind the calmest, middle and roughest third of the leaders, by what these lose
+        per distance, where it is known; and roots of mean squares of logarithms of ratios:
+        ``slope`` of these three, and ``spectrum`` of both densities, 0 if all records are too
+        short.
     """
     share = twins.sum(numeric_only=True) / records.sum(numeric_only=True)
     energy, lost, distance = (
         share[name]
         for name in (f"energy_{smoothing}s_j", f"lost_{smoothing}s_j", f"distance_{smoothing}s_m")
     )
+    by_third = _lost_by_third(twins, records, smoothing)
     density = densities(twins).sum() / densities(records).sum()
     apart = np.log(density.fillna(1.0).to_numpy())
     return {
         "energy": float(energy / distance),
         "lost": float(lost / distance),
         "distance": float(distance),
+        **{f"lost_{number}": value for number, value in enumerate(by_third, 1)},
+        "slope": float(np.sqrt(np.mean(np.log(by_third) ** 2))) if by_third else np.nan,
         "spectrum": float(np.sqrt(np.mean(apart**2))),
     }
+
+
+def _lost_by_third(twins: pd.DataFrame, records: pd.DataFrame, smoothing: float) -> list[float]:
+    """Return what drivers lose per distance over the recorded, by thirds of their leaders."""
+    if LEADER_LOST not in records or len(records) < 3:
+        return []
+    calm_first = (records[LEADER_LOST] / records[LEADER_WAY]).to_numpy().argsort()
+    lost, way = (f"{x}_{smoothing}s_{unit}" for x, unit in (("lost", "j"), ("distance", "m")))
+    sums = (
+        [table.iloc[part].sum(numeric_only=True) for table in (twins, records)]
+        for part in np.array_split(calm_first, 3)
+    )
+    return [float(a[lost] / a[way] / (b[lost] / b[way])) for a, b in sums]
 
 
 @dataclass(frozen=True)
@@ -301,25 +339,32 @@ class Tried:
 
 
 def tried(
-    observed: Observed, drivers: pd.DataFrame, progress: Progress | None = None
+    observed: Observed,
+    drivers: pd.DataFrame,
+    progress: Progress | None = None,
+    perception: bool = False,
 ) -> dict[Reaction, Tried]:
     """Drive twins with all of :data:`DELAYS` × :data:`NOISES`.
 
     Args:
         observed, drivers: see :func:`drive_twins`.
         progress: called as ``progress(tried, total, text)``.
+        perception: also with every second of both × :data:`GAP_NOISES`.
     """
     found: dict[Reaction, Tried] = {}
     together = max(1, AT_ONCE // (REPEATS * observed.count))
-    for delay in DELAYS:
-        every = [Reaction(delay, noise) for noise in NOISES]
+    grid = {delay: [Reaction(delay, noise) for noise in NOISES] for delay in DELAYS}
+    for delay in DELAYS[::2] if perception else ():
+        grid[delay] += [Reaction(delay, x, gap) for x in NOISES[::2] for gap in GAP_NOISES]
+    count = sum(map(len, grid.values()))
+    for every in grid.values():
         for start in range(0, len(every), together):
             reactions = every[start : start + together]
             twins = drive_twins(observed, drivers, reactions)
             grown = growth(observed, drivers, reactions)
             found |= dict(zip(reactions, map(Tried, twins, grown), strict=True))
             if progress is not None:
-                progress(len(found), len(DELAYS) * len(NOISES), "reactions tried")
+                progress(len(found), count, "reactions tried")
     return found
 
 
@@ -330,8 +375,12 @@ def choose_reaction(
 
     What is minimised is the sum of squares of three logarithms, each over its
     :data:`TOLERANCES`: of the energy lost to accelerating and of the spectrum, both over the
-    recorded, and of the growth of energy along a string of such drivers.
+    recorded, and of the growth of energy along a string of such drivers. Where noises of the
+    perceived gap were tried, that of the ``slope`` of :func:`ratios` is the fourth.
     """
+    sized = {name: size for name, size in TOLERANCES.items() if name != "slope"}
+    if any(reaction.gap_noise for reaction in tries):
+        sized = TOLERANCES
 
     def distance(reaction: Reaction) -> float:
         near = ratios(tries[reaction].twins[rows], records[rows])
@@ -339,8 +388,9 @@ def choose_reaction(
             "lost": np.log(near["lost"]),
             "spectrum": near["spectrum"],
             "growth": tries[reaction].growth,
+            "slope": near["slope"],
         }
-        return float(sum((errors[name] / size) ** 2 for name, size in TOLERANCES.items()))
+        return float(sum((errors[name] / size) ** 2 for name, size in sized.items()))
 
     return min(tries, key=distance)
 
@@ -356,7 +406,11 @@ def cross_chosen(tries: Mapping[Reaction, Tried], records: pd.DataFrame) -> pd.D
 
 
 def compare_twins(
-    observed: Observed, drivers: pd.DataFrame, react: bool, progress: Progress | None = None
+    observed: Observed,
+    drivers: pd.DataFrame,
+    react: bool,
+    progress: Progress | None = None,
+    perception: bool = False,
 ) -> tuple[Reaction, pd.DataFrame, list[str]]:
     """Compare calibrated drivers with the recorded ones.
 
@@ -364,7 +418,7 @@ def compare_twins(
         observed: the records.
         drivers: see :func:`drive_twins`.
         react: also choose a reaction that all drivers share.
-        progress: see :func:`tried`.
+        progress, perception: see :func:`tried`.
 
     Returns:
         The reaction; what was measured (:func:`measure_motion`, with the columns episode and
@@ -381,7 +435,7 @@ def compare_twins(
         if accelerate(observed):
             line = _line(TWINS, found, one_step_error(observed, drivers, 0.0))
         return Reaction(), _together(found, observed), [line]
-    tries = tried(observed, drivers, progress)
+    tries = tried(observed, drivers, progress, perception)
     reaction = choose_reaction(tries, records, np.ones(len(records), bool))
     found = {
         RECORDED_DRIVERS: records,
@@ -393,7 +447,8 @@ def compare_twins(
         for who, delay in ((TWINS, 0.0), (REACTING, reaction.delay))
     }
     line = (
-        f"reaction delay {reaction.delay:g} s and acceleration noise {reaction.noise:g} m/s² "
+        f"reaction delay {reaction.delay:g} s and acceleration noise {reaction.noise:g} m/s²"
+        f"{f', noise of perceived gaps {reaction.gap_noise:g},' * bool(reaction.gap_noise)} "
         f"chosen ({100 * np.expm1(tries[reaction].growth):+.0f} % of energy from the first to the "
         f"{CARS}th in a row); below, each driver has what was chosen on others"
     )
@@ -404,7 +459,7 @@ def compare_twins(
 def accelerate(observed: Observed) -> bool:
     """Whether drivers lose a measurable part of their energy to accelerating."""
     records = measure_recorded(observed)
-    lost, energy = (records[f"{x}_{SMOOTHINGS[0]}s_j"].sum() for x in ("lost", "energy"))
+    lost, energy = (records[f"{x}_{AVERAGES[0]}s_j"].sum() for x in ("lost", "energy"))
     return bool(lost > LEAST_LOST * energy)
 
 
@@ -415,14 +470,15 @@ def _together(found: Mapping[str, pd.DataFrame], observed: Observed) -> pd.DataF
 
 
 def _line(who: str, found: Mapping[str, pd.DataFrame], one_step: float) -> str:
-    each = [ratios(found[who], found[RECORDED_DRIVERS], smoothing=width) for width in SMOOTHINGS]
+    each = [ratios(found[who], found[RECORDED_DRIVERS], smoothing=width) for width in AVERAGES]
     energies = ", ".join(f"{one['energy']:.3f}" for one in each)
     losses = ", ".join(f"{one['lost']:.2f}" for one in each)
+    parts = ", ".join(f"{value:.2f}" for name, value in each[0].items() if "lost_" in name)
     own, theirs = (found[x].mean(numeric_only=True) for x in (who, RECORDED_DRIVERS))
     return (
         f"drivers {who}: RMSPE {100 * own.rmspe:.1f} %; {energies} of the recorded energy per km, "
-        f"{losses} of what accelerating loses (speeds smoothed over {SMOOTHINGS[0]}, "
-        f"{SMOOTHINGS[1]} s); "
+        f"{losses} of what accelerating loses (speeds smoothed over {AVERAGES[0]}, "
+        f"{AVERAGES[1]} s), {parts} of it behind the calmest, middle and roughest leaders; "
         f"spectrum off by a factor {np.exp(each[0]['spectrum']):.2f}, one-step error "
         f"{one_step:.2f} m/s²; distance {each[0]['distance']:.3f} of the recorded one, gap "
         f"{own.gap_m:.1f} m against {theirs.gap_m:.1f} m, long time gaps "

@@ -1,11 +1,13 @@
 """Energy models: what driving draws from a battery or a tank, and who has which."""
 
-from lcc_rl.energy.base import EnergyModel
+from lcc_rl.energy.base import AVERAGED, AVERAGES, EnergyModel
 from lcc_rl.energy.electric import ElectricCar, PaperMotor
 from lcc_rl.energy.fleet import Fleet, as_fleet
 from lcc_rl.energy.fuel import CirclesFuel
 
 __all__ = [
+    "AVERAGED",
+    "AVERAGES",
     "CirclesFuel",
     "ElectricCar",
     "EnergyModel",

@@ -10,6 +10,11 @@ from torch import Tensor
 
 from lcc_rl.settings import Settings
 
+# Widths of moving averages of speeds before their energy is computed [s]: with a shorter one the
+# noise of records counts, with a longer one what drivers do does not.
+AVERAGES = (1.1, 3.1)
+AVERAGED = tuple(f"path_energy_{seconds:g}s_kj" for seconds in AVERAGES)  # such energies [kJ]
+
 Grade = Annotated[float, Field(ge=-0.3, le=0.3)]  # of the road [rad]
 
 

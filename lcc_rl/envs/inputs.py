@@ -19,6 +19,7 @@ from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.data.sources import LoadedEpisodes
 from lcc_rl.energy import Fleet, as_fleet
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.pattern import RING
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.settings import TARGET
@@ -138,9 +139,10 @@ def described(population: Population, cfg: StudyConfig) -> str:
     who = f"{len(gap)} human drivers ({_origin(cfg.drivers)}{taken})"
     line = f"{who} {behind}: mean v0 {speed.mean():.1f} m/s, mean T {gap.mean():.2f} s"
     reaction = getattr(population, "reaction", None)
-    if reaction is None or not (reaction.delay or reaction.noise):
+    if reaction is None or reaction == Reaction():
         return line
-    return f"{line}, reaction delay {reaction.delay:g} s, noise {reaction.noise:g} m/s²"
+    line += f", reaction delay {reaction.delay:g} s, noise {reaction.noise:g} m/s²"
+    return line + f", of perceived gaps {reaction.gap_noise:g}" * bool(reaction.gap_noise)
 
 
 def _origin(drivers: Node) -> str:

@@ -17,7 +17,7 @@ from numba.core.errors import NumbaError
 from torch import Tensor
 
 from lcc_rl.functional.machine_code import compiled
-from lcc_rl.functional.recorder import Recorder, Untranslatable
+from lcc_rl.functional.recorder import Recorder, TensorsOnly, Untranslatable
 
 log = logging.getLogger("lcc_rl")
 
@@ -35,18 +35,25 @@ class Rowwise:
         function: maps tensors ``[n, width]`` to tensors ``[n, width]``; rows do not mix.
         examples: a row of each argument, ``[1, width]``.
         what: its name in the line of the log that says that it is not translated.
-
+        make: makes machine code of its source.
     Attributes:
         translated: whether it runs as machine code.
     """
 
-    def __init__(self, function: TensorFunction, examples: Sequence[Tensor], what: str) -> None:
+    def __init__(
+        self,
+        function: TensorFunction,
+        examples: Sequence[Tensor],
+        what: str,
+        make: Callable[[str], Callable[..., None]] = compiled,
+    ) -> None:
         self.function = function
         with torch.no_grad():
             results = function(*examples)
         self.widths = [(x.shape[-1], x.numpy().dtype) for x in results]
         try:
-            self.kernel, self.tables = translated(function, examples)
+            source, self.tables = translated(function, examples)
+            self.kernel = make(source)
             self.translated = True
             self(*(x.numpy() for x in examples))
         except (Untranslatable, NumbaError) as error:
@@ -69,10 +76,8 @@ class Rowwise:
         return tuple(x.numpy() for x in tensors)
 
 
-def translated(
-    function: TensorFunction, examples: Sequence[Tensor]
-) -> tuple[Callable[..., None], list[Array]]:
-    """Return a function as machine code, and the tables that are its last arguments.
+def translated(function: TensorFunction, examples: Sequence[Tensor]) -> tuple[str, list[Array]]:
+    """Return the source of a function on numbers, and the tables that are its last arguments.
 
     Raises:
         Untranslatable: naming the operation that has no counterpart on single numbers.
@@ -83,7 +88,7 @@ def translated(
         columns = range(example.shape[-1])
         variables = [recorder.variable(f"x{place}[row, {column}]", ()) for column in columns]
         recorder.add(example, torch.tensor(variables).reshape(1, -1))
-    with torch.no_grad(), recorder:
+    with torch.no_grad(), recorder, TensorsOnly():
         results = function(*examples)
     outputs = [recorder.numbers(x, x.dtype).flatten().tolist() for x in results]
     needed = recorder.needed(variable for output in outputs for variable in output)
@@ -100,4 +105,4 @@ def translated(
     names = ", ".join(f"{name}{i}" for name, each in counts for i in range(len(each)))
     body = "".join(f"        {line}\n" for line in lines)
     source = f"def kernel({names}):\n    for row in range(len(x0)):\n{body}"
-    return compiled(source), [table.numpy() for table in recorder.tables]
+    return source, [table.numpy() for table in recorder.tables]

@@ -10,7 +10,7 @@ from inspect import signature
 import torch
 from torch import Tensor
 
-from lcc_rl.energy import Fleet, as_fleet
+from lcc_rl.energy import AVERAGED, AVERAGES, Fleet, as_fleet
 from lcc_rl.functional.safety import NEVER
 
 KILO = 1e-3
@@ -74,6 +74,39 @@ def energy_measures(
     if strange is not None:
         count = steps.squeeze(0).clamp(min=1)
         found["share_infeasible"] = (strange * alive).sum(0) / count
+    return found
+
+
+def averaged_energies(
+    speed: Tensor,
+    alive: Tensor,
+    time_step: float,
+    energy: Fleet | None = None,
+    kind: Tensor | None = None,
+) -> dict[str, Tensor]:
+    """Path energies of speeds averaged over :data:`lcc_rl.energy.AVERAGES`, of the whole way.
+
+    Neither noise of a recorded speed nor that of a model counts. The ends, where an average is not
+    whole, count as the rest does.
+
+    Args:
+        speed, alive, time_step, energy, kind: as of :func:`energy_measures`.
+
+    Returns:
+        By name of :data:`lcc_rl.energy.AVERAGED`, each ``[*batch, n, 1]`` [kJ]; NaN if no average
+        is whole.
+    """
+    energy, found = as_fleet(energy), {}
+    way = (0.5 * (speed[:-1] + speed[1:]) * alive).sum(0) * time_step
+    for name, seconds in zip(AVERAGED, AVERAGES, strict=True):
+        width = round(seconds / time_step)
+        if width >= len(speed):
+            found[name] = torch.full_like(way, torch.nan)
+            continue
+        mean = speed.unfold(0, width, 1).mean(-1)
+        power = energy.power(mean[:-1], mean.diff(dim=0) / time_step, kind)
+        own = energy_measures(power, mean, alive[width - 1 :], time_step, energy, kind)
+        found[name] = own["path_energy_kj"] * way / own["distance_m"]
     return found
 
 

@@ -15,9 +15,10 @@ from torch import Tensor
 
 from lcc_rl.config.words import RECORDED
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.energy import Fleet, as_fleet
+from lcc_rl.energy import AVERAGED, Fleet, as_fleet
 from lcc_rl.evaluation.metrics import (
     KILO,
+    averaged_energies,
     energy_measures,
     measured_ttc,
     safety_measures,
@@ -39,6 +40,7 @@ SUMMED = (
     "steady_energy_kj",
     "acceleration_loss_kj",
     "path_energy_kj",
+    *AVERAGED,
 )
 # Columns of an episode that the steps of a sample episode repeat.
 SAMPLED = (
@@ -115,14 +117,9 @@ def measures(
         if "power" not in series:
             continue
         kinds = series.get(CLASS[1])
-        found = energy_measures(
-            series["power"],
-            series["speed"],
-            alive.unsqueeze(-2),
-            time_step,
-            energy,
-            None if kinds is None else kinds[0],
-        )
+        how = alive.unsqueeze(-2), time_step, energy, None if kinds is None else kinds[0]
+        found = energy_measures(series["power"], series["speed"], *how)
+        found |= averaged_energies(series["speed"], *how)
         for name, value in found.items():
             added = value.mean(-2) if name.startswith("share_") else value.sum(-2)
             columns[f"{group}_{name}"] = added

@@ -32,7 +32,7 @@ from lcc_rl.evaluation.named import (
 )
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
-from lcc_rl.pieces import RecordedStart
+from lcc_rl.pieces import Observation, Piece, RecordedStart
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.results.runs import flatten, told_apart
 from lcc_rl.settings import TARGET, path_of
@@ -238,6 +238,9 @@ def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
     """Return the scenario under study with the agent, and where it has none the filter, of own."""
     cfg = deepcopy(cfg)
     cfg.agent = own.agent
+    seen = own.observation.made(Piece)
+    if isinstance(seen, Observation) and seen.tells_presence(own.scenario.vehicles):
+        cfg.observation = cfg.observation.changed(presence=True)
     if cfg.scenario.filters.get(AUTOMATED) is None and own.scenario.filters.get(AUTOMATED):
         log.info("the policy of variant %s keeps the filter of its training", own.variant)
         cfg.scenario.filters[AUTOMATED] = own.scenario.filters[AUTOMATED]
@@ -273,8 +276,8 @@ def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Popu
     """
     weights, own = policy
     check_scenario(path, own, cfg)
-    other = _of_training(cfg, own)
-    other.variant, other.observation = own.variant, own.observation
+    other = _of_training(replace(cfg, observation=own.observation), own)
+    other.variant = own.variant
     other.deployed = own.deployed
     other.scenario.controllers[AUTOMATED] = own.scenario.controllers[AUTOMATED]
     for name, node in own.scenario.pieces.items():

@@ -181,20 +181,23 @@ class Reaction:
     Args:
         delay: age of the speed, gap and relative speed that a driver reacts to [s].
         noise: standard deviation of a noise of the acceleration, see :class:`NoiseStep` [m/s²].
+        gap_noise: the same of the logarithm of the perceived gap.
     """
 
     delay: float = 0.0
     noise: float = 0.0
+    gap_noise: float = 0.0
 
 
 NOISE_TIME = 0.7  # time constant of the noise of the acceleration [s]
+GAP_NOISE_TIME = 2.0  # that of the noise of the perceived gap [s]
 
 
 @dataclass(frozen=True)
 class NoiseStep:
-    """A step of the noise of the acceleration, exact for any time step.
+    """A step of a smooth noise, exact for any time step.
 
-    The noise is white noise behind two low-passes of the time constant :data:`NOISE_TIME`, so that
+    The noise is white noise behind two low-passes of one time constant, so that
     it has a finite jerk, as a pedal has; an Ornstein–Uhlenbeck process has one low-pass only. With
     z ~ N(0, 1), xₖ = 2ρ xₖ₋₁ − ρ² xₖ₋₂ + c z has the standard deviation 1; neighbours have the
     correlation ``linked``.
@@ -210,9 +213,9 @@ class NoiseStep:
     linked: float
 
     @classmethod
-    def of(cls, time_step: float) -> Self:
-        """Return the step of a time step [s]."""
-        kept = math.exp(-time_step / NOISE_TIME)
+    def of(cls, time_step: float, time_constant: float = NOISE_TIME) -> Self:
+        """Return the step of a time step and a time constant [s]."""
+        kept = math.exp(-time_step / time_constant)
         new = math.sqrt((1.0 - kept * kept) ** 3 / (1.0 + kept * kept))
         return cls(kept, new, 2.0 * kept / (1.0 + kept * kept))
 
@@ -234,6 +237,7 @@ def follow(
     time_step: float,
     late: int = 0,
     disturbed: Callable[[int, Tensor], Tensor] | None = None,
+    perceived: Callable[[Tensor], Tensor] | None = None,
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """Drive a follower behind a leader, step by step (A18).
 
@@ -247,6 +251,7 @@ def follow(
         late: steps by which speed, gap and relative speed are old when the driver reacts; until
             then, they are those of the start.
         disturbed: makes the command that is executed out of the number of the step and the law's.
+        perceived: makes the gap that the driver sees out of the true one, once a step.
 
     Yields:
         Speed, gap and executed acceleration after each step, ``[*batch]``.
@@ -255,7 +260,10 @@ def follow(
     for step, (ahead, ahead_reached) in enumerate(pairwise(leader_speed)):
         now = (speed, gap, speed - ahead)
         seen.extend([now] * (1 if seen else late + 1))
-        command = law(*seen[0], *own)
+        own_speed, distance, approach_rate = seen[0]
+        if perceived is not None:
+            distance = perceived(distance)
+        command = law(own_speed, distance, approach_rate, *own)
         if disturbed is not None:
             command = disturbed(step, command)
         reached, executed = advance_speed(speed, command, time_step)

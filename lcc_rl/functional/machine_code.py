@@ -32,8 +32,19 @@ def read(table: Any, place: Any) -> Any:
     return table[place]
 
 
+@numba.njit
+def layer(weights: Any, bias: Any, inputs: Any) -> Any:
+    """Return ``bias`` and the sum of the rows of ``weights``, each times one of the inputs."""
+    found = bias.copy()
+    for place, value in enumerate(inputs):
+        for unit in range(len(found)):
+            found[unit] += value * weights[place, unit]
+    return found
+
+
 SCOPE = {
     "pick": pick,
+    "layer": layer,
     "read": read,
     "ndtri": ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(
         get_cython_function_address("scipy.special.cython_special", "ndtri")
@@ -68,6 +79,8 @@ def kept(source: str) -> Callable[..., None]:
     folder (``NUMBA_CACHE_DIR``), under a name that contains a hash of the source. If it cannot be
     kept or read, the function is compiled for this process.
     """
+    if "ndtri(" in source:  # a pointer into this process
+        return compiled(source)
     # Sums may be fused with products; nothing else is changed for speed.
     compile_it = partial(numba.njit, fastmath={"contract"}, error_model="numpy", nogil=True)
     name = f"kernel_{hashlib.sha256(source.encode()).hexdigest()[:16]}"

@@ -28,11 +28,14 @@ class VehicleString:
         roles: role of every vehicle, front to back; where places are drawn, in any order.
         drawn: places are drawn anew in every episode; the counts of the roles stay.
         ring: the first vehicle follows the last.
+        measured: what a vehicle sees of itself and its neighbours is measured from outside, and
+            read by the names of the views.
     """
 
     roles: tuple[str, ...] = (AUTOMATED,)
     drawn: bool = False
     ring: bool = False
+    measured: bool = False
 
     def __len__(self) -> int:
         return len(self.roles)

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 MOST_STATEMENTS = 4000  # numba takes 2 to 4 s for each thousand
@@ -30,6 +31,7 @@ ARITHMETIC = {
     "sin": "np.sin({0})",
     "atanh": "np.arctanh({0})",
     "tanh": "np.tanh({0})",
+    "relu": "pick({0} < 0, f32(0), {0})",
     "special_ndtri": "f32(ndtri({0}))",
     "pow": "{0} ** {1}",
     "lerp": "{0} + {2} * ({1} - {0})",
@@ -53,7 +55,7 @@ COMPARISONS = {
     "eq": "{0} == {1}",
     "ne": "{0} != {1}",
 }
-METHODS = ("bitwise_not", "clamp", "index", "searchsorted", "where")  # methods of Recorder
+METHODS = ("addmm", "bitwise_not", "clamp", "index", "searchsorted", "where")  # methods of Recorder
 REDUCTIONS = {"sum": "add", "any": "logical_or", "all": "logical_and"}
 # They move entries, whatever these are, and are applied to the numbers of the variables.
 MOVES = {
@@ -65,8 +67,22 @@ MOVES = {
 SHAPES = {"zeros_like", "ones_like", "full_like", "empty_like", "new_zeros", "new_ones", "new_full"}
 
 
+TAKING = (Tensor.numpy, Tensor.__array__, Tensor.tolist)  # methods that leave tensors
+
+
 class Untranslatable(Exception):
     """An operation has no counterpart on single numbers."""
+
+
+class TensorsOnly(TorchFunctionMode):
+    """Refuses to take numbers out of tensors, of which a recorder would see constants."""
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        if func in TAKING:
+            raise Untranslatable(f"it takes numbers out of tensors by {func.__name__}")
+        return func(*args, **(kwargs or {}))
 
 
 class Recorder(TorchDispatchMode):
@@ -198,6 +214,18 @@ class Recorder(TorchDispatchMode):
         parts = variables.flatten(0, len(dims) - 1).unbind(0)
         formula = ARITHMETIC[REDUCTIONS[name]]
         return reduce(lambda *two: self._stated(formula, two), parts).reshape(result.shape)
+
+    def _addmm(self, result: Tensor, bias: Tensor, value: Tensor, weight: Tensor) -> Tensor:
+        """Record a layer of a network: each row is one array of numbers."""
+        if self.of(bias) is not None or self.of(weight) is not None:
+            raise Untranslatable("weights that depend on the inputs")
+        tables = f"{self._table(weight.contiguous())}, {self._table(bias)}"
+        rows = []
+        for row in self.numbers(value, result.dtype).tolist():
+            numbers = "".join(f"{{{place}}}, " for place in range(len(row)))
+            array = self.variable(f"layer({tables}, ({numbers}))", tuple(row))
+            rows.append([self.variable(f"{{0}}[{place}]", (array,)) for place in range(len(bias))])
+        return torch.tensor(rows, dtype=torch.int64)
 
     def _bitwise_not(self, result: Tensor, value: Tensor) -> Tensor:
         return self._each("bitwise_xor", result.dtype, value, -1)

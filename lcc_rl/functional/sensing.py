@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from lcc_rl.functional.actuation import PairState
+from lcc_rl.functional.layout import join
+
+ROUNDING = 0.02  # of the rate of a gap in single precision, and some more [m/s]
 
 
 @dataclass(frozen=True)
@@ -17,6 +21,7 @@ class Sensing:
     Args:
         gap, speed, ahead: largest errors of the gap [m], of the own speed and of that of the
             vehicle ahead [m/s].
+        scale: largest error of both speeds as a share of them.
         late: age of a measurement that arrives, in steps.
         longest: steps in a row, at the most, in which none arrives and the last one stays.
     """
@@ -24,6 +29,7 @@ class Sensing:
     gap: float
     speed: float
     ahead: float
+    scale: float
     late: int
     longest: int
 
@@ -39,10 +45,50 @@ class Sensing:
         """
         return replace(
             measured,
-            speed=measured.speed + self.speed,
+            speed=(measured.speed + self.speed) / (1.0 - self.scale),
             gap=measured.gap - self.gap,
-            ahead=(measured.ahead - self.ahead).clamp(min=0.0),
+            ahead=(measured.ahead - self.ahead).clamp(min=0.0) / (1.0 + self.scale),
         )
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """By how much the rate of the measured gap differs from the measured relative speed.
+
+    A gap is measured by another instrument than speeds are, or replayed from other columns of a
+    record. Where they disagree, nobody knows which is right: each limit is kept by the worse.
+
+    Args:
+        sensing: bounds of errors, which explain some of the difference.
+        time_step: T [s].
+        settling: time constant with which differences are averaged [s].
+    """
+
+    sensing: Sensing
+    time_step: float
+    settling: float = 0.5
+
+    def next(self, kept: Tensor, gap: Tensor, relative: Tensor) -> Tensor:
+        """Return the memory after a measurement, ``[…, 3]``; one of zeros begins anew.
+
+        It holds 1, the measured gap plus the way of half a step [m], from which the next gap is
+        predicted by the trapezoidal rule, and the average difference [m/s].
+        """
+        begun, predicted, average = kept.split(1, -1)
+        half = 0.5 * self.time_step * relative
+        share = (1.0 - math.exp(-self.time_step / self.settling)) * begun
+        average = average + share * ((gap - half - predicted) / self.time_step - average)
+        return join([torch.ones_like(gap), gap + half, average], -1)
+
+    def difference(self, kept: Tensor, relative: Tensor) -> Tensor:
+        """Return what the gap grows faster than the relative speed says [m/s].
+
+        Zero where rounding explains it, or the errors that the sensors are known to have.
+        """
+        sensing, found = self.sensing, kept[..., 2:]
+        held = self.time_step * sensing.longest * relative.abs()  # no measurement arrived
+        explained = (2.0 * sensing.gap + held) / self.settling + sensing.speed + sensing.ahead
+        return torch.where(found.abs() > explained + ROUNDING, found, 0.0)
 
 
 def brought_up(

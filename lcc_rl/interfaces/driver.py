@@ -1,191 +1,220 @@
-"""Policies and rules that drive vehicles of another simulator by their measurements.
-
-A driver consists of pieces of the environment: the network with its filter (:mod:`.export`), the
-memory that it observes, or the controller.
-"""
+"""Policies and rules that drive vehicles of another simulator by their measurements."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
 
+import numpy as np
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
-from lcc_rl.config.nodes import Node
+from lcc_rl.config import load
 from lcc_rl.config.words import FILTERED
-from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.checks import BATCH, check_step
-from lcc_rl.errors import ConfigError, require
+from lcc_rl.envs.rowwise import Array, Rowwise
+from lcc_rl.errors import ConfigError, Diverged, require, unknown_name
 from lcc_rl.evaluation.named import controller_of, is_policy, label_of, setting_of
-from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
-from lcc_rl.functional.string import entries_ahead
-from lcc_rl.interfaces.exported import ExportedPolicy, exported_policy
-from lcc_rl.pieces import Controller, ObservationMemory
-from lcc_rl.pieces.base import SEED, STEP, Key, State, StepTransform
-from lcc_rl.pieces.world import World
-from lcc_rl.results.policies import load_policy
-
-# Each driven vehicle is an episode of its own: who is ahead leads, who is behind follows.
-STRING = VehicleString((AUTOMATED, HUMAN))
-COMMAND_KEY = ("command", AUTOMATED)
-PRESENT_KEY = ("behind", "present")
-MEASURED_KEYS: tuple[Key, ...] = (
-    *(("leader", name) for name in ("speed", "acceleration")),
-    *(("vehicles", name) for name in ("speed", "gap", "relative_speed", "acceleration")),
-    *(PRESENT_KEY, SEED, STEP),
+from lcc_rl.functional.machine_code import kept
+from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.functional.recorder import Untranslatable
+from lcc_rl.interfaces.exported import (
+    BEHIND_PRESENT,
+    DrivingProgram,
+    described_input,
+    driving,
+    measuring,
+    program,
 )
+from lcc_rl.pieces import CBFFilter, Controller
 
-
-class Measured(NamedTuple):
-    """Measurements of one vehicle, of the vehicle ahead and of the one behind.
-
-    Speeds [m/s], gaps bumper to bumper [m], accelerations executed during the last step [m/s²];
-    ``present`` is 1 if there is a vehicle behind, else 0.
-    """
-
-    speed: float
-    gap: float
-    acceleration: float
-    speed_ahead: float
-    acceleration_ahead: float
-    speed_behind: float
-    gap_behind: float
-    acceleration_behind: float
-    present: float
-
-
-def state_of(rows: Sequence[Measured]) -> State:
-    """Return measurements as entries of an environment, one row per vehicle."""
-    table = torch.tensor(rows, dtype=torch.float32)
-    seen = dict(zip(Measured._fields, table.split(1, -1), strict=True))
-    state: State = {PRESENT_KEY: seen["present"]}
-    for name in ("speed", "acceleration"):
-        state["leader", name] = seen[f"{name}_ahead"]
-    for name in ("speed", "gap", "acceleration"):
-        own, behind = seen[name], seen[f"{name}_behind"]
-        state["vehicles", name] = torch.stack([own, behind], 1)
-    speed = state["vehicles", "speed"]
-    state["vehicles", "relative_speed"] = entries_ahead(state["leader", "speed"], speed) - speed
-    return state
+# Own motion, that of the vehicle ahead and of the one behind.
+MEASURED = (
+    *("self.speed", "self.gap", "self.acceleration", "ahead.speed", "ahead.acceleration"),
+    *("behind.speed", "behind.gap", "behind.acceleration", BEHIND_PRESENT),
+)
+KNOWN = set(MEASURED)
+WIDEST = 200  # numbers remembered in machine code
 
 
 class Driver:
-    """Computes accelerations of any number of vehicles, and updates their memories.
+    """Computes the accelerations of any number of cars, and keeps what each remembers.
 
     Args:
         name: a run, a run folder, a policy file, ``pretrained/<name>``, or a controller by name
             (``"idm_acc"``), as object, class, function, file or node, as :func:`lcc_rl.compare`
-            takes it.
-        time_step: duration of a step of the other simulator [s].
+            takes it. A rule whose name ends in ``_filtered`` drives behind the safety filter.
+        time_step: duration of a step of the simulator [s]; a policy needs that of its training.
         trust: modules outside this package that a policy may name.
+        safety: the safety filter behind which it drives; None: a policy's own, and for rules whose
+            name ends in ``_filtered`` that of ``+filter=cbf``.
+        seed: seed of the drivers' noise; each car that begins draws by the next one.
 
     Attributes:
-        kept: keys of the entries that are remembered from step to step.
+        names: what :meth:`step` reads, SI units: ``"self.gap"`` …
+        cars: the cars of the last step.
 
     Raises:
-        LccError: if the policy or rule is unknown, was trained with another step, reads an entry
-            that is not measured, or returns another shape than a row per vehicle.
+        LccError: if the policy or rule is unknown, was trained with another step, reads what is
+            not measured, or returns another shape than a row per vehicle.
+
+    Examples:
+        >>> driver = Driver("idm_acc", time_step=0.1)
+        >>> driver.names
+        ['self.speed', 'self.gap', 'ahead.speed']
+        >>> round(driver.step({"self.speed": 12.0, "self.gap": 20.0, "ahead.speed": 13.0}), 2)
+        2.6
     """
 
-    def __init__(self, name: Any, time_step: float, trust: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        name: Any,
+        time_step: float,
+        trust: Sequence[str] = (),
+        safety: CBFFilter | None = None,
+        seed: int = 0,
+    ) -> None:
         who = setting_of(name)
         self.name = who if isinstance(who, str) else label_of(who)
-        self.time_step = time_step
-        self.module: ExportedPolicy | None = None
-        pieces: list[StepTransform] = []
-        filtered = isinstance(who, str) and who.endswith(FILTERED)
-        require(not filtered, f"{who}: there is no safety filter here, but that of a policy")
+        self.time_step, self.seed = time_step, seed
         if is_policy(who):
-            pieces += self._policy(who, trust)
+            self.program = program(who, trust, safety=safety)
+            trained = self.program.controller.time_step
+            if abs(trained - time_step) > 1e-9:
+                raise ConfigError(
+                    f"{who} was trained with steps of {trained:g} s, the simulation has "
+                    f"{time_step:g} s (--step-length {trained:g} sets SUMO's)"
+                )
         else:
-            pieces.append(self._build(Controller, controller_of(who), AUTOMATED))
-        self.pieces = pieces
-        self.kept = [key for piece in pieces for key in (*piece.targets, *piece.constants)]
-        self.kept = [key for key in self.kept if key != COMMAND_KEY]
+            self.program = self._rule(who, safety)
+        self.names = self.program.names
+        self.behind = {x for x in self.names if x.startswith("behind.")} - {BEHIND_PRESENT}
         self._check()
+        self.reset()
 
-    def _policy(self, name: str, trust: Sequence[str]) -> list[StepTransform]:
-        self.module, (_, cfg) = exported_policy(name, trust), load_policy(name, trust=trust)
-        trained = float(cfg.scenario.time_step)
-        if abs(trained - self.time_step) > 1e-9:
-            raise ConfigError(
-                f"{name} was trained with steps of {trained:g} s, the simulation has "
-                f"{self.time_step:g} s (--step-length {trained:g} sets SUMO's)"
-            )
-        memory = cfg.scenario.pieces.get("memory")
-        wanted = any(column.startswith("memory.") for column in self.module.names)
-        return [self._build(ObservationMemory, memory, "memory")] if wanted and memory else []
-
-    def _build(self, kind: type[StepTransform], node: Node, name: str) -> Any:
-        return node.made(kind).bind(World(STRING, self.time_step, population=bootstrap()), name)
+    def _rule(self, who: Any, safety: CBFFilter | None) -> DrivingProgram:
+        if safety is None and isinstance(who, str) and who.endswith(FILTERED):
+            filters = load("evaluate", ["variant=idm", "+filter=cbf"]).scenario.filters
+            safety = filters[AUTOMATED].made(CBFFilter)
+        node = controller_of(who, safety is not None and safety.time_gap is not None)
+        return driving([node.made(Controller)], safety, measuring(self.time_step))
 
     def _check(self) -> None:
-        for key in self.reads():
-            if key not in (*MEASURED_KEYS, *self.kept):
-                known = ", ".join(".".join(key) for key in MEASURED_KEYS)
+        for name in self.names:
+            if name not in MEASURED:
+                known = ", ".join(MEASURED)
                 raise ConfigError(
-                    f"{self.name} reads {'.'.join(key)}, which is not measured here, only {known}"
+                    f"{self.name} reads {name}, which is not measured here, only {known}"
                 )
-        none = torch.zeros(BATCH, 1).long()
-        trial = state_of([Measured(*[1.0] * len(Measured._fields))] * BATCH) | {
-            SEED: none,
-            STEP: none,
-        }
-        before = {**trial, **self.begin(trial)}
-        for piece in self.pieces:
-            check_step(piece, before, trial)
+        self.program.step(*self._examples(BATCH), apply=check_step)  # type: ignore[misc]
 
-    def reads(self) -> list[Key]:
-        """Return the keys of all entries that the driver reads."""
-        names = [] if self.module is None else self.module.names
-        sources = [key for piece in self.pieces for _, key in piece.needs]
-        return [*sources, *(place(name)[0] for name in names)]
+    def _examples(self, count: int) -> list[Tensor]:
+        """Return measurements, and the memory of cars that begin, if there is one."""
+        state, seeds = torch.ones(count, len(self.names)), torch.zeros(count, 1).long()
+        return [state, self.program.begin(state.double(), seeds)] if self.program.width else [state]
 
-    def begin(self, measured: State) -> State:
-        """Return the memories of vehicles that are driven for the first time.
+    def reset(self, cars: Sequence[Hashable] | None = None) -> None:
+        """Let cars begin anew: what they remember begins with their next measurement.
 
         Args:
-            measured: the entries :data:`MEASURED_KEYS`, one row per vehicle.
+            cars: which cars of the last step; None: all, and their seeds.
         """
-        start = TensorDict(batch_size=measured[STEP].shape[:1])
-        for key, value in measured.items():
-            start.set(key, value)
-        for piece in self.pieces:
-            piece.begin(TensorDict(batch_size=start.batch_size), start)
-        return {key: start.get(key) for key in self.kept}
+        if cars is None:
+            self.cars: Sequence[Any] = ()
+            self.memory, self.begun = np.zeros((0, self.program.width)), 0
+            return
+        stay = [place for place, car in enumerate(self.cars) if car not in cars]
+        self.cars, self.memory = [self.cars[place] for place in stay], self.memory[stay]
 
-    @torch.no_grad()
-    def __call__(self, measured: State, kept: State) -> tuple[Tensor, State]:
-        """Return accelerations ``[vehicles]`` [m/s²] and the memories after this step.
+    def step(self, measured: Mapping[str, Any], cars: Sequence[Hashable] | None = None) -> Any:
+        """Return the acceleration of each car for the step that begins [m/s²].
 
         Args:
-            measured: the entries :data:`MEASURED_KEYS`, one row per vehicle; see :func:`state_of`.
-            kept: memories of the step before, or of :meth:`begin`.
+            measured: numbers of one car by name, or of several cars as arrays of one length. A car
+                has no vehicle behind if none of its entries is given, or where
+                ``"behind.present"`` is 0.
+            cars: ids of the cars, in the order of the arrays; by default 0, 1, 2 … A car that the
+                last step did not have begins anew, one that is no longer there is forgotten.
+
+        Returns:
+            A number where numbers are given, else an array, ``[cars]``.
+
+        Raises:
+            ConfigError: if a measurement is missing or unknown, or sizes differ.
+            Diverged: if a command is no number; nothing is remembered of the step then.
         """
-        reached = dict(measured)
-        for piece in self.pieces:
-            piece.derive({**measured, **kept}, reached)
-        after = {key: reached[key] for key in self.kept}
-        if self.module is None:
-            return reached[COMMAND_KEY].flatten(), after
-        columns = [value(reached, name) for name in self.module.names]
-        return self.module(torch.stack(columns, -1)).flatten(), after
+        state, alone = self._state(measured)
+        self._admit(range(len(state)) if cars is None else list(cars), state)
+        command, *memory = self._rows(state, *[self.memory] * (self.program.width > 0))
+        if not np.isfinite(command).all():
+            place = int(np.isfinite(command).argmin())
+            what = f"the command of {self.cars[place]} is {command[place, 0]}"
+            raise Diverged(f"{self.name}: {what}")
+        if memory:
+            (self.memory,) = memory
+        return float(command[0, 0]) if alone else command[:, 0]
+
+    def _admit(self, cars: Sequence[Hashable], state: Array) -> None:
+        """Take the cars of a step: bring what they remember into their order."""
+        if cars == self.cars:
+            return
+        words = f"cars must be {len(state)} different ids, as many as measured, got {cars}"
+        require(len(cars) == len(set(cars)) == len(state), words)
+        places = {car: place for place, car in enumerate(self.cars)}
+        stay = [row for row, car in enumerate(cars) if car in places]
+        new = [row for row, car in enumerate(cars) if car not in places]
+        if self.program.width:
+            memory = np.zeros((len(state), self.program.width))
+            memory[stay] = self.memory[[places[cars[row]] for row in stay]]
+            given = torch.from_numpy(state[new]).double()
+            seeds = self.seed + self.begun + torch.arange(len(new)).unsqueeze(-1)
+            memory[new] = self.program.begin(given, seeds).numpy()
+            self.memory = memory
+        self.cars, self.begun = cars, self.begun + len(new)
+
+    def _state(self, measured: Mapping[str, Any]) -> tuple[Array, bool]:
+        """Return what the program reads, ``[cars, names]``, and whether numbers were given."""
+        if unknown := measured.keys() - KNOWN:
+            raise unknown_name("measurement", str(min(unknown, key=str)), MEASURED)
+        try:
+            measured = self._completed(measured) if self.behind else measured
+            columns = [np.asarray(measured[name], np.float32) for name in self.names]
+            shape = max((column.shape for column in columns), key=len)
+            state = np.empty((math.prod(shape), len(columns)), np.float32)
+            for place, column in enumerate(columns):
+                state[:, place] = column
+        except KeyError as error:
+            name, unit, meaning = described_input(error.args[0])
+            words = f"{self.name} reads {name}, which is not given: {meaning} [{unit}]"
+            raise ConfigError(words) from error
+        except ValueError as error:
+            words = f"measured must hold numbers, or arrays of one length: {error}"
+            raise ConfigError(words) from error
+        return state, not shape
+
+    def _completed(self, measured: Mapping[str, Any]) -> dict[str, Any]:
+        """Return measurements with those of a vehicle behind, also where there is none.
+
+        A policy that observes whether there is one is given zeros then; any other a vehicle at the
+        own speed and gap.
+        """
+        found, absent = dict(measured), measured.keys().isdisjoint(self.behind)
+        present = found.setdefault(BEHIND_PRESENT, float(not absent))
+        for name in () if np.all(present) else self.behind:
+            entry = name.partition(".")[2]
+            zero = BEHIND_PRESENT in self.names or entry == "acceleration"
+            nobody = 0.0 if zero else measured[f"self.{entry}"]
+            found[name] = nobody if absent else np.where(present, found[name], nobody)
+        return found
+
+    @cached_property
+    def _rows(self) -> Rowwise:
+        """The program by rows, once it is needed."""
+        make = kept if self.program.width <= WIDEST else _by_tensors
+        return Rowwise(self.program.step, self._examples(1), self.name, make)
 
 
-def place(name: str) -> tuple[Key, int]:
-    """Return the key of an exported policy's input, and its row or column in that entry."""
-    view, entry, *column = name.split(".")
-    if (view, entry) == PRESENT_KEY:
-        return PRESENT_KEY, int(*column)
-    if view == "memory":
-        return (view, entry), int(*column)
-    key = {"self": "vehicles", "ahead": "leader", "behind": "vehicles"}.get(view, view)
-    return (key, ".".join([entry, *column])), int(view == "behind")
-
-
-def value(state: State, name: str) -> Tensor:
-    """Return an input of an exported policy, ``[vehicles]``."""
-    key, index = place(name)
-    return state[key].flatten(1)[:, index]
+def _by_tensors(source: str) -> Any:
+    raise Untranslatable(f"machine code for more than {WIDEST} remembered numbers takes minutes")

@@ -23,7 +23,7 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.errors import ConfigError, how_to_install, require, unknown_name
 from lcc_rl.evaluation.foreign import network_of
 from lcc_rl.evaluation.named import is_policy, rules
-from lcc_rl.interfaces.exported import Remembering, described_input, program
+from lcc_rl.interfaces.exported import described_input, program
 from lcc_rl.interfaces.onnx_policy import MAKES, TAKES
 from lcc_rl.interfaces.ring_page import ring_page
 from lcc_rl.io.atomic import atomic_path, new_file
@@ -94,14 +94,13 @@ def _program(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> tupl
     """Return the exported program, and what is to know about it as JSON."""
     module = program(policy, trust, cfg)
     inputs = [described_input(name)._asdict() for name in module.names]
-    own = module.policy if isinstance(module, Remembering) else module
     about: dict[str, Any] = {
         "policy": str(policy if cfg is None else type(policy).__name__),
         "lcc_rl": __version__,
         "inputs": inputs,
     }
-    about |= {"output": "acceleration [m/s²]", "filter": own.safety is not None}
-    widths = [len(module.names)] + ([module.width] if isinstance(module, Remembering) else [])
+    about |= {"output": "acceleration [m/s²]", "filter": module.safety is not None}
+    widths = [len(module.names), module.width][: 1 + (module.width > 0)]
     batch = dict(zip(TAKES, [{0: torch.export.Dim("batch", min=1)}] * len(widths), strict=False))
     examples = tuple(torch.ones(2, width) for width in widths)
     made = torch.export.export(module, examples, dynamic_shapes=batch)

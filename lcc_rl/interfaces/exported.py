@@ -1,127 +1,186 @@
-"""Trained policies as modules of plain tensors, from measurements to accelerations."""
+"""Policies and rules as programs of plain tensors: from what a vehicle measures to accelerations.
+
+A program consists of pieces of the environment in their order: what a policy remembers and
+observes, the controller, the safety filter. :mod:`.export` writes it to files, :mod:`.driver` runs
+it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from pydantic import InstanceOf
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.data import Unbounded
 
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import constant_profiles
-from lcc_rl.envs.step import pieces_of
+from lcc_rl.envs.step import pieces_of, read_before
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import with_weights
-from lcc_rl.pieces import Action, CBFFilter, Observation
-from lcc_rl.pieces.base import ROLE, Piece, declared
-from lcc_rl.pieces.cbf import FILTER_READS
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
+from lcc_rl.pieces import Action, CBFFilter, Controller, Observation
+from lcc_rl.pieces.base import (
+    OBSERVATION,
+    ROLE,
+    SEED,
+    STEP,
+    Key,
+    Piece,
+    RoleTransform,
+    State,
+    StepTransform,
+    declared,
+    next_key,
+)
 from lcc_rl.pieces.knowledge import ObservationMemory
-from lcc_rl.pieces.views import VEHICLES
+from lcc_rl.pieces.views import BEHIND, VEHICLES
+from lcc_rl.pieces.world import World
 from lcc_rl.results.policies import load_policy
+from lcc_rl.settings import Positive, values
 
 # Entries computed inside from other measurements: v_ahead − v.
 DERIVED_INPUTS = {
     "self.relative_speed": ("ahead.speed", "self.speed"),
     "behind.relative_speed": ("self.speed", "behind.speed"),
 }
-BEHIND_PRESENT, REMEMBERED = "behind.present", "memory.entries."
+BEHIND_PRESENT = "behind.present"
+COMMAND_KEY = ("command", AUTOMATED)
 
 
 class Input(NamedTuple):
-    """A column of an exported policy's input: its name, unit and meaning."""
+    """A column of a program's input: its name, unit and meaning."""
 
     name: str
     unit: str
     meaning: str
 
 
-class ExportedPolicy(nn.Module):
+class NetworkController(Controller):
+    """Commands the action of a network, in [−1, 1], times the largest acceleration."""
+
+    network: InstanceOf[nn.Module]  # from the scaled observation to actions
+    max_acceleration: Positive  # of action 1, in both directions [m/s²]
+
+    reads = (next_key(OBSERVATION),)
+
+    def setup(self, world: World) -> None:
+        """Read the observation."""
+        self.declare(world)
+        self.layers = self.network  # as a part of this module
+
+    def command(self, observation: Tensor) -> Tensor:
+        """Return the commands."""
+        return self.max_acceleration * self.layers(observation.flatten(1)).unsqueeze(1)
+
+
+class DrivingProgram(nn.Module):
     """From measurements ``[batch, inputs]`` to accelerations ``[batch, 1]`` [m/s²].
 
+    A program that remembers takes and returns its memory, ``[batch, width]``, too. Where its first
+    number is zero, a vehicle begins anew.
+
     Args:
-        network: from the scaled observation to actions in [−1, 1].
-        observation: the piece that gathers and scales measurements.
-        action: the piece that turns actions into accelerations.
-        safety: the safety filter, or None.
-        memory: the piece that remembers what the columns ``memory.entries.…`` hold, or None.
+        pieces: a policy's memory and observation, the controller, the safety filter, in this order
+            and bound to :func:`measuring`.
+
+    Attributes:
+        names: the inputs, such as ``"self.gap"``.
+        inputs: the inputs that each entry is made of.
+        kept: the entries that are remembered: their specs.
+        width: how many numbers the memory has, 0 if there is none.
     """
 
-    constants: Tensor
-
-    def __init__(
-        self, network: nn.Module, observation: Observation, action: Action, safety: Any, memory: Any
-    ) -> None:
+    def __init__(self, pieces: Sequence[Piece]) -> None:
         super().__init__()
-        self.network, self.largest, self.safety = network, action.max_acceleration, safety
-        self.memory = memory
-        self.register_buffer("constants", observation.factors.clone())
-        seen = observation.columns()
-        needed = [name for column in seen for name in column]
-        needed += FILTER_READS if safety is not None else ()
-        flat = [base for name in needed for base in DERIVED_INPUTS.get(name, (name,))]
-        self.names = list(dict.fromkeys(flat))
-        self.columns = [[self._places(name) for name in column] for column in seen]
+        self.pieces, self.parts = list(pieces), nn.ModuleList(pieces)
+        self.controller = next(p for p in pieces if isinstance(p, Controller))
+        self.safety = next((p for p in pieces if isinstance(p, CBFFilter)), None)
+        self.observation = next((p for p in pieces if isinstance(p, Observation)), None)
+        # The observation's inputs come first.
+        inner = sorted(pieces, key=lambda piece: isinstance(piece, ObservationMemory))
+        needs = [key for piece in inner for _, key in piece.needs]
+        before, clock = read_before(pieces), [key for key in (SEED, STEP) if key in needs]
+        self.kept: dict[Key, Any] = {key: Unbounded((1,), dtype=torch.int64) for key in clock}
+        for piece in pieces:
+            own = [key for key in piece.entries if key in before]
+            self.kept |= piece.specs(torch.Size([]), None, own)
+        self.sizes = [spec.shape.numel() for spec in self.kept.values()]
+        self.width = 1 + sum(self.sizes) if self.kept else 0
+        written = {SEED, STEP}.union(*(piece.entries for piece in pieces))
+        self.inputs = {key: self._inputs(".".join(key)) for key in needs if key not in written}
+        self.names = list(dict.fromkeys(name for names in self.inputs.values() for name in names))
 
-    def _places(self, name: str) -> tuple[int, ...]:
-        bases = DERIVED_INPUTS.get(name, (name,))
-        if name == "behind.relative_speed" and BEHIND_PRESENT in self.names:
-            bases = (*bases, BEHIND_PRESENT)
-        return tuple(self.names.index(base) for base in bases)
+    def _inputs(self, name: str) -> tuple[str, ...]:
+        """Return the inputs that an entry is made of; several numbers are an input each."""
+        columns = [] if self.observation is None else self.observation.columns()
+        several = tuple(column for column, *_ in columns if column.startswith(f"{name}."))
+        return several or DERIVED_INPUTS.get(name, (name,))
 
-    def _value(self, state: Tensor, places: tuple[int, ...]) -> Tensor:
-        first, *others = (state[:, place : place + 1] for place in places)
-        difference = first - others[0] if others else first
-        return difference * others[1] if len(others) > 1 else difference
+    def forward(self, state: Tensor, memory: Tensor | None = None) -> Any:
+        """Return the accelerations to command and, if there is one, the memory after the step."""
+        if memory is None:
+            return self.step(state)[0]
+        begun = memory[:, :1]
+        seeds = torch.zeros_like(begun, dtype=torch.int64)
+        return self.step(state, torch.where(begun > 0.0, memory, self.begin(state, seeds)))
 
-    def forward(self, state: Tensor) -> Tensor:
-        """Return the acceleration to command."""
-        rows = []
-        for value, *bases in self.columns:
-            seen = self._value(state, value)
-            rows.append(seen - self._value(state, bases[0]) if bases else seen)
-        action = self.network(torch.cat(rows, -1) * self.constants)
-        command = action.clamp(-1.0, 1.0) * self.largest
-        if self.safety is None:
-            return command
-        measured = (self._value(state, self._places(name)) for name in FILTER_READS)
-        filtered: Tensor = self.safety.filtered(command, *measured)
-        return filtered
+    def begin(self, state: Tensor, seeds: Tensor) -> Tensor:
+        """Return the memories of vehicles that begin now, from seeds ``[batch, 1]``, int64."""
+        start = TensorDict()  # without batch dimensions, whose number an export would take as fixed
+        clock: State = {SEED: seeds, STEP: torch.zeros_like(seeds)}
+        for key, value in {**self.measured(state), **clock}.items():
+            start.set(key, value)
+        for piece in self.pieces:
+            if isinstance(piece, StepTransform):
+                piece.begin(TensorDict(), start)
+        return self._packed({key: start.get(key) for key in self.kept}, state)
 
+    def step(
+        self, state: Tensor, memory: Tensor | None = None, apply: Any = None
+    ) -> tuple[Tensor, ...]:
+        """Return the accelerations and, if there is a memory, that after the step.
 
-class Remembering(nn.Module):
-    """A policy with its memory: ``state``, ``memory`` to ``acceleration``, ``next_memory``.
+        ``apply(piece, before, reached)`` applies each piece, by default ``piece.derive``.
+        """
+        reached = self.measured(state)
+        before = dict(reached)
+        if memory is not None:
+            values = memory[:, 1:].split(self.sizes, -1)
+            for (key, spec), value in zip(self.kept.items(), values, strict=True):
+                before[key] = value.reshape(-1, *spec.shape).to(spec.dtype)
+        reached |= {key: before[key] + (key == STEP) for key in (SEED, STEP) if key in before}
+        for piece in self.pieces:
+            apply(piece, before, reached) if apply else piece.derive(before, reached)
+        command = reached[COMMAND_KEY].flatten(1)
+        return (command,) if memory is None else (command, self._packed(reached, memory))
 
-    A memory of zeros begins anew; the first number of ``next_memory`` is one.
-    """
+    def _packed(self, entries: State, like: Tensor) -> Tensor:
+        rows = [torch.ones_like(like[:, :1])]
+        for key, spec in self.kept.items():
+            rows.append(entries[key].expand(like.shape[0], *spec.shape).flatten(1).to(like.dtype))
+        return torch.cat(rows, 1)
 
-    def __init__(self, policy: ExportedPolicy) -> None:
-        super().__init__()
-        self.policy, memory = policy, policy.memory
-        self.repeat = memory.depth if memory.stacked else memory.repeat
-        self.width = 1 + memory.counted * self.repeat
-        flat = [base for name in memory.sources for base in DERIVED_INPUTS.get(name, (name,))]
-        names = [name for name in policy.names if not name.startswith(REMEMBERED)]
-        self.names = list(dict.fromkeys([*names, *flat]))
-
-    def forward(self, state: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the acceleration to command, and the memory of the next step."""
-        measured = dict(zip(self.names, state.split(1, -1), strict=True))
-        pairs = (
-            [measured[x] for x in DERIVED_INPUTS.get(name, (name,))]
-            for name in self.policy.memory.sources
-        )
-        now = torch.cat([one - other[0] if other else one for one, *other in pairs], -1)
-        begun, kept = memory.split((1, self.width - 1), -1)
-        kept = torch.where(begun > 0.0, kept, now.repeat_interleave(self.repeat, -1))
-        entries, kept = self.policy.memory.remember(kept, now)
-        measured |= {f"{REMEMBERED}{n}": x for n, x in enumerate(entries.split(1, -1))}
-        acceleration = self.policy(torch.cat([measured[name] for name in self.policy.names], -1))
-        return acceleration, torch.cat([torch.ones_like(begun), kept], -1)
+    def measured(self, state: Tensor) -> State:
+        """Return the entries that are measured, ``[batch, 1, width]``."""
+        columns = dict(zip(self.names, state.unsqueeze(1).split(1, -1), strict=True))
+        found = {}
+        for key, names in self.inputs.items():
+            value = torch.cat([columns[name] for name in names], -1)
+            if names == DERIVED_INPUTS.get(".".join(key)):
+                value = columns[names[0]] - columns[names[1]]
+                if key[0] == BEHIND and BEHIND_PRESENT in columns:  # zero where there is nobody
+                    value = value * columns[BEHIND_PRESENT]
+            found[key] = value
+        return found
 
 
 def described_input(name: str) -> Input:
@@ -135,16 +194,33 @@ def described_input(name: str) -> Input:
     return Input(name, "–", f"{entry} ({whose.get(view, view)})")
 
 
-def exported_policy(
-    policy: str | Path | nn.Module, trust: Sequence[str] = (), cfg: StudyConfig | None = None
-) -> ExportedPolicy:
-    """Build the policy that is exported.
+def measuring(time_step: float, behind: bool = True) -> World:
+    """Return the world of a vehicle that measures its neighbours, by steps of so many seconds.
+
+    Without ``behind``, there is not always a vehicle behind.
+    """
+    string = VehicleString((AUTOMATED, HUMAN)[: 1 + behind], ring=True, measured=True)
+    return World(string, time_step, population=bootstrap())
+
+
+def program(
+    policy: str | Path | nn.Module,
+    trust: Sequence[str] = (),
+    cfg: StudyConfig | None = None,
+    safety: CBFFilter | None = None,
+) -> DrivingProgram:
+    """Build the program of a trained policy.
 
     Args:
-        policy: as for ``lcc_rl.interfaces.export.export``; or a network, see
+        policy: a run folder, a policy file, or ``pretrained/<name>``; or a network, see
             :func:`lcc_rl.evaluation.foreign.network_of`.
         trust: modules outside this package that the policy may name.
         cfg: the configuration in which a network was trained.
+        safety: the filter behind which it drives; None: its own.
+
+    Raises:
+        ConfigError: if no network drives, or its filter knows the faults of a scenario.
+        ResultsError: if the policy cannot be read.
     """
     population, weights = bootstrap(), None
     if not isinstance(policy, nn.Module):
@@ -152,13 +228,12 @@ def exported_policy(
     assert cfg is not None
     scenario = cfg.scenario
     leader = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["constant"])
-    env = build_env(cfg, leader, population)
-    pieces = pieces_of(env)
+    pieces = pieces_of(build_env(cfg, leader, population))
     found = {kind: [p for p in pieces if isinstance(p, kind)] for kind in (Observation, Action)}
     if not all(found.values()):
         raise ConfigError(f"{policy}: no network drives its vehicles; nothing to export")
-    safety = next((p for p in pieces if isinstance(p, CBFFilter)), None)
-    if safety is not None and safety.memories:
+    safety = safety or next((p for p in pieces if isinstance(p, CBFFilter)), None)
+    if safety is not None and any(vars(safety).get("remembers", {}).values()):
         raise ConfigError(
             f"{policy}: its filter remembers commands or measurements, an exported policy nothing; "
             "only without delays, lag and drop-outs can it be exported"
@@ -170,15 +245,22 @@ def exported_policy(
         assert isinstance(learned, TensorDictModule)
         network = learned.module
     (observation,), (action,) = found.values()
-    memory = next((p for p in pieces if isinstance(p, ObservationMemory)), None)
-    module = ExportedPolicy(network, observation, action, safety, memory)
-    return module.eval().requires_grad_(False)
+    world = measuring(scenario.time_step, BEHIND_PRESENT not in observation.names)
+    remembers = any(name.startswith("memory.") for name in observation.seen)
+    memory = [p for p in pieces if isinstance(p, ObservationMemory) and remembers]
+    largest = action.max_acceleration
+    network = NetworkController(network=network, max_acceleration=largest)
+    return driving([*memory, observation, network], safety, world)
 
 
-def program(
-    policy: str | Path | nn.Module, trust: Sequence[str] = (), cfg: StudyConfig | None = None
-) -> ExportedPolicy | Remembering:
-    """Return the module that a program is made of; arguments as for :func:`exported_policy`."""
-    module = exported_policy(policy, trust, cfg)
-    remembers = any(name.startswith(REMEMBERED) for name in module.names)
-    return Remembering(module) if remembers else module
+def driving(pieces: Sequence[Piece], safety: CBFFilter | None, world: World) -> DrivingProgram:
+    """Return the program of pieces and a filter, which acts from the start, in a world.
+
+    See :class:`DrivingProgram` and :func:`measuring`; all are bound here.
+    """
+    if safety is not None:
+        world = replace(world, filtered=[AUTOMATED])
+        pieces = [*pieces, type(safety)(**values(safety) | {"from_s": 0.0})]
+    roles = [AUTOMATED if isinstance(piece, RoleTransform) else None for piece in pieces]
+    bound = [piece.bind(world, role) for piece, role in zip(pieces, roles, strict=True)]
+    return DrivingProgram(bound).eval().requires_grad_(False)

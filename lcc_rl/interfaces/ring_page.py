@@ -26,10 +26,12 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.functional.random import stream_id
 from lcc_rl.interfaces.driver import Driver
+from lcc_rl.interfaces.exported import NetworkController
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.cbf import SLOWEST
 from lcc_rl.pieces.controllers import stream_name
 from lcc_rl.pieces.drivers import DriverModel
+from lcc_rl.pieces.knowledge import ObservationMemory
 from lcc_rl.settings import values
 
 RING_TASK = ("variant=alcc", "task=ring-22")
@@ -59,7 +61,7 @@ def page_data(policy: str | Path, trust: Sequence[str] = ()) -> dict[str, Any]:
     cfg = load("evaluate", RING_TASK)
     scenario, energy = cfg.scenario, build_energy(cfg).models[0]
     assert isinstance(energy, CirclesFuel)
-    rules = {name: Driver(name, scenario.time_step).pieces[0] for name in RING_RULES}
+    rules = {name: Driver(name, scenario.time_step).program.controller for name in RING_RULES}
     return {
         "policy": str(policy),
         "time_step": scenario.time_step,
@@ -91,26 +93,28 @@ def _human(cfg: StudyConfig) -> dict[str, float]:
 
 def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict[str, Any]:
     """Return weights, scales and memory of a policy, and its safety filter."""
-    driver = Driver(policy, time_step, trust)
-    if driver.module is None:
+    program = Driver(policy, time_step, trust).program
+    controller = program.controller
+    if not isinstance(controller, NetworkController):
         raise ConfigError(f"{policy}: a rule; a page needs a policy")
-    module, memory = driver.module, driver.pieces
-    layers = [x for x in module.network.modules() if not list(x.children())]
+    observation: Any = program.observation
+    memory = [piece for piece in program.pieces if isinstance(piece, ObservationMemory)]
+    layers = [x for x in controller.layers.modules() if not list(x.children())]
     kept = [(name, time) for x in memory for name in x.sources for time in x.seconds]
-    seen = [*module.names, *(name for name, _ in kept)]
+    columns = observation.columns()
+    seen = [*(name for column in columns for name in column), *(name for name, _ in kept)]
     strange = [type(x).__name__ for x in layers if not isinstance(x, LAYERS)]
     strange += [name for name in seen if name.partition(".")[0] not in VIEWS]
     strange += ["stacked memory"] if any(x.stacked for x in memory) else []
-    strange += ["late filter"] if module.safety is not None and module.safety.late else []
+    strange += ["late filter"] if program.safety is not None and program.safety.late else []
     if strange:
         raise ConfigError(f"{policy}: the page cannot compute its {', '.join(strange)}")
     return {
         "layers": [_layer(layer) for layer in layers],
-        "names": module.names,
-        "columns": module.columns,
-        "scales": module.constants.tolist(),
-        "max_acceleration": module.largest,
-        "filter": None if module.safety is None else filter_data(module.safety),
+        "columns": columns,
+        "scales": observation.factors.tolist(),
+        "max_acceleration": controller.max_acceleration,
+        "filter": None if program.safety is None else filter_data(program.safety),
         "memory": [{"source": name, "seconds": time} for name, time in kept],
     }
 

@@ -11,17 +11,14 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
 from unittest.mock import patch
 
-import torch
-
 from lcc_rl.errors import ConfigError, Diverged, how_to_install
-from lcc_rl.interfaces.driver import PRESENT_KEY, Driver, Measured, state_of
-from lcc_rl.pieces.base import SEED, STEP, State
+from lcc_rl.interfaces.driver import MEASURED, Driver
+from lcc_rl.pieces import CBFFilter
 
 UNCHECKED, RELEASED = 0, -1.0  # SUMO's speed mode without checks, and the speed that releases
 
@@ -50,13 +47,10 @@ class Bridge:
     not observe that, a vehicle at the own speed and gap is assumed. SUMO changes lanes.
 
     Args:
-        driver: a run, a run folder, a policy file, ``pretrained/<name>``, or a controller by name
-            (``"idm_acc"``), as object, class, function, file or node, as :func:`lcc_rl.compare`
-            takes it.
+        driver: a policy or a rule, as :class:`lcc_rl.interfaces.driver.Driver` takes it.
         vehicles: ids of the driven vehicles, which may enter later, or a predicate on ids.
         sight: distance at which a vehicle ahead is seen, bumper to bumper [m].
-        trust: modules outside this package that a policy may name.
-        seed: seed of the drivers' noise.
+        trust, safety, seed: see :class:`lcc_rl.interfaces.driver.Driver`.
 
     Raises:
         LccError: if libsumo is missing or runs no simulation, or the driver cannot drive there.
@@ -69,17 +63,16 @@ class Bridge:
         sight: float = 150.0,
         trust: Sequence[str] = (),
         seed: int = 0,
+        safety: CBFFilter | None = None,
     ) -> None:
         self.sumo = load_sumo()
         if not self.sumo.isLoaded():
             raise ConfigError("SUMO runs no simulation: call libsumo.start([…]) first")
-        self.driver = Driver(driver, self.sumo.simulation.getDeltaT(), trust)
+        delta = self.sumo.simulation.getDeltaT()
+        self.driver = Driver(driver, delta, trust, safety, seed)
         names = {vehicles} if isinstance(vehicles, str) else vehicles
         self.chosen = names if callable(names) else set(names).__contains__
-        self.sight, self.seed, self.begun = sight, seed, 0
-        self.tells = PRESENT_KEY in self.driver.reads()
-        self.keys = [*self.driver.kept, SEED, STEP]
-        self.driven: dict[str, State] = {}  # what each vehicle remembers: the keys
+        self.sight = sight
         self.modes: dict[str, int] = {}  # of those commanded, their speed modes before
 
     def command(self, execute: bool = True) -> dict[str, float]:
@@ -98,37 +91,24 @@ class Bridge:
         present = cars.getIDList()
         seen = {car: self._measured(car) for car in present if self.chosen(car)}
         measured = {car: row for car, row in seen.items() if row is not None}
-        for car in [car for car in self.driven if car not in measured]:
+        for car in [car for car in self.modes if car not in measured]:
             self._release(car, car in present)
-        if not measured:
-            return {}
-        for car, row in measured.items():
-            if car not in self.driven:
-                self._take(car, state_of([row]))
-        before = {key: torch.cat([self.driven[car][key] for car in measured]) for key in self.keys}
-        wanted, after = self.driver(state_of(list(measured.values())) | before, before)
-        after |= {SEED: before[SEED], STEP: before[STEP] + 1}
+        columns = zip(*measured.values(), strict=True) if measured else [()] * len(MEASURED)
+        try:
+            wanted = self.driver.step(dict(zip(MEASURED, columns, strict=True)), list(measured))
+        except Diverged as error:
+            raise Diverged(f"{error} at {self.sumo.simulation.getTime():g} s") from error
         commands = dict(zip(measured, wanted.tolist(), strict=True))
-        for car, acceleration in commands.items():
-            if not math.isfinite(acceleration):
-                when = f"at {self.sumo.simulation.getTime():g} s"
-                raise Diverged(f"{self.driver.name}: the command of {car} is {acceleration} {when}")
-        for place, (car, acceleration) in enumerate(commands.items()):
-            if execute:
-                self._set(car, cars.getSpeed(car) + acceleration * self.driver.time_step)
-            self.driven[car] = {key: entry[place : place + 1] for key, entry in after.items()}
+        for car, acceleration in commands.items() if execute else ():
+            self._set(car, cars.getSpeed(car) + acceleration * self.driver.time_step)
         return commands
 
     def release(self) -> None:
         """Return all vehicles to SUMO's own model."""
         present = self.sumo.vehicle.getIDList()
-        for car in list(self.driven):
+        for car in list(self.modes):
             self._release(car, car in present)
-
-    def _take(self, car: str, state: State) -> None:
-        own = {SEED: torch.tensor([[self.seed + self.begun]]), STEP: torch.zeros(1, 1).long()}
-        self.driven[car] = own | self.driver.begin(state | own)
-        self.begun += 1
+        self.driver.reset(self.driver.cars)
 
     def _set(self, car: str, speed: float) -> None:
         if car not in self.modes:
@@ -137,13 +117,13 @@ class Bridge:
         self.sumo.vehicle.setSpeed(car, max(speed, 0.0))
 
     def _release(self, car: str, present: bool) -> None:
-        del self.driven[car]
-        mode = self.modes.pop(car, None)
-        if present and mode is not None:
+        mode = self.modes.pop(car)
+        if present:
             self.sumo.vehicle.setSpeedMode(car, mode)
             self.sumo.vehicle.setSpeed(car, RELEASED)
 
-    def _measured(self, car: str) -> Measured | None:
+    def _measured(self, car: str) -> tuple[float, ...] | None:
+        """Return what :data:`MEASURED` names of a vehicle; None if it sees nobody ahead."""
         cars = self.sumo.vehicle
         ahead, free = cars.getLeader(car, self.sight) or ("", 0.0)
         gap = free + cars.getMinGap(car)  # SUMO's gaps are without the least one desired
@@ -152,10 +132,7 @@ class Bridge:
         own = (cars.getSpeed(car), gap, cars.getAcceleration(car))
         lead = (cars.getSpeed(ahead), cars.getAcceleration(ahead))
         behind, free = cars.getFollower(car, self.sight) or ("", 0.0)
-        other: tuple[float, float, float] = (own[0], gap, 0.0)
-        if self.tells:
-            other = (0.0, 0.0, 0.0)
-        if behind:
-            room = free + cars.getMinGap(behind)
-            other = (cars.getSpeed(behind), room, cars.getAcceleration(behind))
-        return Measured(*own, *lead, *other, float(bool(behind)))
+        if not behind:
+            return (*own, *lead, 0.0, 0.0, 0.0, 0.0)
+        room = free + cars.getMinGap(behind)
+        return (*own, *lead, cars.getSpeed(behind), room, cars.getAcceleration(behind), 1.0)

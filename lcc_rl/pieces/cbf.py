@@ -18,8 +18,8 @@ from lcc_rl.functional.braking import (
     safe_acceleration,
     safe_command,
 )
-from lcc_rl.functional.layout import join
-from lcc_rl.functional.sensing import brought_up
+from lcc_rl.functional.layout import batch_innermost, join
+from lcc_rl.functional.sensing import Agreement, brought_up
 from lcc_rl.pieces.actuation import ACTUATION, Actuation
 from lcc_rl.pieces.base import Entry, RoleTransform
 from lcc_rl.pieces.sensors import SENSORS, Sensors, frames_of
@@ -29,6 +29,7 @@ from lcc_rl.settings import NonNegative, Positive
 
 ROUNDING = 5e-3  # of gaps [m] and accelerations [m/s²] in single precision
 FILTER_READS = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
+REMEMBERS = 3  # numbers in the filter's memory of gaps
 SLOWEST = 1.0  # slower speeds count as this, as in the time gap: the limit has a slope [m/s]
 
 
@@ -50,6 +51,11 @@ class CBFFilter(RoleTransform):
     any sample as long as the vehicle ahead brakes no harder; which steps that covers, the
     :class:`CBFGuarantee` of :meth:`watch` writes. If a measurement or the command is no number, the
     filter brakes fully.
+
+    It trusts gaps. Where the measured gap grows at another rate than the measured relative speed
+    says (:class:`lcc_rl.functional.sensing.Agreement`), limits of nearness count with the lower
+    speed ahead, those of distance with the higher. While the gap is below ``margin`` and does not
+    grow, the vehicle does not accelerate.
 
     With a ``shortest_time_gap``, ``gap − shortest_time_gap·v`` is kept positive, too, by the same
     expectation as comfort: as far as the vehicle ahead keeps its acceleration and braking suffices.
@@ -92,7 +98,10 @@ class CBFFilter(RoleTransform):
     from_s: NonNegative = 0.0  # moment of the episode from which on it acts, see Handover [s]
 
     measures = True
-    writes = (COMMANDED,)
+    agreed = Entry(
+        "role.agreement", "–, m, m/s", "1, the gap last measured, what it grows too fast", REMEMBERS
+    )
+    writes = (COMMANDED, agreed)
 
     def validate(self) -> None:
         if self.time_gap is not None and (self.shortest_time_gap or 0.0) >= self.time_gap:
@@ -114,7 +123,9 @@ class CBFFilter(RoleTransform):
         self.remembers = {ACTUATION: self.late, SENSORS: self.sensing.oldest > 0}
         self.memories = [f"{self.role}.{name}" for name, needed in self.remembers.items() if needed]
         self.from_step = world.steps(self.from_s, "from_s")
-        seen = [f"next.{WANTED}.{self.role}", *FILTER_READS, *self.memories]
+        self.agreement = Agreement(self.sensing, world.time_step)
+        kept = [f"{self.role}.agreement", *self.memories]
+        seen = [f"next.{WANTED}.{self.role}", *FILTER_READS, *kept]
         self.declare(world, [*seen, *["episode.step"] * (self.from_step > 0)])
         self.limits = Braking(self.response.braking, self.braking_ahead, self.time_to_collision)
 
@@ -122,12 +133,13 @@ class CBFFilter(RoleTransform):
         """Return the piece that records the steps for which the filter promises its limit."""
         return CBFGuarantee(safety=self).bind(World(self.string), self.role)
 
-    def compute(self, wanted: Tensor, *more: Tensor) -> Tensor:
-        """Return the commands that the vehicles obey."""
+    def compute(self, wanted: Tensor, *state: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the commands that the vehicles obey, and what is remembered of gaps."""
         if not self.from_step:
-            return self.filtered(wanted, *more)
-        *state, step = more
-        return torch.where(step < self.from_step, wanted, self.filtered(wanted, *state))
+            return self.filtered(wanted, *state)
+        *state, step = state  # type: ignore[assignment]
+        command, agreed = self.filtered(wanted, *state)
+        return torch.where(step < self.from_step, wanted, command), agreed
 
     def kept(self, memories: Sequence[Tensor], nothing: Tensor) -> list[Tensor]:
         """Return the memories of actuation and sensors; ``nothing``, one column, for none."""
@@ -149,25 +161,34 @@ class CBFFilter(RoleTransform):
         gap: Tensor,
         ahead: Tensor,
         ahead_acceleration: Tensor,
+        agreed: Tensor,
         *memories: Tensor,
-    ) -> Tensor:
-        """Return the commands that the vehicles obey, ``[*batch, n, 1]`` [m/s²].
+    ) -> tuple[Tensor, Tensor]:
+        """Return the commands that the vehicles obey, ``[*batch, n, 1]`` [m/s²], and a memory.
 
         Args:
             wanted: commands [m/s²].
             speed, gap, ahead, ahead_acceleration: the state measured [m/s, m, m/s, m/s²].
+            agreed: the memory of the step before, ``[*batch, n, 3]``; zeros begin anew.
             *memories: the entries that :attr:`memories` names.
         """
         # Any of them that is no number, or infinite, shows in the sum.
         known = (wanted + speed + gap + ahead + ahead_acceleration).isfinite()
-        kept = self.kept(memories, wanted)
-        measured = PairState(speed, gap, ahead, kept[0][..., :1])
+        kept, relative = self.kept(memories, wanted), ahead - speed
+        with torch.no_grad():  # what is measured agrees in a simulator: there is no slope
+            agreed = self.agreement.next(agreed, gap, relative)
+            agreed = batch_innermost(torch.where(known, agreed, 0.0))
+            differs = self.agreement.difference(agreed, relative)
+        nearer = (ahead + differs.clamp(max=0.0)).clamp(min=0.0)
+        measured = PairState(speed, gap, nearer, kept[0][..., :1])
         worst = self._when_it_acts(self.sensing.worst(measured), -self.braking_ahead, *kept)
         safe = self._safe(replace(worst, gap=worst.gap - self.margin))
         now = self._when_it_acts(measured, ahead_acceleration, *kept)
-        command = self._comfortable(wanted, now, ahead_acceleration, safe)
+        command = self._comfortable(wanted, now, ahead_acceleration, differs.abs(), safe)
+        stays = (gap < self.margin) & (relative + differs <= 0.0)
+        command = torch.where(stays, command.clamp(max=0.0), command)
         command = command.clamp(-self.max_acceleration, self.max_acceleration)
-        return torch.where(known, command, -self.max_acceleration)
+        return torch.where(known, command, -self.max_acceleration), agreed
 
     def _safe(self, worst: PairState) -> Tensor:
         """Return the largest command that leaves the vehicle where braking suffices."""
@@ -177,29 +198,38 @@ class CBFFilter(RoleTransform):
         return safe_acceleration(*state, self.limits, self.time_step)
 
     def _comfortable(
-        self, wanted: Tensor, now: PairState, ahead_acceleration: Tensor, safe: Tensor
+        self,
+        wanted: Tensor,
+        now: PairState,
+        ahead_acceleration: Tensor,
+        doubt: Tensor,
+        safe: Tensor,
     ) -> Tensor:
-        """Return the command nearest to what is wanted within all bounds, not clamped."""
+        """Return the command nearest to what is wanted within all bounds, not clamped.
+
+        The vehicle ahead may be faster by ``doubt`` than ``now`` says.
+        """
         speed, gap, closing = now.speed, now.gap, now.speed - now.ahead
+        opening = doubt - closing
         free, half = gap - self.margin, 0.5 * self.time_step
         shortest = self.time_to_collision
         command = wanted
         if self.time_gap is not None:
             allowed, slope = self._allowed(speed, self.time_gap)
-            least = (-closing - self.time_gap_rate * (allowed - gap)) / slope
+            least = (opening - self.time_gap_rate * (allowed - gap)) / slope
             command = torch.maximum(command, least)
         if self.longest_gap is not None:
             foresight = math.sqrt(2.0 * self.longest_gap / self.max_acceleration)
-            room = self.longest_gap - gap + foresight * closing
-            faster = (-closing - self.time_gap_rate * room) / (foresight + half)
+            room = self.longest_gap - gap - foresight * opening
+            faster = (opening - self.time_gap_rate * room) / (foresight + half)
             command = torch.maximum(command, ahead_acceleration + faster)
         slower = self.rate * (free - shortest * closing) - closing
         comfort = ahead_acceleration + slower / (shortest + half)
         command = torch.minimum(command, torch.minimum(comfort, safe))
         if self.shortest_time_gap is not None:
             room = gap - self.shortest_time_gap * speed
-            opening = half * ahead_acceleration - closing
-            held = (self.time_gap_rate * room + opening) / (self.shortest_time_gap + half)
+            grows = half * ahead_acceleration - closing
+            held = (self.time_gap_rate * room + grows) / (self.shortest_time_gap + half)
             command = torch.minimum(command, held)
         return command
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -11,10 +11,15 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.driver_models import DriverConstants, NoiseStep, Reaction
+from lcc_rl.functional.driver_models import (
+    GAP_NOISE_TIME,
+    DriverConstants,
+    NoiseStep,
+    Reaction,
+)
 from lcc_rl.functional.gipps import GippsConstants
 from lcc_rl.functional.idm import IDMConstants
-from lcc_rl.functional.layout import join
+from lcc_rl.functional.layout import join, reverse
 from lcc_rl.functional.ovm import FVDMConstants, OVMConstants
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.functional.random import between, choose, normal, stream_id, uniform
@@ -25,8 +30,11 @@ from lcc_rl.pieces.views import MOTION_READS
 from lcc_rl.pieces.world import MOST_LATE, World
 from lcc_rl.settings import Factors, NonNegative, Positive, Share
 
+Delay = Annotated[int, Field(ge=0, le=MOST_LATE)]
 # Draws that all drivers of an episode share.
-WIENER_STREAM, TIME_GAP_STREAM = stream_id("drivers.wiener"), stream_id("drivers.time_gap")
+WIENER_STREAM, TIME_GAP_STREAM, DELAY_STREAM, NOISE_STREAM = (
+    stream_id(f"drivers.{name}") for name in ("wiener", "time_gap", "delay", "noise")
+)
 LONGEST_TIME_GAP = 1000.0  # time gap up to which an equilibrium gap is written [s]
 
 
@@ -47,11 +55,19 @@ class Drivers(Controller):
     time_gap_range: Factors = (1.0, 1.0)
     # Steps by which speed, gap and relative speed are old when the driver reacts; until then,
     # those at the start of the episode. None: the reaction delay of the population.
-    delay: Annotated[int, Field(ge=0, le=MOST_LATE)] | None = None
+    delay: Delay | None = None
+    # Steps from which and to which every episode of training draws its delay; evaluation takes
+    # delay, as does a training without a range.
+    delay_range: tuple[Delay, Delay] | None = None
+    # Factors of the noise of the acceleration in an episode of training; evaluation takes 1.
+    acceleration_noise_range: Factors = (1.0, 1.0)
     # Standard deviation of a smooth noise of the acceleration, see
     # lcc_rl.functional.driver_models.NoiseStep [m/s²]; None: of the population.
     acceleration_noise: NonNegative | None = None
+    # The same of a noise of the logarithm of the perceived gap.
+    gap_noise: NonNegative | None = None
 
+    LATER = ("gap_noise",)
     name = HUMAN
     known = (
         Entry("role.driver", "–", "id of each vehicle's driver in the population", option=True),
@@ -65,6 +81,7 @@ class Drivers(Controller):
         "role.motion_history", "m/s, m, m/s", "past (speed, gap, relative speed), latest first"
     )
     latest = Entry("role.acceleration_noise", "m/s²", "noise of the acceleration, latest first", 2)
+    gap_latest = Entry("role.gap_noise", "–", "noise of ln of the seen gap, latest first", 2)
     law: ClassVar[type[DriverConstants]] = IDMConstants
     tells_gap: ClassVar[bool] = False  # whether the equilibrium gap is written
     further: ClassVar[tuple[str, ...]] = ()  # entries of the role that acceleration reads, too
@@ -72,31 +89,44 @@ class Drivers(Controller):
     time_gaps: ClassVar[Tensor]
     index: ClassVar[Tensor]
 
+    def validate(self) -> None:
+        soonest, latest = self.delay_range or (0, 0)
+        if soonest > latest:
+            raise ValueError(f"delay_range must not fall, got {list(self.delay_range or ())}")
+
     def setup(self, world: World) -> None:
         """Take the drivers, and choose what is read and written by the settings."""
         role = self.name
         speeds, time_gaps, self.drivers = self.described(world, f"scenario.controllers.{role}")
         reaction = self.reaction(world)
-        late, spread = self.delay, self.acceleration_noise
+        late, spread, sight = self.delay, self.acceleration_noise, self.gap_noise
         what = "the reaction delay of drivers"
-        self.late = world.late(reaction.delay, what) if late is None else late
+        late = world.late(reaction.delay, what) if late is None else late
+        # The least and the largest delay; drivers remember as far back as the largest.
+        drawn = world.nominal or self.delay_range is None
+        self.soonest, self.late = (late, late) if drawn else self.delay_range  # type: ignore[misc]
         self.noise_spread = reaction.noise if spread is None else spread
+        self.gap_spread = reaction.gap_noise if sight is None else sight
         self.noise_step = NoiseStep.of(world.time_step)
+        self.gap_noise_step = NoiseStep.of(world.time_step, GAP_NOISE_TIME)
         self.starts = self.tells_gap and not world.string.ring
         memory = [self.history.wide(3 * self.late)] * (self.late > 0)
         memory += [self.latest] * (self.noise_spread > 0)
+        memory += [self.gap_latest] * (self.gap_spread > 0)
         names = [*MOTION_READS, f"{role}.desired_speed", f"{role}.desired_time_gap", "episode.seed"]
         names += ["episode.step", *(f"{role}.{name}" for name in self.further)]
         self.declare(world, names, keeps=self.known[: 3 + self.starts], remembers=memory)
         self.limits = None  # drives as a person, in automated vehicles, too
         walk = self.wiener / world.time_step**0.5
         self.spreads = tuple(walk * factor for factor in world.deviations(self.wiener_range))
+        self.noise_factors = world.deviations(self.acceleration_noise_range)
         self.time_gap_factors = world.deviations(self.time_gap_range)
         self.noise_stream = stream_id(f"{stream_name(role)}.noise")
         self.wiener_stream = stream_id(f"{stream_name(role)}.wiener")
-        self.noise_streams = [
-            stream_id(f"{stream_name(role)}.acceleration_noise{end}") for end in ("", ".before")
-        ]
+        self.noise_streams, self.gap_noise_streams = (
+            [stream_id(f"{stream_name(role)}.{what}{end}") for end in ("", ".before")]
+            for what in ("acceleration_noise", "gap_noise")
+        )
         self.driver_stream = stream_id(f"{stream_name(role)}.driver")
         self.register_buffer("desired_speeds", speeds)
         self.register_buffer("time_gaps", time_gaps)
@@ -129,16 +159,25 @@ class Drivers(Controller):
         """Return the commands, then the history and the noise where they are kept."""
         motion = (speed, gap, relative_speed)
         kept: list[Tensor] = []
+        noise = sight = None
+        if self.gap_spread:
+            *more, before = more  # type: ignore[assignment]
+            how = self.gap_spread, self.gap_noise_step, self.gap_noise_streams
+            kept.insert(0, sight := self._noise_of(before, seed, step, *how))
         if self.noise_spread:
             *more, before = more  # type: ignore[assignment]
-            kept.append(self._noise_of(before, seed, step))
+            how = self.noise_spread, self.noise_step, self.noise_streams
+            kept.insert(0, noise := self._noise_of(before, seed, step, *how))
         if self.late:
             *more, history = more  # type: ignore[assignment]
             now = join(motion, -1)
             # Before the first step nothing else was ever seen.
             past = torch.where(step == 0, now.repeat(*[1] * (now.ndim - 1), self.late), history)
-            motion = past[..., -3:].split(1, -1)
-            kept.insert(0, join([now, past[..., :-3]], -1))
+            seen = join([now, past], -1)
+            motion = self._then(seen, seed).split(1, -1)
+            kept.insert(0, seen[..., :-3])
+        if sight is not None:
+            motion = (motion[0], motion[1] * sight[..., :1].exp(), motion[2])
         command = self.acceleration(*motion, desired_speed, time_gap, *more)
         if self.noise:
             draw = uniform(seed, step, self.noise_stream + self.index)
@@ -146,19 +185,35 @@ class Drivers(Controller):
         if self.wiener:
             spread = between(self.spreads, seed, WIENER_STREAM)
             command = command + spread * normal(seed, step, self.wiener_stream + self.index)
-        if self.noise_spread:
-            command = command + kept[-1][..., :1]
+        if noise is not None:
+            factor = between(self.noise_factors, seed, NOISE_STREAM)
+            command = command + factor * noise[..., :1]
         return (command, *kept) if kept else command
 
-    def _noise_of(self, before: Tensor, seed: Tensor, step: Tensor) -> Tensor:
-        """Return the latest two values of the noise from those before [m/s²]."""
-        drawn, further = (
-            self.noise_spread * normal(seed, step, stream + self.index)
-            for stream in self.noise_streams
-        )
-        first = join(self.noise_step.start(drawn, further), -1)
+    def _then(self, seen: Tensor, seed: Tensor) -> Tensor:
+        """Return what the drivers react to, of the motion seen from the present back."""
+        if self.soonest == self.late:
+            return seen[..., -3:]
+        span = self.late - self.soonest + 1
+        late = self.soonest + (span * uniform(seed, 0, DELAY_STREAM)).long()
+        columns = 3 * late + torch.arange(3, device=seen.device)
+        columns = columns.expand(*seen.shape[:-1], 3)
+        return reverse(reverse(seen).gather(0, reverse(columns)))
+
+    def _noise_of(
+        self,
+        before: Tensor,
+        seed: Tensor,
+        step: Tensor,
+        spread: float,
+        noise_step: NoiseStep,
+        streams: Sequence[int],
+    ) -> Tensor:
+        """Return the latest two values of a noise from those before."""
+        drawn, further = (spread * normal(seed, step, stream + self.index) for stream in streams)
+        first = join(noise_step.start(drawn, further), -1)
         latest, last = before.split(1, -1)
-        later = join([self.noise_step.next(latest, last, drawn), latest], -1)
+        later = join([noise_step.next(latest, last, drawn), latest], -1)
         return torch.where(step == 0, first, later)
 
     def acceleration(
@@ -222,6 +277,7 @@ class DriverModel(Drivers):
     parameters: Annotated[InstanceOf[DriverConstants] | None, BeforeValidator(_made)] = None
 
     def validate(self) -> None:
+        super().validate()
         if (self.desired_speed is None) != (self.time_gap is None):
             raise ValueError("desired_speed and time_gap belong together: give both or none")
 

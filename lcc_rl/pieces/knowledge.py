@@ -114,19 +114,9 @@ class ObservationMemory(StepTransform):
 
     def compute(self, kept: Tensor, *measured: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         """Return the entries, and the history where it is kept."""
-        found, kept = self.remember(kept, torch.cat(measured, -1))
-        return (found, kept) if self.stacked else found
-
-    def remember(self, kept: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the entries, and what is kept for the next step.
-
-        Args:
-            kept: of the step before, ``[…, sources × seconds]`` or the whole history.
-            now: what is measured, ``[…, sources]``.
-        """
+        now = torch.cat(measured, -1)
         if not self.stacked:
-            found = torch.lerp(kept, now.repeat_interleave(self.repeat, -1), self.shares)
-            return found, found
+            return torch.lerp(kept, now.repeat_interleave(self.repeat, -1), self.shares)
         past = kept.unflatten(-1, (self.counted, self.depth))
         past = torch.cat([now.unsqueeze(-1), past[..., :-1]], -1)
         seen = past[..., self.places]

@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces.base import OBSERVATION, Entry, Feature
 from lcc_rl.pieces.views import BEHIND, PRESENT, Views
 from lcc_rl.pieces.world import World
@@ -23,8 +23,8 @@ class Observation(Feature):
     """Gathers entries, each times a fixed constant, into ``("automated", "observation")``.
 
     Writes ``[*batch, A, entries]``, one row per automated vehicle. If a vehicle may have
-    fewer than ``visible`` vehicles behind, their entries are zero and one more entry per vehicle
-    behind says whether it is there (1 or 0). HCFS observes the state H3, see
+    fewer than ``visible`` vehicles behind, or with ``presence``, their entries are zero and one
+    more entry per vehicle behind says whether it is there (1 or 0). HCFS observes the state H3, see
     ``conf/observation/platoon.yaml``.
     """
 
@@ -39,6 +39,7 @@ class Observation(Feature):
     # one for each of as many equal parts; None: as they are. A difference does not hide what
     # matters in large numbers.
     relative_to: Mapping[str, str | Sequence[str] | None] | None = None
+    presence: bool = False  # tell which vehicles behind are there, even where all always are
     raw: bool = False  # take every entry times 1, in SI units, whatever its scale
 
     measures = True
@@ -54,6 +55,11 @@ class Observation(Feature):
     def _flat(self) -> dict[tuple[str, str], float]:
         return {(view, name): x for view, own in self.scales.items() for name, x in own.items()}
 
+    def tells_presence(self, string: VehicleString) -> bool:
+        """Whether entries say which vehicles behind are there."""
+        everywhere = Views(string, AUTOMATED, [], self.visible).sees_all_behind()
+        return BEHIND in self.scales and (self.presence or not everywhere)
+
     def setup(self, world: World) -> None:
         """Find the entries and their columns."""
         flat, string, visible = self._flat(), world.string, self.visible
@@ -65,7 +71,7 @@ class Observation(Feature):
         bases = _bases(self.relative_to or {}, flat, counts)
         values = [x for x, n in zip(flat.values(), counts, strict=True) for _ in range(n)]
         seen = list(flat)
-        if BEHIND in self.scales and not Views(string, AUTOMATED, [], visible).sees_all_behind():
+        if self.tells_presence(string):
             seen.append((BEHIND, PRESENT))
             values += [1.0] * visible
             bases.append([])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
+from pydantic import Field
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -38,6 +39,8 @@ class Sensors(RoleTransform):
     gap_error: NonNegative = 0.0  # largest, of the gap [m]
     speed_error: NonNegative = 0.0  # largest, of the own speed [m/s]
     ahead_error: NonNegative = 0.0  # largest, of the speed of the vehicle ahead [m/s]
+    # Largest, of both speeds as a share of them: each is wrong by one factor for a whole episode.
+    scale_error: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
     error_time: NonNegative = 0.0  # in which errors change, a number of steps; 0: a step [s]
     delay: NonNegative = 0.0  # age of a measurement that arrives, a number of steps [s]
     dropouts: Share = 0.0  # chance that a measurement does not arrive: the last one stays
@@ -69,6 +72,7 @@ class Sensors(RoleTransform):
         # The same entries at reset, where there is no step before.
         self.first = Views(world.string, role, [*TRUE_STATE, "episode.seed", "episode.step"])
         self.streams = [stream_id(f"{role}.sensors.{name}") for name in ("gap", "speed", "ahead")]
+        self.scales = [stream_id(f"{role}.sensors.{name}_scale") for name in ("speed", "ahead")]
         self.missing = stream_id(f"{role}.sensors.missing")
         self.register_buffer("index", torch.arange(*self.rows).unsqueeze(-1))
 
@@ -82,7 +86,8 @@ class Sensors(RoleTransform):
             world.late(getattr(self, name), f"scenario.sensors.{role}.{name}")
             for name in ("delay", "longest_dropout")
         )
-        return Sensing(self.gap_error, self.speed_error, self.ahead_error, late, longest)
+        errors = (self.gap_error, self.speed_error, self.ahead_error, self.scale_error)
+        return Sensing(*errors, late, longest)
 
     def compute(self, memory: Tensor, *seen: Tensor) -> tuple[Tensor, ...]:
         """Return what is measured, and what is kept."""
@@ -106,8 +111,12 @@ class Sensors(RoleTransform):
             bound * self._error(seed, step - number, stream)
             for bound, stream in zip(bounds, self.streams, strict=True)
         )
-        speed = (speed + speed_error).clamp(min=0.0)
-        ahead = (ahead + ahead_error).clamp(min=0.0)
+        own, other = (
+            1.0 + self.sensing.scale * (2.0 * uniform(seed, 0, stream + self.index) - 1.0)
+            for stream in self.scales
+        )
+        speed = (own * speed + speed_error).clamp(min=0.0)
+        ahead = (other * ahead + ahead_error).clamp(min=0.0)
         kept = join([age, frames], -1)
         return gap + gap_error, speed, ahead - speed, ahead, acceleration, kept
 

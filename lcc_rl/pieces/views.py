@@ -102,6 +102,9 @@ class Views:
         if len(name) - (name[0] == NEXT) != 2:
             raise ConfigError(f"expected a name such as self.gap, got {given!r}")
         prefix, (space, entry) = name[:-2], name[-2:]
+        if self.string.measured and space in (SELF, AHEAD, BEHIND, LEADER):
+            seen = AHEAD if space == LEADER else space
+            return partial(_as_it_is, self._place((*prefix, seen, entry)))
         if space in (SELF, AHEAD):
             return self._at((*prefix, VEHICLES, entry), -1 if space == AHEAD else 0)
         if space == BEHIND:

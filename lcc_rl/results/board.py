@@ -59,7 +59,8 @@ def row_of(
     row |= {name: _number(found[name]) for name in COPIED}
     row["measures"] = {measure.key: _number(found[measure.key]) for measure in MEASURES}
     row["limits"] = {
-        name: {"bound": bound, "value": _number(found[name])} for name, bound in task.limits.items()
+        one.key: {"bound": bound, "value": _number(found[one.key])}
+        for one, bound in task.bounds.items()
     }
     row |= {name: int(str(found[name])) for name in ("collisions", "windows", "drives")}
     return row | {"kept": bool(found["kept"]), "drivers": drivers}

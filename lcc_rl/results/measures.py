@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from lcc_rl.energy import AVERAGED, AVERAGES
 from lcc_rl.results.windows import DAMPING, DISTANCE, WAYS, episode_mean, how
 
 PATH = "total_path_energy_kj"
@@ -115,6 +116,10 @@ MEASURES = [
     Measure(PATH, "path energy [kJ]", "{:.1f}"),
     Measure("total_acceleration_loss_kj", "  lost to accelerating [kJ]", "{:.1f}"),
     _energy("path_energy_", "  path energy per vehicle and km [kJ]", "path_energy"),
+    *(
+        _energy(name.removesuffix("kj"), f"    of speeds averaged over {seconds:g} s [kJ]")
+        for name, seconds in zip(AVERAGED, AVERAGES, strict=True)
+    ),
     Measure(DISTANCE, "distance of all vehicles [m]", "{:.0f}"),
     Measure("total_energy_kj", "energy as drawn [kJ]", "{:.1f}"),
     Measure("cav_energy_kj", "  CAV [kJ]", "{:.1f}"),
@@ -125,7 +130,7 @@ MEASURES = [
     Measure("mean_speed_mps", "mean speed [m/s]"),
     Measure(SPEED_STD, "deviation of a speed in time [m/s]", score=SPEED_STD),
     Measure(FINAL_SPREAD, "spread of speeds at the end [m/s]", score=FINAL_SPREAD),
-    Measure(FLOW, "flow [vehicles/h]", "{:.0f}"),
+    Measure(FLOW, "flow [vehicles/h]", "{:.0f}", limit="flow\n≥ {:.0f}\n[1/h]"),
     Measure("string_ratio", "string ratio", score="string_ratio"),
     Measure("damped", "episodes that end calm", "{:.0%}"),
     Measure(DAMPING, "  from when on, mean [s]", "{:.0f}", of="damped_s", per="damped"),

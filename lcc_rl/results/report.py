@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lcc_rl.config.words import FILTERED
+from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.energy import Fleet
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.io.files import Rows
@@ -39,13 +39,13 @@ RULE = "rule"  # the IDM tuned on the same data, by the gradient
 RULE_ROWS = (RULE, "idm_acc_filtered", "idm_acc")
 # Strategies that networks are compared with. All but the rule learn nothing.
 UNTRAINED = (
-    *("direct", "idm", HUMAN, "recorded", "constant_filtered", RULE),
+    *("direct", "idm", HUMAN, RECORDED, "constant_filtered", RULE),
     *("idm_acc_filtered", "acc_filtered", "idm_acc", "acc"),
 )
 FEW_WINDOWS, SHORT = 5, 150.0  # windows; seconds of them
 SCORE, FLOW_LOST = "score", "flow_lost"
 SAVED = Shown("saved_pct", "saved\n[%]")
-WAY = Shown("distance_pct", "dis-\ntance\n[%]")
+WAY, FLOW_SHARE = Shown("distance_pct", "dis-\ntance\n[%]"), Shown("flow_pct", "flow\n[%]")
 COLLISIONS, KEEPS = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
 FLOW_NAMED = 0.05  # share of the flow from which on a table says that it is lost
 MUCH = 0.01  # share of time beyond the reach of an energy model that tables and log name
@@ -217,6 +217,7 @@ def report(
     """
     if task:
         task = replace(task, against=against) if against else task.among(windows["strategy"])
+        task = task.resolved(windows)
     table, said = summary(windows, task, energy, against), remarks(windows)
     percent = {f"saved_pct{end}": 100.0 * table[f"saving{end}"] for end in ("", "_low", "_high")}
     percent["distance_pct"] = -100.0 * table["distance_lost"] + 0.0  # no negative zero
@@ -262,15 +263,17 @@ def _of_energy(table: pd.DataFrame, energy: Fleet | None, filtered: bool) -> dic
     cars = table[table[PATH].notna()] if table[PATH].notna().any() else table
     cars = cars.sort_values(PATH_PER_KM, ascending=False, kind="stable").reset_index(drop=True)
     against = (cars["against"].iloc[0] or None) if len(cars) > 1 else None
-    note = "" if against is None else f"{saved_against(cars, against)}; distance against theirs; "
+    who, flow = flow_against(cars)
+    way, whose = (WAY, "distance against theirs") if flow.isna().all() else (FLOW_SHARE, who)
+    note = "" if against is None else f"{saved_against(cars, against)}; {whose}; "
     short = [one for one in MEASURES if one.short]
-    columns = {"energy_kj_per_km": cars[PATH_PER_KM]}
+    columns = {"energy_kj_per_km": cars[PATH_PER_KM], FLOW_SHARE.key: flow}
     columns |= {one.shown.key: (one.scale * cars[one.key]).round(2) for one in short}
     shown = [Shown("energy_kj_per_km", "energy\n[kJ/km]")]
     if energy is not None and burns_one_fuel(energy):
         columns["fuel_g_per_km"] = cars[PATH_PER_KM] * in_unit(1.0, "g/km", energy)
         shown.append(Shown("fuel_g_per_km", "fuel\n[g/km]"))
-    shown += [] if against is None else [SAVED, WAY]
+    shown += [] if against is None else [SAVED, way]
     shown += [*(one.shown for one in short), COLLISIONS]
     return {
         "short": shortened(cars.assign(**columns), shown),
@@ -288,7 +291,7 @@ def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
     shown = [
         Shown(SCORE, task.label.replace(" ", "\n")),
         SAVED,
-        way,
+        *(() if way.key in {one.key for one in limits} else [way]),
         *limits,
         COLLISIONS,
         KEEPS,
@@ -329,6 +332,18 @@ def saved_against(found: pd.DataFrame, against: str, always: bool = False) -> st
     if drives < min(LEAST_DRIVES, windows):
         over += f" (too narrow: windows of {several(drives, 'drive')} are alike)"
     return f"{words}, with the 95 % interval over {over}"
+
+
+def flow_against(table: pd.DataFrame) -> tuple[str, pd.Series]:
+    """Return whose flow the others' is compared with, and the differences [%].
+
+    These are the recorded drivers, else the drivers that savings are against.
+    """
+    known = set(table["strategy"])
+    name = RECORDED if RECORDED in known else table["against"].iloc[0]
+    whole = table.loc[table["strategy"] == name, FLOW]
+    share = table[FLOW] / (whole.iloc[0] if len(whole) else np.nan) - 1.0
+    return f"flow against {in_words(str(name))}", 100.0 * share
 
 
 def flow_note(table: pd.DataFrame) -> str:
@@ -383,10 +398,14 @@ def _sentence(windows: pd.DataFrame, rows: Mapping[str, Any], name: str, other: 
     own, theirs = (100.0 * rows[x][LONG_GAPS] for x in (name, other))
     article = "the " if in_words(name) != name else ""
     interval = f"({low:.1f} … {high:.1f})".replace("-", "−")
+    flows = [f"{rows[x][FLOW]:,.0f}" for x in (name, other, RECORDED) if x in rows]
+    flow = f"; flow: {flows[0]} vehicles per hour against {flows[1]}"
+    flow += f", {in_words(RECORDED)} {flows[2]}" if len(flows) > 2 else ""
+    flow *= bool(np.isfinite(rows[name][FLOW]))
     return (
         f"With {article}{in_words(name)}, energy per vehicle and km is {saved:.1f} % {interval} "
         f"{less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of "
-        f"the time against {theirs:.2f} %."
+        f"the time against {theirs:.2f} %{flow}."
     )
 
 

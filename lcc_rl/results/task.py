@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
+from typing import Literal
 
+import pandas as pd
+
+from lcc_rl.config.words import RECORDED
 from lcc_rl.errors import unknown_name
 from lcc_rl.results import measures
 from lcc_rl.results.measures import Measure
@@ -22,8 +26,9 @@ class Task(Settings):
     unit: str = "kJ/km"  # of an energy over a distance, see lcc_rl.results.units
     against: str = HUMAN  # the strategy that the others are compared with
     # Bounds by column: the largest value of max_… and the smallest of min_… in any episode, and
-    # the largest mean of share_… over all episodes.
-    limits: Mapping[str, NonNegative] = field(default_factory=dict)
+    # the largest mean of share_… over all episodes, the smallest mean of flow_vph; ``recorded`` for
+    # the value of the recorded drivers.
+    limits: Mapping[str, NonNegative | Literal["recorded"]] = field(default_factory=dict)
 
     def validate(self) -> None:
         if self.score not in measures.score_measures():
@@ -40,10 +45,22 @@ class Task(Settings):
         names = list(dict.fromkeys(map(str, strategies)))
         return self if self.against in names else replace(self, against=names[0])
 
+    def resolved(self, windows: pd.DataFrame) -> Task:
+        """Return the task with the values of the recorded drivers as its limits that are these."""
+        part, known = windows[windows["strategy"] == RECORDED], measures.limit_measures()
+        found = {
+            key: known[key].value(part) if bound == RECORDED and len(part) else bound
+            for key, bound in self.limits.items()
+        }
+        return replace(self, limits=found)
+
     @property
     def bounds(self) -> dict[Measure, float]:
-        """The limits by measure."""
-        return {measures.limit_measures()[key]: bound for key, bound in self.limits.items()}
+        """The limits by measure, without those of recorded drivers that are not known."""
+        known = measures.limit_measures()
+        return {
+            known[key]: bound for key, bound in self.limits.items() if not isinstance(bound, str)
+        }
 
     @property
     def measure(self) -> Measure:

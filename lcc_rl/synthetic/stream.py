@@ -17,7 +17,7 @@ import pandas as pd
 from pydantic import Field, InstanceOf
 
 from lcc_rl.data.car_following import Criteria
-from lcc_rl.data.sources import LoadedEpisodes, episodes_of
+from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource
 from lcc_rl.data.trajectories import (
     FOOT,
     FRAME,
@@ -88,7 +88,8 @@ class StreamSource(Settings):
         Raises:
             DataError: if no pair meets the criteria.
         """
-        loaded = episodes_of(as_recorded(self.generate().samples), self.criteria, None)
+        recorded = as_recorded(self.generate().samples)
+        loaded = TrajectorySource(criteria=self.criteria).extracted(recorded)
         size = f"{self.recordings} recordings of {self.platoons} platoons of {self.vehicles}"
         line = f"synthetic stream: {size} vehicles, seed {self.seed}"
         return replace(loaded, report=[line, *loaded.report])

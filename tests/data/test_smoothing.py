@@ -5,12 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from ngsim_text import cells, csv_text, pair
 
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.smoothing import SavitzkyGolay
+from lcc_rl.data.smoothing import SavitzkyGolay, averaged
+from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.data.trajectories import Trajectories
+from lcc_rl.errors import DataError
 
 FOOT = 0.3048
 EVERY = [SavitzkyGolay(), SavitzkyGolay(window_s=0.8, order=2)]
@@ -98,3 +101,38 @@ def test_ripple_at_standstill_becomes_zero_and_is_counted(tmp_path: Path) -> Non
     smoothed = SavitzkyGolay()(drive(tmp_path, position))
     assert smoothed.samples["speed_mps"].eq(0).all()
     assert "36 speeds below zero became zero" in str(smoothed.report)
+
+
+def noisy_pairs() -> pd.DataFrame:
+    """Two pairs of 20 s whose leader's speed is measured with noise."""
+    generator, time = np.random.default_rng(0), np.round(0.1 * np.arange(200), 1)
+    parts = []
+    for number in (0, 1):
+        noise = generator.normal(0.0, 0.1, len(time))
+        speed = {"leader_speed_mps": 10.0 + number + noise, "follower_speed_mps": 10.0 + number}
+        gap = 20.0 + np.cumsum(np.append(0.0, 0.1 * noise[:-1]))
+        parts.append(pd.DataFrame({"episode": number, "time_s": time, "gap_m": gap, **speed}))
+    return pd.concat(parts, ignore_index=True)
+
+
+def test_an_average_takes_noise_and_keeps_gaps_consistent(tmp_path: Path) -> None:
+    noisy_pairs().to_parquet(tmp_path / "pairs.parquet")
+    source = {"path": str(tmp_path / "pairs.parquet")}
+    raw, loaded = (EpisodesSource(**source, **x).load() for x in ({}, {"average_s": 1.1}))
+    assert "averaged over 1.1 s: left out 20 rows" in loaded.report[-1]
+    for number, episode in loaded.episodes.groupby("episode"):
+        whole = raw.episodes[raw.episodes["episode"] == number]
+        assert episode["time_s"].tolist() == whole["time_s"].tolist()[5:-5]
+        for name in ("leader_speed_mps", "gap_m"):
+            means = whole[name].rolling(11, center=True).mean().iloc[5:-5]
+            np.testing.assert_allclose(episode[name], means, rtol=1e-5)
+        apart = episode["leader_speed_mps"] - episode["follower_speed_mps"]
+        np.testing.assert_allclose(episode["gap_m"].diff()[1:], 0.1 * apart[:-1], atol=1e-4)
+
+
+def test_an_average_longer_than_all_episodes_is_refused() -> None:
+    columns = {"follower_position_m": 0.0, "leader_position_m": 0.0}
+    with pytest.raises(
+        DataError, match=r"mine\.csv: the longest episode has 20\.0 s, data\.average_s"
+    ):
+        averaged(noisy_pairs().assign(**columns), 30.0, "mine.csv")

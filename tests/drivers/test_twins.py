@@ -29,7 +29,7 @@ from lcc_rl.drivers.twins import (
     ratios,
     tried,
 )
-from lcc_rl.errors import DataError
+from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.driver_models import PARAMETERS
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.power import acceleration_loss
@@ -155,7 +155,15 @@ def test_twins_of_one_delay_meet_the_same_noise() -> None:
     pd.testing.assert_frame_equal(loud, alone)
     # Without reaction they are the drivers themselves.
     assert (quiet.pop("rmspe") < 1e-9).all()
-    pd.testing.assert_frame_equal(quiet, measure_recorded(observed), rtol=1e-9)
+    records = measure_recorded(observed)
+    pd.testing.assert_frame_equal(quiet, records[quiet.columns], rtol=1e-9)
+    same = ratios(quiet, records)
+    assert [same[f"lost_{third}"] for third in (1, 2, 3)] == pytest.approx([1.0] * 3)
+    assert same["slope"] == pytest.approx(0.0, abs=1e-6)
+    seen = drive_twins(observed, known, [Reaction(0.0, 0.0, 0.3)])[0]
+    near = ratios(seen, records)
+    assert near["lost_1"] > 1.0
+    assert near["slope"] > same["slope"]
     assert (loud["lost_1.1s_j"] > quiet["lost_1.1s_j"]).all()
 
 
@@ -165,6 +173,23 @@ def test_the_search_for_a_reaction_reports_its_progress(monkeypatch) -> None:
     seen = []
     tried(observe(episodes), known, lambda *state: seen.append(state))
     assert seen == [(13, 26, "reactions tried"), (26, 26, "reactions tried")]
+
+
+def test_noises_of_the_gap_are_tried_and_weigh_rough_leaders_only_where_asked(monkeypatch) -> None:
+    for name, values in (("DELAYS", (0.0,)), ("NOISES", (0.0, 0.2)), ("GAP_NOISES", (0.3,))):
+        monkeypatch.setattr(twins, name, values)
+    episodes, known = followed(0.0, 0.2, drivers=6)
+    observed = observe(episodes)
+    every = tried(observed, known, perception=True)
+    assert set(every) == {Reaction(), Reaction(0.0, 0.2), Reaction(0.0, 0.0, 0.3)}
+    rows = np.ones(6, bool)
+    records = measure_recorded(observed)
+    assert choose_reaction(every, records, rows) == Reaction(0.0, 0.2)
+    result = Calibrator(reaction=True, perception=True)(observed)
+    assert "gap_noise" in result.drivers
+    assert any("of it behind the calmest, middle and roughest" in line for line in result.report)
+    with pytest.raises(ConfigError, match="perception chooses a part of the reaction"):
+        Calibrator(perception=True)
 
 
 def test_drivers_that_hold_their_speeds_tell_nothing() -> None:

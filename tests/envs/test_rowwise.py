@@ -9,6 +9,8 @@ import torch
 from lcc_rl.envs.rowwise import Rowwise
 
 TABLE = torch.linspace(-1.0, 1.0, 12).reshape(4, 3)
+LAYERS = torch.nn.Sequential(torch.nn.Linear(4, 6), torch.nn.ReLU(), torch.nn.Linear(6, 2))
+LAYERS.requires_grad_(False)
 PLACES = torch.tensor([3, 0, 2])
 
 FUNCTIONS = {
@@ -25,6 +27,7 @@ FUNCTIONS = {
     "folds": lambda x, n: x.sum(-1, keepdim=True) * (x > 1.0).any(-1, keepdim=True),
     "tables": lambda x, n: TABLE[n].sum(-2) + TABLE[:, 1][n][..., :3] - x[..., PLACES],
     "search": lambda x, n: torch.searchsorted(TABLE[1], x[..., :3].contiguous()) + n[..., :3] * 0.5,
+    "network": lambda x, n: LAYERS(x),
     "truth": lambda x, n: (x > 0.0) * x + (x <= 0.0).to(x.dtype) + (x > 0.0).double(),
 }
 
@@ -60,6 +63,10 @@ def test_what_has_no_translation_is_computed_by_tensors(subtests) -> None:
         lambda x, n: (torch.rsub(x, 1.0, alpha=2.0),),
         lambda x, n: (x.gather(-1, n),),  # no constant to read from
         lambda x, n: (x.clone().mul_(2.0),),  # changes what it is given
+        lambda x, n: (torch.as_tensor(2.0 * x.numpy()),),  # leaves tensors
+        lambda x, n: (torch.as_tensor(2.0 * np.asarray(x)),),
+        lambda x, n: (torch.tensor(x.tolist()),),
+        lambda x, n: (torch.addmm(x, x, torch.eye(4)),),  # no constant bias
     ]:
         with subtests.test(function=function):
             rows, given = Rowwise(function, examples(1), "a test"), examples(5)

@@ -3,7 +3,13 @@
 import pytest
 import torch
 
-from lcc_rl.evaluation.metrics import energy_measures, safety_measures, string_measures
+from lcc_rl.energy import AVERAGED, as_fleet
+from lcc_rl.evaluation.metrics import (
+    averaged_energies,
+    energy_measures,
+    safety_measures,
+    string_measures,
+)
 from lcc_rl.evaluation.rows import grouped
 from lcc_rl.functional.pattern import parse_string
 from lcc_rl.results.measures import limit_measures
@@ -25,6 +31,26 @@ def test_energy_counts_only_the_running_steps() -> None:
     first = ((2911 + 251.9) * 100 + (2911 + 277.09) * 100) * 0.1 / 1e3
     second = (2911 + 251.9) * 400 * 0.1 / 1e3
     torch.testing.assert_close(measures["acceleration_loss_kj"], torch.tensor([first, second]))
+
+
+def test_averaged_energies_leave_noise_out_and_count_the_whole_way() -> None:
+    time = 0.1 * torch.arange(300).view(-1, 1, 1, 1)
+    even = (10.0 + 0.05 * time).expand(300, 2, 1, 1)
+    jitter = 0.1 * (-1.0) ** torch.arange(300).view(-1, 1, 1, 1)
+    alive = torch.ones(299, 2, 1, 1, dtype=torch.bool)
+    alive[100:, 1] = False  # the second episode ends early
+
+    def driven(speed: torch.Tensor) -> dict[str, torch.Tensor]:
+        power = as_fleet(None).power(speed[:-1], speed.diff(dim=0) / 0.1)
+        raw = energy_measures(power, speed, alive, 0.1)
+        return raw | averaged_energies(speed, alive, 0.1)
+
+    smooth, noisy = driven(even), driven(even + jitter)
+    assert (noisy["path_energy_kj"] > 3.0 * smooth["path_energy_kj"]).all()
+    for name in AVERAGED:
+        torch.testing.assert_close(smooth[name], smooth["path_energy_kj"], rtol=5e-3, atol=0.0)
+        torch.testing.assert_close(noisy[name], smooth[name], rtol=0.1, atol=0.0)
+    assert averaged_energies(even[:20], alive[:19], 0.1)[AVERAGED[1]].isnan().all()
 
 
 def test_safety() -> None:
@@ -55,7 +81,7 @@ def test_safety() -> None:
     assert set(measures) == set(expected)
     named = {name for name in expected if name.startswith(("max_", "min_", "share_"))}
     filtered = {"share_ttc_unpromised", "share_turned_unsafe"}
-    assert named | {"share_leader_faster"} | filtered == set(limit_measures())
+    assert named | {"share_leader_faster", "flow_vph"} | filtered == set(limit_measures())
     for name, values in expected.items():
         torch.testing.assert_close(measures[name].flatten(), torch.tensor(values))
 

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import check_refused, compose
+from helpers import ACTION, POPULATION, check_refused, compose, wavy_profiles
 from tensordict.nn import TensorDictModule
 
+from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.named import TUNED
@@ -17,8 +18,10 @@ from lcc_rl.evaluation.strategies import (
     baseline,
     check_distinct,
     named_apart,
+    trained,
 )
 from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.results.policies import load_policy
 
 
 @pytest.mark.parametrize("name", TUNED)
@@ -107,3 +110,13 @@ def test_a_policy_of_a_task_is_refused_without_a_task_and_in_another_scenario() 
         check_policy(compose("alcc"), own)
     with pytest.raises(ConfigError, match="in the scenario leading_cruise, not in ring"):
         check_policy(compose("alcc", "task=ring-22"), own)
+
+
+def test_a_policy_that_may_be_the_last_drives_where_it_never_is() -> None:
+    weights, own = load_policy("pretrained/i24-mixed")  # learned at drawn places
+    cfg = compose("alcc", "task=i24-mixed", "scenario.string=automated human*2 automated human")
+    strategy = trained(cfg, "pretrained/i24-mixed", (weights, own), POPULATION)
+    env = build_env(strategy.cfg, wavy_profiles(), POPULATION, 2)
+    observed = strategy.policy(env.reset())
+    assert observed[ACTION].shape == (2, 2, 1)
+    assert (observed["automated", "observation"][..., -1] == 1.0).all()

@@ -83,6 +83,10 @@ def test_mistakes_are_named_before_the_data_are_read(tmp_path, monkeypatch) -> N
     cases = [
         ("task=i80-follow compare=[idm] task.unit=mpg", "unit=mpg"),
         ("task=i80-follow compare=[idm] +task.limits.gap=3", "task.limits 'gap'"),
+        (
+            "task=i80-follow compare=[idm] +task.limits.flow_vph=recorded",
+            "flow_vph=recorded: add recorded to evaluation.baselines",
+        ),
         ("variant=idm compare=[follower_stoper]", "follower_stopper"),
         ("variant=alcc", "variant alcc is learned: give policy="),
         ("variant=idm evaluation.shards=2 evaluation.shard=2", "shard must lie from 0 to"),

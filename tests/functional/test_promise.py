@@ -16,6 +16,7 @@ from lcc_rl.functional.braking import Braking, least_room_to_come
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.safety import time_to_collision
 from lcc_rl.pieces import Actuation, CBFFilter, Sensors
+from lcc_rl.pieces.cbf import REMEMBERS
 from lcc_rl.pieces.world import World
 
 STEP, LIMIT, STEPS, HARD = 0.1, 4.0, 300, 3.0
@@ -29,9 +30,13 @@ FAULTS = {
     "delay 0.2 s, lag 1 s": (Actuation(delay=0.2, lag=1.0), Sensors()),
     "brakes 2.5 m/s²": (Actuation(braking=2.5), Sensors()),
     "errors": (Actuation(), Sensors(**ERRORS)),
+    "scale": (Actuation(), Sensors(scale_error=0.02)),
     "sensors 0.2 s late": (Actuation(), Sensors(delay=0.2)),
     "drop-outs": (Actuation(), Sensors(**LOST)),
-    "all": (Actuation(delay=0.2, lag=0.3, braking=2.5), Sensors(delay=0.2, **ERRORS, **LOST)),
+    "all": (
+        Actuation(delay=0.2, lag=0.3, braking=2.5),
+        Sensors(delay=0.2, scale_error=0.01, **ERRORS, **LOST),
+    ),
 }
 
 
@@ -48,6 +53,7 @@ class Road:
         self.chance = torch.Generator().manual_seed(seed)
         self.obeyed = self.acceleration = self.ahead_acceleration = torch.zeros(count, 1)
         self.pending = torch.zeros(count, self.response.late)
+        self.agreed = torch.zeros(count, REMEMBERS)
         self.dropped = torch.zeros(count, 1, dtype=torch.long)
         found = states(count, self.limits, seed, self.room)
         self.speed, room, self.ahead = (x.unsqueeze(-1) for x in found)
@@ -57,6 +63,7 @@ class Road:
         self.leads = torch.randint(0, 6, (count,), generator=self.chance)
         # Who sees everything too rosy, who sees it so or too dark in turn, who at random.
         self.errs = torch.randint(0, 3, (count, 1), generator=self.chance)
+        self.factor = 1.0 - 2.0 * (self.errs == 1).float()  # of the error of scale, always
 
     def room(self, speed: Tensor, gap: Tensor, ahead: Tensor, braking: Braking) -> Tensor:
         now = PairState(*(x.unsqueeze(-1) for x in (speed, gap, ahead)), self.obeyed)
@@ -77,21 +84,23 @@ class Road:
         turns = 2.0 * torch.randint(0, 2, (count, 1), generator=self.chance) - 1.0
         drawn = 2.0 * draw(count, self.chance).unsqueeze(-1) - 1.0
         sign = torch.where(self.errs == 0, 1.0, torch.where(self.errs == 1, turns, drawn))
-        speed = (speed - sign * bounds.speed).clamp(min=0.0)
-        ahead = (ahead + sign * bounds.ahead).clamp(min=0.0)
+        factor = self.factor * bounds.scale
+        speed = ((1.0 - factor) * speed - sign * bounds.speed).clamp(min=0.0)
+        ahead = ((1.0 + factor) * ahead + sign * bounds.ahead).clamp(min=0.0)
         memories = {
             "automated.actuation": torch.cat([self.obeyed, self.pending], -1),
             "automated.sensors": torch.cat([age.float(), stack.flatten(-2)], -1),
         }
         kept = (memories[name] for name in self.filter.memories)
-        return [speed, gap + sign * bounds.gap, ahead, acceleration, *kept]
+        return [speed, gap + sign * bounds.gap, ahead, acceleration, self.agreed, *kept]
 
     def advance(self, step: int) -> Tensor:
         """Take a step; return time-to-collision [s]."""
         wish = torch.full_like(self.speed, HARD)
         if step % 50 < 25:
             wish = torch.where(draw(len(wish), self.chance).unsqueeze(-1) < 0.8, wish, -HARD)
-        line = torch.cat([self.pending, self.filter.filtered(wish, *self.measured())], -1)
+        command, self.agreed = self.filter.filtered(wish, *self.measured())
+        line = torch.cat([self.pending, command], -1)
         self.obeyed, self.pending = self.response.next(self.obeyed, line[:, :1]), line[:, 1:]
         speed, self.acceleration = advance_speed(self.speed, self.obeyed, STEP)
         gap = self.gap.squeeze(-1)
@@ -144,8 +153,9 @@ def farthest_behind(piece: CBFFilter) -> tuple[float, float]:
     phase = 20.0 * draw(len(gap), chance).unsqueeze(-1)
     wish = torch.where(draw(len(gap), chance).unsqueeze(-1) < 0.5, -HARD, 0.0)
     seen, farthest, least = torch.zeros_like(gap), 0.0, torch.inf
+    agreed = torch.zeros(len(gap), REMEMBERS)
     for step in range(600):
-        command = piece.filtered(wish, speed, gap, ahead, seen)
+        command, agreed = piece.filtered(wish, speed, gap, ahead, seen, agreed)
         pressed = torch.where((step * STEP + phase) % 20.0 < 12.0, 0.5 * HARD, -2.6)
         reached = advance_speed(speed, command, STEP)[0]
         ahead_reached = advance_speed(ahead, pressed, STEP)[0].clamp(max=50.0)

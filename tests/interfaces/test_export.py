@@ -14,18 +14,25 @@ from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.interfaces.export import main
-from lcc_rl.interfaces.exported import ExportedPolicy, exported_policy
+from lcc_rl.interfaces.exported import DrivingProgram, program
 from lcc_rl.results.policies import load_policy
 
 
 @pytest.fixture(scope="module")
-def module() -> ExportedPolicy:
-    return exported_policy("pretrained/i80-follow")
+def module() -> DrivingProgram:
+    return program("pretrained/i80-follow")
 
 
-def states(module: ExportedPolicy, count: int = 256) -> torch.Tensor:
+def states(module: DrivingProgram, count: int = 256) -> torch.Tensor:
     chance = torch.Generator().manual_seed(0)
     return 20.0 * torch.rand(count, len(module.names), generator=chance)
+
+
+def memories(module: DrivingProgram, count: int = 256) -> torch.Tensor:
+    """Of filters: gaps of as many metres as are predicted, and what they grow too fast [m/s]."""
+    chance = torch.Generator().manual_seed(1)
+    drawn, begun = torch.rand(count, 2, generator=chance), torch.ones(count, module.width - 2)
+    return torch.cat([begun, 20.0 * drawn[:, :1], drawn[:, 1:] - 0.5], -1)
 
 
 def test_it_commands_what_the_vehicle_of_the_environment_obeys(module) -> None:
@@ -36,10 +43,12 @@ def test_it_commands_what_the_vehicle_of_the_environment_obeys(module) -> None:
 
     def policy(td):
         state = torch.stack([value(td, name) for name in module.names], -1)
-        said.append(module(state).squeeze(-1))
+        acceleration, memory[0] = module(state, memory[0])
+        said.append(acceleration.squeeze(-1))
         return td.set(("automated", "action"), said[-1].view(-1, 1, 1) / 3.0)
 
     said: list[torch.Tensor] = []
+    memory = [torch.zeros(16, module.width)]
     record, _ = play(env, policy, None, [("command", "automated")])
     obeyed = record["command", "automated"].flatten(1)[-60:]
     # Filtered inside already, the environment's own filter changes nothing.
@@ -56,16 +65,18 @@ def value(td, name: str) -> torch.Tensor:
 def test_the_filter_is_inside(module) -> None:
     near = {"ahead.speed": 0.0, "self.gap": 5.0}
     state = torch.tensor([[near.get(name, 15.0) for name in module.names]])
-    assert module(state).item() == -3.0
-    assert torch.isfinite(module(torch.full_like(state, torch.nan))).all()
+    anew = torch.zeros(1, module.width)
+    assert module(state, anew)[0].item() == -3.0
+    assert all(x.isfinite().all() for x in module(torch.full_like(state, torch.nan), anew))
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 def test_a_pytorch_program_computes_the_same_and_says_what_it_reads(module, tmp_path) -> None:
     path = lcc_rl.export("pretrained/i80-follow", tmp_path / "policy.pt2")
     about = {"lcc_rl": ""}
-    program = torch.export.load(path, extra_files=about).module()
-    torch.testing.assert_close(program(states(module)), module(states(module)))
+    loaded = torch.export.load(path, extra_files=about).module()
+    given = (states(module), memories(module))
+    torch.testing.assert_close(loaded(*given), module(*given))
     assert [item["name"] for item in json.loads(about["lcc_rl"])["inputs"]] == module.names
     with pytest.raises(ResultsError, match="is already there"):
         lcc_rl.export("pretrained/i80-follow", path)
@@ -77,9 +88,10 @@ def test_onnxruntime_computes_the_same(module, tmp_path) -> None:
     pytest.importorskip("onnxscript", reason="extra interfaces")
     path = lcc_rl.export("pretrained/i80-follow", tmp_path / "policy.onnx")
     session = runtime.InferenceSession(path)
-    state = states(module)
-    (found,) = session.run(None, {"state": state.numpy()})
-    np.testing.assert_allclose(found, module(state).numpy(), atol=1e-5)
+    state, memory = states(module), memories(module)
+    found = session.run(None, {"state": state.numpy(), "memory": memory.numpy()})
+    for one, other in zip(found, module(state, memory), strict=True):
+        np.testing.assert_allclose(one, other.numpy(), atol=1e-5)
     about = json.loads(session.get_modelmeta().custom_metadata_map["lcc_rl"])
     assert about["filter"] is True
     assert [item["name"] for item in about["inputs"]] == module.names

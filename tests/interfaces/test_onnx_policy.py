@@ -27,11 +27,10 @@ from lcc_rl.evaluation.named import controller_of, is_policy
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.evaluation.strategies import driven_by, trained
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.interfaces.driver import Driver, Measured, state_of
-from lcc_rl.interfaces.exported import ExportedPolicy, Remembering
+from lcc_rl.interfaces.driver import Driver
+from lcc_rl.interfaces.exported import NetworkController, driving, measuring
 from lcc_rl.interfaces.onnx_policy import OnnxPolicy, Program
 from lcc_rl.pieces import Action, Observation
-from lcc_rl.pieces.base import SEED, STEP
 from lcc_rl.pieces.knowledge import ObservationMemory
 from lcc_rl.results.policies import load_policy
 
@@ -103,12 +102,9 @@ def test_a_program_remembers_what_it_returned(tmp_path) -> None:
     torch.testing.assert_close(kept, data["vehicles", "gap"][:, :, :1].cumsum(1))
     torch.testing.assert_close(data["next", "command", "automated"], gaps)
     # Alike where another simulator measures, such as SUMO.
-    driver, measured = Driver(path, 0.1), state_of([Measured(*[1.0] * 9)] * 2)
-    measured |= {key: torch.zeros(2, 1, dtype=torch.int64) for key in (SEED, STEP)}
-    kept = driver.begin(measured)
+    driver = Driver(path, 0.1)
     for step in range(1, 4):
-        command, kept = driver(measured, kept)
-        assert command.tolist() == [float(step)] * 2
+        assert driver.step({"self.gap": [1.0, 0.5]}).tolist() == [step, 0.5 * step]
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +156,8 @@ def test_it_remembers_as_the_piece_does(kind) -> None:
     kinds = (Observation, Action, ObservationMemory)
     seen, action, memory = (next(p for p in pieces if isinstance(p, k)) for k in kinds)
     network = torch.nn.Linear(len(seen.factors), 1)
-    driver = Remembering(ExportedPolicy(network, seen, action, None, memory))
+    controller = NetworkController(network=network, max_acceleration=action.max_acceleration)
+    driver = driving([memory, seen, controller], None, measuring(0.1))
     kept = torch.zeros(3, driver.width)
 
     whose = {"self": ("vehicles", 0), "ahead": ("leader", 0), "behind": ("vehicles", 1)}

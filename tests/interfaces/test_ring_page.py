@@ -28,6 +28,7 @@ from lcc_rl.interfaces.export import export
 from lcc_rl.interfaces.ring_page import RING_TASK, filter_data, ring_page
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.base import SEED
+from lcc_rl.pieces.cbf import REMEMBERS
 from lcc_rl.results.policies import load_policy
 
 STEPS, EPISODE = 600, 976413892
@@ -151,7 +152,8 @@ def test_filter_and_fuel_are_the_packages_in_any_state(browser) -> None:
     filters = [CBFFilter(**settings).bind() for settings in ({}, WIDER)]
     given = {"states": states.tolist(), "filters": [filter_data(f) for f in filters]}
     found = torch.tensor(browser(ring_page(RING), ALL, **given), dtype=torch.float64)
-    wanted = [f.filtered(*states.unsqueeze(1).split(1, -1)).flatten() for f in filters]
+    columns, anew = states.unsqueeze(1).split(1, -1), states.new_zeros(len(states), 1, REMEMBERS)
+    wanted = [f.filtered(*columns, anew)[0].flatten() for f in filters]
     fuel = CirclesFuel(vehicle="Compact").fuel(states[:, 1], states[:, 4])
     torch.testing.assert_close(found, torch.stack([*wanted, fuel], -1), rtol=1e-7, atol=1e-8)
 

@@ -126,12 +126,13 @@ def test_with_nobody_ahead_in_sight_sumo_drives(tmp_path) -> None:
         libsumo.simulationStep()
         commanded = bridge.command()
     assert not commanded
-    assert not bridge.driven
+    assert not bridge.driver.cars
     assert libsumo.vehicle.getSpeedMode("own") == 31
     libsumo.vehicle.setSpeed("lead", 0.0)
     while not bridge.command():
         libsumo.simulationStep()
-    assert bridge.driven["own"]["episode", "step"].item() == 1
+    memory, ahead = bridge.driver.memory, bridge._measured("own")[3]
+    assert memory[:, 1:5].tolist() == [pytest.approx([ahead] * 4)]  # it has begun anew
     libsumo.vehicle.remove("own")
     libsumo.simulationStep()
     assert not bridge.command()
@@ -217,8 +218,7 @@ def test_bad_input_is_one_clear_error(tmp_path) -> None:
     start(tmp_path, {"lead": (500.0, 10.0), "own": (480.0, 10.0)})
     cases = [
         ("follow_stopper", "Did you mean 'follower_stopper'"),
-        ("acc_filtered", "acc_filtered: there is no safety filter here"),
-        ({"_target_": "lcc_rl.pieces.CACC"}, "vehicles.gap_error, which is not measured"),
+        ({"_target_": "lcc_rl.pieces.CACC"}, "CACC reads self.gap_error, which is not measured"),
         (nobody_knows, r"nobody_knows.*: the command of own is nan at 0\.1 s"),
         (alone, r"alone writes .* \[\] .* expected \[1, 1\] .* per vehicle"),
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -15,7 +16,9 @@ from lcc_rl.evaluation.metrics import safety_measures
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.functional.actuation import PairState, Response
 from lcc_rl.functional.braking import Braking, safe_command
+from lcc_rl.functional.kinematics import advance_speed
 from lcc_rl.pieces import Actuation, CBFFilter
+from lcc_rl.pieces.cbf import REMEMBERS
 from lcc_rl.pieces.rewards import TERMS
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import Positive
@@ -138,23 +141,61 @@ def test_the_filter_brakes_when_it_cannot_know(subtests) -> None:
             with subtests.test(value=value, place=place):
                 given = [column(x, x) for x in (0.5, 8.0, 20.0, 8.0, 0.0)]
                 given[place][0] = value
-                command = CBFFilter().bind().filtered(*given)
+                command, _ = CBFFilter().bind().filtered(*given, torch.zeros(1, REMEMBERS))
                 assert command[0] == -3.0
                 assert command[1] == 0.5
+
+
+def command(piece: CBFFilter, *given: float) -> torch.Tensor:
+    """What the filter makes of a wish, own speed, gap, speed and acceleration ahead at first."""
+    state = [column(x) for x in (*given, *[0.0] * (5 - len(given)))]
+    return piece.filtered(*state, torch.zeros(1, REMEMBERS))[0]
 
 
 def test_the_margin_counts_as_contact() -> None:
     # Both drive 5 m/s, 2.2 m apart; of that 2.2 − 0.2 = 2 m are free: 3 · 2 / (4 + 0.05) m/s².
     piece = CBFFilter(rate=3.0, margin=0.2).bind()
-    held = piece.filtered(column(3.0), column(5.0), column(2.2), column(5.0), column(0.0))
+    held = command(piece, 3.0, 5.0, 2.2, 5.0)
     assert held.item() == pytest.approx(6.0 / 4.05, rel=1e-5)
 
 
 def test_safety_wins() -> None:
     # A gap far too long, closing far too fast: the limits contradict each other.
     piece = CBFFilter(time_gap=0.5, full_speed=0.0).bind()
-    speed, gap, ahead = (column(x) for x in (10.0, 20.0, 2.0))
-    assert piece.filtered(column(3.0), speed, gap, ahead, column(0.0)) == -3.0
+    assert command(piece, 3.0, 10.0, 20.0, 2.0) == -3.0
+
+
+def test_below_its_margin_it_does_not_accelerate_until_the_gap_grows() -> None:
+    piece = CBFFilter(margin=2.0).bind()
+    for ahead, accelerates in [(0.0, False), (0.5, True)]:
+        assert (command(piece, 1.0, 0.0, 1.9, ahead, 2.0) > 0.0) == accelerates
+
+
+LIMITS = {"margin": 2.0, "time_gap": None, "longest_gap": 115.0, "shortest_time_gap": 1.05}
+# What a leader's reported speed runs ahead of the rate of its position: for ten seconds of twenty,
+# as in a record behind which a car collided [m/s]; throughout, as a share, as in a data set.
+REPORTED = torch.tensor([[3.0, 0.0], [-3.0, 0.0], [0.0, 0.02], [0.0, -0.02]])
+WAVES, SPEED = torch.tensor([1.0, 1.0, 0.0, 0.0]), torch.tensor([25.0, 25.0, 33.0, 33.0])
+
+
+@pytest.mark.parametrize("wish", [3.0, -0.5])
+def test_gaps_are_kept_whatever_speed_is_reported(wish: float) -> None:
+    ahead_by, share = (x.unsqueeze(-1) for x in REPORTED.unbind(-1))
+    piece, commands = CBFFilter(**LIMITS).bind(), torch.full((4, 1), wish)
+    leader, wave = SPEED.unsqueeze(-1), WAVES.unsqueeze(-1)
+    speed, gap, said, kept = leader, torch.full((4, 1), 60.0), leader, torch.zeros(4, REMEMBERS)
+    record = []
+    for step in range(1500):
+        # Stop and go, a wave a minute, or a constant speed.
+        reached = SPEED.unsqueeze(-1) * (1.0 - wave * math.sin(math.pi * step / 600.0) ** 2)
+        before, said = said, (reached * (1.0 + share) + ahead_by * (step % 200 < 100)).clamp(min=0)
+        given, kept = piece.filtered(commands, speed, gap, said, (said - before) / 0.1, kept)
+        after, _ = advance_speed(speed, given, 0.1)
+        gap, speed, leader = gap + 0.05 * (leader + reached - speed - after), after, reached
+        record.append(gap)
+    gaps = torch.cat(record, -1)
+    assert gaps.amin() > 1.0
+    assert gaps[:, 300:].amax() < 117.0
 
 
 class Mistaken(Actuation):

@@ -137,6 +137,30 @@ def test_drivers_react_as_their_population_does() -> None:
         assert not {("human", "motion_history"), ("human", "acceleration_noise")} & set(keys)
 
 
+def test_drivers_misjudge_their_gaps_as_their_population_does() -> None:
+    cfg, reacting = human("human", QUIET), replace(POPULATION, reaction=Reaction(0.3, 0.25, 0.2))
+    data = rolled(cfg, population=reacting, batch=256, steps=20)
+    noise = data["next", "human", "gap_noise"][..., :1].squeeze(-1)
+    assert noise.std().item() == pytest.approx(0.2, rel=0.1)
+    # Two low-passes of 2 s: ρ = e^−1/20, see above.
+    later = (noise[:, 10:] * noise[:, :-10]).mean() / noise.square().mean()
+    assert later.item() == pytest.approx(0.910, abs=0.06)
+    # The gap alone is seen so, by the late law, to which the noise of the acceleration is added.
+    exact = rolled(
+        cfg, population=replace(reacting, reaction=Reaction(0.3, 0.25)), batch=256, steps=1
+    )
+    command, other = (x["next", "command", "human"][:, 0, :, 0] for x in (data, exact))
+    nearer = noise[:, 0] < 0.0
+    assert (command[nearer] <= other[nearer]).all()
+    assert (command[~nearer] >= other[~nearer]).all()
+    added = data["next", "human", "acceleration_noise"]
+    assert torch.equal(added[:, 0], exact["next", "human", "acceleration_noise"][:, 0])
+    keys = rolled(
+        human("human", QUIET, "scenario.controllers.human.gap_noise=0"), population=reacting
+    )
+    assert ("human", "gap_noise") not in keys.keys(True, True)
+
+
 def test_each_driver_of_a_mixture_has_its_own_model_and_parameters() -> None:
     data = rolled(human("calibrated", QUIET), population=MIXED, batch=16)
     own, driver = MIXED.parameters(), data["human", "driver"]
@@ -175,3 +199,19 @@ def test_a_handover_passes_on_what_a_late_driver_remembers() -> None:
         "scenario.horizon=20",
     )
     check_env_specs(build_env(cfg, steady(), POPULATION, 2))
+
+
+def test_every_episode_of_training_draws_its_delay() -> None:
+    def played(nominal: bool, *more: str, batch: int = 64) -> torch.Tensor:
+        cfg = human("human", QUIET, *(f"scenario.controllers.human.{x}" for x in more))
+        env = build_env(cfg, wavy_profiles(), POPULATION, batch, 0, nominal=nominal)
+        return env.rollout(12, break_when_any_done=False)["vehicles", "speed"]
+
+    known = torch.stack([played(False, f"delay={late}") for late in range(4)])
+    drawn = played(False, "delay_range=[0,3]")
+    equal = ((known - drawn).abs() < 1e-5).flatten(2).all(-1)
+    assert (equal.sum(0) == 1).all()
+    assert (equal.sum(1) > 5).all()
+    assert torch.equal(played(True, "delay_range=[1,3]", "delay=2"), played(True, "delay=2"))
+    with pytest.raises(ConfigError, match=r"delay_range must not fall, got \[3, 1\]"):
+        played(False, "delay_range=[3,1]")

@@ -66,3 +66,16 @@ def test_errors_are_functions_of_the_episodes_seed() -> None:
     without = record("scenario.sensors.automated.gap_error=0.0")[ROLE, "sensed_gap"]
     # Nothing that the drawn actions do depends on what is measured.
     assert (one[ROLE, "sensed_gap"] - without).std() > 0.2
+
+
+def test_an_error_of_scale_is_one_factor_of_each_speed_in_an_episode() -> None:
+    exact = ("gap_error=0", "speed_error=0", "ahead_error=0", "delay=0", "scale_error=0.02")
+    lost = ("dropouts=0", "longest_dropout=0")
+    found = record(*(f"scenario.sensors.automated.{x}" for x in (*exact, *lost)))
+    true = found["vehicles", "speed"][..., [0, 2], :]
+    moves = true > 0.1
+    factor = torch.where(moves, found[ROLE, "sensed_speed"] / true - 1.0, torch.nan)
+    drawn = factor.nanmean(0, keepdim=True)
+    assert ((factor - drawn).abs()[moves] < 1e-4).all()
+    assert 0.018 < drawn.abs().max() <= 0.02
+    assert len(drawn.unique()) == drawn.numel()  # of every vehicle its own

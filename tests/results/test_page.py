@@ -191,6 +191,22 @@ def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     assert "%" not in few
 
 
+def test_flow_stands_against_the_recorded_drivers_in_table_and_verdict() -> None:
+    frame = episodes(profiles=12).replace({"strategy": {"idm": "rule", "reference": "human"}})
+    flows = {"alcc": 1900.0, "rule": 1800.0, "human": 2100.0, "direct": 2000.0}
+    frame["flow_vph"] = frame["strategy"].map(flows)
+    found = said(frame)
+    assert "flow against simulated drivers" in found.caption
+    assert found.verdict.splitlines()[0].endswith("; flow: 1,900 vehicles per hour against 1,800.")
+    people = frame[frame["strategy"] == "human"].assign(strategy="recorded", flow_vph=2000.0)
+    found = said(pd.concat([frame, people]))
+    shares = found.short.set_index("strategy")["flow_pct"].to_dict()
+    expected = {"alcc": -5.0, "rule": -10.0, "human": 5.0, "recorded": 0.0}
+    assert shares == pytest.approx(expected)
+    assert "flow against the recorded drivers" in found.caption
+    assert found.verdict.splitlines()[0].endswith(" 1,800, the recorded drivers 2,000.")
+
+
 def test_the_table_of_an_evaluation_ends_with_the_verdict(tmp_path, capsys) -> None:
     cfg = load("evaluate", ["variant=alcc"])
     frame = episodes(profiles=12).replace({"strategy": {"idm": "rule", "reference": "human"}})

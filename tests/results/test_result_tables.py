@@ -214,6 +214,18 @@ def test_a_table_says_who_loses_more_than_5_percent_of_the_flow() -> None:
     assert found["kept"].all()
 
 
+def test_flow_may_be_limited_to_that_of_the_recorded_drivers(capsys) -> None:
+    flows = {"human": 2000.0, "recorded": 1900.0, "near": 1950.0, "far": 1800.0}
+    rows = pd.concat(driven(name, 1.0, flow_vph=flow) for name, flow in flows.items())
+    task = Task(name="mine", limits={"flow_vph": "recorded"})
+    one = report(windows_for(rows), task, MOTOR)
+    assert one.table["kept"].tolist() == [True, True, True, False]
+    print_table(terminal(one))
+    assert " ≥ 1900 " in capsys.readouterr().out
+    alone = report(windows_for(rows[rows["strategy"] == "far"]), task, MOTOR)
+    assert alone.table["kept"].tolist() == [True]  # nobody is there to keep it to
+
+
 def test_all_scores_name_limits_in_words_and_wrap_names_at_spaces_only(capsys) -> None:
     others = ("follower_stopper", "pi_saturation", "constant", "mpc_far")
     rows = pd.concat(driven(name, 1.0, share_ttc_unsafe=0.001) for name in ("human", *others))

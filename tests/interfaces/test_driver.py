@@ -1,0 +1,177 @@
+"""Cars driven from outside are given the commands that the environment's cars are given."""
+
+from __future__ import annotations
+
+from functools import cache
+from time import perf_counter
+
+import numpy as np
+import pytest
+import torch
+from helpers import POPULATION, check_refused, wavy_profiles
+from page_blocks import ROOT, blocks
+
+from lcc_rl.config import load
+from lcc_rl.envs import build_env
+from lcc_rl.errors import ConfigError, Diverged
+from lcc_rl.evaluation.strategies import baseline, trained
+from lcc_rl.interfaces.driver import Driver
+from lcc_rl.pieces import CBFFilter
+from lcc_rl.pieces.base import SEED
+from lcc_rl.results.policies import load_policy
+
+POLICY = "pretrained/i24-follow5"  # a memory, a filter, the vehicle behind
+CARS, STEPS, FIRST = 4, 80, 5
+DRIVERS = (POLICY, "pretrained/i24-mixed", "idm_acc_filtered", "pi_saturation", "idm", "mpc")
+VIEWS = {"self": ("vehicles", 0), "ahead": ("leader", 0), "behind": ("vehicles", 1)}
+
+
+@cache
+def driven(driver: str) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Return what the cars of an environment measure before each step, and their commands."""
+    words = ["variant=alcc", f"scenario.horizon={STEPS}", "+filter=cbf"]
+    cfg = load("evaluate", words)
+    if driver.startswith("pretrained"):
+        strategy = trained(cfg, driver, load_policy(driver), POPULATION)
+        strategy.cfg.scenario.filters = strategy.own.scenario.filters
+    else:
+        strategy = baseline(cfg, driver)
+    env = build_env(strategy.cfg, wavy_profiles(), POPULATION, CARS, nominal=True)
+    start = env.reset().select(SEED)
+    start[SEED] = FIRST + torch.arange(CARS).unsqueeze(-1)
+    with torch.no_grad():
+        data = env.rollout(
+        STEPS, strategy.policy, tensordict=env.reset(start), auto_reset=False,
+        break_when_any_done=False,
+    )  # fmt: skip
+    measured = {
+        f"{view}.{entry}": data[space, entry].flatten(2)[..., place].numpy().T
+        for view, (space, place) in VIEWS.items()
+        for entry in ("speed", "gap", "acceleration")
+        if (view, entry) != ("ahead", "gap")
+    }
+    return measured, data["next", "command", "automated"].flatten(2)[..., 0].numpy().T
+
+
+def at(step: int, measured: dict[str, np.ndarray], cars=slice(None)) -> dict[str, np.ndarray]:
+    return {name: values[step][cars] for name, values in measured.items()}
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_cars_are_commanded_as_those_of_the_environment(name) -> None:
+    measured, commands = driven(name)
+    driver = Driver(name, 0.1, seed=FIRST)
+    found = [driver.step(at(step, measured)) for step in range(STEPS)]
+    np.testing.assert_allclose(found, commands, atol=2e-4)
+    assert np.ptp(commands) > 0.5
+    # A car alone, by numbers, is commanded as one of several.
+    alone = Driver(name, 0.1, seed=FIRST + 2)
+    for step in range(STEPS):
+        one = alone.step({key: float(x) for key, x in at(step, measured, 2).items()})
+        assert isinstance(one, float)
+        assert one == pytest.approx(found[step][2], abs=1e-5)
+
+
+def test_cars_come_and_go_and_begin_anew() -> None:
+    measured, _ = driven(POLICY)
+    whole, driver, fresh = (Driver(POLICY, 0.1) for _ in range(3))
+    for step in range(30):
+        expected = whole.step(at(step, measured))
+        order = [0, 1, 2, 3] if step % 2 else [3, 0, 2, 1]
+        # Car 1 leaves for a while, car 3 is reset when it returns.
+        present = [car for car in order if car != 1 or not 10 <= step < 20]
+        if step == 20:
+            driver.reset(["car3"])
+        found = driver.step(at(step, measured, present), [f"car{car}" for car in present])
+        began = [1, 3] if step >= 20 else []
+        anew = fresh.step(at(step, measured, began), began)
+        for car, command, kept in zip(present, found, driver.memory, strict=True):
+            own, past = (anew, fresh) if car in began else (expected, whole)
+            place = list(past.cars).index(car)
+            assert command == pytest.approx(own[place], abs=1e-5)
+            np.testing.assert_allclose(kept, past.memory[place], rtol=1e-5)
+    assert (abs(whole.memory[[1, 3]] - fresh.memory) > 0.01).any(1).all()
+    assert driver.step({name: [] for name in driver.names}, []).shape == (0,)
+
+
+def test_without_a_vehicle_behind() -> None:
+    measured, _ = driven(POLICY)
+    here = at(0, measured)
+    without = {name: x for name, x in here.items() if not name.startswith("behind")}
+    like_own = without | {"behind.speed": here["self.speed"], "behind.gap": here["self.gap"]}
+    names = [here | {"behind.present": [1, 0, 0, 1]}, without, like_own, here]
+    some, none, assumed, every = (Driver(POLICY, 0.1).step(given) for given in names)
+    np.testing.assert_array_equal(none, assumed)
+    np.testing.assert_array_equal(some, np.where([True, False, False, True], every, none))
+    assert (none != every).all()
+
+
+def hold(gap, speed):
+    return 0.1 * (gap - 30.0) + 0.0 * speed
+
+
+def by_numpy(gap):
+    return torch.as_tensor(0.1 * np.asarray(gap) - 1.0)
+
+
+def nothing(gap):
+    return gap * float("nan")
+
+
+def test_a_rule_of_ones_own_drives_behind_a_filter_of_ones_own() -> None:
+    near = {"self.speed": 20.0, "self.gap": 40.0, "ahead.speed": 15.0, "ahead.acceleration": 0.0}
+    assert Driver(hold, 0.1).step({"self.speed": 20.0, "self.gap": 40.0}) == pytest.approx(1.0)
+    found = [
+        Driver(who, 0.1, safety=CBFFilter(time_to_collision=shortest)).step(near)
+        for who, shortest in [(hold, 4.0), (hold, 6.0), (f"{__name__}.hold", 6.0)]
+    ]
+    assert found[2] == found[1] < -1.0 < found[0]
+    assert Driver(f"{__name__}.hold_filtered", 0.1).step(near) == found[0]
+    driver = Driver(by_numpy, 0.5)
+    assert [driver.step({"self.gap": gap}) for gap in (20.0, 30.0)] == pytest.approx([1.0, 2.0])
+
+
+def test_bad_input_is_one_clear_error() -> None:
+    making = [
+        (POLICY, 0.2, "trained with steps of 0.1 s"),
+        ("cacc tuned", 0.1, "cacc tuned reads self.gap_error, which is not measured here, only"),
+        ("pretrained/hcfs", 0.2, "pretrained/hcfs reads .*, which is not measured here, only"),
+        ("idm_ac", 0.1, "Did you mean 'idm_acc'"),
+    ]
+    check_refused(Driver, making, ConfigError)
+    given = {"self.speed": 9.0, "self.gap": 20.0, "ahead.speed": 9.0}
+    steps = [
+        ({"self.speed": 9.0}, None, r"idm_acc reads self.gap, which is not given: gap .* \[m\]"),
+        (given | {"self.gaps": 1.0}, None, "Did you mean 'self.gap'"),
+        (given | {"self.gap": [1.0, 2.0]}, ["a"], "cars must be 2 different"),
+        (given, ["a", "a"], "cars must be 1 different ids"),
+        (given | {"self.gap": [[1.0], [2.0]]}, None, "arrays of one length"),
+        (given | {"self.gap": [1.0, 2.0], "self.speed": [1.0]}, None, "arrays of one length"),
+        (given | {"self.gap": "near"}, None, "measured must hold numbers"),
+    ]
+    check_refused(Driver("idm_acc", 0.1).step, steps, ConfigError)
+    with pytest.raises(Diverged, match="nothing: the command of car7 is nan"):
+        Driver(nothing, 0.1).step({"self.gap": [1.0]}, ["car7"])
+
+
+def test_the_example_of_the_page_prints_what_it_shows(capsys) -> None:
+    page = blocks(ROOT / "docs" / "interfaces.md")
+    (place,) = (n for n, block in enumerate(page) if "import Driver" in block.text)
+    assert len([line for line in page[place].text.splitlines() if line.strip()]) <= 25
+    exec(page[place].text, {})
+    assert capsys.readouterr().out == page[place + 1].text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [POLICY, "idm_acc_filtered"])
+def test_a_step_of_one_car_takes_less_than_100_microseconds(name) -> None:
+    driver = Driver(name, 0.1)
+    measured = {
+        key: float(x) for key, x in at(0, driven(name)[0], 0).items() if key in driver.names
+    }
+    times = []
+    for _ in range(2000):
+        before = perf_counter()
+        driver.step(measured)
+        times.append(perf_counter() - before)
+    assert np.quantile(times, 0.25) < 1e-4
