@@ -121,6 +121,7 @@ def learners(reference: Path, docs: Path) -> None:
     how = {name: ("score", kind) for name, kind in scores.items()}
     how |= {name: (name, "mean") for name in rows.columns[4:]}
     table = rows.groupby(["task", "strategy"], sort=False).agg(**how).reset_index()
+    table.loc[table["score_low"] == table["score_high"], ["score_low", "score_high"]] = np.nan
     fill(docs / "learners.md", {"learners": as_markdown(table.dropna(axis=1, how="all"))})
 
 
