@@ -117,6 +117,17 @@ def tasks(reference: Path, docs: Path) -> None:
     fill(docs / "limits.md", {"averaged": averaged.averaged(kept)})
 
 
+def learners(reference: Path, docs: Path) -> None:
+    """Write what each learner reaches: a row per task and learner, with the range of its seeds."""
+    rows = worded(read_parquet(reference / "learners.parquet"))
+    scores = {"score": "mean", "score_low": "min", "score_high": "max"}
+    how = {name: ("score", kind) for name, kind in scores.items()}
+    how |= {name: (name, "mean") for name in rows.columns[4:]}
+    table = rows.groupby(["task", "strategy"], sort=False).agg(**how).reset_index()
+    table.loc[table["score_low"] == table["score_high"], ["score_low", "score_high"]] = np.nan
+    fill(docs / "learners.md", {"learners": as_markdown(table.dropna(axis=1, how="all"))})
+
+
 def task_table(name: str, table: pd.DataFrame) -> str:
     """Return the Markdown table of a task below its name; the kept scores hold every measure."""
     first = {str(key): value for key, value in table.iloc[0].items()}
@@ -240,6 +251,7 @@ def main(words: Sequence[str] | None = None) -> int:
     for name in SHOWN_OF:
         study(name, options.reference, options.docs)
     tasks(options.reference, options.docs)
+    learners(options.reference, options.docs)
     figures(options.reference, options.docs / "figures")
     print(f"written: {options.docs}")
     return 0
