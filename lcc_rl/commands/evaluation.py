@@ -47,18 +47,16 @@ from lcc_rl.evaluation.strategies import (
 )
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
-from lcc_rl.results.names import in_words
+from lcc_rl.results.names import counted_windows, in_words, several
 from lcc_rl.results.platoons import case_report
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
 from lcc_rl.results.render import print_table, terminal
 from lcc_rl.results.report import (
     Report,
-    counted_windows,
     few_windows,
     leader_too_fast,
     remarks,
     report,
-    several,
     windows_for,
 )
 from lcc_rl.results.runs import EPISODES, STEPS, check_folder, resumed_config, save_config

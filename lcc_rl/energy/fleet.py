@@ -89,12 +89,11 @@ class Fleet:
         """
         if not any(model.heating_value for model in self.models):
             return {}
-        return {
-            name: self._of(
-                lambda model, x, _, part=part: model.burnt(x)[part], energy, energy, kind
-            )
-            for part, name in enumerate(BURNT)
-        }
+
+        def part(number: int) -> Tensor:
+            return self._of(lambda model, x, _: model.burnt(x)[number], energy, energy, kind)
+
+        return {name: part(number) for number, name in enumerate(BURNT)}
 
     def _known(self, name: str, enough: Any, *motion: Any) -> Tensor | None:
         """Return what models define, false of the others; None unless enough define it."""

@@ -137,14 +137,17 @@ def other_drivers(cfg: StudyConfig) -> str:
 
     The settings that the task has for its own drivers have gone with them.
     """
+    if cfg.task is None or HUMAN not in cfg.scenario.vehicles.names:
+        return ""
+    name = cfg.task["name"]
     try:
-        own = cfg.task and load("evaluate", [f"task={cfg.task['name']}"])
+        own = load("evaluate", [f"task={name}"])
     except ConfigError:  # a task that stands in no file
         return ""
-    if not own or own.drivers == cfg.drivers or HUMAN not in cfg.scenario.vehicles.names:
+    if own.drivers == cfg.drivers:
         return ""
     return (
-        f"Human drivers: {origin_of(cfg.drivers)}, in place of those of task={cfg.task['name']} "
+        f"Human drivers: {origin_of(cfg.drivers)}, in place of those of task={name} "
         f"({origin_of(own.drivers)}), whose published scores are for others."
     )
 
