@@ -285,10 +285,7 @@ class _Fit:
         return drivers.sort_values("episode", kind="stable", ignore_index=True)
 
     def equilibrium(self, own: Mapping[str, Any], constants: DriverConstants) -> dict[str, Any]:
-        """Return each record's mean speed and gap, and the driver's equilibrium gap at this speed.
-
-        Near v0 it is longer than s0 + v T; it is capped as at the start of an episode.
-        """
+        """Return each record's mean speed and gap, and the driver's equilibrium gap at it."""
         seen, samples = self.observed, torch.tensor(self.observed.samples)
         speed, gap = (x.cpu().sum(0) / samples for x in (seen.follower_speed, seen.gaps))
         given = {name: torch.tensor(values) for name, values in own.items()}

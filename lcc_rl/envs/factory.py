@@ -132,10 +132,7 @@ def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
 
 
 def after_uncounted(cfg: StudyConfig) -> tuple[StudyConfig, int, int]:
-    """Return what an evaluation drives, and its first steps that are not counted.
-
-    Returns:
-        The configuration, the steps in which humans drive all, and those of the warm-up.
+    """Return what an evaluation drives, its first steps for humans alone, and its warm-up's steps.
 
     Raises:
         ConfigError: if a duration is no number of steps, or nothing is left to count.

@@ -133,10 +133,7 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
 
 
 def other_drivers(cfg: StudyConfig) -> str:
-    """Return a sentence where a task is driven with other human drivers than its own; else nothing.
-
-    The settings that the task has for its own drivers have gone with them.
-    """
+    """Return a sentence where a task has other human drivers than its own; else nothing."""
     if cfg.task is None or HUMAN not in cfg.scenario.vehicles.names:
         return ""
     name = cfg.task["name"]
