@@ -65,8 +65,11 @@ ENOUGH = {
     "batch_size=1024": "batch_size=4",
     "num_envs=64": "num_envs=2",
     "batch_size=64": "batch_size=4",
-    '"frames_per_batch": 19200': '"frames_per_batch": 80',
-    '"total_frames": 192000': '"total_frames": 160',
+    '"evaluation.drivers=24"': repr([LENGTH, *WINDOWS, *DATA])[1:-1],
+    "19200,": "80,",
+    "768000": "160",
+    '1.2]"]': f'1.2]", *{list(DATA)}]',
+    "learn(300_000,": "learn(9_600,",
     "rollout(6000": "rollout(20",
     "rollout(300": "rollout(20",
     "(0, 2999, 5999)": "(0, 9, 19)",
@@ -76,6 +79,7 @@ ENTRIES = {"run": "pipeline"}  # entry points that are not called as their comma
 NEEDS = {
     "interfaces.md": ("gymnasium", "stable_baselines3", "onnx", "onnxscript", "onnxruntime"),
     "sweeps.md": ("optuna",),
+    "learners.md": ("stable_baselines3", "onnx", "onnxscript", "onnxruntime"),
 }
 PLACEHOLDER = re.compile(r"<[^<>=]*>…?|…")
 LAUNCH = ("hydra/launcher=",)  # of extras that need not be installed

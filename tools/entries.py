@@ -61,7 +61,8 @@ def configurations() -> Iterator[StudyConfig]:
         cfg.scenario.string = drawn_or_single
         yield cfg
     human = "scenario.controllers.human"
-    late = [f"controller@{human}=ovm", f"{human}.delay=4", f"{human}.acceleration_noise=0.3"]
+    late = [f"controller@{human}=ovm", f"{human}.delay=4"]
+    late += [f"{human}.{noise}_noise=0.3" for noise in ("acceleration", "gap")]
     yield load("train", ["variant=alcc", SIZES, *late])
     handover = "controller@scenario.controllers.automated=handover"
     yield load("train", ["variant=reference", "scenario=ring", handover, SIZES])

@@ -1,4 +1,4 @@
-"""What fleets save over the share of automated vehicles, for docs/tasks.md."""
+"""What fleets save over the share of automated vehicles, for docs/fleets.md."""
 
 from __future__ import annotations
 
@@ -27,6 +27,10 @@ SHARE, LEARNED = "penetration", "learned"
 SHOWN = {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"}
 HUMAN, RULE = "human", "idm_acc"
 SETTINGS = {  # of what is kept for fronts, for readers
+    "drives": "I-24, whole drives",
+    "drives_taught": "I-24, whole drives, trained so",
+    "drives_wavy": "I-24, wavy half of the drives",
+    "drives_wavy_taught": "I-24, wavy half of the drives, trained so",
     "front": "I-24, 100 s",
     "free": "free driving, 100 s",
     "long": "I-24, 400 s",
@@ -34,6 +38,7 @@ SETTINGS = {  # of what is kept for fronts, for readers
     "true": "true drivers, I-24, 100 s",
     "true_taught": "true drivers, I-24, 100 s, trained so",
 }
+DRIVES, PANELS = "drives", ("front", "free", "long", "true")
 TAUGHT = ", trained "  # what makes a setting one whose fleets learned in it
 SHOWN_AS = {
     LEARNED: ("learned", "#0072b2"),
@@ -100,7 +105,8 @@ def percent(found: Estimate) -> str:
 def drawn_fronts(rows: pd.DataFrame) -> Figure:
     """Draw, for each setting, the learned fleets beside the rule's fronts, a colour per share."""
     figure = new_figure(PAGE_WIDTH, 5.4)
-    titles = [setting for setting in SETTINGS.values() if TAUGHT not in setting]
+    titles = [SETTINGS[name] for name in PANELS]
+    rows = rows[~rows["setting"].str.startswith(DRIVES)]
     axes = dict(zip(titles, figure.subplots(2, 2).flat, strict=True))
     shares = 100.0 * np.sort(rows[SHARE].unique())
     hues = dict(zip(shares.round(), COLOURS, strict=False))

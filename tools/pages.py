@@ -100,11 +100,14 @@ def study(name: str, reference: Path, docs: Path) -> None:
 
 
 def tasks(reference: Path, docs: Path) -> None:
-    """Write the tables of docs/tasks.md, docs/leaderboard.md and docs/limits.md."""
+    """Write the tables of docs/{tasks,fleets,leaderboard,limits}.md."""
     tables = {path.stem: read_parquet(path) for path in sorted((reference / "tasks").glob("*"))}
     parts = [task_table(name, table) for name, table in tables.items() if "score_name" in table]
-    fronts = fleets.fronts(tables["fleets_fronts"])
-    fill(docs / "tasks.md", {"fleets": fronts, "tasks": "\n\n".join(parts)})
+    rows = tables["fleets_fronts"]
+    drives = rows["setting"].str.startswith(fleets.DRIVES)
+    found = {"drives": fleets.fronts(rows[drives]), "fleets": fleets.fronts(rows[~drives])}
+    fill(docs / "fleets.md", found)
+    fill(docs / "tasks.md", {"tasks": "\n\n".join(parts)})
     files = sorted((reference / "scores").glob("*.json"))
     documents = {path.name: read_json(path) for path in files}
     with naming_run(reference / "scores"):
@@ -112,6 +115,17 @@ def tasks(reference: Path, docs: Path) -> None:
     fill(docs / "leaderboard.md", {"board": table})
     kept = read_parquet(reference / "averaged.parquet")
     fill(docs / "limits.md", {"averaged": averaged.averaged(kept)})
+
+
+def learners(reference: Path, docs: Path) -> None:
+    """Write what each learner reaches: a row per task and learner, with the range of its seeds."""
+    rows = worded(read_parquet(reference / "learners.parquet"))
+    scores = {"score": "mean", "score_low": "min", "score_high": "max"}
+    how = {name: ("score", kind) for name, kind in scores.items()}
+    how |= {name: (name, "mean") for name in rows.columns[4:]}
+    table = rows.groupby(["task", "strategy"], sort=False).agg(**how).reset_index()
+    table.loc[table["score_low"] == table["score_high"], ["score_low", "score_high"]] = np.nan
+    fill(docs / "learners.md", {"learners": as_markdown(table.dropna(axis=1, how="all"))})
 
 
 def task_table(name: str, table: pd.DataFrame) -> str:
@@ -237,6 +251,7 @@ def main(words: Sequence[str] | None = None) -> int:
     for name in SHOWN_OF:
         study(name, options.reference, options.docs)
     tasks(options.reference, options.docs)
+    learners(options.reference, options.docs)
     figures(options.reference, options.docs / "figures")
     print(f"written: {options.docs}")
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,25 +15,10 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import after_humans, world_of
-from lcc_rl.errors import ConfigError, one_line, require
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import Observation
 from lcc_rl.pieces.controllers import Population
-
-# What an agent has once it is started, its test, and what messages call it.
-WANTED: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "loop": (
-        lambda it: inspect.isclass(it) and issubclass(it, TrainingLoop),
-        "a class derived from lcc_rl.agents.TrainingLoop, such as CollectingLoop",
-    ),
-    "policy": (
-        lambda it: (
-            isinstance(it, TensorDictModule)
-            and (it.in_keys, it.out_keys) == (["observation"], ["action"])
-        ),
-        "a TensorDictModule from 'observation' to 'action' that setup makes (make_actor)",
-    ),
-}
 
 
 def learns(cfg: StudyConfig) -> bool:
@@ -57,10 +41,18 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
     scene = Scene(observation.event_shape[-1], cfg.seed, device, world, observation, limit)
     agent: Agent = cfg.agent.made(Agent)
     learner = agent.start(scene)
-    for name, (fits, wanted) in WANTED.items():
-        got = getattr(learner, name, None)
-        words = f"agent: {type(agent).__name__}.{name} must be {wanted}, got {got!r}"
-        require(fits(got), one_line(words)[:300])
+    where = f"agent: {type(agent).__name__}"
+    loop, policy = (getattr(learner, name, None) for name in ("loop", "policy"))
+    require(
+        inspect.isclass(loop) and issubclass(loop, TrainingLoop),
+        f"{where}.loop must be a class derived from lcc_rl.agents.TrainingLoop, got {loop!r}",
+    )
+    keys = [getattr(policy, name, None) for name in ("in_keys", "out_keys")]
+    require(
+        isinstance(policy, TensorDictModule) and keys == [["observation"], ["action"]],
+        f"{where}.policy must be a TensorDictModule from 'observation' to 'action', such as "
+        f"make_actor's, got {type(policy).__name__}",
+    )
     return learner
 
 

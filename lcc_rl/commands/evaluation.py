@@ -39,7 +39,6 @@ from lcc_rl.evaluation.strategies import (
     baselines,
     beside_filtered,
     check_distinct,
-    given,
     named_apart,
     no_policy,
     studied,
@@ -282,10 +281,12 @@ def strategies_of(
         strategies.append(dataclasses.replace(one, name=name or one.name))
     if own:
         strategies += studied(cfg, policy, inputs.population)
-    for name, given_policy in (further or {}).items():
+    for name, policy_given in (further or {}).items():
         _check_label(name, "a policy", "")
+        require(learns(cfg), f"{name} is a policy, and variant {cfg.variant} learns nothing")
         env = build_env(cfg, inputs.evaluation, inputs.population, 1, 0, cfg.device, nominal=True)
-        strategies.append(given(cfg, name, given_policy, env.reset()))
+        policy_given.tried(env.reset())
+        strategies.append(Strategy(name, cfg, policy_given))
     strategies = beside_filtered(cfg, strategies) + strategies
     for strategy in (s for s in strategies if s.policy is not None):
         cases.check_cases(strategy.cfg, inputs)

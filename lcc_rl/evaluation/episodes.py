@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config.words import RECORDED
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import after_uncounted
 from lcc_rl.envs.inputs import Inputs, build_energy
@@ -210,7 +211,9 @@ class Episodes:
         leader = leader_measures(inputs.evaluation, profile, self.energy, self.warm_up)
         if self.cfg.scenario.road == RING:  # where nobody leads
             leader[:] = np.nan
-        measured = measures(groups, alive, time_step, self.energy)
+        # Drivers are recorded by sensors, whose noise costs energy in what they drove.
+        recorded = RECORDED in self.cfg.evaluation.baselines
+        measured = measures(groups, alive, time_step, self.energy, recorded)
         length, free = self.cfg.scenario.vehicle_length, inputs.population.desired_speed[driver]
         measured |= traffic(record, alive, length, time_step, free)
         rows = pd.concat([described, leader, as_frame(measured, crashed)], axis=1)

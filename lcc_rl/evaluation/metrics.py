@@ -107,7 +107,9 @@ def averaged_energies(
         if width >= len(speed):
             found[name] = torch.full_like(way, torch.nan)
             continue
-        mean = speed.unfold(0, width, 1).mean(-1)
+        # Sums of single precision would lose what differs from one average to the next.
+        sums = torch.cat([torch.zeros_like(speed[:1]), speed]).cumsum(0, dtype=torch.float64)
+        mean = ((sums[width:] - sums[:-width]) / width).to(speed)
         power = energy.power(mean[:-1], mean.diff(dim=0) / time_step, kind)
         own = energy_measures(power, mean, alive[width - 1 :], time_step, energy, kind)
         found[name] = own["path_energy_kj"] * way / own["distance_m"]

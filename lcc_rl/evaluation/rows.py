@@ -103,7 +103,11 @@ def _slice(places: list[int]) -> slice | list[int]:
 
 
 def measures(
-    groups: Groups, alive: Tensor, time_step: float, energy: Fleet | None = None
+    groups: Groups,
+    alive: Tensor,
+    time_step: float,
+    energy: Fleet | None = None,
+    averaged: bool = True,
 ) -> dict[str, Tensor]:
     """Return the measures of a batch, each ``[batch, 1]``; energies add up over vehicles (A20).
 
@@ -112,6 +116,7 @@ def measures(
         alive: whether each step belongs to a running episode, ``[time, batch, 1]``.
         time_step: duration of a step [s].
         energy: the energy models; None for that of the ALCC paper.
+        averaged: energies of averaged speeds, too.
     """
     columns: dict[str, Tensor] = {}
     for group in ("cav", "hdv"):
@@ -121,7 +126,7 @@ def measures(
         kinds = series.get(CLASS[1])
         how = alive.unsqueeze(-2), time_step, energy, None if kinds is None else kinds[0]
         found = energy_measures(series["power"], series["speed"], *how)
-        found |= averaged_energies(series["speed"], *how)
+        found |= averaged_energies(series["speed"], *how) if averaged else {}
         for name, value in found.items():
             added = value.mean(-2) if name.startswith("share_") else value.sum(-2)
             columns[f"{group}_{name}"] = added

@@ -16,8 +16,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tensordict import TensorDictBase
-
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import NOT_IDENTITY, load
@@ -26,7 +24,6 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.errors import ConfigError, ResultsError, require
 from lcc_rl.evaluation.fit import check_action, check_scenario, check_width
-from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import (
     DIRECT,
     PEOPLE,
@@ -289,23 +286,6 @@ def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Popu
     check_action(path, own, other)
     strategy = with_weights(other, weights, own.seed, path, population)
     return replace(strategy, cfg=deployed(other), own=own)
-
-
-def given(cfg: StudyConfig, name: str, policy: GivenPolicy, moment: TensorDictBase) -> Strategy:
-    """Build the strategy of a policy that a program gives, in the scenario under study.
-
-    Args:
-        cfg: the configuration under study, whose observation the policy reads.
-        name: its name in tables.
-        policy: that of another library.
-        moment: the first moment of an episode, at which it is tried.
-
-    Raises:
-        ConfigError: if no policy drives in this scenario, or this one does not.
-    """
-    require(learns(cfg), f"{name} is a policy, and variant {cfg.variant} learns nothing")
-    policy.tried(moment)
-    return Strategy(name, cfg, policy)
 
 
 def with_weights(

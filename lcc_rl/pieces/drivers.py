@@ -59,15 +59,15 @@ class Drivers(Controller):
     # Steps from which and to which every episode of training draws its delay; evaluation takes
     # delay, as does a training without a range.
     delay_range: tuple[Delay, Delay] | None = None
-    # Factors of the noise of the acceleration in an episode of training; evaluation takes 1.
-    acceleration_noise_range: Factors = (1.0, 1.0)
     # Standard deviation of a smooth noise of the acceleration, see
     # lcc_rl.functional.driver_models.NoiseStep [m/s²]; None: of the population.
     acceleration_noise: NonNegative | None = None
-    # The same of a noise of the logarithm of the perceived gap.
+    # That from which and to which every episode of training draws its noise, likewise [m/s²].
+    acceleration_noise_range: tuple[NonNegative, NonNegative] | None = None
+    # Standard deviation of a smooth noise of ln of the perceived gap; None: of the population.
     gap_noise: NonNegative | None = None
 
-    LATER = ("gap_noise",)
+    LATER = ("delay_range", "acceleration_noise_range", "gap_noise")
     name = HUMAN
     known = (
         Entry("role.driver", "–", "id of each vehicle's driver in the population", option=True),
@@ -90,9 +90,10 @@ class Drivers(Controller):
     index: ClassVar[Tensor]
 
     def validate(self) -> None:
-        soonest, latest = self.delay_range or (0, 0)
-        if soonest > latest:
-            raise ValueError(f"delay_range must not fall, got {list(self.delay_range or ())}")
+        for name in ("delay_range", "acceleration_noise_range"):
+            drawn = getattr(self, name)
+            if drawn and drawn[0] > drawn[1]:
+                raise ValueError(f"{name} must not fall, got {list(drawn)}")
 
     def setup(self, world: World) -> None:
         """Take the drivers, and choose what is read and written by the settings."""
@@ -102,10 +103,12 @@ class Drivers(Controller):
         late, spread, sight = self.delay, self.acceleration_noise, self.gap_noise
         what = "the reaction delay of drivers"
         late = world.late(reaction.delay, what) if late is None else late
-        # The least and the largest delay; drivers remember as far back as the largest.
-        drawn = world.nominal or self.delay_range is None
-        self.soonest, self.late = (late, late) if drawn else self.delay_range  # type: ignore[misc]
-        self.noise_spread = reaction.noise if spread is None else spread
+        noise = reaction.noise if spread is None else spread
+        # The least and the largest of an episode; drivers remember as far back as the largest.
+        ranges = self.delay_range, self.acceleration_noise_range
+        delays, noises = (None, None) if world.nominal else ranges
+        self.soonest, self.late = delays or (late, late)
+        self.noise_least, self.noise_spread = noises or (noise, noise)
         self.gap_spread = reaction.gap_noise if sight is None else sight
         self.noise_step = NoiseStep.of(world.time_step)
         self.gap_noise_step = NoiseStep.of(world.time_step, GAP_NOISE_TIME)
@@ -119,7 +122,6 @@ class Drivers(Controller):
         self.limits = None  # drives as a person, in automated vehicles, too
         walk = self.wiener / world.time_step**0.5
         self.spreads = tuple(walk * factor for factor in world.deviations(self.wiener_range))
-        self.noise_factors = world.deviations(self.acceleration_noise_range)
         self.time_gap_factors = world.deviations(self.time_gap_range)
         self.noise_stream = stream_id(f"{stream_name(role)}.noise")
         self.wiener_stream = stream_id(f"{stream_name(role)}.wiener")
@@ -186,7 +188,8 @@ class Drivers(Controller):
             spread = between(self.spreads, seed, WIENER_STREAM)
             command = command + spread * normal(seed, step, self.wiener_stream + self.index)
         if noise is not None:
-            factor = between(self.noise_factors, seed, NOISE_STREAM)
+            least = self.noise_least / self.noise_spread
+            factor = between((least, 1.0), seed, NOISE_STREAM)
             command = command + factor * noise[..., :1]
         return (command, *kept) if kept else command
 

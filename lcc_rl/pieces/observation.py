@@ -42,6 +42,7 @@ class Observation(Feature):
     presence: bool = False  # tell which vehicles behind are there, even where all always are
     raw: bool = False  # take every entry times 1, in SI units, whatever its scale
 
+    LATER = ("presence",)
     measures = True
     gathered = Entry(OBSERVATION, "–", "observed entries, each times its constant")
     factors: ClassVar[Tensor]

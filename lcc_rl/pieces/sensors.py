@@ -46,6 +46,7 @@ class Sensors(RoleTransform):
     dropouts: Share = 0.0  # chance that a measurement does not arrive: the last one stays
     longest_dropout: NonNegative = 0.0  # in a row, a number of steps [s]
 
+    LATER = ("scale_error",)
     measured = (
         Entry("role.sensed_gap", "m", "gap as measured"),
         Entry("role.sensed_speed", "m/s", "own speed as measured"),

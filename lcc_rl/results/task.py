@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import pandas as pd
+from pydantic import StringConstraints
 
 from lcc_rl.config.words import RECORDED
 from lcc_rl.errors import unknown_name
@@ -14,6 +15,8 @@ from lcc_rl.results import measures
 from lcc_rl.results.measures import Measure
 from lcc_rl.results.names import HUMAN, heading
 from lcc_rl.settings import NonNegative, Settings
+
+Percent = Annotated[str, StringConstraints(pattern=r"^\d+(\.\d+)? ?%$")]
 
 
 class Task(Settings):
@@ -27,8 +30,8 @@ class Task(Settings):
     against: str = HUMAN  # the strategy that the others are compared with
     # Bounds by column: the largest value of max_… and the smallest of min_… in any episode, and
     # the largest mean of share_… over all episodes, the smallest mean of flow_vph; ``recorded`` for
-    # the value of the recorded drivers.
-    limits: Mapping[str, NonNegative | Literal["recorded"]] = field(default_factory=dict)
+    # the value of the recorded drivers, ``98 %`` for that share of the value of ``against``.
+    limits: Mapping[str, NonNegative | Literal["recorded"] | Percent] = field(default_factory=dict)
 
     def validate(self) -> None:
         if self.score not in measures.score_measures():
@@ -46,17 +49,19 @@ class Task(Settings):
         return self if self.against in names else replace(self, against=names[0])
 
     def resolved(self, windows: pd.DataFrame) -> Task:
-        """Return the task with the values of the recorded drivers as its limits that are these."""
-        part, known = windows[windows["strategy"] == RECORDED], measures.limit_measures()
-        found = {
-            key: known[key].value(part) if bound == RECORDED and len(part) else bound
-            for key, bound in self.limits.items()
-        }
+        """Return the task with numbers as the limits that are those of other strategies."""
+        known, found = measures.limit_measures(), dict(self.limits)
+        for key, bound in self.limits.items():
+            if isinstance(bound, str):
+                name = RECORDED if bound == RECORDED else self.against
+                share = 1.0 if bound == RECORDED else 0.01 * float(bound.rstrip(" %"))
+                part = windows[windows["strategy"] == name]
+                found[key] = share * known[key].value(part) if len(part) else bound
         return replace(self, limits=found)
 
     @property
     def bounds(self) -> dict[Measure, float]:
-        """The limits by measure, without those of recorded drivers that are not known."""
+        """The limits by measure, without those of other strategies that are not known."""
         known = measures.limit_measures()
         return {
             known[key]: bound for key, bound in self.limits.items() if not isinstance(bound, str)

@@ -29,8 +29,8 @@ EACH = pytest.mark.parametrize("agent", AGENTS)
 
 @pytest.fixture(autouse=True)
 def my_learner(monkeypatch) -> Any:
-    """The module that docs/extend.md tells to write."""
-    page = (block.text for block in blocks(ROOT / "docs" / "extend.md"))
+    """The module that docs/learners.md tells to write."""
+    page = (block.text for block in blocks(ROOT / "docs" / "learners.md"))
     (text,) = (text for text in page if text.startswith("# my_learner.py"))
     module = ModuleType("my_learner")
     monkeypatch.setitem(sys.modules, "my_learner", module)
@@ -90,7 +90,7 @@ def test_the_clipped_ratio_is_of_the_policy_that_played() -> None:
 WRONG = [
     ("self.noise = GaussianExploration", "self.sound = abs", "must make noise, the exploration"),
     ("loop = ReinforceLoop", "loop = dict", "loop must be a class derived .* got <class 'dict'>"),
-    ("lr=self.learning_rate)", "lr=1.0); self.policy = len", "policy must be .* got <built-in fu"),
+    ("lr=self.learning_rate)", "lr=1.0); self.policy = len", "policy must be .* got builtin"),
     ('"loss_value": returns', '"loss": returns', "must return numbers .* 'loss_value' among them"),
     ("(Agent)", "(Settings)", "expected a subclass of .*Agent, got my_learner.Reinforce"),
 ]

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -15,6 +19,9 @@ from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.modules import Actor, AdditiveGaussianModule, ValueOperator
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
+
+import lcc_rl
+from lcc_rl.evaluation.foreign import as_given
 
 FRAMES, ITERATIONS = 80, 3
 
@@ -84,27 +91,88 @@ def test_single_agent_ddpg() -> None:
     assert not torch.equal(vector(actor), before)
 
 
+# -- the page of learners --------------------------------------------------------------------------
+
+PAGE = [block.text for block in blocks(ROOT / "docs" / "learners.md")]
+# What marks the program of each recipe.
+RECIPES = {
+    "ppo": '{"PPO": policy}',
+    "recurrent": "GRUModule",
+    "frames": "CatFrames, N=4",
+    "mappo": "centralised = True",
+    "ippo": "centralised = True",
+}
+SMALL = {"19200": str(FRAMES), "768000": str(ITERATIONS * FRAMES), '1.2]"]': f'1.2]", *{DATA}]'}
+
+
+def run_recipe(monkeypatch, kind: str, changes: dict[str, str]) -> dict[str, Any]:
+    """Run the program of a recipe, changed; what it compares is left as ``compared``."""
+
+    def changed(text: str) -> str:
+        for much, little in changes.items():
+            text = text.replace(much, little)
+        return text
+
+    shared = ModuleType("my_ppo")
+    (text,) = (text for text in PAGE if text.startswith("# my_ppo.py"))
+    exec(changed(text), vars(shared))
+    monkeypatch.setitem(sys.modules, "my_ppo", shared)
+    (text,) = (text for text in PAGE if RECIPES[kind] in text and "my_ppo import" in text)
+    text = text.replace("centralised = True", f"centralised = {kind != 'ippo'}")
+    space: dict[str, Any] = {}
+
+    def compared(policies: dict[str, Any], overrides: Sequence[str] = ()) -> None:
+        space.update(compared=policies, overrides=list(overrides))
+
+    monkeypatch.setattr(lcc_rl, "compare", compared)
+    exec(changed(text), space)
+    monkeypatch.undo()
+    return space
+
+
 @pytest.mark.filterwarnings("error:The env passed to:FutureWarning")
-@pytest.mark.parametrize("kind", ["ppo", "mappo", "ippo"])
-def test_the_examples_of_the_page_learn(kind) -> None:
-    several = kind != "ppo"
-    page = [block.text for block in blocks(ROOT / "docs" / "interfaces.md")]
-    (text,) = (x for x in page if "ClipPPOLoss" in x and ("MultiAgentMLP" in x) == several)
-    small = {"19200": str(FRAMES), "192000": str(ITERATIONS * FRAMES)}
-    if several:
-        small |= {"[mixed]": "[mixed, *DATA]", "batch_size=64": "batch_size=4"}
-        small |= {"centralised = True": f"centralised = {kind == 'mappo'}"}
-    else:
-        small |= {"batch_size=64": "batch_size=4, overrides=DATA"}
-    for much, little in small.items():
-        assert much in text
-        text = re.sub(rf"{re.escape(much)}\b" if much.isdigit() else re.escape(much), little, text)
-    space = {"DATA": DATA}
-    exec(text, space)
-    if several:
+@pytest.mark.parametrize("kind", RECIPES)
+def test_the_recipes_of_the_page_learn(monkeypatch, kind) -> None:
+    space = run_recipe(monkeypatch, kind, {**SMALL, "batch_size=64": "batch_size=4"})
+    if kind in ("mappo", "ippo"):
         assert space["env"].group_map == {"automated": ["automated_0", "automated_1"]}
-    assert len(space["rewards"]) == ITERATIONS
-    assert torch.tensor(space["rewards"]).isfinite().all()
-    for state in space["optimizer"].state.values():  # of every weight of both networks
-        assert torch.isfinite(state["exp_avg"]).all()
-        assert state["exp_avg"].abs().sum() > 0.0
+    rewards = space.get("rewards") or [0.0] * ITERATIONS
+    assert len(rewards) == ITERATIONS
+    assert torch.tensor(rewards).isfinite().all()
+    ((name, policy),) = space["compared"].items()
+    mixed = [word for word in space["overrides"] if "string" in word]
+    env = lcc_rl.make_env("alcc", 1, [*DATA, *mixed], single=False)
+    as_given(policy, name).tried(env.reset())
+    for weight in policy.parameters():
+        assert weight.isfinite().all()
+        assert weight.grad is None or weight.grad.abs().sum() > 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", RECIPES)
+def test_the_recipes_of_the_page_drive(monkeypatch, kind) -> None:
+    """Judged by speed, distance and energy: a policy that stands still has a fair reward, too."""
+    space = run_recipe(monkeypatch, kind, {"768000": str(20 * 19200)})
+    words = [*space["overrides"], "evaluation.drivers=12", "evaluation.baselines=[human]"]
+    rows = lcc_rl.compare(space["compared"], overrides=words).rows
+    own, human = rows[rows["strategy"] != "human"], rows[rows["strategy"] == "human"]
+    assert own["mean_speed_mps"].mean() > 0.8 * human["mean_speed_mps"].mean()
+    assert own["total_distance_m"].mean() > 0.8 * human["total_distance_m"].mean()
+    assert own["collided"].mean() < 0.02
+    energy = [part["total_path_energy_kj"].mean() for part in (own, human)]
+    assert energy[0] < 2.5 * energy[1]
+
+
+@pytest.mark.slow
+def test_two_workers_train_as_the_page_says(tmp_path) -> None:
+    small = {**SMALL, 'alcc", 32': 'alcc", 4'}
+    for name in ("my_ppo", "two_workers"):
+        (text,) = (text for text in PAGE if text.startswith(f"# {name}.py"))
+        for much, little in small.items():
+            text = text.replace(much, little)
+        text = text.replace('"evaluation.drivers=24"', repr([*DATA, "experiment=smoke"])[1:-1])
+        (tmp_path / f"{name}.py").write_text(text)
+    words = [sys.executable, "two_workers.py"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "PPO, two workers" in done.stdout

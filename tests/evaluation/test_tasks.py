@@ -24,6 +24,7 @@ FEW = ("experiment=smoke", "evaluation.profiles=2", "scenario.horizon=12")
 MORE = {
     "i80-follow": [*DATA, "evaluation.drivers=2"],
     "i24-follow5": DATA,
+    "i24-fleet": [*DATA, "scenario.string=automated human automated human"],
     "i24-mixed": [*DATA, "scenario.string={size: 8, penetration: 0.25}"],
     "platoon-highway": [*DATA, "leader.least_variation=0"],
 }

@@ -213,5 +213,12 @@ def test_every_episode_of_training_draws_its_delay() -> None:
     assert (equal.sum(0) == 1).all()
     assert (equal.sum(1) > 5).all()
     assert torch.equal(played(True, "delay_range=[1,3]", "delay=2"), played(True, "delay=2"))
-    with pytest.raises(ConfigError, match=r"delay_range must not fall, got \[3, 1\]"):
-        played(False, "delay_range=[3,1]")
+    louder = "acceleration_noise_range=[0,0.4]"
+    assert torch.equal(played(True, louder), played(True))
+    quiet, loud = played(False), played(False, "acceleration_noise=0.4")
+    apart, most = ((x - quiet).abs().mean((1, 2, 3)) for x in (played(False, louder), loud))
+    assert (apart < most).all()
+    assert apart.min() < 0.1 * most.min()
+    for name in ("delay", "acceleration_noise"):
+        with pytest.raises(ConfigError, match=rf"{name}_range must not fall, got \[3.*, 1"):
+            played(False, f"{name}_range=[3,1]")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -214,7 +215,7 @@ def test_a_table_says_who_loses_more_than_5_percent_of_the_flow() -> None:
     assert found["kept"].all()
 
 
-def test_flow_may_be_limited_to_that_of_the_recorded_drivers(capsys) -> None:
+def test_flow_may_be_limited_to_that_of_other_strategies(capsys) -> None:
     flows = {"human": 2000.0, "recorded": 1900.0, "near": 1950.0, "far": 1800.0}
     rows = pd.concat(driven(name, 1.0, flow_vph=flow) for name, flow in flows.items())
     task = Task(name="mine", limits={"flow_vph": "recorded"})
@@ -222,6 +223,10 @@ def test_flow_may_be_limited_to_that_of_the_recorded_drivers(capsys) -> None:
     assert one.table["kept"].tolist() == [True, True, True, False]
     print_table(terminal(one))
     assert " ≥ 1900 " in capsys.readouterr().out
+    # Of the simulated drivers, which the task compares with, that is 1,940.
+    share = replace(task, limits={"flow_vph": "97 %"})
+    kept = report(windows_for(rows), share, MOTOR).table["kept"]
+    assert kept.tolist() == [True, False, True, False]
     alone = report(windows_for(rows[rows["strategy"] == "far"]), task, MOTOR)
     assert alone.table["kept"].tolist() == [True]  # nobody is there to keep it to
 

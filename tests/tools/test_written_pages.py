@@ -30,7 +30,8 @@ def same(docs: Path, *names: str) -> None:
 
 def test_the_pages_hold_the_scores_kept(docs) -> None:
     pages.tasks(REFERENCE, docs)
-    same(docs, "tasks.md", "leaderboard.md")
+    pages.learners(REFERENCE, docs)
+    same(docs, "tasks.md", "fleets.md", "leaderboard.md", "learners.md")
 
 
 @pytest.mark.slow
