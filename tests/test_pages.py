@@ -54,6 +54,7 @@ ENOUGH = {
     "range(64)": "range(2)",
     "evaluation.shards=64": "evaluation.shards=2 evaluation.batch_size=8",
     "automated*100": "automated*8",
+    "evaluation.warm_up=20": "evaluation.warm_up=1",
     "evaluation.repeats=2000": "evaluation.repeats=4",
     "evaluation.repeats=200": "evaluation.repeats=2",
     "--iterations 200": "--iterations 2",

@@ -5,6 +5,7 @@ lcc-rl table outputs/evaluate/<run> --all               # every measure
 lcc-rl table outputs/evaluate/<run> --against idm       # savings against it
 lcc-rl table outputs/evaluate/<run> --format latex      # for booktabs
 lcc-rl table outputs/evaluate/<run> --columns who,saved_pct
+lcc-rl table outputs/evaluate/<run> --all --format csv --decimal comma   # for a spreadsheet
 lcc-rl table outputs/train/<sweep> --figure sweep.pdf   # a row for each setting; its seeds joined
 lcc-rl table outputs/alcc/tables/<table>.parquet --format latex
 """
@@ -51,7 +52,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ending = typed(Annotated[str, Field(pattern=r"\.(png|pdf|svg)$")])
     parser.add_argument("--figure", type=ending, help="draw the table, too: a .png, .pdf or .svg")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
+    marks = "of --format csv; comma, as spreadsheets of many countries read, divides columns by ;"
+    parser.add_argument("--decimal", choices=("point", "comma"), default="point", help=marks)
     options = parser.parse_args(arguments)
+    if options.decimal == "comma" and options.format != "csv":
+        parser.error("--decimal comma needs --format csv")
     names = options.columns.split(",") if options.columns else None
     note, numbers = "", options.format == "csv" and not names
     if options.run.suffix == ".parquet":
@@ -70,7 +75,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         else:
             note = report.note
             table = report.short if numbers else for_print(report, names or [])
-    print(TABLE_FORMATS[options.format](table))
+    if options.decimal == "comma":
+        print(table.to_csv(index=False, sep=";", decimal=",").rstrip())
+    else:
+        print(TABLE_FORMATS[options.format](table))
     if note and options.format != "csv":
         print(f"% {note}" if options.format == "latex" else f"\n{note}")
 

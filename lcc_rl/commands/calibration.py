@@ -19,12 +19,20 @@ from rich.table import Table
 from lcc_rl.config import config_hash
 from lcc_rl.config.nodes import CALLED, as_plain
 from lcc_rl.config.schemas import CalibrateConfig
-from lcc_rl.drivers.calibrator import OUT, Calibration, count_records
+from lcc_rl.drivers.calibrator import (
+    EQUILIBRIUM,
+    MEAN_GAP,
+    MEAN_SPEED,
+    OUT,
+    Calibration,
+    count_records,
+)
 from lcc_rl.drivers.parameters import MODEL, parameters_of
 from lcc_rl.drivers.population import from_table
 from lcc_rl.envs.inputs import load_episodes
 from lcc_rl.figures.calibration import calibration_figure, joint_figure, twins_figure
 from lcc_rl.figures.drawing import save
+from lcc_rl.functional.driver_models import PARAMETERS
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.render import DASH
 from lcc_rl.results.runs import check_folder, save_config
@@ -37,6 +45,9 @@ ERROR_HEADINGS = (
     *(("rmspe", "RMSPE [%]"), ("gap_rmse_m", "gap RMSE [m]")),
     ("gap_nrmse", "gap NRMSE [%]"),
 )
+
+# Gaps over the record's mean speed, in the table below T.
+BESIDE_T = ((EQUILIBRIUM, "  at equilibrium [s]"), (MEAN_GAP, "  recorded [s]"))
 
 
 def run(
@@ -133,6 +144,9 @@ def _summary(drivers: pd.DataFrame) -> Table:
     for one in parameters_of(drivers[MODEL].unique()).values():
         row = (_spread(part[one.column]) for part in parts.values())
         table.add_row(escape(re.sub(r" \$.*\$", "", one.label)), *row)
+        for gap, label in BESIDE_T if one.column == PARAMETERS["time_gap"].column else ():
+            times = (_spread(part[gap] / part[MEAN_SPEED]) for part in parts.values())
+            table.add_row(escape(label), *times)
     populations = [from_table(part).summary() for part in parts.values()]
     correlations = (row["correlation"] for row in populations)
     shown = (f"{value:.2f}" if math.isfinite(value) else DASH for value in correlations)

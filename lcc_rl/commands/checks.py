@@ -13,7 +13,7 @@ from lcc_rl.config import load
 from lcc_rl.config.nodes import CALLED, nodes_in
 from lcc_rl.config.schemas import StudyConfig, TrainConfig
 from lcc_rl.envs import Inputs, build_env
-from lcc_rl.envs.factory import after_humans
+from lcc_rl.envs.factory import after_uncounted
 from lcc_rl.envs.inputs import (
     LOADS,
     build_drivers,
@@ -105,7 +105,7 @@ def training_bytes(cfg: StudyConfig, moment: TensorDictBase) -> dict[str, float]
 def evaluation_bytes(cfg: StudyConfig, moment: TensorDictBase, inputs: Inputs) -> dict[str, float]:
     """Return the bytes of the largest block of an evaluation; arguments as above."""
     settings, count = cfg.evaluation, len(inputs.evaluation)
-    steps = after_humans(cfg, settings.humans_first).scenario.horizon
+    steps = after_uncounted(cfg)[0].scenario.horizon
     if settings.rows == "episodes":
         count = plan_of(cfg, inputs).size
     longest = max((case.horizon for case in inputs.full_length), default=0)

@@ -28,7 +28,7 @@ from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store
-from lcc_rl.evaluation.fit import check_policy, other_traffic
+from lcc_rl.evaluation.fit import check_policy, other_drivers, other_traffic
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import DIRECT, controller_of, is_policy, is_shipped, label_of
 from lcc_rl.evaluation.strategies import (
@@ -46,18 +46,16 @@ from lcc_rl.evaluation.strategies import (
 )
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
-from lcc_rl.results.names import in_words
+from lcc_rl.results.names import counted_windows, in_words, several
 from lcc_rl.results.platoons import case_report
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
 from lcc_rl.results.render import print_table, terminal
 from lcc_rl.results.report import (
     Report,
-    counted_windows,
     few_windows,
     leader_too_fast,
     remarks,
     report,
-    several,
     windows_for,
 )
 from lcc_rl.results.runs import EPISODES, STEPS, check_folder, resumed_config, save_config
@@ -274,7 +272,7 @@ def strategies_of(
     if own and learns(cfg) and cfg.policy is None:
         raise no_policy(cfg)
     inputs = load_inputs(cfg)
-    for line in inputs.report:
+    for line in filter(None, [*inputs.report, other_drivers(cfg)]):
         log.info(line)
     check_evaluation(cfg, inputs)
     strategies = _rules(cfg, rivals, inputs)
@@ -438,8 +436,10 @@ def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterato
                 yield case_report(part, case, f"{of}{case}")
         return
     filtered = cfg.scenario.filters.get(AUTOMATED) is not None
+    words = list(filter(None, [other_drivers(cfg)]))
     for source, part in by_source(windows_for(rows)):
-        yield report(part, task_of(cfg), build_energy(cfg), filtered, source, against=against)
+        one = report(part, task_of(cfg), build_energy(cfg), filtered, source, against=against)
+        yield dataclasses.replace(one, remarks=[*one.remarks, *words])
 
 
 def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
@@ -454,7 +454,9 @@ def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
         if one.of in counts:
             of = [x for x in (_task_name(cfg), one.of) if x]
             windows = counted_windows(counts[one.of], "held-out " * bool(len(inputs.training)))
+            warm_up = cfg.evaluation.warm_up
             size = f"{windows} × {drivers}, {cfg.scenario.horizon} steps"
+            size += f", after {warm_up:g} s" if warm_up else ""
             title = ": ".join([*of, size])
         print_table(terminal(one, title, cfg.table == "all"))
     seconds = cfg.scenario.horizon * cfg.scenario.time_step

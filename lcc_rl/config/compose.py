@@ -46,6 +46,8 @@ NOT_IDENTITY = (
 )
 # Launchers that come with other packages: which extra brings them.
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
+# Settings that came later: without them a run is what it was before.
+LATER = ("evaluation.warm_up",)
 NEEDED = ("data", "split", "drivers", "observation", "calibration")  # of commands that have them
 NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =
 # Hydra's keys are without quotes.
@@ -342,12 +344,13 @@ def identity(cfg: Any, *unused: str, changed: bool = False) -> str:
         changed: only what differs from the defaults of the classes counts.
     """
     content = without_defaults(cfg) if changed else as_plain(cfg, places=False)
-    for key in (*NOT_IDENTITY, *unused):
+    for key in (*NOT_IDENTITY, *unused, *LATER):
         *path, last = key.split(".")
         node = content
         for part in path:
             node = node.get(part) or {}
-        node.pop(last, None)
+        if key not in LATER or not node.get(last):
+            node.pop(last, None)
     if not any((content.get("inputs") or {}).values()):
         content.pop("inputs", None)
     return config_hash(content)

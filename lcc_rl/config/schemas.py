@@ -127,12 +127,15 @@ class EvaluationConfig(Settings):
     compiled: bool | None = None
     full_length: bool = False
     humans_first: NonNegative = 0.0  # on a ring: before what is measured [s]
+    warm_up: NonNegative = 0.0  # first seconds of an episode, in which only collisions count [s]
 
     def validate(self) -> None:
         if self.shard >= self.shards:
             raise ConfigError(
                 f"evaluation.shard must lie from 0 to {self.shards - 1}, got {self.shard}"
             )
+        if self.warm_up and self.rows != "episodes":
+            raise ConfigError("evaluation.warm_up needs evaluation.rows=episodes")
 
 
 class BaseConfig(Settings):

@@ -43,10 +43,11 @@ THOUSANDS = r"^-?[0-9]{1,3}(,[0-9]{3})+(\.[0-9]*)?$"
 NUMBER = r"^-?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI][nN][fF]|[nN][aA][nN])$"
 NUMERIC_TYPES = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null, pa.types.is_decimal)
 ISO, FRAMES = "iso", "frames/"  # dates and times of ISO 8601; before the frames a second
+CLOCK, CLOCK_TIME = "hh:mm:ss", r"^ *([01]?[0-9]|2[0-3]):[0-5][0-9]:[0-5][0-9]([.,][0-9]+)? *$"
 SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": FOOT, "kn": 1852 / 3600}
 # Units by quantity, and their size; the first is the SI unit.
 UNITS: dict[str, dict[str, float]] = {
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, ISO: 1.0},
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, ISO: 1.0, CLOCK: 1.0},
     "speed": {**SPEEDS, "kph": SPEEDS["km/h"]},
     "length": {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT},
 }
@@ -413,13 +414,20 @@ def _shown(cell: pa.Scalar) -> str:
 
 
 def _seconds(cells: Cells) -> Cells:
-    """Dates and times of ISO 8601 as seconds since 1970; other cells as they are."""
+    """Dates and times of ISO 8601 as seconds since 1970, of a clock since midnight; else as is."""
     if not (pa.types.is_string(cells.type) or pa.types.is_timestamp(cells.type)):
         return cells
     for kind in (pa.timestamp("ns"), pa.timestamp("ns", "UTC")):
         with suppress(pa.ArrowInvalid):
             count = pc.cast(pc.cast(cells, kind), pa.int64())
             return pc.multiply(pc.cast(count, pa.float64(), safe=False), 1e-9)
+    match = pc.match_substring_regex
+    if pa.types.is_string(cells.type) and pc.any(match(cells[:99], CLOCK_TIME)).as_py():
+        which, text = match(cells, CLOCK_TIME), pc.utf8_trim_whitespace(cells)
+        text = pc.replace_substring_regex(pc.replace_substring(text, ",", "."), "^(.):", r"0\1:")
+        stamps = pc.binary_join_element_wise("1970-01-01T", text, "")
+        seconds = _seconds(pc.if_else(which, stamps, pa.scalar(None, pa.string())))
+        return pc.if_else(which, pc.cast(seconds, pa.string()), cells)
     return cells
 
 

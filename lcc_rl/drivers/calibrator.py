@@ -39,6 +39,8 @@ INNER = GeneticSettings(population=16, generations=8)
 # Columns of the errors; those of the part held out end in ``_out``.
 ERROR_COLUMNS = {SPEED_RMSPE: "rmspe", GAP_RMSE: "gap_rmse_m", GAP_NRMSE: "gap_nrmse"}
 OUT = "_out"
+GAPS_OFF = 0.1  # relative error of gaps from which on speeds alone may be too little to fit
+MEAN_SPEED, MEAN_GAP, EQUILIBRIUM = "mean_speed_mps", "mean_gap_m", "equilibrium_gap_m"
 IMPLAUSIBLE = 1.0  # relative error of the median driver's gap from which on the report says so
 CONGESTED = "; followers that never drive freely do not tell it"
 
@@ -197,7 +199,8 @@ class _Fit:
         error, genetic = self.error(constants), getattr(self.settings, f"{self.mode}_genetic")
         found = self.search(error, self.names, self.observed.count, genetic, self.progress)
         drivers = self.table(found.best.to("cpu", torch.float64), constants)
-        return drivers, lines + _findings(drivers, self.names, self.limits, self.table_of)
+        what = self.names, self.limits, self.table_of, self.settings.objective
+        return drivers, lines + _findings(drivers, *what)
 
     def error(self, constants: DriverConstants) -> FitError:
         """Return what is minimised, as a function of the fitted parameters."""
@@ -254,6 +257,7 @@ class _Fit:
         own = dict(zip(self.names, best.numpy().T, strict=True))
         for name, one in self.table_of.items():
             columns[one.column] = own.get(name, getattr(constants, name, None))
+        columns |= self.equilibrium(own, constants)
         for end, part in self.parts.items():
             exact = FitError(part.to("cpu", torch.float64), constants, self.names)
             measures = exact.measures(best.unsqueeze(1))
@@ -280,6 +284,16 @@ class _Fit:
         # The episodes are sorted by length; the table has the order of the input.
         return drivers.sort_values("episode", kind="stable", ignore_index=True)
 
+    def equilibrium(self, own: Mapping[str, Any], constants: DriverConstants) -> dict[str, Any]:
+        """Return each record's mean speed and gap, and the driver's equilibrium gap at it."""
+        seen, samples = self.observed, torch.tensor(self.observed.samples)
+        speed, gap = (x.cpu().sum(0) / samples for x in (seen.follower_speed, seen.gaps))
+        given = {name: torch.tensor(values) for name, values in own.items()}
+        v0, headway = (given.pop(name) for name in INDIVIDUAL)
+        steady = constants.with_(**given).equilibrium_gap(speed, v0, headway)
+        found = {MEAN_SPEED: speed, MEAN_GAP: gap, EQUILIBRIUM: steady}
+        return {name: values.numpy() for name, values in found.items()}
+
 
 def count_records(drivers: pd.DataFrame) -> str:
     """Return how many records a calibration in one mode fitted, and of how many drivers."""
@@ -293,6 +307,7 @@ def _findings(
     names: Sequence[str],
     limits: Mapping[str, Any],
     table: Mapping[str, Parameter],
+    objective: FitMeasure,
 ) -> list[str]:
     """Lines on the quality of the fit and on what it could not identify."""
     error = 100.0 * drivers["rmspe"]
@@ -301,9 +316,17 @@ def _findings(
         f"median {error.median():.2f} %, worst {error.max():.1f} %"
     ]
     for end, part in (("", "fitted"), (OUT, "held out")):
-        if f"gap_rmse_m{OUT}" in drivers:
-            speed, gap = 100.0 * drivers[f"rmspe{end}"], drivers[f"gap_rmse_m{end}"]
-            lines.append(f"{part}: RMSPE {speed.mean():.2f} %, gap RMSE {gap.mean():.2f} m (means)")
+        if f"gap_rmse_m{end}" in drivers:
+            speed, gap, share = (drivers[f"{x}{end}"].mean() for x in ERROR_COLUMNS.values())
+            both = f"RMSPE {100.0 * speed:.2f} %, gap RMSE {gap:.2f} m, {100.0 * share:.1f} %"
+            lines.append(f"{part}: {both} of the gap (means)")
+    speed, share = drivers["rmspe"].mean(), drivers["gap_nrmse"].mean()
+    if objective == SPEED_RMSPE and share > max(GAPS_OFF, 3.0 * speed):
+        line = (
+            f"gaps are off by {100.0 * share:.0f} %, speeds by {100.0 * speed:.1f} %: speeds alone "
+            "tell little here; calibration.objective=both fits gaps, too"
+        )
+        lines.append(Concern(line))
     for name in names:
         bound = drivers[f"{name}_at_bound"]
         if bound.any():

@@ -1,6 +1,6 @@
 """Energy models: what driving draws from a battery or a tank, and who has which."""
 
-from lcc_rl.energy.base import AVERAGED, AVERAGES, EnergyModel
+from lcc_rl.energy.base import AVERAGED, AVERAGES, BURNT, EnergyModel
 from lcc_rl.energy.electric import ElectricCar, PaperMotor
 from lcc_rl.energy.fleet import Fleet, as_fleet
 from lcc_rl.energy.fuel import CirclesFuel
@@ -8,6 +8,7 @@ from lcc_rl.energy.fuel import CirclesFuel
 __all__ = [
     "AVERAGED",
     "AVERAGES",
+    "BURNT",
     "CirclesFuel",
     "ElectricCar",
     "EnergyModel",

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from typing import Annotated
 
+import torch
 from pydantic import Field
 from torch import Tensor
 
@@ -14,6 +16,7 @@ from lcc_rl.settings import Settings
 # noise of records counts, with a longer one what drivers do does not.
 AVERAGES = (1.1, 3.1)
 AVERAGED = tuple(f"path_energy_{seconds:g}s_kj" for seconds in AVERAGES)  # such energies [kJ]
+BURNT = ("fuel_l", "co2_g")  # what an energy of fuel is in litres, and its carbon dioxide [g]
 
 Grade = Annotated[float, Field(ge=-0.3, le=0.3)]  # of the road [rad]
 
@@ -31,6 +34,7 @@ class EnergyModel(Settings, ABC):
             vehicle stores counts as kinetic energy over efficiency.
         heating_value: of the fuel [J/g]; 0 for a vehicle without fuel.
         density: of the fuel [kg/L].
+        carbon_dioxide: of a gram of the fuel [g]; NaN where it is not known.
     """
 
     mass = 1500.0
@@ -38,11 +42,19 @@ class EnergyModel(Settings, ABC):
     efficiency = 1.0
     heating_value = 0.0
     density = 0.0
+    carbon_dioxide = math.nan
 
     @property
     def inertia(self) -> float:
         """The mass that is accelerated, rotating parts included [kg]."""
         return self.mass * self.rotating_mass
+
+    def burnt(self, energy: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the fuel [L] and its carbon dioxide [g] of an energy drawn [J]; 0 without fuel."""
+        if not self.heating_value:
+            return torch.zeros_like(energy), torch.zeros_like(energy)
+        grams = energy / self.heating_value
+        return grams * 1e-3 / self.density, grams * self.carbon_dioxide
 
     @abstractmethod
     def power(self, speed: Tensor, acceleration: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lcc_rl.energy.base import EnergyModel
+from lcc_rl.energy.base import BURNT, EnergyModel
 from lcc_rl.energy.electric import PaperMotor
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.guard import unchanged
@@ -81,6 +81,19 @@ class Fleet:
     ) -> Tensor | None:
         """Return where a vehicle cannot accelerate like this; None if no model defines it."""
         return self._known("infeasible", any, speed, acceleration, kind)
+
+    def burnt(self, energy: Tensor, kind: Tensor | None = None) -> dict[str, Tensor]:
+        """Return :data:`BURNT` of energies drawn [J], of whatever shape; empty if none burns fuel.
+
+        Vehicles without fuel add nothing.
+        """
+        if not any(model.heating_value for model in self.models):
+            return {}
+
+        def part(number: int) -> Tensor:
+            return self._of(lambda model, x, _: model.burnt(x)[number], energy, energy, kind)
+
+        return {name: part(number) for number, name in enumerate(BURNT)}
 
     def _known(self, name: str, enough: Any, *motion: Any) -> Tensor | None:
         """Return what models define, false of the others; None unless enough define it."""

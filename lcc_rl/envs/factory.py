@@ -131,6 +131,23 @@ def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
     return cfg
 
 
+def after_uncounted(cfg: StudyConfig) -> tuple[StudyConfig, int, int]:
+    """Return what an evaluation drives, its first steps for humans alone, and its warm-up's steps.
+
+    Raises:
+        ConfigError: if a duration is no number of steps, or nothing is left to count.
+    """
+    settings, scenario = cfg.evaluation, cfg.scenario
+    warm = World(time_step=scenario.time_step).steps(settings.warm_up, "evaluation.warm_up")
+    require(
+        warm < scenario.horizon,
+        f"evaluation.warm_up must be below the {scenario.horizon * scenario.time_step:g} s of an "
+        f"episode (scenario.horizon), got {settings.warm_up:g} s",
+    )
+    driven = after_humans(cfg, settings.humans_first)
+    return driven, driven.scenario.horizon - scenario.horizon, warm
+
+
 def _by_role(scenario: ScenarioConfig, group: str) -> list[tuple[str, Node]]:
     """Return what a group describes by role, of the roles that the string has.
 

@@ -136,7 +136,7 @@ def described(population: Population, cfg: StudyConfig) -> str:
     behind = "on a ring" if cfg.scenario.road == RING else f"behind leaders of {whose}"
     mode = getattr(population, "mode", None)
     taken = f", drivers.mode={mode}" if mode else ""
-    who = f"{len(gap)} human drivers ({_origin(cfg.drivers)}{taken})"
+    who = f"{len(gap)} human drivers ({origin_of(cfg.drivers)}{taken})"
     line = f"{who} {behind}: mean v0 {speed.mean():.1f} m/s, mean T {gap.mean():.2f} s"
     reaction = getattr(population, "reaction", None)
     if reaction is None or reaction == Reaction():
@@ -145,7 +145,7 @@ def described(population: Population, cfg: StudyConfig) -> str:
     return line + f", of perceived gaps {reaction.gap_noise:g}" * bool(reaction.gap_noise)
 
 
-def _origin(drivers: Node) -> str:
+def origin_of(drivers: Node) -> str:
     """Return where drivers come from; of a function of the user's own only its name is known."""
     if drivers.settings[TARGET] != BOOTSTRAP:
         return drivers.name

@@ -15,7 +15,7 @@ from torch import Tensor
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import RECORDED
 from lcc_rl.envs import build_env
-from lcc_rl.envs.factory import after_humans
+from lcc_rl.envs.factory import after_uncounted
 from lcc_rl.envs.inputs import Inputs, build_energy
 from lcc_rl.errors import require
 from lcc_rl.evaluation.rollout import Player, reset_options
@@ -163,8 +163,8 @@ class Episodes:
         compiled: bool | None = None,
     ) -> None:
         self.strategy, self.inputs, self.plan, self.seed = strategy, inputs, plan, seed
-        self.cfg = after_humans(any_leader(strategy.cfg), strategy.cfg.evaluation.humans_first)
-        self.begun = self.cfg.scenario.horizon - strategy.cfg.scenario.horizon
+        self.cfg, begun, self.warm_up = after_uncounted(any_leader(strategy.cfg))
+        self.begun = begun + self.warm_up
         if compiled is None:
             compiled = len(plan) * self.cfg.scenario.horizon >= COMPILED_STEPS
         env = build_env(
@@ -194,6 +194,7 @@ class Episodes:
             return f"{number} (profile {name}, driver {met}, seed {int(options[SEED][number])})"
 
         record, alive = self.player.play(options, named)
+        crashed = (alive.unsqueeze(-2) & (record["vehicles", "gap"] <= 0.0)).any(0).any(-2)
         record, alive = {key: x[self.begun :] for key, x in record.items()}, alive[self.begun :]
         groups = grouped(record, self.cfg.scenario.vehicles)
         described = describe(
@@ -205,16 +206,17 @@ class Episodes:
             repeat if plan.repeats > 1 else None,
         )
         desired = desired_speeds(self.strategy, described)
-        described[FASTER] = leader_faster(inputs.evaluation, profile, desired)
+        described[FASTER] = leader_faster(inputs.evaluation, profile, desired, self.warm_up)
         time_step = self.cfg.scenario.time_step
-        leader = leader_measures(inputs.evaluation, profile, self.energy)
+        leader = leader_measures(inputs.evaluation, profile, self.energy, self.warm_up)
         if self.cfg.scenario.road == RING:  # where nobody leads
             leader[:] = np.nan
         # Drivers are recorded by sensors, whose noise costs energy in what they drove.
         recorded = RECORDED in self.cfg.evaluation.baselines
         measured = measures(groups, alive, time_step, self.energy, recorded)
-        measured |= traffic(record, alive, self.cfg.scenario.vehicle_length, time_step)
-        rows = pd.concat([described, leader, as_frame(measured)], axis=1)
+        length, free = self.cfg.scenario.vehicle_length, inputs.population.desired_speed[driver]
+        measured |= traffic(record, alive, length, time_step, free)
+        rows = pd.concat([described, leader, as_frame(measured, crashed)], axis=1)
         rows = rows.iloc[:count]
         inside = [index - block * plan.size for index in sorted(self.samples)]
         inside = [index for index in inside if 0 <= index < count]

@@ -8,10 +8,12 @@ from typing import Any
 
 from tensordict.nn import TensorDictModule
 
+from lcc_rl.config import load
 from lcc_rl.config.nodes import as_plain
 from lcc_rl.config.schemas import AUTO, StudyConfig
+from lcc_rl.envs.inputs import origin_of
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.runs import differing, flatten
 
@@ -127,6 +129,23 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     return (
         f"{path} was trained with other {others}: with {options} as in the config.yaml of its "
         "training, an evaluation is of the windows that were held out there"
+    )
+
+
+def other_drivers(cfg: StudyConfig) -> str:
+    """Return a sentence where a task has other human drivers than its own; else nothing."""
+    if cfg.task is None or HUMAN not in cfg.scenario.vehicles.names:
+        return ""
+    name = cfg.task["name"]
+    try:
+        own = load("evaluate", [f"task={name}"])
+    except ConfigError:  # a task that stands in no file
+        return ""
+    if own.drivers == cfg.drivers:
+        return ""
+    return (
+        f"Human drivers: {origin_of(cfg.drivers)}, in place of those of task={name} "
+        f"({origin_of(own.drivers)}), whose published scores are for others."
     )
 
 

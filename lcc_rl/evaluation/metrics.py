@@ -16,6 +16,8 @@ from lcc_rl.functional.safety import NEVER
 KILO = 1e-3
 UNSAFE_TTC = 4.0  # [s] (A10)
 LONG_TIME_GAP = 2.5  # [s] (A13)
+SHORT_TIME_GAP = 1.0  # [s]
+APART = 1.0  # brakings of a vehicle that are closer in time count as one [s]
 CALM = 0.5  # spread of the speeds at which a wave counts as damped [m/s]
 PACE = 1.0  # below it a long time gap is a matter of metres [m/s]
 ACTS = 0.01  # change of a command by which a filter acts [m/s²]
@@ -43,7 +45,8 @@ def energy_measures(
         ``energy_kj``, ``net_energy_kj`` (a trip that ends slower than it began has used energy
         that it did not draw), what the speeds driven take without accelerating
         (``steady_energy_kj``), what a path takes without what the motion stores
-        (``path_energy_kj``; of a model without such a part the net energy), ``distance_m``, and,
+        (``path_energy_kj``; of a model without such a part the net energy), ``distance_m``, its
+        fuel and carbon dioxide (:data:`lcc_rl.energy.BURNT`) where a model burns fuel, and,
         of models that know them, what accelerating loses (``acceleration_loss_kj``) and the share
         of time in which the vehicle cannot accelerate as it does (``share_infeasible``), each
         ``[*batch, n, 1]``.
@@ -70,6 +73,7 @@ def energy_measures(
     if lost is not None:
         found["acceleration_loss_kj"] = total(lost) * KILO
         found["path_energy_kj"] = steady + found["acceleration_loss_kj"]
+    found |= energy.burnt(found["path_energy_kj"] / KILO, kind)
     strange = energy.infeasible(*motion, kind)
     if strange is not None:
         count = steps.squeeze(0).clamp(min=1)
@@ -139,6 +143,17 @@ class Reductions:
         count = self.steps.clamp(min=1) * entry.shape[-2]
         return (entry * self.alive).sum(0).sum(-2) / count
 
+    def total(self, entry: Tensor) -> Tensor:
+        """Integral over time, added up over vehicles."""
+        return (entry * self.alive).sum(0).sum(-2) * self.time_step
+
+    def begun(self, state: Tensor) -> Tensor:
+        """How often a state of a vehicle begins, :data:`APART` after its last time at the least."""
+        state, recent = state & self.alive, torch.zeros_like(state)
+        for back in range(1, max(1, round(APART / self.time_step)) + 1):
+            recent[back:] |= state[:-back]
+        return (state & ~recent).sum(0).sum(-2)
+
     def lowest(self, entry: Tensor) -> Tensor:
         """Minimum over time and vehicles."""
         return torch.where(self.alive, entry, torch.inf).amin(0).amin(-2)
@@ -184,12 +199,23 @@ METRICS: dict[str, Callable[..., Tensor]] = {
         _turned(over, safe) & (promised > 0.0)
     ),
 }
+# Measures of all vehicles of a string, likewise; ``free`` is v0 [m/s], ``[*batch, 1]``.
+ROAD_METRICS: dict[str, Callable[..., Tensor]] = {
+    "brakings_below_2": lambda over, acceleration: over.begun(acceleration < -2.0),
+    "brakings_below_3": lambda over, acceleration: over.begun(acceleration < -3.0),
+    "share_time_gap_short": lambda over, time_gap: over.mean(time_gap < SHORT_TIME_GAP),
+    "vehicle_time_s": lambda over, gap: over.total(torch.ones_like(gap)),
+    "delay_s": lambda over, speed, free: over.total(1.0 - 0.5 * (speed[:-1] + speed[1:]) / free),
+}
 
 
 def safety_measures(
-    series: Mapping[str, Tensor], alive: Tensor, time_step: float
+    series: Mapping[str, Tensor],
+    alive: Tensor,
+    time_step: float,
+    metrics: Mapping[str, Callable[..., Tensor]] = METRICS,
 ) -> dict[str, Tensor]:
-    """Safety, efficiency and comfort of the automated vehicles of a string, by :data:`METRICS`.
+    """Safety, efficiency and comfort of vehicles of a string.
 
     Args:
         series: ``ttc`` [s], ``time_gap`` [s], ``gap`` [m], ``jerk`` [m/s³] after every step,
@@ -198,13 +224,15 @@ def safety_measures(
             ``safe``, and the desired and commanded accelerations ``wanted`` and ``command`` [m/s²].
         alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
         time_step: duration of a step [s].
+        metrics: what is measured, such as :data:`ROAD_METRICS` of all vehicles; by default
+            :data:`METRICS`, of the automated ones.
 
     Returns:
         Minima and maxima over the vehicles, shares of time and root mean squares averaged over
         them, each ``[*batch, 1]``; the least time-to-collision is NaN where no gap ever closed.
     """
     over, found = Reductions(alive, time_step), {}
-    for name, metric in METRICS.items():
+    for name, metric in metrics.items():
         _, *entries = signature(metric).parameters
         if all(entry in series for entry in entries):
             found[name] = metric(over, *(series[entry] for entry in entries))

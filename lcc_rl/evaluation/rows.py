@@ -15,9 +15,10 @@ from torch import Tensor
 
 from lcc_rl.config.words import RECORDED
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.energy import AVERAGED, Fleet, as_fleet
+from lcc_rl.energy import AVERAGED, BURNT, Fleet, as_fleet
 from lcc_rl.evaluation.metrics import (
     KILO,
+    ROAD_METRICS,
     averaged_energies,
     energy_measures,
     measured_ttc,
@@ -41,6 +42,7 @@ SUMMED = (
     "acceleration_loss_kj",
     "path_energy_kj",
     *AVERAGED,
+    *BURNT,
 )
 # Columns of an episode that the steps of a sample episode repeat.
 SAMPLED = (
@@ -142,18 +144,30 @@ def measures(
     return {**columns, "steps": alive.sum(0)}
 
 
-def as_frame(columns: dict[str, Tensor]) -> pd.DataFrame:
-    """Return the measures of a batch as one row per episode."""
+def as_frame(columns: dict[str, Tensor], collided: Tensor) -> pd.DataFrame:
+    """Return the measures of a batch as one row per episode.
+
+    An episode that a collision ended before what is counted has no measures, NaN.
+    """
     frame = pd.DataFrame({key: value.squeeze(-1).cpu().numpy() for key, value in columns.items()})
-    lowest = [frame[key] for key in ("min_gap_m", "hdv_min_gap_m") if key in frame]
-    frame.insert(len(frame.columns) - 1, "collided", np.minimum.reduce(lowest) <= 0.0)
+    if (frame["steps"] == 0).any():
+        frame = frame.where(frame["steps"] > 0).assign(steps=frame["steps"])
+    frame.insert(len(frame.columns) - 1, "collided", collided.squeeze(-1).cpu().numpy())
     return frame
 
 
-def traffic(record: Record, alive: Tensor, length: float, time_step: float) -> dict[str, Tensor]:
-    """Return what the whole string did, each ``[batch, 1]``; see :func:`string_measures`."""
+def traffic(
+    record: Record, alive: Tensor, length: float, time_step: float, free: Tensor
+) -> dict[str, Tensor]:
+    """Return what the whole string did, each ``[batch, 1]``.
+
+    It is :func:`string_measures` and :data:`ROAD_METRICS`; ``free`` is v0 by episode ``[batch]``.
+    """
     steps, leader = len(alive), record.get(("leader", "speed"))
-    return string_measures(
+    series = {name: entry for (space, name), entry in record.items() if space == "vehicles"}
+    series["free"] = free.to(alive.device).view(-1, 1, 1)
+    found = safety_measures(series, alive.unsqueeze(-2), time_step, ROAD_METRICS)
+    return found | string_measures(
         record["vehicles", "speed"][-steps:],
         record["vehicles", "gap"],
         alive,
@@ -199,25 +213,30 @@ def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:
     return drivers if given is None else np.full_like(drivers, given)
 
 
-def leader_faster(profiles: Profiles, profile: Tensor, desired: np.ndarray) -> np.ndarray:
-    """Return the share of time in which the leader of each episode drives faster than v0 [m/s]."""
+def leader_faster(
+    profiles: Profiles, profile: Tensor, desired: np.ndarray, first: int = 0
+) -> np.ndarray:
+    """Return the share of time in which the leader of each episode drives faster than v0 [m/s].
+
+    It is counted from the step ``first`` on.
+    """
     shares = np.zeros(len(desired))
     for index in profile.unique().tolist():
-        speeds, rows = profiles.record(index).numpy(), (profile == index).numpy()
+        speeds, rows = profiles.record(index)[first:].numpy(), (profile == index).numpy()
         shares[rows] = (speeds[:, None] > desired[rows]).mean(0)
     return np.where(np.isnan(desired), np.nan, shares)
 
 
 def leader_measures(
-    profiles: Profiles, profile: Tensor, energy: Fleet | None = None
+    profiles: Profiles, profile: Tensor, energy: Fleet | None = None, first: int = 0
 ) -> pd.DataFrame:
     """Return the path energy [kJ] and the mean speed [m/s] of the leader of each episode.
 
-    The leader has the first energy model.
+    The leader has the first energy model; it is counted from the step ``first`` on.
     """
     fleet, found = as_fleet(energy), {}
     for index in profile.unique().tolist():
-        speed = profiles.record(index)
+        speed = profiles.record(index)[first:]
         power = fleet.path_power(speed[:-1], speed.diff() / profiles.time_step)
         drawn = power.sum() * profiles.time_step * KILO
         found[index] = (float(drawn), float(speed.mean()))

@@ -19,8 +19,7 @@ from lcc_rl.figures.drawing import (
     style,
 )
 from lcc_rl.results.bootstrap import band
-from lcc_rl.results.names import in_words
-from lcc_rl.results.report import several
+from lcc_rl.results.names import in_words, several
 
 ROLLING = 10  # iterations of the rolling mean
 BAND_NOTE = (

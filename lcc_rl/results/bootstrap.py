@@ -15,6 +15,7 @@ from lcc_rl.arrays import Floats
 CONFIDENCE = 0.95
 RESAMPLES = 9999
 LEAST_DRIVES = 5  # fewer tell too little of how drives differ
+STUDENT = (12.706, 4.303, 3.182)  # 97.5 % quantiles of Student's t by degrees of freedom, from 1
 RESAMPLING_SEED = 0  # of the resampling: the same rows give the same interval
 WITHOUT_WINDOWS = -1  # stream of seeds that are resampled without windows
 
@@ -23,11 +24,15 @@ Side = Mapping[str, Floats]  # columns of one side of a comparison, each ``[...,
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with the bounds of its 95 % interval; NaN bounds if nothing can be resampled."""
+    """A value with the bounds of its 95 % interval; NaN bounds if nothing can be resampled.
+
+    Two drives or more that are too few to be resampled also have a t-interval ``over_drives``.
+    """
 
     value: float
     low: float = np.nan
     high: float = np.nan
+    over_drives: tuple[float, float] | None = None
 
     def columns(self, name: str, factor: float = 1.0) -> dict[str, float]:
         """Return ``name``, ``name_low`` and ``name_high``, scaled."""
@@ -84,7 +89,27 @@ def estimate(
         return Estimate(value)
     low, high = bounds(found)
     # Of two windows one is drawn, and the share of both may lie outside those of either.
-    return Estimate(value, min(float(low), value), max(float(high), value))
+    ends = min(float(low), value), max(float(high), value)
+    return Estimate(value, *ends, _over_drives(statistic, sides, drives or (), value))
+
+
+def _over_drives(
+    statistic: Callable[..., Any], sides: Sequence[Side], drives: Sequence[object], value: float
+) -> tuple[float, float] | None:
+    """Return the t-interval of a statistic over two to four drives.
+
+    Its standard error is that of the jackknife: each drive is left out once.
+    """
+    names = list(dict.fromkeys(drives))
+    if not 2 <= len(names) < LEAST_DRIVES:
+        return None
+    left = []
+    for name in names:
+        kept = np.array([drive != name for drive in drives])
+        means = ({key: x[..., kept, :].mean((-2, -1)) for key, x in one.items()} for one in sides)
+        left.append(float(statistic(*means)))
+    beside = STUDENT[len(names) - 2] * float(np.std(left)) * (len(names) - 1) ** 0.5
+    return value - beside, value + beside
 
 
 def _sizes(side: Side) -> tuple[int, ...]:

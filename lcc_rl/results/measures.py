@@ -112,6 +112,11 @@ def _energy(kind: str, label: str = "", score: str = "") -> Measure:
     return Measure(key, label, "{:.1f}", of=of, per=DISTANCE, factor=1e3, score=score)
 
 
+def _per(key: str, label: str, of: str, factor: float, form: str = "{:.2f}") -> Measure:
+    """Return a column of all vehicles over their distance."""
+    return Measure(key, label, form, of=of, per=DISTANCE, factor=factor)
+
+
 MEASURES = [
     Measure(PATH, "path energy [kJ]", "{:.1f}"),
     Measure("total_acceleration_loss_kj", "  lost to accelerating [kJ]", "{:.1f}"),
@@ -127,6 +132,10 @@ MEASURES = [
     _energy("", "  as drawn, per vehicle and km [kJ]", "energy"),
     _energy("net_energy_", score="net_energy"),
     *(Measure(f"{group}_net_energy_kj") for group in ("cav", "hdv", "total")),
+    _per("fuel_l_per_100km", "fuel [L/100 km]", "all_fuel_l", 1e5),
+    _per("co2_g_per_km", "carbon dioxide of it [g/km]", "all_co2_g", 1e3, "{:.1f}"),
+    _per("travel_time_s_per_km", "travel time [s/km]", "vehicle_time_s", 1e3),
+    _per("delay_s_per_km", "  delay against v0 [s/km]", "delay_s", 1e3),
     Measure("mean_speed_mps", "mean speed [m/s]"),
     Measure(SPEED_STD, "deviation of a speed in time [m/s]", score=SPEED_STD),
     Measure(FINAL_SPREAD, "spread of speeds at the end [m/s]", score=FINAL_SPREAD),
@@ -147,6 +156,11 @@ MEASURES = [
     Measure("share_filter_acts", "time in which the filter acts", "{:.1%}"),
     Measure("share_time_gap_long", "time with time gap > 2.5 s", PERCENT, "long\ngaps\n≤ {:g} %"),
     Measure(LONG_GAPS, "  above 1 m/s", PERCENT, "long\ngaps\n≤ {:g} %", "long\ngap\n[%]"),
+    Measure(
+        "share_time_gap_short", "all: time with time gap < 1 s", PERCENT, "gap\n< 1 s\n≤ {:g} %"
+    ),
+    _per("brakings_below_2_per_100km", "brakings < −2 m/s² [1/100 km]", "brakings_below_2", 1e5),
+    _per("brakings_below_3_per_100km", "  < −3 m/s² [1/100 km]", "brakings_below_3", 1e5),
     Measure("rms_jerk_mps3", "RMS jerk [m/s³]"),
     Measure(FASTER, "time with a leader faster than v0", "{:.1%}", "leader\nfaster\n≤ {:g} %"),
     Measure(REACH[0], "CAV beyond the energy model's reach", "{:.1%}"),

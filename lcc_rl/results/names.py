@@ -1,4 +1,4 @@
-"""Names of strategies as they stand in tables, figures and pages."""
+"""Names of strategies and numbers of things as they stand in tables, figures and pages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ SUFFIX_UNITS = {
     "kj": "kJ",
     "ms": "ms",
 }
-SUFFIX_UNITS |= {"m": "m", "s": "s", "vph": "1/h", "g_per_km": "g/km"}
+SUFFIX_UNITS |= {"m": "m", "s": "s", "vph": "1/h", "g_per_km": "g/km", "s_per_km": "s/km"}
+SUFFIX_UNITS |= {"l_per_100km": "L/100 km", "per_100km": "1/100 km"}
 INITIALS = ("cav", "hdv", "ttc", "sd")
 NETWORK = "alcc"
 FILTER_ALONE = "constant_filtered"
@@ -83,3 +84,13 @@ def heading(column: str) -> str:
     words = (column.removesuffix(f"_{suffix}") if suffix else column).split("_")
     text = " ".join(word.upper() if word in INITIALS else word for word in words)
     return f"{text} [{SUFFIX_UNITS[suffix]}]" if suffix else text
+
+
+def several(count: int, what: str) -> str:
+    """Return a number of things in words."""
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
+def counted_windows(windows: int, which: str = "") -> str:
+    """Return a number of windows in words, ``which`` such as ``"held-out "``."""
+    return several(windows, f"{which}window")

@@ -28,7 +28,7 @@ from lcc_rl.results.measures import (
     Measure,
     Shown,
 )
-from lcc_rl.results.names import HUMAN, NETWORK, in_words
+from lcc_rl.results.names import HUMAN, NETWORK, counted_windows, in_words, several
 from lcc_rl.results.task import Task
 from lcc_rl.results.units import burns_one_fuel, check_unit, in_unit
 from lcc_rl.results.windows import DISTANCE, DRIVE, TRAINED, WAYS, savings, windows_of
@@ -44,6 +44,7 @@ UNTRAINED = (
 )
 FEW_WINDOWS, SHORT = 5, 150.0  # windows; seconds of them
 SCORE, FLOW_LOST = "score", "flow_lost"
+FEW_DRIVES = ("saving_drives_low", "saving_drives_high")  # a t-interval, of less than five
 SAVED = Shown("saved_pct", "saved\n[%]")
 WAY, FLOW_SHARE = Shown("distance_pct", "dis-\ntance\n[%]"), Shown("flow_pct", "flow\n[%]")
 COLLISIONS, KEEPS = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
@@ -170,6 +171,8 @@ def summary(
             known = against not in (None, name) and of[0] in windows
             share = savings(windows, of[0], name, str(against), of[1]) if known else NOTHING
             row |= share.columns(key)
+            if key == "saving":
+                row |= dict(zip(FEW_DRIVES, share.over_drives or (np.nan, np.nan), strict=True))
         row |= {measure.key: measure.value(part) for measure in MEASURES}
         rows.append(row)
     table = pd.DataFrame(rows)
@@ -226,6 +229,7 @@ def report(
     short, shown = made.pop("short")
     rows = _rows(task, table["against"].iloc[0])
     words = "" if task else verdict(windows, table, few)
+    words = "\n".join(filter(None, [words, few_drives(table)]))
     made |= {"full_caption": FULL, "verdict": words, "remarks": said}
     return Report(of, table, short, shown, rows, **made)
 
@@ -240,6 +244,8 @@ def _rows(task: Task | None, against: str | None) -> list[Measure]:
         Measure("saving", f"saved against {in_words(str(against))}", "{:+.2%}"),
         Measure("saving_low", "  95 % interval, low", "{:+.2%}"),
         Measure("saving_high", "    high", "{:+.2%}"),
+        Measure(FEW_DRIVES[0], "  over its few drives (t), low", "{:+.2%}"),
+        Measure(FEW_DRIVES[1], "    high", "{:+.2%}"),
         Measure("drawn_saving", "  as drawn, per episode", "{:+.1%}"),
         Measure("distance_lost", "distance lost", "{:+.2%}"),
         Measure(FLOW_LOST, "flow lost", "{:+.2%}"),
@@ -330,8 +336,17 @@ def saved_against(found: pd.DataFrame, against: str, always: bool = False) -> st
         up_to = "up to " if found.loc[found["seeds"] > 0, "seeds"].nunique() > 1 else ""
         over += f" and {up_to}{seeds} training seeds"
     if drives < min(LEAST_DRIVES, windows):
-        over += f" (too narrow: windows of {several(drives, 'drive')} are alike)"
+        over += f" (too narrow: too few drives, {drives}, whose windows are alike)"
     return f"{words}, with the 95 % interval over {over}"
+
+
+def few_drives(table: pd.DataFrame) -> str:
+    """Return in a sentence the intervals over less than five drives; empty without."""
+    found = table[table[FEW_DRIVES[0]].notna()]
+    rows = zip(found["strategy"], *(100.0 * found[name] for name in FEW_DRIVES), strict=True)
+    words = (f"{in_words(str(name))} {low:.1f} … {high:.1f}" for name, low, high in rows)
+    text = "; ".join(words).replace("-", "−")
+    return f"Saved [%], t-interval over {table['drives'].max()} drives: {text}." if text else ""
 
 
 def flow_against(table: pd.DataFrame) -> tuple[str, pd.Series]:
@@ -461,16 +476,6 @@ def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
         for name, remedy in remedies.items()
         if shares.get(name, 0.0) > MOSTLY
     ]
-
-
-def several(count: int, what: str) -> str:
-    """Return a number of things in words."""
-    return f"{count} {what}{'s' * (count != 1)}"
-
-
-def counted_windows(windows: int, which: str = "") -> str:
-    """Return a number of windows in words, ``which`` such as ``"held-out "``."""
-    return several(windows, f"{which}window")
 
 
 def sample_of(rows: pd.DataFrame, drivers: pd.DataFrame | None = None) -> str:

@@ -72,6 +72,23 @@ def test_units(tmp_path) -> None:
     truth(TableSource(path=written(tmp_path, frame), columns=columns, units=units).load())
 
 
+def test_times_of_a_clock(tmp_path) -> None:
+    # As programs and as spreadsheets write them.
+    for form, mark in (("{:02d}:{:02d}:{:04.1f}", "."), (" {:d}:{:02d}:{:04.1f}", ",")):
+        frame, first = long_table(), 7 * 36_000 + 15 * 600
+        tenths = (frame["t"] * 10.0).round().astype(int) + first
+        parts = zip(tenths // 36_000, tenths // 600 % 60, tenths % 600 / 10.0, strict=True)
+        clock = pd.Series([form.format(*part).replace(".", mark) for part in parts])
+        for units in ({}, {"time": "hh:mm:ss"}):
+            path = written(tmp_path, frame.assign(t=clock))
+            found = TableSource(path=path, columns=BY_GAP, units=units).load().episodes
+            assert found["time_s"].min() == pytest.approx(0.1 * first)
+            truth(LoadedEpisodes(found.assign(time_s=found["time_s"] - 0.1 * first), []))
+    clock[7] = "25:00:61"
+    with pytest.raises(DataError, match=r"row 8.*'25:00:61'.*expected a number"):
+        TableSource(path=written(tmp_path, frame.assign(t=clock)), columns=BY_GAP).load()
+
+
 def test_separators_and_decimal_commas(tmp_path) -> None:
     frame = long_table().assign(gap=lambda table: table["gap"].fillna(99.0))
     for separator, decimal in ((";", ","), (";", "."), ("\t", "."), (" ", ".")):
@@ -284,7 +301,10 @@ def test_impossible_tables() -> None:
         ({"vehicle_length": -1.0}, "vehicle_length must be greater"),
         ({"smoothing": SavitzkyGolay()}, "smooths positions"),
         *(
-            ({"units": {"time": unit}}, r"unit in data\.units\.time: .*frames/<rate>, iso, min")
+            (
+                {"units": {"time": unit}},
+                r"unit in data\.units\.time: .*frames/<rate>, hh:mm:ss, iso, min",
+            )
             for unit in ("frames/0", "frames/-1", "frames/x", "frames/nan", "frames")
         ),
     ]

@@ -174,6 +174,33 @@ def test_constants_are_chosen_over_all_drivers(model, make_episodes):
     assert any("constants chosen" in line for line in chosen.report)
 
 
+def test_the_equilibrium_gap_is_that_at_the_recorded_speed(uneven_lengths):
+    rows = quick(uneven_lengths).drivers
+    seen = uneven_lengths.groupby("episode")[["follower_speed_mps", "gap_m"]].mean()
+    np.testing.assert_allclose(rows[["mean_speed_mps", "mean_gap_m"]], seen)
+    v0, headway, speed = (rows[x] for x in ("desired_speed_mps", "time_gap_s", "mean_speed_mps"))
+    longer = (2.0 + speed * headway) / (1.0 - (speed / v0) ** 4).clip(lower=1e-6) ** 0.5
+    expected = np.minimum(longer, 4.0 + 3.0 * speed)
+    np.testing.assert_allclose(rows["equilibrium_gap_m"], expected)
+    assert (rows["equilibrium_gap_m"] > 2.0 + speed * headway).any()
+
+
+def test_gaps_that_speeds_do_not_tell_are_named(make_episodes):
+    # Noise of the gap, none of the speed.
+    episodes = make_episodes([40.0], [1.2])
+    noise = np.random.default_rng(0).normal(1.0, 0.2, len(episodes))
+    episodes["gap_m"] *= noise
+    named = {
+        aim: any(
+            "calibration.objective=both" in line for line in fit(episodes, objective=aim).report
+        )
+        for aim in ("speed_rmspe", "both")
+    }
+    assert named == {"speed_rmspe": True, "both": False}
+    clean = fit(make_episodes([40.0], [1.2])).report
+    assert not any("calibration.objective=both" in line for line in clean)
+
+
 def test_rows_keep_the_order_and_identity_of_the_input(uneven_lengths):
     both = Calibrator(modes=["local", "global"], local_genetic=QUICK, global_genetic=QUICK)
     seen: list[tuple[int, int]] = []
@@ -185,6 +212,7 @@ def test_rows_keep_the_order_and_identity_of_the_input(uneven_lengths):
     assert drivers.columns.tolist() == [
         *("episode", "recording", "follower_id", "leader_id"),
         *(PARAMETERS[name].column for name in fitted("global")),
+        *("mean_speed_mps", "mean_gap_m", "equilibrium_gap_m"),
         *("rmspe", "gap_rmse_m", "gap_nrmse", "samples"),
         *(f"{name}_at_bound" for name in fitted("global")),
         *("mode", "model"),

@@ -102,3 +102,15 @@ def test_mistakes_are_named() -> None:
         ],
         ConfigError,
     )
+
+
+def test_fuel_and_carbon_dioxide_are_those_of_each_class() -> None:
+    energy, kind = torch.full((4,), 1e6), torch.tensor([0, 1, 2, 0])  # [J]
+    found = Fleet(MODELS).burnt(energy, kind)
+    # 1 MJ over 42.36 kJ/g of petrol, over diesel's; the electric car burns none.
+    petrol, diesel = 1e6 / 42360.0, 1e6 / MODELS["truck"].heating_value
+    litres = [petrol / 745.0, diesel / 832.0, 0.0, petrol / 745.0]
+    assert found["fuel_l"].tolist() == pytest.approx(litres)
+    grams = [3.07 * petrol, 3.186 * diesel, 0.0, 3.07 * petrol]
+    assert found["co2_g"].tolist() == pytest.approx(grams)
+    assert Fleet({"electric": ElectricCar()}).burnt(energy) == {}

@@ -6,14 +6,15 @@ import json
 
 import pytest
 import torch
-from helpers import compose, make_agent
+from helpers import check_refused, compose, make_agent
 
 from lcc_rl.agents.factory import make_trainer
 from lcc_rl.config import load
 from lcc_rl.envs import build_env, load_inputs
+from lcc_rl.envs.factory import after_uncounted
 from lcc_rl.envs.rollout import DifferentiableRollout
 from lcc_rl.errors import ConfigError
-from lcc_rl.evaluation.episodes import Episodes, evaluate, plan_of
+from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import baseline
 
 RING = ("variant=alcc", "task=ring-22", "scenario.string=automated human*5")
@@ -104,7 +105,14 @@ def test_noise_differs_in_training(subtests) -> None:
             assert ends == pytest.approx([0.74, 1.26] if nominal else [0.5, 2.0], rel=0.15)
 
 
-def test_an_open_road_is_refused() -> None:
-    cfg = load("evaluate", ["variant=idm", "evaluation.humans_first=20"])
-    with pytest.raises(ConfigError, match="humans_first needs a ring"):
-        Episodes(baseline(cfg, "idm"), load_inputs(cfg), plan_of(cfg, load_inputs(cfg)), 0)
+def test_what_cannot_be_left_uncounted_is_refused() -> None:
+    cases = [
+        ("humans_first=20", "humans_first needs a ring"),
+        ("warm_up=30", "warm_up must be below the 30 s"),
+        ("warm_up=0.25", "warm_up must be a multiple of the time step"),
+    ]
+    check_refused(
+        lambda word: after_uncounted(load("evaluate", ["variant=idm", f"evaluation.{word}"])),
+        cases,
+        ConfigError,
+    )

@@ -104,3 +104,24 @@ def test_drawn_places_are_measured_by_role() -> None:
     ratio = drawn["hdv_distance_m"] / drawn["cav_distance_m"]
     assert 1.7 < ratio.mean() < 2.3
     assert ratio.std() < 0.5
+
+
+def test_a_warm_up_is_driven_and_not_counted() -> None:
+    whole, _ = run("idm")
+    late, steps = run("idm", "evaluation.warm_up=4", sample_episodes=1)
+    first, _ = run("idm", "scenario.horizon=40")
+    for name in ("cav_distance_m", "hdv_energy_kj", "vehicle_time_s", "cav_path_energy_kj"):
+        assert (late[name] + first[name]).to_numpy() == pytest.approx(whole[name], rel=1e-4)
+    assert (late["steps"] == 60).all()
+    assert (late["min_gap_m"] >= whole["min_gap_m"]).all()
+    assert len(steps) == 60
+    assert late["leader_speed_mps"].iloc[0] == pytest.approx(float(PROFILES.record(0)[40:].mean()))
+
+
+def test_a_collision_counts_in_the_warm_up() -> None:
+    cfg = compose("alcc", "scenario.horizon=100", "evaluation.warm_up=9.5")
+    rammer = steady(1.0, build_env(cfg, PROFILES, POPULATION, len(PROFILES) * 3))
+    rows, _ = evaluate(Strategy("rammer", cfg, rammer), INPUTS, 3, 64, 1)
+    assert rows["collided"].all()
+    assert (rows["steps"] == 0).any()
+    assert rows.loc[rows["steps"] == 0, ["min_gap_m", "total_energy_kj"]].isna().all(axis=None)

@@ -5,6 +5,7 @@ import torch
 
 from lcc_rl.energy import AVERAGED, as_fleet
 from lcc_rl.evaluation.metrics import (
+    ROAD_METRICS,
     averaged_energies,
     energy_measures,
     safety_measures,
@@ -81,7 +82,9 @@ def test_safety() -> None:
     assert set(measures) == set(expected)
     named = {name for name in expected if name.startswith(("max_", "min_", "share_"))}
     filtered = {"share_ttc_unpromised", "share_turned_unsafe"}
-    assert named | {"share_leader_faster", "flow_vph"} | filtered == set(limit_measures())
+    assert named | {"share_leader_faster", "share_time_gap_short", "flow_vph"} | filtered == set(
+        limit_measures()
+    )
     for name, values in expected.items():
         torch.testing.assert_close(measures[name].flatten(), torch.tensor(values))
 
@@ -148,3 +151,30 @@ def test_every_string_has_the_places_of_its_automated_vehicles() -> None:
     groups = grouped(record, parse_string("human automated human automated"))
     assert groups["cav"]["place"].tolist() == [[[1, 3]]] * 2
     assert groups["cav"]["speed"].flatten(1).tolist() == [[1.0, 3.0], [5.0, 7.0]]
+
+
+def test_what_a_road_asks_of_all_vehicles() -> None:
+    # Two vehicles, steps of 0.5 s: the first brakes hard three times, the second time within a
+    # second of the first; the second vehicle once.
+    own = torch.tensor([-2.5, -1.0, -2.5, 0.0, 0.0, -3.5])
+    acceleration = torch.stack([own, torch.tensor([0.0] * 5 + [-9.0])], 1).view(6, 1, 2, 1)
+    alive = torch.ones(6, 1, 1, 1, dtype=torch.bool)
+    series = {
+        "acceleration": acceleration,
+        "gap": torch.ones(6, 1, 2, 1),
+        "time_gap": torch.tensor([0.9, 1.1]).view(1, 1, 2, 1).expand(6, 1, 2, 1),
+        "speed": torch.full((7, 1, 2, 1), 20.0),
+        "free": torch.full((1, 1, 1), 25.0),
+    }
+    found = safety_measures(series, alive, 0.5, ROAD_METRICS)
+    expected = {
+        "brakings_below_2": 3.0,  # steps 0 and 5 of the first, step 5 of the second
+        "brakings_below_3": 2.0,
+        "share_time_gap_short": 0.5,
+        "vehicle_time_s": 6.0,
+        "delay_s": 1.2,  # 6 s − 120 m over 25 m/s
+    }
+    assert {name: pytest.approx(float(x)) for name, x in found.items()} == expected
+    alive[5] = False
+    found = safety_measures(series, alive, 0.5, ROAD_METRICS)
+    assert float(found["brakings_below_2"]) == 1.0

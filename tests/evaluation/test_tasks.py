@@ -15,6 +15,7 @@ from lcc_rl.commands import evaluation
 from lcc_rl.commands.evaluation import task_of
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.fit import other_drivers
 from lcc_rl.results.names import in_words
 
 TASKS = sorted(path.stem for path in Path("conf/task").glob("*.yaml"))
@@ -91,7 +92,25 @@ def test_mistakes_are_named_before_the_data_are_read(tmp_path, monkeypatch) -> N
         ("variant=idm compare=[follower_stoper]", "follower_stopper"),
         ("variant=alcc", "variant alcc is learned: give policy="),
         ("variant=idm evaluation.shards=2 evaluation.shard=2", "shard must lie from 0 to"),
+        ("variant=cacc evaluation.warm_up=5", "warm_up needs evaluation.rows=episodes"),
     ]
     check_refused(
         lambda words: evaluation.run(load("evaluate", words.split()), tmp_path), cases, ConfigError
     )
+
+
+def test_any_population_fits_any_task() -> None:
+    path = "drivers.path=lcc_rl/assets/i80_drivers.parquet"
+    for task in TASKS:
+        own = load("evaluate", [f"task={task}"])
+        assert other_drivers(own) == "", task
+        for name in sorted(path.stem for path in Path("conf/drivers").glob("*.yaml")):
+            words = [f"task={task}", f"drivers={name}"]
+            cfg = load("evaluate", [*words, path] if name == "calibrated" else words)
+            alone = load("evaluate", [f"drivers={name}", *[path] * (name == "calibrated")])
+            assert cfg.drivers == alone.drivers, words
+            driven = cfg.drivers != own.drivers and "human" in cfg.scenario.vehicles.names
+            assert bool(other_drivers(cfg)) == driven, words
+    # The noise of the task's drivers has gone with them.
+    human = load("evaluate", ["task=i24-mixed", "drivers=i80"]).scenario.controllers["human"]
+    assert human == load("evaluate", ["drivers=i80"]).scenario.controllers["human"]

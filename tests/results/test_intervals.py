@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 from lcc_rl.results.bootstrap import crossed, mean, saving, share_saved
 from lcc_rl.results.fronts import (
@@ -196,7 +197,8 @@ def test_windows_of_one_drive_are_resampled_together() -> None:
     alone, whole = saving(own, traffic[:, None]), saving(own, traffic[:, None], drives=drives)
     assert whole.value == alone.value
     assert whole.high - whole.low > 2.0 * (alone.high - alone.low)
-    assert saving(own, traffic[:, None], drives=["a"] * 40 + ["b"] * 40) == alone  # too few to tell
+    few = saving(own, traffic[:, None], drives=["a"] * 40 + ["b"] * 40)  # too few to tell
+    assert (few.low, few.high) == (alone.low, alone.high)
     # With ten windows alike in every drive, drives are all that there is.
     alike = np.repeat(generator.normal(0.0, 1.0, (8, 2)), 10, axis=0)
     found, each = crossed(alike, drives=drives), crossed(alike[::10])
@@ -204,3 +206,17 @@ def test_windows_of_one_drive_are_resampled_together() -> None:
     shuffled = generator.permutation(80)
     again = saving(own[shuffled], traffic[shuffled][:, None], drives=[drives[i] for i in shuffled])
     assert again.high - again.low == pytest.approx(whole.high - whole.low, rel=0.1)
+
+
+def test_few_drives_have_a_t_interval_beside_that_over_windows() -> None:
+    # Three drives of four windows each; windows of a drive save alike.
+    shares = np.array([0.02, 0.05, 0.11])
+    baseline = np.full((12, 1), 100.0)
+    own = baseline * (1.0 - np.repeat(shares, 4)).reshape(-1, 1)
+    drives = np.repeat(list("abc"), 4).tolist()
+    found = saving(own, baseline, drives=drives)
+    low, high = stats.t.interval(0.95, 2, shares.mean(), shares.std(ddof=1) / 3**0.5)
+    assert found.over_drives == pytest.approx((low, high), rel=1e-3)
+    assert low < found.low < found.high < high
+    for many in (["a"] * 12, list("abcdef") * 2):  # nothing to tell from; enough to resample
+        assert saving(own, baseline, drives=many).over_drives is None

@@ -114,5 +114,8 @@ def test_tables_are_printed_as_kept(name: str, tmp_path: Path, capsys) -> None:
         if form == "csv":  # numbers of all digits
             found, kept = pd.read_csv(StringIO(printed)), pd.read_csv(file)
             pd.testing.assert_frame_equal(found, kept, rtol=1e-9)
+            table.main([str(tmp_path), *words, "--decimal", "comma"])
+            comma = pd.read_csv(StringIO(capsys.readouterr().out), sep=";", decimal=",")
+            pd.testing.assert_frame_equal(comma, kept, rtol=1e-9)
         else:
             assert printed == file.read_text(encoding="utf-8"), f"{name}, {form}"
