@@ -144,7 +144,7 @@ def _as_declared(annotation: Any, value: Any, where: str) -> Any:
         each = inner if len(inner) == len(value) and ... not in inner else inner[:1] * len(value)
         found = [_as_declared(one, x, where) for one, x in zip(each, value, strict=True)]
         return tuple(found) if kind is tuple else found
-    if not isinstance(value, Mapping) or not inspect.isclass(kind):
+    if not isinstance(value, Mapping) or not inspect.isclass(kind) or inspect.isabstract(kind):
         return value
     if issubclass(kind, Settings):
         return parse(kind, value, where)
