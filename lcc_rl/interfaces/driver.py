@@ -76,6 +76,8 @@ class Driver:
         safety: CBFFilter | None = None,
         seed: int = 0,
     ) -> None:
+        usable = isinstance(time_step, (int, float)) and 0.0 < time_step < math.inf
+        require(usable, f"time_step must be a positive number of seconds, got {time_step!r}")
         who = setting_of(name)
         self.name = who if isinstance(who, str) else label_of(who)
         self.time_step, self.seed = time_step, seed
@@ -84,8 +86,8 @@ class Driver:
             trained = self.program.controller.time_step
             if abs(trained - time_step) > 1e-9:
                 raise ConfigError(
-                    f"{who} was trained with steps of {trained:g} s, the simulation has "
-                    f"{time_step:g} s (--step-length {trained:g} sets SUMO's)"
+                    f"{who} was trained with steps of {trained!r} s, the simulation has "
+                    f"{time_step!r} s (in SUMO, --step-length {trained:g} sets it)"
                 )
         else:
             self.program = self._rule(who, safety)
@@ -136,7 +138,8 @@ class Driver:
                 has no vehicle behind if none of its entries is given, or where
                 ``"behind.present"`` is 0.
             cars: ids of the cars, in the order of the arrays; by default 0, 1, 2 … A car that the
-                last step did not have begins anew, one that is no longer there is forgotten.
+                last step did not have begins anew, one that is no longer there is forgotten. So
+                does one that measured what is no number, for which it brakes, behind a filter.
 
         Returns:
             A number where numbers are given, else an array, ``[cars]``.
@@ -154,6 +157,9 @@ class Driver:
             raise Diverged(f"{self.name}: {what}")
         if memory:
             (self.memory,) = memory
+            if not np.isfinite(self.memory).all():
+                held = zip(self.cars, self.memory, strict=True)
+                self.reset([car for car, row in held if not np.isfinite(row).all()])
         return float(command[0, 0]) if alone else command[:, 0]
 
     def _admit(self, cars: Sequence[Hashable], state: Array) -> None:
@@ -176,6 +182,8 @@ class Driver:
 
     def _state(self, measured: Mapping[str, Any]) -> tuple[Array, bool]:
         """Return what the program reads, ``[cars, names]``, and whether numbers were given."""
+        words = f"measured must name measurements, such as self.gap, got {type(measured).__name__}"
+        require(isinstance(measured, Mapping), words)
         if unknown := measured.keys() - KNOWN:
             raise unknown_name("measurement", str(min(unknown, key=str)), MEASURED)
         try:

@@ -235,8 +235,8 @@ def program(
     safety = safety or next((p for p in pieces if isinstance(p, CBFFilter)), None)
     if safety is not None and any(vars(safety).get("remembers", {}).values()):
         raise ConfigError(
-            f"{policy}: its filter remembers commands or measurements, an exported policy nothing; "
-            "only without delays, lag and drop-outs can it be exported"
+            f"{policy}: its filter remembers commands under way or earlier measurements, which "
+            "nothing outside an environment knows: it needs one without delays, lag and drop-outs"
         )
     if isinstance(policy, nn.Module):
         network = policy

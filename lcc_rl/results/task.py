@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any
 
 import pandas as pd
-from pydantic import StringConstraints
+from pydantic import BeforeValidator
 
 from lcc_rl.config.words import RECORDED
 from lcc_rl.errors import unknown_name
 from lcc_rl.results import measures
 from lcc_rl.results.measures import Measure
 from lcc_rl.results.names import HUMAN, heading
-from lcc_rl.settings import NonNegative, Settings
+from lcc_rl.settings import Settings
 
-Percent = Annotated[str, StringConstraints(pattern=r"^\d+(\.\d+)? ?%$")]
+PERCENT = re.compile(r"\d+(\.\d+)? ?%")
+
+
+def _bound(value: Any) -> Any:
+    known = value == RECORDED or (isinstance(value, str) and PERCENT.fullmatch(value))
+    if known or (isinstance(value, (int, float)) and value >= 0.0):
+        return value
+    what = f"a number, {RECORDED}, or a share of the value of task.against such as 98 %"
+    raise ValueError(f"must be {what}, got {value!r}; ~task.limits.<name> removes a limit")
+
+
+Bound = Annotated[float | str, BeforeValidator(_bound)]
 
 
 class Task(Settings):
@@ -31,7 +43,7 @@ class Task(Settings):
     # Bounds by column: the largest value of max_… and the smallest of min_… in any episode, and
     # the largest mean of share_… over all episodes, the smallest mean of flow_vph; ``recorded`` for
     # the value of the recorded drivers, ``98 %`` for that share of the value of ``against``.
-    limits: Mapping[str, NonNegative | Literal["recorded"] | Percent] = field(default_factory=dict)
+    limits: Mapping[str, Bound] = field(default_factory=dict)
 
     def validate(self) -> None:
         if self.score not in measures.score_measures():

@@ -94,6 +94,21 @@ def test_cars_come_and_go_and_begin_anew() -> None:
     assert driver.step({name: [] for name in driver.names}, []).shape == (0,)
 
 
+def test_a_car_begins_anew_after_a_measurement_that_is_no_number() -> None:
+    measured, _ = driven(POLICY)
+    driver, whole, fresh = (Driver(POLICY, 0.1) for _ in range(3))
+    for step in range(12):
+        given = at(step, measured)
+        expected = whole.step(given)
+        if step == 5:
+            given["ahead.speed"] = np.where([0, 1, 0, 0], np.nan, given["ahead.speed"])
+        found = driver.step(given)
+        if step > 5:
+            expected[1] = fresh.step(at(step, measured, [1]))[0]
+        np.testing.assert_allclose(found[[0, 2, 3]], expected[[0, 2, 3]], atol=1e-5)
+        assert found[1] == pytest.approx(-3.0 if step == 5 else expected[1], abs=1e-5)
+
+
 def test_without_a_vehicle_behind() -> None:
     measured, _ = driven(POLICY)
     here = at(0, measured)
@@ -137,6 +152,8 @@ def test_bad_input_is_one_clear_error() -> None:
         ("cacc tuned", 0.1, "cacc tuned reads self.gap_error, which is not measured here, only"),
         ("pretrained/hcfs", 0.2, "pretrained/hcfs reads .*, which is not measured here, only"),
         ("idm_ac", 0.1, "Did you mean 'idm_acc'"),
+        *((x, 0, "time_step must be a positive number") for x in ("idm_acc", POLICY)),
+        ("idm_acc", None, "time_step must be a positive number of seconds, got None"),
     ]
     check_refused(Driver, making, ConfigError)
     given = {"self.speed": 9.0, "self.gap": 20.0, "ahead.speed": 9.0}
@@ -147,6 +164,7 @@ def test_bad_input_is_one_clear_error() -> None:
         (given, ["a", "a"], "cars must be 1 different ids"),
         (given | {"self.gap": [[1.0], [2.0]]}, None, "arrays of one length"),
         (given | {"self.gap": [1.0, 2.0], "self.speed": [1.0]}, None, "arrays of one length"),
+        ([1.0, 2.0], None, "measured must name measurements, such as self.gap, got list"),
         (given | {"self.gap": "near"}, None, "measured must hold numbers"),
     ]
     check_refused(Driver("idm_acc", 0.1).step, steps, ConfigError)
