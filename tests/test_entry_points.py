@@ -74,7 +74,7 @@ def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> 
     done = run_command("lcc_rl.cli.pipeline", *words, cwd=tmp_path, check=True)
     job = tmp_path / "job"
     lines = done.stdout.splitlines()
-    assert len(lines) <= 26, done.stdout
+    assert len(lines) <= 28, done.stdout
     assert lines[-1].startswith("page: ")
     assert (job / "report.html").read_text().count("<img") >= 5
     assert "candidates: stretches" in (job / "pipeline.log").read_text()
