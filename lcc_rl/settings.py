@@ -59,14 +59,16 @@ MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a 
 Parallel = Annotated[int, Field(ge=1, le=MOST_PARALLEL)]
 
 
-def _increasing(factors: tuple[float, float]) -> tuple[float, float]:
-    if factors[0] > factors[1]:
-        raise ValueError(f"expected two increasing positive factors, got {list(factors)}")
-    return factors
+def _increasing(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError(f"must not fall, got {list(ends)}")
+    return ends
 
+
+Increasing = AfterValidator(_increasing)  # of the two ends of a range
 
 # Least and largest factor that a training episode draws by its seed; an evaluation takes 1.
-Factors = Annotated[tuple[Positive, Positive], Field(strict=False), AfterValidator(_increasing)]
+Factors = Annotated[tuple[Positive, Positive], Field(strict=False), Increasing]
 
 TARGET = "_target_"  # the key that names the class of a node
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)

@@ -28,7 +28,7 @@ from lcc_rl.pieces.controllers import Controller, stream_name
 from lcc_rl.pieces.leader import LEADER_SPEED
 from lcc_rl.pieces.views import MOTION_READS
 from lcc_rl.pieces.world import MOST_LATE, World
-from lcc_rl.settings import Factors, NonNegative, Positive, Share
+from lcc_rl.settings import Factors, Increasing, NonNegative, Positive, Share
 
 Delay = Annotated[int, Field(ge=0, le=MOST_LATE)]
 # Draws that all drivers of an episode share.
@@ -58,12 +58,12 @@ class Drivers(Controller):
     delay: Delay | None = None
     # Steps from which and to which every episode of training draws its delay; evaluation takes
     # delay, as does a training without a range.
-    delay_range: tuple[Delay, Delay] | None = None
+    delay_range: Annotated[tuple[Delay, Delay], Increasing] | None = None
     # Standard deviation of a smooth noise of the acceleration, see
     # lcc_rl.functional.driver_models.NoiseStep [m/s²]; None: of the population.
     acceleration_noise: NonNegative | None = None
     # That from which and to which every episode of training draws its noise, likewise [m/s²].
-    acceleration_noise_range: tuple[NonNegative, NonNegative] | None = None
+    acceleration_noise_range: Annotated[tuple[NonNegative, NonNegative], Increasing] | None = None
     # Standard deviation of a smooth noise of ln of the perceived gap; None: of the population.
     gap_noise: NonNegative | None = None
 
@@ -88,12 +88,6 @@ class Drivers(Controller):
     desired_speeds: ClassVar[Tensor]
     time_gaps: ClassVar[Tensor]
     index: ClassVar[Tensor]
-
-    def validate(self) -> None:
-        for name in ("delay_range", "acceleration_noise_range"):
-            drawn = getattr(self, name)
-            if drawn and drawn[0] > drawn[1]:
-                raise ValueError(f"{name} must not fall, got {list(drawn)}")
 
     def setup(self, world: World) -> None:
         """Take the drivers, and choose what is read and written by the settings."""
@@ -280,7 +274,6 @@ class DriverModel(Drivers):
     parameters: Annotated[InstanceOf[DriverConstants] | None, BeforeValidator(_made)] = None
 
     def validate(self) -> None:
-        super().validate()
         if (self.desired_speed is None) != (self.time_gap is None):
             raise ValueError("desired_speed and time_gap belong together: give both or none")
 

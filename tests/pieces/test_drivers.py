@@ -220,5 +220,5 @@ def test_every_episode_of_training_draws_its_delay() -> None:
     assert (apart < most).all()
     assert apart.min() < 0.1 * most.min()
     for name in ("delay", "acceleration_noise"):
-        with pytest.raises(ConfigError, match=rf"{name}_range must not fall, got \[3.*, 1"):
+        with pytest.raises(ConfigError, match=rf"{name}_range: must not fall, got \[3.*, 1"):
             played(False, f"{name}_range=[3,1]")
