@@ -37,7 +37,7 @@ NOT_RUN = {
     "lcc-rl animate": "tests/results/test_motion.py runs it",
     "lcc-rl evaluate experiment=main": "tests/test_entry_points.py does it with a job of its own",
     "lcc-rl score": "tests/evaluation/test_score.py runs it",
-    "python docs/recipes": "tests/envs/test_stock_torchrl.py runs them",
+    "python docs/recipes": "tests/envs/test_stock_torchrl.py and tests/test_card.py run them",
     "python tools/benchmarks": "tests/tools/test_benchmark.py runs it",
     "python tools/kill_test.py": "takes an hour",
 }
