@@ -58,7 +58,7 @@ def space_time(
         return None
     speeds = np.concatenate([found[name].speed.ravel() for name in whole])
     low, top = float(speeds.min()), float(speeds.max())
-    scale = (low if low > 0.3 * top else 0.0, top)  # nobody nearly stands: colours tell more
+    scale = (low if low > 0.3 * top else 0.0, top)  # if no car nearly stands, colours tell more
     figure = new_figure(COLUMN_WIDTH if len(whole) == 1 else PAGE_WIDTH, 2.6)
     axes = figure.subplots(1, len(whole), sharey=True, squeeze=False)[0]
     for axis, name in zip(axes, whole, strict=True):

@@ -160,7 +160,7 @@ def _facts(text: str, path: str) -> ProgramFacts:
 
 
 def _line(error: Exception) -> str:
-    """Return an error of somebody else as one line that is not too long."""
+    """Return an error of another library as one line that is not too long."""
     return one_line(str(error))[:300]
 
 

@@ -58,7 +58,7 @@ class Communication(Feature):
     hearing: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
-        """Find who hears whom.
+        """Find which vehicle receives messages from which.
 
         Raises:
             ConfigError: if a chain goes all the way round a ring.

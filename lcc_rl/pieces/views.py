@@ -146,7 +146,7 @@ class Views:
         if distance < 0:
             entry = entries_ahead(entries[lead] if lead >= 0 else None, entry)
         elif distance > 0:
-            # The first vehicles come round to the end on a ring; elsewhere nobody is there.
+            # The first vehicles come round to the end on a ring; elsewhere there is none.
             wrapped = entry[..., :distance, :]
             end = wrapped if self.string.ring else torch.zeros_like(wrapped)
             entry = join([entry[..., distance:, :], end], -2)[..., : len(self.string), :]
