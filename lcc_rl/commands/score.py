@@ -85,7 +85,7 @@ FILE = "score.json"
 
 
 class Scored(NamedTuple):
-    """Who is scored: the name in tables, what was given, and the policy where it is one."""
+    """A scored controller: its name in tables, what was given, and the policy if it is one."""
 
     label: str
     who: str

@@ -58,7 +58,7 @@ class ProgramInput(Settings):
 
 
 class ProgramFacts(Settings):
-    """What the metadata of a program say."""
+    """Contents of a program's metadata."""
 
     inputs: Annotated[tuple[given_as(ProgramInput), ...], Field(strict=False, min_length=1)]  # type: ignore[valid-type]
     output: Literal["acceleration [m/s²]"]
@@ -165,7 +165,7 @@ def _line(error: Exception) -> str:
 
 
 class OnnxPolicy(Controller):
-    """Commands what an ONNX program computes from what its metadata name; see the module.
+    """A controller that is an ONNX program; its metadata name its inputs, see the module.
 
     A program that remembers keeps its memory in ``(role, "program")``, ``[*batch, n, width]``. It
     passes no gradient.

@@ -260,7 +260,7 @@ class Corrected(RoleTransform):
 
 
 class CBFGuarantee(RoleTransform):
-    """Writes for which steps a filter answers, ``(role, "promised")``, ``[*batch, n, 1]``.
+    """Writes which steps a filter's guarantee covers, ``(role, "promised")``, ``[*batch, n, 1]``.
 
     1 where the vehicle was safe when the step began and the vehicle ahead braked no harder than
     is reckoned with, in the step and since the oldest measurement that may be in use:

@@ -41,7 +41,7 @@ def stream_name(role: str) -> str:
 
 
 class Population(Protocol):
-    """What the pieces need to know of a driver population."""
+    """Parameters of a driver population that pieces read."""
 
     @property
     def desired_speed(self) -> Tensor:

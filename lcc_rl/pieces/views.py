@@ -48,7 +48,7 @@ def as_key(key: NestedKey) -> Key:
 
 
 class Views:
-    """What vehicles of one role see, as tensors of one row per vehicle.
+    """Views of the vehicles of one role, as tensors of one row per vehicle.
 
     Args:
         string: the string of vehicles.
