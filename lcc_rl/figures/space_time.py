@@ -20,7 +20,7 @@ from lcc_rl.results.motion import SampleMotion, motion_of, sample_episodes, tell
 FEWEST = 3  # vehicles; of fewer, speeds over time show all
 POINT_STEPS = 5  # steps between the points of a line
 MOST_PANELS = 3  # panels
-RIMS = {True: "controlled", False: "human"}  # the fewer of both
+RIMS = {True: "controlled cars", False: "human drivers"}  # the fewer of both
 # Red stands, blue drives: ends that differ without red and green, and nothing fades into white.
 SPEED_COLOURS = LinearSegmentedColormap.from_list(
     "speed", ["#a50f15", "#f0a202", "#2ca25f", "#08519c"]
@@ -72,7 +72,7 @@ def side_by_side(motions: Mapping[str, SampleMotion], high: float = 2.6) -> Figu
         axis.set_xlabel("time [s]")
     axes[0].set_ylabel("position [m]")
     first = next(iter(motions.values()))
-    rims = f"; black rim: {RIMS[_few(first)]}" if len(set(first.roles)) > 1 else ""
+    rims = f"; black rim: places of {RIMS[_few(first)]}" if len(set(first.roles)) > 1 else ""
     figure.colorbar(lines, ax=axes, label=f"speed [m/s]{rims}")
     return figure
 

@@ -164,7 +164,10 @@ def test_diagrams_of_open_roads_unroll_side_by_side(tmp_path) -> None:
         assert nothing == ["0", "0"]
     with Image.open(animate(both, tmp_path / "waves.gif")) as image:
         inks = [np.asarray(frame.convert("L")) < 128 for frame in ImageSequence.Iterator(image)]
-    drawn = [[int(ink[:, part].sum()) for ink in inks] for part in np.array_split(range(inks[0].shape[1]), 2)]
+    drawn = [
+        [int(ink[:, part].sum()) for ink in inks]
+        for part in np.array_split(range(inks[0].shape[1]), 2)
+    ]
     assert all(counts == sorted(counts) and counts[-1] > counts[0] for counts in drawn)
 
 
