@@ -15,7 +15,7 @@ import pandas as pd
 
 from lcc_rl.commands.evaluation import complete
 from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, read_once
-from lcc_rl.config import load, quoted, top_key, with_inputs
+from lcc_rl.config import key_of, load, quoted, top_key, with_inputs
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.figures.evaluation import measures_of
 from lcc_rl.functional.pattern import HUMAN
@@ -78,7 +78,7 @@ def run(folder: Path, overrides: Sequence[str], shares: Sequence[str] = ROAD_SHA
     of_data = [item for item in overrides if top_key(item) in ("data", "calibration")]
     driven = [item for item in overrides if item not in of_data]
     given, found = {top_key(item) for item in driven}, []
-    cfg = load("pipeline", ["~experiment", *FITTED, *of_data])
+    cfg = load("pipeline", ["~experiment", *_beside(FITTED, of_data)])
     first, *_ = [_evaluation(driven, share) for share in shares]  # refused before data are read
     read_once(cfg, folder, learns=False)
     if "leader" not in given:
@@ -98,9 +98,14 @@ def run(folder: Path, overrides: Sequence[str], shares: Sequence[str] = ROAD_SHA
 
 
 def _evaluation(words: Sequence[str], share: str) -> EvaluateConfig:
-    part = f"scenario.string.penetration={float(share) / 100.0:g}"
-    cfg: EvaluateConfig = load("evaluate", [*DRIVEN, *words, part])
+    part = f"scenario.string.penetration={share}e-2"
+    cfg: EvaluateConfig = load("evaluate", [*_beside(DRIVEN, words), part])
     return cfg
+
+
+def _beside(defaults: Sequence[str], words: Sequence[str]) -> list[str]:
+    given = set(map(key_of, words))
+    return [*(item for item in defaults if key_of(item) not in given), *words]
 
 
 def leader_drives(episodes: pd.DataFrame, time_step: float) -> pd.DataFrame:
