@@ -38,7 +38,8 @@ from lcc_rl.settings import values
 
 RING_TASK = ("variant=alcc", "task=ring-22")
 OF_RING = ("circumference", "string", "vehicle_length", "initial_speed", "time_step")
-OF_DRIVERS = ("drivers", "scenario.controllers.human")
+OF_RING += ("sensors", "actuators")
+OF_DRIVERS = ("drivers", "controllers.human")
 DRAWS = ("noise", "wiener", "acceleration_noise", "acceleration_noise.before", "driver")
 RING_RULES = ("follower_stopper", "pi_saturation")
 # What the page computes.
@@ -56,9 +57,8 @@ def ring_page(policy: str | Path, trust: Sequence[str] = (), overrides: Sequence
     Raises:
         LccError: if the policy cannot be read, or the page cannot compute it or the ring.
     """
-    text = json.dumps(
-        page_data(policy, trust, overrides), ensure_ascii=False, separators=(",", ":")
-    )
+    data = page_data(policy, trust, overrides)
+    text = json.dumps(data, ensure_ascii=False, separators=(",", ":"))
     template = files("lcc_rl.assets").joinpath("ring.html").read_text(encoding="utf-8")
     # Within a script no tag may begin.
     return template.replace("DATA", text.replace("<", "\\u003c"), 1)
@@ -114,7 +114,7 @@ def ring_of(policy: str | Path, trust: Sequence[str], overrides: Sequence[str]) 
     for name in OF_RING:
         if not any(key.startswith(f"scenario.{name}") for key in given):
             setattr(cfg.scenario, name, getattr(own.scenario, name))
-    if own.drivers is not None and not any(key.startswith(OF_DRIVERS) for key in given):
+    if own.drivers is not None and not any(x in key for x in OF_DRIVERS for key in given):
         cfg.drivers = own.drivers
         cfg.scenario.controllers[HUMAN] = own.scenario.controllers[HUMAN]
     if own.energy is not None and "energy" not in map(top_key, given):
