@@ -15,9 +15,9 @@ from lcc_rl.settings import Positive
 
 FUEL = "circles_fuel.csv"
 GASOLINE, DIESEL = 0.745, 0.832  # [kg/L]
-# Carbon dioxide per gram of fuel: 69.3 g/MJ of 44.3 kJ/g, 74.1 g/MJ of 43.0 kJ/g (IPCC Guidelines
-# 2006, Vol. 2, Tables 1.2 and 3.2.1).
-CARBON_DIOXIDE = {GASOLINE: 3.07, DIESEL: 3.186}
+# Carbon dioxide of burnt fuel [kg/L]: 8,887 and 10,180 g per US gallon (US EPA, Greenhouse Gas
+# Emissions from a Typical Passenger Vehicle, EPA-420-F-11-041, 2011).
+CARBON_DIOXIDE = {GASOLINE: 2.348, DIESEL: 2.689}
 TRUCKS = ("Class4PND", "Class8Tractor")
 STANDSTILL, STILL = 0.1, 0.01  # slower than the first [m/s], weaker than the second [m/s²]: idle
 # Fuel that gives a vehicle its kinetic energy: 15.4 kJ of it per gram, 35 % of 44 kJ.
@@ -57,7 +57,7 @@ class CirclesFuel(EnergyModel):
         self.heating_value = self.own["gs2kW"] * KILOWATT
         self.truck = self.vehicle in TRUCKS
         self.density = DIESEL if self.truck else GASOLINE
-        self.carbon_dioxide = CARBON_DIOXIDE[self.density]
+        self.carbon_dioxide = CARBON_DIOXIDE[self.density] / self.density
         self.mass, self.efficiency = self.own["mass_kg"], KINETIC / self.heating_value
 
     def power(self, speed: Tensor, acceleration: Tensor) -> Tensor:

@@ -252,7 +252,7 @@ def sample(
         columns: dict[str, np.ndarray] = {"time_s": np.arange(1, steps + 1) * time_step}
         for group, series in groups.items():
             for name, values in series.items():
-                rows = values[-alive.shape[0] :][:steps, index].reshape(steps, -1)
+                rows = values[-alive.shape[0] :][:steps, index].flatten(1)
                 rows = measured_ttc(rows) if name == "ttc" else rows
                 for place in range(rows.shape[1]):
                     label = group if rows.shape[1] == 1 else f"{group}{place + 1}"

@@ -41,6 +41,7 @@ from lcc_rl.pieces.base import (
     declared,
     next_key,
 )
+from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.knowledge import ObservationMemory
 from lcc_rl.pieces.views import BEHIND, VEHICLES
 from lcc_rl.pieces.world import World
@@ -194,13 +195,14 @@ def described_input(name: str) -> Input:
     return Input(name, "–", f"{entry} ({whose.get(view, view)})")
 
 
-def measuring(time_step: float, behind: bool = True) -> World:
+def measuring(time_step: float, behind: bool = True, population: Population | None = None) -> World:
     """Return the world of a vehicle that measures its neighbours, by steps of so many seconds.
 
-    Without ``behind``, there is not always a vehicle behind.
+    Without ``behind``, there is not always a vehicle behind. Human drivers are of the population,
+    by default the shipped one.
     """
     string = VehicleString((AUTOMATED, HUMAN)[: 1 + behind], ring=True, measured=True)
-    return World(string, time_step, population=bootstrap())
+    return World(string, time_step, population=population or bootstrap())
 
 
 def program(

@@ -111,6 +111,6 @@ def test_fuel_and_carbon_dioxide_are_those_of_each_class() -> None:
     petrol, diesel = 1e6 / 42360.0, 1e6 / MODELS["truck"].heating_value
     litres = [petrol / 745.0, diesel / 832.0, 0.0, petrol / 745.0]
     assert found["fuel_l"].tolist() == pytest.approx(litres)
-    grams = [3.07 * petrol, 3.186 * diesel, 0.0, 3.07 * petrol]
+    grams = [2.348 / 0.745 * petrol, 2.689 / 0.832 * diesel, 0.0, 2.348 / 0.745 * petrol]
     assert found["co2_g"].tolist() == pytest.approx(grams)
     assert Fleet({"electric": ElectricCar()}).burnt(energy) == {}
