@@ -60,7 +60,7 @@ from lcc_rl.results.report import (
 )
 from lcc_rl.results.runs import EPISODES, STEPS, check_folder, resumed_config, save_config
 from lcc_rl.results.task import Task
-from lcc_rl.results.units import check_unit
+from lcc_rl.results.units import OF_FUEL, burns_one_fuel, check_unit
 from lcc_rl.results.windows import by_source
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
@@ -166,11 +166,16 @@ def draw(rows: Rows, cfg: EvaluateConfig, folder: Path) -> None:
 
 
 def task_of(cfg: StudyConfig) -> Task | None:
-    """Return the task of a configuration; None without one."""
+    """Return the task of a configuration; None without one.
+
+    If its unit is one of a single fuel, and scenario.fleet adds vehicles of another, it is kJ/km.
+    """
     if cfg.task is None:
         return None
-    task = parse(Task, cfg.task, "task")
-    check_unit(task.unit, build_energy(cfg))
+    task, energy = parse(Task, cfg.task, "task"), build_energy(cfg)
+    if cfg.scenario.fleet and task.unit in OF_FUEL and not burns_one_fuel(energy):
+        return dataclasses.replace(task, unit="kJ/km")
+    check_unit(task.unit, energy)
     return task
 
 
