@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lcc_rl.energy import Fleet
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
@@ -85,7 +85,7 @@ class EnergyClasses(StepTransform):
         start.set(CLASS, kinds.expand(*start.batch_size, count, 1).clone())
 
 
-def speed_limits(start: TensorDictBase, fleet: Fleet | None) -> Tensor | None:
+def speed_limits(start: TensorDictBase, fleet: Any) -> Tensor | None:
     """Return the speed limit of every vehicle at reset, ``[*batch, N, 1]`` [m/s]; None for none."""
     kinds = start.get(CLASS, None)
     return None if kinds is None or fleet is None else fleet.speed_limits(kinds)
