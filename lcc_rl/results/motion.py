@@ -31,8 +31,7 @@ class SampleMotion:
         front: front bumper of what the first vehicle follows, ``[T]`` [m]: of the leader, who
             begins at 0; on a ring of the last vehicle, a round further on.
         leader: the leader's speed, ``[T]`` [m/s]; None on a ring.
-        length: of every vehicle, or of what the first one follows and then of each, ``[N + 1]``
-            [m].
+        length: of every vehicle; or ``[N + 1]``, of what the first one follows, then of each [m].
         circumference: of a ring [m]; None on an open road.
     """
 

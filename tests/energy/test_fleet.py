@@ -13,6 +13,7 @@ from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet, PaperMotor, VehicleCl
 from lcc_rl.envs import DifferentiableRollout, StringCollector
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.fit import classes
 from lcc_rl.evaluation.rows import traffic
 from lcc_rl.interfaces.exported import program
 from lcc_rl.pieces.features import CLASS
@@ -261,6 +262,10 @@ def test_what_does_not_use_classes_is_what_it_was() -> None:
     trucks = load("evaluate", ["task=i24-mixed", "+fleet=trucks"])  # petrol and diesel
     assert identity(trucks) != identity(cfg)
     assert task_of(trucks).unit == "kJ/km"
+    assert (classes(cfg), classes(trucks)) == (
+        "",
+        "Classes of vehicles (scenario.fleet): 15% of human: truck.",
+    )
     fleet = build_energy(trucks)
     assert fleet.shares == [1.0, 0.0]
     assert fleet.roles["human"] == pytest.approx([0.85, 0.15])
@@ -279,8 +284,12 @@ def test_mistakes_in_classes_are_named() -> None:
             (built(*TRUCKS, "scenario.fleet.truck.share=2"), "scenario.fleet.truck.share must be"),
             (built(*TRUCKS, "scenario.fleet.truck.length=0"), "scenario.fleet.truck.length must"),
             (
-                built(*TRUCKS, "scenario.fleet.truck.roles=[lorry]"),
+                built(*TRUCKS, "scenario.fleet.truck.roles=[human,lorry]"),
                 r"role \(scenario.fleet.truck.roles\).*lorry.*automated, human",
+            ),
+            (
+                built(*TRUCKS, string("automated")),
+                "fleet.truck.speed_limit=9.0 has no effect: no vehicle of the string is human",
             ),
             (built("scenario.fleet={truck: {share: 0.1}}"), r"scenario.fleet.*truck.*_target_"),
             (
