@@ -19,6 +19,7 @@ from PIL import Image  # comes with matplotlib
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.figures.drawing import INK, legend_above, new_figure, style
 from lcc_rl.figures.ring_picture import ring_picture
+from lcc_rl.figures.unrolled import unroll
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.results.motion import MotionSeries, SampleMotion
@@ -36,7 +37,8 @@ def animate(motions: Mapping[str, SampleMotion], path: str | Path) -> Path:
     """Write an animation; the ending chooses the form.
 
     A page (``.html``) plays in any browser, with a slider; a ``.gif`` or ``.mp4`` plays a long
-    episode faster and says so. They show one episode. An ``.svg`` shows rings side by side.
+    episode faster and says so. They show one episode. An ``.svg`` shows rings side by side. Of an
+    open road an ``.svg``, or a ``.gif`` of several, shows space-time diagrams that unroll.
 
     Args:
         motions: episodes of two moments or more, by what they are for the reader.
@@ -56,8 +58,10 @@ def animate(motions: Mapping[str, SampleMotion], path: str | Path) -> Path:
     with atomic_path(path) as temporary:
         if path.suffix == ".html":
             temporary.write_text(page(motion, title), encoding="utf-8")
-        elif path.suffix == ".svg":
+        elif path.suffix == ".svg" and motion.circumference is not None:
             temporary.write_text(ring_picture(motions), encoding="utf-8")
+        elif path.suffix == ".svg" or len(motions) > 1:
+            unroll(motions, temporary, path.suffix)
         elif path.suffix == ".gif":
             _write_gif(motion, title, temporary)
         else:
@@ -69,8 +73,8 @@ def check_ending(path: Path, episodes: int = 1) -> None:
     """Check that an animation can be written in the form that its file's ending means."""
     if path.suffix not in ANIMATION_FORMATS:
         raise unknown_name("ending of an animation", path.suffix, ANIMATION_FORMATS)
-    if episodes > 1 and path.suffix != ".svg":
-        raise ConfigError(f"{path.suffix} shows one strategy; of a ring, an .svg shows several")
+    if episodes > 1 and path.suffix not in (".svg", ".gif"):
+        raise ConfigError(f"{path.suffix} shows one strategy; an .svg or a .gif shows several")
     if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
         raise ConfigError("an .mp4 needs ffmpeg, which is not installed; write a .html or .gif")
 

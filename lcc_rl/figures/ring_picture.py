@@ -48,7 +48,7 @@ def ring_picture(motions: Mapping[str, SampleMotion]) -> str:
         ConfigError: if a motion is not of a ring road.
     """
     if any(motion.circumference is None for motion in motions.values()):
-        raise ConfigError("an .svg shows the ring road only; write an .html, .gif or .mp4")
+        raise ConfigError("an .svg shows rings or open roads, not both")
     top = max(float(motion.speed.max()) for motion in motions.values())
     panels = [_panel(*item, place, top) for place, item in enumerate(motions.items())]
     wide = WIDE * len(motions)

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 import yaml
 from matplotlib.colors import to_rgb
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from lcc_rl.commands import animate as command
 from lcc_rl.errors import ConfigError, ResultsError
@@ -164,9 +164,27 @@ def test_an_svg_turns_each_car_by_its_way_and_shows_rings_side_by_side(tmp_path)
     found = np.array([text.split(";") for text in turns[:3]], float).T
     assert found == pytest.approx(-360.0 / 500.0 * middle, abs=0.051)
     assert len(list(root.iter(f"{SVG}circle"))) == 2 + 2  # two roads, two marks
-    for wrong, ending in (({"a": drifting()}, "svg"), ({"a": moved, "b": moved}, "gif")):
+    two = {"a": moved, "b": moved}
+    for wrong, ending in (({"a": moved, "b": drifting()}, "svg"), (two, "gif"), (two, "html")):
         with pytest.raises(ConfigError, match=ending):
             animate(wrong, tmp_path / f"x.{ending}")
+
+
+def test_diagrams_of_open_roads_unroll_side_by_side(tmp_path) -> None:
+    both = {"a < b": drifting(3, seconds=6.0), "c": drifting(4, seconds=6.0)}
+    root = ElementTree.parse(animate(both, tmp_path / "waves.svg")).getroot()
+    covers = [[x.get("values").split(";") for x in rect] for rect in root.iter(f"{SVG}rect")]
+    assert len(covers) == 2
+    for (left, right, _), (wide, *nothing) in covers:
+        assert float(wide) == pytest.approx(float(right) - float(left), abs=0.11)
+        assert nothing == ["0", "0"]
+    with Image.open(animate(both, tmp_path / "waves.gif")) as image:
+        inks = [np.asarray(frame.convert("L")) < 128 for frame in ImageSequence.Iterator(image)]
+    drawn = [
+        [int(ink[:, part].sum()) for ink in inks]
+        for part in np.array_split(range(inks[0].shape[1]), 2)
+    ]
+    assert all(counts == sorted(counts) and counts[-1] > counts[0] for counts in drawn)
 
 
 @pytest.fixture
