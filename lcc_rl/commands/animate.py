@@ -40,7 +40,7 @@ def run(
 
     Args:
         folder: of an evaluation, a training or a main job.
-        strategies: who drives, each a name of the table or of its rows, or
+        strategies: each a name of the table or of its rows, or
             ``"<name>: <words for the reader>"``; none for the last one of the table. An ``.svg``,
             or of an open road a ``.gif``, shows several beside each other.
         episode: which of their sample episodes, from 0.

@@ -184,20 +184,20 @@ def _task_name(cfg: StudyConfig) -> str | None:
 
 
 def only_named(cfg: EvaluateConfig) -> bool:
-    """Whether only those are compared that are named: nobody's policy is its own variant's."""
+    """True if ``compare=`` names every policy."""
     return bool(cfg.compare) and cfg.policy is None and learns(cfg)
 
 
 def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], list[tuple[str, str]]]:
-    """Return whom ``compare`` names: controllers by their names in tables, and policies.
+    """Return what ``compare`` names: controllers by their names in tables, and policies.
 
     Policies are their name, where one was given, and path; the folder of a sweep stands for those
     of its runs. Nobody is left where no vehicle of the string is automated, as at the share 0 of a
     sweep.
 
     Raises:
-        ConfigError: if two have one name, or one has that of somebody else, or a controller is
-            unknown or has nobody to drive.
+        ConfigError: if two have one name, or one has a reserved name, or a controller is
+            unknown or has no vehicle to drive.
     """
     named = cfg.compare
     for who in named.values() if isinstance(named, Mapping) else named:
@@ -237,7 +237,7 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], list[tuple[str, str]]
 
 
 def _check_label(label: str, who: Any, own: str) -> None:
-    """Refuse a row's name that tables use for somebody else; ``own`` may be said of who it is."""
+    """Refuse reserved names of rows; ``own`` is allowed for the strategy of that name."""
     plain = label.removesuffix(FILTERED)
     require(
         in_words(plain) in (plain, in_words(own)),
@@ -324,7 +324,7 @@ def _read_policies(
 
 
 def _rules(cfg: EvaluateConfig, rivals: Mapping[str, Any], inputs: Inputs) -> list[Strategy]:
-    """Return the baselines and named controllers; nobody drives as recorded where nobody was."""
+    """Return the baselines and named controllers; ``recorded`` only with recorded drivers."""
     lacking = _lacking_record(cfg, inputs)
     for asked in [f"compare={RECORDED}"] * (RECORDED in rivals) + _held_as_recorded(cfg):
         require(not lacking, f"{asked}: {lacking}; use trajectories of several vehicles")
@@ -343,7 +343,7 @@ def _held_as_recorded(cfg: EvaluateConfig) -> list[str]:
 def _lacking_record(cfg: EvaluateConfig, inputs: Inputs) -> str:
     """Return why no vehicle drives as a recorded one; empty where one can."""
     if inputs.evaluation.followers is None:
-        return "nobody was recorded behind these leaders"
+        return "no driver was recorded behind these leaders"
     first = applies(cfg, RECORDED)
     return "" if first else "the automated vehicle is not the first behind the leader"
 
@@ -370,7 +370,7 @@ def evaluate_and_write(
         steps = pd.concat([trace for _, trace in results], ignore_index=True)
         check_present(folder)
         write_parquet(steps, folder / STEPS, metadata)
-        # Last: who finds it finds a finished run.
+        # Last: it marks a finished run.
         write_parquet(rows, folder / EPISODES, metadata)
     else:
         rows = _by_blocks(strategies, cfg, inputs, folder, metadata)

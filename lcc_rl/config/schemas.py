@@ -140,7 +140,7 @@ class EvaluationConfig(Settings):
 
 
 class BaseConfig(Settings):
-    """What every command shares."""
+    """Settings that all commands share."""
 
     seed: Seed
     device: Device  # cpu, cuda or cuda:<number>
@@ -166,7 +166,7 @@ class CalibrateConfig(BaseConfig):
 
 
 class StudyConfig(BaseConfig):
-    """What every command that drives vehicles shares."""
+    """Settings of all commands that drive vehicles."""
 
     variant: str
     drivers: Described

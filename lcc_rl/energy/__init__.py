@@ -1,4 +1,4 @@
-"""Energy models: what driving draws from a battery or a tank, and who has which."""
+"""Energy models: the power that driving draws, and which vehicle has which model."""
 
 from lcc_rl.energy.base import AVERAGED, AVERAGES, BURNT, EnergyModel
 from lcc_rl.energy.electric import ElectricCar, PaperMotor

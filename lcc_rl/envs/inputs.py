@@ -132,7 +132,7 @@ def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
 
 
 def described(population: Population, cfg: StudyConfig) -> str:
-    """Return a line on who drives, and behind whom."""
+    """Return a line on the human drivers and their leaders."""
     speed, gap = population.desired_speed, population.time_gap
     own = cfg.leader is not None and "source" not in cfg.leader.settings
     leaders = cfg.leader if own else cfg.data

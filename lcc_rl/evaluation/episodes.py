@@ -143,7 +143,7 @@ class Episodes:
     for every strategy, and the batch size changes a row by no more than rounding.
 
     Args:
-        strategy: who drives, and its environment's configuration.
+        strategy: what drives, and its environment's configuration.
         inputs: held-out windows and drivers.
         plan: which episodes.
         seed: seed of the noise.
@@ -211,7 +211,7 @@ class Episodes:
         described[FASTER] = leader_faster(inputs.evaluation, profile, desired, self.warm_up)
         time_step = self.cfg.scenario.time_step
         leader = leader_measures(inputs.evaluation, profile, self.energy, self.warm_up)
-        if self.cfg.scenario.road == RING:  # where nobody leads
+        if self.cfg.scenario.road == RING:  # without a leader
             leader[:] = np.nan
         # Drivers are recorded by sensors, whose noise costs energy in what they drove.
         recorded = RECORDED in self.cfg.evaluation.baselines

@@ -62,7 +62,7 @@ def side_by_side(motions: Mapping[str, SampleMotion], high: float = 2.6) -> Figu
     """Return a diagram of each motion, by what stands above it; ``high`` in inches."""
     speeds = np.concatenate([motion.speed.ravel() for motion in motions.values()])
     low, top = float(speeds.min()), float(speeds.max())
-    scale = (low if low > 0.3 * top else 0.0, top)  # nobody nearly stands: colours tell more
+    scale = (low if low > 0.3 * top else 0.0, top)  # if no car nearly stands, colours tell more
     figure = new_figure(COLUMN_WIDTH if len(motions) == 1 else PAGE_WIDTH, high)
     axes = figure.subplots(1, len(motions), sharey=True, squeeze=False)[0]
     for axis, (name, motion) in zip(axes, motions.items(), strict=True):

@@ -40,7 +40,7 @@ WIDEST = 200  # numbers remembered in machine code
 
 
 class Driver:
-    """Computes the accelerations of any number of cars, and keeps what each remembers.
+    """Computes the accelerations of any number of cars, and keeps the memory of each.
 
     Args:
         name: a run, a run folder, a policy file, ``pretrained/<name>``, or a controller by name

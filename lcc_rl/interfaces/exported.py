@@ -177,7 +177,7 @@ class DrivingProgram(nn.Module):
             value = torch.cat([columns[name] for name in names], -1)
             if names == DERIVED_INPUTS.get(".".join(key)):
                 value = columns[names[0]] - columns[names[1]]
-                if key[0] == BEHIND and BEHIND_PRESENT in columns:  # zero where there is nobody
+                if key[0] == BEHIND and BEHIND_PRESENT in columns:  # zero where there is none
                     value = value * columns[BEHIND_PRESENT]
             found[key] = value
         return found

@@ -42,8 +42,8 @@ class Bridge:
     """Lets a policy or a rule drive vehicles of the SUMO simulation that runs in libsumo.
 
     The commands are executed exactly: SUMO's checks of speeds, right of way and traffic lights are
-    off for the driven vehicles (speed mode 0). SUMO's own model drives a vehicle that sees nobody
-    ahead within ``sight``; its memory then begins anew. If nobody is behind and the policy does
+    off for the driven vehicles (speed mode 0). SUMO's own model drives a vehicle that sees none
+    ahead within ``sight``; its memory then begins anew. If none is behind and the policy does
     not observe that, a vehicle at the own speed and gap is assumed. SUMO changes lanes.
 
     Args:
@@ -123,7 +123,7 @@ class Bridge:
             self.sumo.vehicle.setSpeed(car, RELEASED)
 
     def _measured(self, car: str) -> tuple[float, ...] | None:
-        """Return what :data:`MEASURED` names of a vehicle; None if it sees nobody ahead."""
+        """Return what :data:`MEASURED` names of a vehicle; None if it sees no vehicle ahead."""
         cars = self.sumo.vehicle
         ahead, free = cars.getLeader(car, self.sight) or ("", 0.0)
         gap = free + cars.getMinGap(car)  # SUMO's gaps are without the least one desired

@@ -54,7 +54,7 @@ CLASS = (VEHICLES, "energy_class")
 class EnergyClasses(StepTransform):
     """Draws the class of every vehicle at reset, ``("vehicles", "energy_class")``, int64.
 
-    By the episode's seed, so that whoever drives meets the same vehicles; numbers are those of
+    By the episode's seed, so that all strategies meet the same vehicles; numbers are those of
     the fleet's models.
     """
 

@@ -103,7 +103,7 @@ def _sensed(role: str, name: str) -> str:
 
 
 class Part(Settings):
-    """Settings of a part of an environment, and what follows from them in a world."""
+    """Settings of a part of an environment, bound to a world."""
 
     name: ClassVar[str] = ""  # by default; that of a part in an environment is its own
 

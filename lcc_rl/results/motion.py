@@ -28,7 +28,7 @@ class SampleMotion:
         roles: of the N vehicles, front to back.
         speed: ``[T, N]`` [m/s].
         gap: to the vehicle ahead, bumper to bumper, ``[T, N]`` [m].
-        front: front bumper of what the first vehicle follows, ``[T]`` [m]: of the leader, who
+        front: front bumper of what the first vehicle follows, ``[T]`` [m]: of the leader, which
             begins at 0; on a ring of the last vehicle, a round further on.
         leader: the leader's speed, ``[T]`` [m/s]; None on a ring.
         length: of every vehicle; or ``[N + 1]``, of what the first one follows, then of each [m].

@@ -1,4 +1,4 @@
-"""Energy per distance in the units of whoever reads it."""
+"""Energy per distance in several units."""
 
 from __future__ import annotations
 
