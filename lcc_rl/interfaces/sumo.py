@@ -19,6 +19,7 @@ from unittest.mock import patch
 from lcc_rl.errors import ConfigError, Diverged, how_to_install
 from lcc_rl.interfaces.driver import MEASURED, Driver
 from lcc_rl.pieces import CBFFilter
+from lcc_rl.pieces.controllers import Population
 
 UNCHECKED, RELEASED = 0, -1.0  # SUMO's speed mode without checks, and the speed that releases
 
@@ -50,7 +51,7 @@ class Bridge:
         driver: a policy or a rule, as :class:`lcc_rl.interfaces.driver.Driver` takes it.
         vehicles: ids of the driven vehicles, which may enter later, or a predicate on ids.
         sight: distance at which a vehicle ahead is seen, bumper to bumper [m].
-        trust, safety, seed: see :class:`lcc_rl.interfaces.driver.Driver`.
+        trust, safety, seed, drivers: see :class:`lcc_rl.interfaces.driver.Driver`.
 
     Raises:
         LccError: if libsumo is missing or runs no simulation, or the driver cannot drive there.
@@ -64,12 +65,13 @@ class Bridge:
         trust: Sequence[str] = (),
         seed: int = 0,
         safety: CBFFilter | None = None,
+        drivers: Population | None = None,
     ) -> None:
         self.sumo = load_sumo()
         if not self.sumo.isLoaded():
             raise ConfigError("SUMO runs no simulation: call libsumo.start([…]) first")
         delta = self.sumo.simulation.getDeltaT()
-        self.driver = Driver(driver, delta, trust, safety, seed)
+        self.driver = Driver(driver, delta, trust, safety, seed, drivers)
         names = {vehicles} if isinstance(vehicles, str) else vehicles
         self.chosen = names if callable(names) else set(names).__contains__
         self.sight = sight
