@@ -37,8 +37,10 @@ from lcc_rl.results.policies import load_policy
 from lcc_rl.settings import values
 
 RING_TASK = ("variant=alcc", "task=ring-22")
-OF_RING = ("circumference", "string", "vehicle_length", "initial_speed", "time_step")
-OF_RING += ("sensors", "actuators")
+OF_RING = (
+    *("circumference", "string", "vehicle_length", "initial_speed", "time_step"),
+    *("sensors", "actuators"),
+)
 OF_DRIVERS = ("drivers", "controllers.human")
 DRAWS = ("noise", "wiener", "acceleration_noise", "acceleration_noise.before", "driver")
 RING_RULES = ("follower_stopper", "pi_saturation")
