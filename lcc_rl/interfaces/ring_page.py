@@ -114,8 +114,9 @@ def ring_of(policy: str | Path, trust: Sequence[str], overrides: Sequence[str]) 
     if own.scenario.road != RING:
         return cfg
     for name in OF_RING:
-        if not any(key.startswith(f"scenario.{name}") for key in given):
-            setattr(cfg.scenario, name, getattr(own.scenario, name))
+        value = getattr(own.scenario, name)
+        if value != {} and not any(key.startswith(f"scenario.{name}") for key in given):
+            setattr(cfg.scenario, name, value)
     if own.drivers is not None and not any(x in key for x in OF_DRIVERS for key in given):
         cfg.drivers = own.drivers
         cfg.scenario.controllers[HUMAN] = own.scenario.controllers[HUMAN]
