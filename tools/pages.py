@@ -48,7 +48,7 @@ from lcc_rl.studies.reproduce import STUDY_RESULTS
 
 REFERENCE, DOCS = Path("outputs/reference"), Path("docs")
 MARKED = re.compile(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", re.DOTALL)
-TASKS_SHOWN = ("i24-follow5", "i24-mixed", "i80-follow", "ring-22")
+TASKS_SHOWN = ("i24-follow5", "i80-follow")
 LIMIT = "limit_"  # begins the columns of kept scores that hold the task's limits
 # Figures of the studies whose rows are kept, on their pages.
 SHOWN_OF = {

@@ -28,7 +28,7 @@ from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store
-from lcc_rl.evaluation.fit import check_policy, other_drivers, other_traffic
+from lcc_rl.evaluation.fit import check_policy, classes, other_drivers, other_traffic
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import DIRECT, controller_of, is_policy, is_shipped, label_of
 from lcc_rl.evaluation.strategies import (
@@ -60,7 +60,7 @@ from lcc_rl.results.report import (
 )
 from lcc_rl.results.runs import EPISODES, STEPS, check_folder, resumed_config, save_config
 from lcc_rl.results.task import Task
-from lcc_rl.results.units import check_unit
+from lcc_rl.results.units import OF_FUEL, burns_one_fuel, check_unit
 from lcc_rl.results.windows import by_source
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
@@ -166,11 +166,16 @@ def draw(rows: Rows, cfg: EvaluateConfig, folder: Path) -> None:
 
 
 def task_of(cfg: StudyConfig) -> Task | None:
-    """Return the task of a configuration; None without one."""
+    """Return the task of a configuration; None without one.
+
+    If its unit is one of a single fuel, and scenario.fleet adds vehicles of another, it is kJ/km.
+    """
     if cfg.task is None:
         return None
-    task = parse(Task, cfg.task, "task")
-    check_unit(task.unit, build_energy(cfg))
+    task, energy = parse(Task, cfg.task, "task"), build_energy(cfg)
+    if cfg.scenario.fleet and task.unit in OF_FUEL and not burns_one_fuel(energy):
+        return dataclasses.replace(task, unit="kJ/km")
+    check_unit(task.unit, energy)
     return task
 
 
@@ -272,7 +277,7 @@ def strategies_of(
     if own and learns(cfg) and cfg.policy is None:
         raise no_policy(cfg)
     inputs = load_inputs(cfg)
-    for line in filter(None, [*inputs.report, other_drivers(cfg)]):
+    for line in filter(None, [*inputs.report, other_drivers(cfg), classes(cfg)]):
         log.info(line)
     check_evaluation(cfg, inputs)
     strategies = _rules(cfg, rivals, inputs)
@@ -436,7 +441,7 @@ def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterato
                 yield case_report(part, case, f"{of}{case}")
         return
     filtered = cfg.scenario.filters.get(AUTOMATED) is not None
-    words = list(filter(None, [other_drivers(cfg)]))
+    words = list(filter(None, [other_drivers(cfg), classes(cfg)]))
     for source, part in by_source(windows_for(rows)):
         one = report(part, task_of(cfg), build_energy(cfg), filtered, source, against=against)
         yield dataclasses.replace(one, remarks=[*one.remarks, *words])

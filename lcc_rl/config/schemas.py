@@ -75,6 +75,7 @@ class ScenarioConfig(Settings):
     filters: Nodes
     actuators: Nodes = Field(default_factory=dict)
     sensors: Nodes = Field(default_factory=dict)
+    fleet: Nodes = Field(default_factory=dict)  # classes of vehicles besides those of energy
     pieces: Nodes
 
     @property

@@ -84,13 +84,9 @@ class CirclesFuel(EnergyModel):
             rate = rate.masked_fill(cut, 0.0)
         return rate.masked_fill(idle, own["fc_idle"])
 
-    def infeasible(self, speed: Tensor, acceleration: Tensor) -> Tensor:
-        """Return where the vehicle cannot accelerate like this."""
-        return acceleration > self._strongest(speed.clamp(min=0.0))
-
-    def _strongest(self, speed: Tensor) -> Tensor:
+    def strongest(self, speed: Tensor) -> Tensor:
         """Return the largest acceleration that is feasible [m/s²]."""
-        own = self.own
+        own, speed = self.own, speed.clamp(min=0.0)
         force = own["b2"] / speed.clamp(min=1e-6) - own["b3"] * speed.square()
         uphill = (own["b5"] + own["b6"] * speed).clamp(max=own["b4"])
         return force.clamp(max=own["b1"]) - uphill * self.grade
@@ -98,7 +94,7 @@ class CirclesFuel(EnergyModel):
     def _rate(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the fuel rate [g/s] of an engine that gets fuel."""
         own, grade = self.own, self.grade
-        acceleration = torch.minimum(acceleration, self._strongest(speed).clamp(min=0.0))
+        acceleration = torch.minimum(acceleration, self.strongest(speed).clamp(min=0.0))
         linear = own["p0"] + speed * (own["p1"] + speed * own["p2"])
         quadratic = own["q0"] + own["q1"] * speed
         vertex = -linear / (2.0 * quadratic).clamp(min=1e-9)

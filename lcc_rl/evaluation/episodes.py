@@ -196,6 +196,8 @@ class Episodes:
         record, alive = self.player.play(options, named)
         crashed = (alive.unsqueeze(-2) & (record["vehicles", "gap"] <= 0.0)).any(0).any(-2)
         record, alive = {key: x[self.begun :] for key, x in record.items()}, alive[self.begun :]
+        if self.cfg.scenario.fleet:
+            record["vehicles", "length"] = self.energy.lengths(record[CLASS])
         groups = grouped(record, self.cfg.scenario.vehicles)
         described = describe(
             self.strategy,
@@ -215,7 +217,7 @@ class Episodes:
         recorded = RECORDED in self.cfg.evaluation.baselines
         measured = measures(groups, alive, time_step, self.energy, recorded)
         length, free = self.cfg.scenario.vehicle_length, inputs.population.desired_speed[driver]
-        measured |= traffic(record, alive, length, time_step, free)
+        measured |= traffic(record, alive, length, time_step, free, self.energy)
         rows = pd.concat([described, leader, as_frame(measured, crashed)], axis=1)
         rows = rows.iloc[:count]
         inside = [index - block * plan.size for index in sorted(self.samples)]

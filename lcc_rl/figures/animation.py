@@ -92,7 +92,7 @@ def page(motion: SampleMotion, title: str) -> str:
         "gap": [_numbers(column) for column in short.gap.T],
         "front": _numbers(short.front),
         "leader": None if short.leader is None else _numbers(short.leader),
-        "length": motion.length,
+        "length": motion.lengths.tolist(),
         "circumference": motion.circumference,
         "colours": ROLE_COLOURS,
         "names": {"leader": "leader", AUTOMATED: ROLE_WORDS[1], HUMAN: ROLE_WORDS[0]},
@@ -183,10 +183,11 @@ def _lines(
 def _along(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int) -> None:
     """Place the cars on an open road, in a view that moves with the leader."""
     front = float(motion.front[moment])
-    fronts = [*motion.position[moment], front]
-    cars.set_segments([[(x - motion.length, 0.0), (x, 0.0)] for x in fronts])
-    longest = float((motion.gap + motion.length).sum(axis=1).max())
-    axis.set_xlim(front - longest - 2 * motion.length, front + motion.length)
+    fronts, first = [*motion.position[moment], front], motion.lengths[0]
+    placed = zip(fronts, np.roll(motion.lengths, -1), strict=True)
+    cars.set_segments([[(x - length, 0.0), (x, 0.0)] for x, length in placed])
+    longest = float((motion.gap + motion.lengths[1:]).sum(axis=1).max())
+    axis.set_xlim(front - longest - 2 * first, front + first)
     axis.set_ylim(-1.0, 1.0)
     axis.set_yticks([])
     axis.spines[["left", "right", "top"]].set_visible(False)
@@ -196,7 +197,7 @@ def _along(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int) 
 def _around(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int) -> None:
     """Place the cars on a circle."""
     turn = 2.0 * np.pi / float(motion.circumference or 1.0)
-    reach = np.linspace(-motion.length, 0.0, 5)
+    reach = np.linspace(-motion.lengths[1:], 0.0, 5, axis=1)
     angles = turn * (motion.position[moment][:, None] + reach)
     cars.set_segments(list(np.stack([np.cos(angles), np.sin(angles)], -1)))
     axis.set_aspect("equal")

@@ -63,10 +63,10 @@ def _panel(name: str, motion: SampleMotion, place: int, top: float) -> str:
     step = float(motion.time[1] - motion.time[0])
     shown = motion.at(slice(None, None, max(round(KEY_STEP / step), 1)))
     turn = 360.0 / float(motion.circumference or 1.0)  # of a metre [degrees]
-    angles = -turn * (shown.position - 0.5 * motion.length)
-    long = math.radians(turn) * RADIUS * motion.length
+    angles = -turn * (shown.position - 0.5 * motion.lengths[1:])
+    long = math.radians(turn) * RADIUS * motion.lengths[1:]
     cars = [
-        _car(role != HUMAN, angles[:, car], shown.speed[:, car] / top, long, _time_of(motion))
+        _car(role != HUMAN, angles[:, car], shown.speed[:, car] / top, long[car], _time_of(motion))
         for car, role in enumerate(motion.roles)
     ]
     last = motion.speed[motion.time > motion.time[-1] - 60.0]

@@ -221,7 +221,8 @@ def program(
         safety: the filter behind which it drives; None: its own.
 
     Raises:
-        ConfigError: if no network drives, or its filter knows the faults of a scenario.
+        ConfigError: if no network drives, its filter knows the faults of a scenario, or its
+            vehicles have a class with limits.
         ResultsError: if the policy cannot be read.
     """
     population, weights = bootstrap(), None
@@ -234,6 +235,12 @@ def program(
     found = {kind: [p for p in pieces if isinstance(p, kind)] for kind in (Observation, Action)}
     if not all(found.values()):
         raise ConfigError(f"{policy}: no network drives its vehicles; nothing to export")
+    for name, node in scenario.fleet.items():
+        if node is not None and AUTOMATED in node.settings["roles"]:
+            raise ConfigError(
+                f"{policy}: it drives vehicles of the class {name} (scenario.fleet), whose limits "
+                "only an environment knows: it cannot drive in SUMO or a file"
+            )
     safety = safety or next((p for p in pieces if isinstance(p, CBFFilter)), None)
     if safety is not None and any(vars(safety).get("remembers", {}).values()):
         raise ConfigError(

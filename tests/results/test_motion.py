@@ -90,6 +90,22 @@ def drifting(vehicles: int = 2, ring: bool = False, seconds: float = 1.2) -> Sam
     )
 
 
+def test_vehicles_of_a_class_have_its_length() -> None:
+    steps = pd.DataFrame({"time_s": [0.1, 0.2], "leader_speed": 10.0})
+    for name, length in (("cav", 5.0), ("hdv", 20.0)):
+        steps = steps.assign(**{f"{name}_{x}": 10.0 for x in ("speed", "gap")})
+        steps[f"{name}_length"] = length
+    for road, lengths in (("open", [5.0, 5.0, 20.0]), ("ring", [20.0, 5.0, 20.0])):
+        scenario = {**OPEN, "road": road, "circumference": 45.0}
+        moved = motion_of(steps, scenario)
+        assert moved.lengths.tolist() == lengths
+        apart = moved.position[0, 0] - moved.position[0, 1]
+        assert apart == pytest.approx(15.0)  # a gap of 10 m and the car ahead
+        assert data_of(page(moved, "trucks"))["length"] == lengths
+        before = moved.front[0] - moved.position[0, 0]
+        assert before == pytest.approx(10.0 + lengths[0])
+
+
 def data_of(text: str) -> dict:
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
     assert found is not None
