@@ -37,9 +37,10 @@ from lcc_rl.results.policies import load_policy
 from lcc_rl.settings import values
 
 RING_TASK = ("variant=alcc", "task=ring-22")
+NOT_ON_PAGE = ("sensors", "actuators", "fleet")
 OF_RING = (
     *("circumference", "string", "vehicle_length", "initial_speed", "time_step"),
-    *("sensors", "actuators"),
+    *NOT_ON_PAGE,
 )
 OF_DRIVERS = ("drivers", "controllers.human")
 DRAWS = ("noise", "wiener", "acceleration_noise", "acceleration_noise.before", "driver")
@@ -75,11 +76,11 @@ def page_data(
     vehicles = scenario.vehicles
     car = energy[0] if len(energy) == 1 and isinstance(energy[0], CirclesFuel) else None
     strange = [f"role {name}" for name in vehicles.names if name not in (HUMAN, AUTOMATED)]
-    strange += [f"scenario.{x}" for x in ("sensors", "actuators") if getattr(scenario, x)]
+    strange += [f"scenario.{x}" for x in NOT_ON_PAGE if getattr(scenario, x)]
     if car is None or car.truck or car.grade:
         strange.append("energy (it takes one car on a level road: energy=compact)")
-    human = _human(cfg)
-    if human is None:
+    human = None if strange else _human(cfg)
+    if human is None and not strange:
         strange.append("drivers (it takes IDM drivers who share a, b and s0, without gap_noise)")
     if strange or car is None:
         raise ConfigError(f"{policy}: a page of the ring cannot carry {', '.join(strange)}")
