@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,9 @@ import lcc_rl
 from lcc_rl.interfaces.ring_page import ring_page
 
 HERE, ROOT = Path(__file__).parent, Path(__file__).parents[1]
+sys.path.append(str(ROOT / "tools"))
+
+import settings  # noqa: E402
 
 project, author, release = "lcc_rl", "The lcc_rl developers", lcc_rl.__version__
 html_title, html_theme = f"lcc_rl {release}", "furo"
@@ -88,7 +92,8 @@ def copy_pages(app: Any, error: Exception | None) -> None:
 
 
 def setup(app: Any) -> None:
-    """Write the page of the ring, and connect what is above."""
+    """Write the pages that are not tracked, and connect what is above."""
+    settings.main()
     (HERE / OPENED[0]).write_text(ring_page(RING), encoding="utf-8")
     app.connect("source-read", read)
     app.connect("include-read", read_included)

@@ -25,7 +25,7 @@ from lcc_rl.results.report import Report, together
 
 @dataclass(frozen=True)
 class Run:
-    """What a training or an evaluation left behind.
+    """The results of a training or an evaluation.
 
     Args:
         folder: its files: configuration, parquet tables, and the policy of a training.

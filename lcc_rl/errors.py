@@ -30,7 +30,7 @@ class ResultsError(LccError, RuntimeError):
 
 
 class Concern(str):
-    """A line of a report that changes results: nobody should have to look for it."""
+    """A line of a report on something that changes results; it is shown first."""
 
 
 class Interrupted(LccError):

@@ -4,7 +4,7 @@ A class that derives from :class:`Settings` is a pydantic dataclass: an annotate
 is a setting with type, range and default; names without annotation are plain class attributes::
 
     class Comfort(RewardTerm):
-        limit: Positive = 2.0    # jerk that nobody feels [m/s³]
+        limit: Positive = 2.0    # jerk below notice [m/s³]
         reads = ("self.jerk",)
         def reward(self, jerk): return -(jerk.abs() - self.limit).clamp(min=0.0)
 

@@ -37,6 +37,7 @@ NOT_RUN = {
     "lcc-rl animate": "tests/results/test_motion.py runs it",
     "lcc-rl evaluate experiment=main": "tests/test_entry_points.py does it with a job of its own",
     "lcc-rl score": "tests/evaluation/test_score.py runs it",
+    "python docs/recipes": "tests/envs/test_stock_torchrl.py and tests/test_card.py run them",
     "python tools/benchmarks": "tests/tools/test_benchmark.py runs it",
     "python tools/kill_test.py": "takes an hour",
 }
@@ -66,8 +67,6 @@ ENOUGH = {
     "num_envs=64": "num_envs=2",
     "batch_size=64": "batch_size=4",
     '"evaluation.drivers=24"': repr([LENGTH, *WINDOWS, *DATA])[1:-1],
-    "19200,": "80,",
-    "768000": "160",
     '1.2]"]': f'1.2]", *{list(DATA)}]',
     "learn(300_000,": "learn(9_600,",
     "rollout(6000": "rollout(20",

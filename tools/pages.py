@@ -48,6 +48,7 @@ from lcc_rl.studies.reproduce import STUDY_RESULTS
 
 REFERENCE, DOCS = Path("outputs/reference"), Path("docs")
 MARKED = re.compile(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", re.DOTALL)
+TASKS_SHOWN = ("i24-follow5", "i80-follow")
 LIMIT = "limit_"  # begins the columns of kept scores that hold the task's limits
 # Figures of the studies whose rows are kept, on their pages.
 SHOWN_OF = {
@@ -100,19 +101,18 @@ def study(name: str, reference: Path, docs: Path) -> None:
 
 
 def tasks(reference: Path, docs: Path) -> None:
-    """Write the tables of docs/{tasks,fleets,leaderboard,limits}.md."""
+    """Write the tables of docs/{fleets,leaderboard,limits}.md."""
     tables = {path.stem: read_parquet(path) for path in sorted((reference / "tasks").glob("*"))}
-    parts = [task_table(name, table) for name, table in tables.items() if "score_name" in table]
+    parts = [task_table(name, tables[name]) for name in TASKS_SHOWN]
     rows = tables["fleets_fronts"]
     drives = rows["setting"].str.startswith(fleets.DRIVES)
     found = {"drives": fleets.fronts(rows[drives]), "fleets": fleets.fronts(rows[~drives])}
     fill(docs / "fleets.md", found)
-    fill(docs / "tasks.md", {"tasks": "\n\n".join(parts)})
     files = sorted((reference / "scores").glob("*.json"))
     documents = {path.name: read_json(path) for path in files}
     with naming_run(reference / "scores"):
         table = board.leaderboard(documents)
-    fill(docs / "leaderboard.md", {"board": table})
+    fill(docs / "leaderboard.md", {"board": table, "tasks": "\n\n".join(parts)})
     kept = read_parquet(reference / "averaged.parquet")
     fill(docs / "limits.md", {"averaged": averaged.averaged(kept)})
 

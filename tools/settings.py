@@ -1,4 +1,4 @@
-"""Write docs/settings.md: every setting of every class, from the annotated fields themselves."""
+"""Write docs/settings.md for make docs: every setting of every class, from the fields."""
 
 from __future__ import annotations
 

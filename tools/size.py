@@ -29,7 +29,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 CEILINGS = {
     "lcc_rl + tools": {"lines": 40_100, "code": 26_100},
     "tests": {"lines": 21_500},
-    "conf": {"yaml": 146},
+    "conf": {"yaml": 147},
 }
 CASES = 1_100  # that a run of all quick tests collects, see tests/tools/test_size.py
 STRUCTURE = {"names in several modules": 60, "floors": 10, "circles": 0}

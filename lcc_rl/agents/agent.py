@@ -44,7 +44,7 @@ class Scene:
 
 
 class Agent(Settings, ABC):
-    """Settings of an algorithm; started in a scene, what it learns: ``policy``.
+    """Settings of a learning algorithm; ``setup`` makes its ``policy``.
 
     ``policy`` reads ``"observation"`` and writes ``"action"``; ``loop`` trains it.
     """

@@ -12,7 +12,7 @@ from lcc_rl.pieces.world import MAX_ACCELERATION
 
 
 class ControllerPolicy(TensorDictModuleBase):
-    """Drives by a controller where a policy is expected.
+    """A controller as a policy: writes its command as the action.
 
     Writes ``("automated", "action")``, ``[*batch, A, 1]``: the command over the acceleration of
     action 1, held within [−1, 1].

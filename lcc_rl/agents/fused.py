@@ -100,7 +100,7 @@ class CriticBatch(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """What an update judges: the actions of the data and, below them, those of the actor."""
+    """Actions that the critics evaluate: those of the data and, below them, those of the actor."""
 
     both: CriticBatch
     data: CriticBatch

@@ -62,15 +62,15 @@ class Limits:
         """Set the limits that are ``recorded`` to the share that recorded drivers miss.
 
         Args:
-            profiles: speeds of the leaders to learn behind, and of who was recorded there.
+            profiles: speeds of the training leaders, and of the drivers recorded behind them.
 
         Raises:
-            ConfigError: if nobody was.
+            ConfigError: if no driver was recorded.
         """
         for name, term in self.recorded.items():
             if profiles.followers is None:
                 raise ConfigError(
-                    f"agent.limits.{name}={RECORDED}: nobody was recorded behind these leaders; "
+                    f"agent.limits.{name}={RECORDED}: no driver was recorded behind these leaders; "
                     f"give the share of the time as a number, such as agent.limits.{name}=0.01"
                 )
             speed, gap = profiles.followers.split(1, -1)

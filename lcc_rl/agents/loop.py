@@ -40,7 +40,7 @@ AgentT = TypeVar("AgentT", bound=Agent)
 
 
 class TrainingLoop(ABC, Generic[AgentT]):
-    """Runs iterations to the end and keeps their record; a subclass says what an iteration is.
+    """Runs iterations to the end and keeps their record; a subclass defines the iteration.
 
     Args:
         agent: what learns.

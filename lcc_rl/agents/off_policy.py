@@ -50,7 +50,7 @@ class Exploration(Settings):
 
 
 class OffPolicy(Agent):
-    """A policy, its Q networks, their loss and optimizers; a subclass says what an update is.
+    """A policy, its Q networks, their loss and optimizers; a subclass defines the update.
 
     Target networks follow by a share of the difference (HCFS H9–H10).
     """

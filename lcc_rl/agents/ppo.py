@@ -25,7 +25,7 @@ LOG_PROB = "action_log_prob"  # where TorchRL's loss expects it
 
 
 class Gaussian(nn.Module):
-    """Mean and standard deviation of the action before the tanh; the latter is the same always."""
+    """Mean and constant standard deviation of the action before the tanh."""
 
     def __init__(self, mean: nn.Module, sigma: float) -> None:
         super().__init__()
@@ -52,7 +52,7 @@ class OnPolicyLoop(CollectingLoop[Any]):
 
 
 class PPO(Agent):
-    """A Gaussian policy and a value, learned by clipped ratios; the mean is what is kept."""
+    """A Gaussian policy and a value, learned by clipped ratios; the kept policy is the mean."""
 
     gamma: Share = 0.99  # discount
     td_lambda: Annotated[float, Field(ge=0.0, le=1.0)] = 0.95  # weight of longer returns, per step

@@ -81,7 +81,7 @@ def text(entry: str, overrides: Sequence[str] = ()) -> str:
             *lines,
             "",
             f"All settings with values: lcc-rl {name} --cfg job; all groups: --help-all;",
-            "pages: docs/settings.md. -m makes a sweep of all combinations: a=1,2 b=3,4.",
+            "pages: README.md and docs/. -m makes a sweep of all combinations: a=1,2 b=3,4.",
         ]
     )
 

@@ -3,7 +3,7 @@
 lcc-rl animate RUN                           # the last strategy, RUN/figures
 lcc-rl animate RUN --strategy idm_acc --episode 1 --out idm.gif
 lcc-rl animate RUN --start 60 --duration 30 --out wave.mp4   # needs ffmpeg
-lcc-rl animate RUN --strategy human --strategy "alcc: a network" --out r.svg
+lcc-rl animate RUN --strategy human --strategy "alcc: a network" --out waves.svg  # or .gif
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ def run(
 
     Args:
         folder: of an evaluation, a training or a main job.
-        strategies: who drives, each a name of the table or of its rows, or
-            ``"<name>: <words for the reader>"``; none for the last one of the table. An ``.svg``
-            shows several beside each other.
+        strategies: each a name of the table or of its rows, or
+            ``"<name>: <words for the reader>"``; none for the last one of the table. An ``.svg``,
+            or of an open road a ``.gif``, shows several beside each other.
         episode: which of their sample episodes, from 0.
         out: the file, see :func:`lcc_rl.figures.animation.animate`; by default a page in the
             run's folder ``figures``.

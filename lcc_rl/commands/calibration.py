@@ -120,7 +120,7 @@ def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: P
     save(joint_figure(result.drivers), folder / "joint_distribution.png", formats=formats)
     save(twins_figure(result.twins), folder / "twins.png", formats=formats)
     write_parquet(result.twins, folder / "twins.parquet", metadata)
-    # Last: who finds it finds a finished calibration.
+    # Last: it marks a finished calibration.
     write_parquet(result.drivers, folder / "drivers.parquet", metadata)
 
 

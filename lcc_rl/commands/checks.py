@@ -159,7 +159,7 @@ def check_variant(cfg: StudyConfig) -> None:
 
 
 def _is_driven_as(cfg: StudyConfig, own: StudyConfig) -> bool:
-    """Whether there is somebody to drive, by the same kind of controller as in another one."""
+    """Whether the kind of controller of another configuration drives automated vehicles here."""
     kinds = [part.scenario.controllers[AUTOMATED].kind for part in (cfg, own)]
     return cfg.scenario.vehicles.count(AUTOMATED) > 0 and kinds[0] is kinds[1]
 

@@ -115,7 +115,7 @@ def block_rows(
     options: Namespace,
     tell: Callable[[int, dict[str, float]], None],
 ) -> Iterator[pd.DataFrame]:
-    """Yield the rows of everybody behind a block of windows."""
+    """Yield the rows of all strategies behind a block of windows."""
     size = cfg.evaluation
     batch = len(block.evaluation) * len(block.population.time_gap)
     hold = round(options.hold / cfg.scenario.time_step)

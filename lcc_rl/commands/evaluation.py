@@ -28,7 +28,7 @@ from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store
-from lcc_rl.evaluation.fit import check_policy, other_drivers, other_traffic
+from lcc_rl.evaluation.fit import check_policy, classes, other_drivers, other_traffic
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import DIRECT, controller_of, is_policy, is_shipped, label_of
 from lcc_rl.evaluation.strategies import (
@@ -60,7 +60,7 @@ from lcc_rl.results.report import (
 )
 from lcc_rl.results.runs import EPISODES, STEPS, check_folder, resumed_config, save_config
 from lcc_rl.results.task import Task
-from lcc_rl.results.units import check_unit
+from lcc_rl.results.units import OF_FUEL, burns_one_fuel, check_unit
 from lcc_rl.results.windows import by_source
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
@@ -166,11 +166,16 @@ def draw(rows: Rows, cfg: EvaluateConfig, folder: Path) -> None:
 
 
 def task_of(cfg: StudyConfig) -> Task | None:
-    """Return the task of a configuration; None without one."""
+    """Return the task of a configuration; None without one.
+
+    If its unit is one of a single fuel, and scenario.fleet adds vehicles of another, it is kJ/km.
+    """
     if cfg.task is None:
         return None
-    task = parse(Task, cfg.task, "task")
-    check_unit(task.unit, build_energy(cfg))
+    task, energy = parse(Task, cfg.task, "task"), build_energy(cfg)
+    if cfg.scenario.fleet and task.unit in OF_FUEL and not burns_one_fuel(energy):
+        return dataclasses.replace(task, unit="kJ/km")
+    check_unit(task.unit, energy)
     return task
 
 
@@ -179,20 +184,20 @@ def _task_name(cfg: StudyConfig) -> str | None:
 
 
 def only_named(cfg: EvaluateConfig) -> bool:
-    """Whether only those are compared that are named: nobody's policy is its own variant's."""
+    """True if ``compare=`` names every policy."""
     return bool(cfg.compare) and cfg.policy is None and learns(cfg)
 
 
 def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], list[tuple[str, str]]]:
-    """Return whom ``compare`` names: controllers by their names in tables, and policies.
+    """Return what ``compare`` names: controllers by their names in tables, and policies.
 
     Policies are their name, where one was given, and path; the folder of a sweep stands for those
     of its runs. Nobody is left where no vehicle of the string is automated, as at the share 0 of a
     sweep.
 
     Raises:
-        ConfigError: if two have one name, or one has that of somebody else, or a controller is
-            unknown or has nobody to drive.
+        ConfigError: if two have one name, or one has a reserved name, or a controller is
+            unknown or has no vehicle to drive.
     """
     named = cfg.compare
     for who in named.values() if isinstance(named, Mapping) else named:
@@ -232,7 +237,7 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], list[tuple[str, str]]
 
 
 def _check_label(label: str, who: Any, own: str) -> None:
-    """Refuse a row's name that tables use for somebody else; ``own`` may be said of who it is."""
+    """Refuse reserved names of rows; ``own`` is allowed for the strategy of that name."""
     plain = label.removesuffix(FILTERED)
     require(
         in_words(plain) in (plain, in_words(own)),
@@ -272,7 +277,7 @@ def strategies_of(
     if own and learns(cfg) and cfg.policy is None:
         raise no_policy(cfg)
     inputs = load_inputs(cfg)
-    for line in filter(None, [*inputs.report, other_drivers(cfg)]):
+    for line in filter(None, [*inputs.report, other_drivers(cfg), classes(cfg)]):
         log.info(line)
     check_evaluation(cfg, inputs)
     strategies = _rules(cfg, rivals, inputs)
@@ -319,7 +324,7 @@ def _read_policies(
 
 
 def _rules(cfg: EvaluateConfig, rivals: Mapping[str, Any], inputs: Inputs) -> list[Strategy]:
-    """Return the baselines and named controllers; nobody drives as recorded where nobody was."""
+    """Return the baselines and named controllers; ``recorded`` only with recorded drivers."""
     lacking = _lacking_record(cfg, inputs)
     for asked in [f"compare={RECORDED}"] * (RECORDED in rivals) + _held_as_recorded(cfg):
         require(not lacking, f"{asked}: {lacking}; use trajectories of several vehicles")
@@ -338,7 +343,7 @@ def _held_as_recorded(cfg: EvaluateConfig) -> list[str]:
 def _lacking_record(cfg: EvaluateConfig, inputs: Inputs) -> str:
     """Return why no vehicle drives as a recorded one; empty where one can."""
     if inputs.evaluation.followers is None:
-        return "nobody was recorded behind these leaders"
+        return "no driver was recorded behind these leaders"
     first = applies(cfg, RECORDED)
     return "" if first else "the automated vehicle is not the first behind the leader"
 
@@ -365,7 +370,7 @@ def evaluate_and_write(
         steps = pd.concat([trace for _, trace in results], ignore_index=True)
         check_present(folder)
         write_parquet(steps, folder / STEPS, metadata)
-        # Last: who finds it finds a finished run.
+        # Last: it marks a finished run.
         write_parquet(rows, folder / EPISODES, metadata)
     else:
         rows = _by_blocks(strategies, cfg, inputs, folder, metadata)
@@ -436,7 +441,7 @@ def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterato
                 yield case_report(part, case, f"{of}{case}")
         return
     filtered = cfg.scenario.filters.get(AUTOMATED) is not None
-    words = list(filter(None, [other_drivers(cfg)]))
+    words = list(filter(None, [other_drivers(cfg), classes(cfg)]))
     for source, part in by_source(windows_for(rows)):
         one = report(part, task_of(cfg), build_energy(cfg), filtered, source, against=against)
         yield dataclasses.replace(one, remarks=[*one.remarks, *words])

@@ -20,8 +20,8 @@ from lcc_rl import results
 from lcc_rl.agents import Analytic
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.checks import check_measured, check_settings
-from lcc_rl.config import NOT_IDENTITY, load, top_key, with_inputs
-from lcc_rl.config.nodes import Node
+from lcc_rl.config import NOT_IDENTITY, config_hash, load, top_key, with_inputs
+from lcc_rl.config.nodes import Node, as_plain
 from lcc_rl.config.schemas import (
     KINDS,
     CalibrateConfig,
@@ -34,14 +34,14 @@ from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.drivers.calibrator import count_records
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.inputs import LOADS, build_energy, load_inputs
-from lcc_rl.errors import Concern, ConfigError, Interrupted
+from lcc_rl.errors import Concern, ConfigError, Interrupted, ResultsError
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
 from lcc_rl.figures.main_page import held_to, write_page
 from lcc_rl.figures.training import training_figure
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.io.files import Rows, write_parquet
+from lcc_rl.io.files import Rows, parquet_metadata, write_parquet
 from lcc_rl.io.settings import read_text
 from lcc_rl.results.render import print_table, terminal
 from lcc_rl.results.report import RULE, report, sample_of, windows_for
@@ -54,7 +54,7 @@ from lcc_rl.results.runs import (
     resumed_config,
     save_config,
 )
-from lcc_rl.results.trust import own_modules
+from lcc_rl.results.trust import own_modules, said_again
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import tell
 from lcc_rl.runs.precision import prepare_torch
@@ -69,6 +69,7 @@ log = logging.getLogger("lcc_rl")
 # all others are passed on to calibration and trainings.
 JOB_OPTIONS = ("calibration", "variants", "jobs", "variant", "resume", "hydra", "data")
 COMMAND_FILE, TRAJECTORIES = "command.txt", "trajectories.parquet"
+MADE = "lcc_rl.data"  # in the metadata of trajectories: which data they are
 NETWORKS = ("reference", "alcc")  # trained by default, and the rule by the gradient
 
 
@@ -156,7 +157,7 @@ def _run(
     try:
         train_all(trainings, folder, cfg.jobs)
     except Interrupted:
-        words = f"stopped; complete it with: lcc-rl run resume={folder}"
+        words = f"stopped; complete it with: lcc-rl run resume={folder}{said_again(final)}"
         raise Interrupted(words) from None
     final.compare = [
         str(folder / name) for name in trainings if (folder / name / "policy.pt").exists()
@@ -189,25 +190,37 @@ def _episodes(cfg: PipelineConfig, folder: Path) -> Node:
     return Node.of(settings, "data")
 
 
-def read_once(cfg: PipelineConfig, folder: Path) -> None:
-    """Read the trajectories, check that they can be split, and keep them; skip what is there."""
-    if (folder / TRAJECTORIES).exists():
+def read_once(cfg: PipelineConfig, folder: Path, learns: bool = True) -> None:
+    """Read the trajectories and keep them; skip what is there.
+
+    If a policy ``learns`` from them, check first that they can be split.
+
+    Raises:
+        ResultsError: if those that are there are of other settings or files.
+    """
+    path, own = folder / TRAJECTORIES, as_plain(cfg.data)
+    made = config_hash([own, cfg.inputs.get("data")])
+    if path.exists():
+        if parquet_metadata(path).get(MADE, made) != made:
+            raise ResultsError(f"{path} is of other data; choose another folder, or remove this")
         return
     loaded = cfg.data.made(LOADS).load()
     _pass_on(loaded.report)
     counts = [line for line in loaded.report if line.startswith(("kept ", "read "))]
     tell(f"data: {(counts or loaded.report)[-1]}")
-    load_inputs(cfg, loaded.episodes).to_learn_from()
+    if learns:
+        load_inputs(cfg, loaded.episodes).to_learn_from()
     episodes = loaded.episodes[list(SCHEMA)].astype({**SCHEMA, "recording": str})
-    write_parquet(episodes, folder / TRAJECTORIES)
+    write_parquet(episodes, path, {MADE: made, "report": "\n".join(loaded.report)})
 
 
 def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
     """Calibrate drivers to the trajectories in the folder, unless that is done."""
     drivers = folder / "calibration" / "drivers.parquet"
+    shared = {item.name: getattr(cfg, item.name) for item in fields(CalibrateConfig)}
+    own = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})
+    check_folder(own, drivers.parent)
     if not drivers.exists():
-        shared = {item.name: getattr(cfg, item.name) for item in fields(CalibrateConfig)}
-        own = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})
         found = calibration.run(own, drivers.parent, Console(quiet=True), tell=_pass_on)
         modes = {str(mode): rows for mode, rows in found.groupby("mode", sort=False)}
         errors = (f"{mode} {100.0 * x['rmspe'].mean():.2f} %" for mode, x in modes.items())

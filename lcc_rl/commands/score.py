@@ -62,7 +62,7 @@ from lcc_rl.runs.output import HEADLINE, tell
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import ERROR, LOCK, claim, forget, record
 
-# Where leaders come from, and human drivers who keep up with them.
+# Sources of leaders, and human drivers that keep up with them.
 LEADER_SOURCES: dict[str, tuple[str, ...]] = {
     "stream": ("data=stream", "drivers=i80"),
     "highway": ("data=highway", "drivers=highway"),
@@ -85,7 +85,7 @@ FILE = "score.json"
 
 
 class Scored(NamedTuple):
-    """Who is scored: the name in tables, what was given, and the policy where it is one."""
+    """A scored controller: its name in tables, what was given, and the policy if it is one."""
 
     label: str
     who: str
@@ -126,7 +126,7 @@ def scored(who: str, trust: Sequence[str] = ()) -> Scored:
     """Read a policy, or find a controller.
 
     Raises:
-        LccError: if there is none, or it drives nobody.
+        LccError: if there is none, or it drives no vehicle.
     """
     require(who not in (DIRECT, RECORDED), f"{who} is no controller that could be scored")
     if is_policy(who):
@@ -143,7 +143,7 @@ def roads(
     A ring has no leader, and a task that names its own record no others.
 
     Raises:
-        LccError: if a setting is wrong, or who is scored does not fit the task.
+        LccError: if a setting is wrong, or the policy does not fit the task.
     """
     words = (f"task={task}", *further)
     own: EvaluateConfig = load("evaluate", words)
@@ -196,7 +196,7 @@ def hash_of(windows: Profiles) -> str:
 
 
 def about(who: Scored) -> dict[str, Any]:
-    """Return the hash of the files of who is scored, and versions."""
+    """Return the hash of the scored policy's files, and versions."""
     contents = [file.read_bytes() for file in who.files()]
     found: dict[str, str | None] = {}
     for name in ("lcc_rl", *SCORED_WITH):
@@ -267,7 +267,7 @@ def leaving_out(what: str, left_out: list[str]) -> Iterator[None]:
 
 
 def _own_name(name: str) -> str:
-    """Return a name that the command line gives; nobody of the package has it."""
+    """Return a name that the command line gives; reserved names are refused."""
     plain = name.removesuffix(FILTERED)
     new = not is_shipped(plain) and in_words(plain) == plain
     require(new, f"--name {name} stands for {in_words(name)!r} in tables: choose another")
@@ -298,8 +298,8 @@ def _source(given: Sequence[str]) -> tuple[str, tuple[str, ...]]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Score and print the table."""
     parser = Arguments(prog="lcc-rl score", description=__doc__)
-    parser.add_argument("who", help="program.onnx, run folder, policy or controller")
-    parser.add_argument("--name", help="who is scored, in tables; by default that of the file")
+    parser.add_argument("who", metavar="policy", help="ONNX file, run, policy file or controller")
+    parser.add_argument("--name", help="name in tables; by default that of the file")
     parser.add_argument("--task", action="append", help="only this task; repeat for several")
     parser.add_argument("--on", action="append", default=[], help="only this source")
     parser.add_argument(

@@ -26,6 +26,7 @@ from lcc_rl.results.platoons import case_table
 from lcc_rl.results.policies import load_policy, save_policy
 from lcc_rl.results.report import summary, windows_for
 from lcc_rl.results.runs import EPISODES, check_folder, resumed_config, save_config
+from lcc_rl.results.trust import said_again
 from lcc_rl.runs.loggers import RowLogger, Silent
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import working
@@ -146,9 +147,8 @@ def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume:
     with build_logger(cfg).opened(folder) as trainer.on_row:
         try:
             trainer.run()
-        except Interrupted as error:  # what may be named has to be said again
-            trust = f" trust=[{','.join(cfg.trust)}]" if cfg.trust else ""
-            raise Interrupted(f"{error}{trust}") from error
+        except Interrupted as error:
+            raise Interrupted(f"{error}{said_again(cfg)}") from error
     weights = agent.policy.state_dict()
     if all(torch.equal(weights[name], value) for name, value in first.items()):
         log.warning(

@@ -47,7 +47,7 @@ NOT_IDENTITY = (
 # Launchers that come with other packages: which extra brings them.
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
 # Settings that came later: without them a run is what it was before.
-LATER = ("evaluation.warm_up",)
+LATER = ("evaluation.warm_up", "scenario.fleet")
 NEEDED = ("data", "split", "drivers", "observation", "calibration")  # of commands that have them
 NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =
 # Hydra's keys are without quotes.

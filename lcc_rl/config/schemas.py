@@ -75,6 +75,7 @@ class ScenarioConfig(Settings):
     filters: Nodes
     actuators: Nodes = Field(default_factory=dict)
     sensors: Nodes = Field(default_factory=dict)
+    fleet: Nodes = Field(default_factory=dict)  # classes of vehicles besides those of energy
     pieces: Nodes
 
     @property
@@ -139,7 +140,7 @@ class EvaluationConfig(Settings):
 
 
 class BaseConfig(Settings):
-    """What every command shares."""
+    """Settings that all commands share."""
 
     seed: Seed
     device: Device  # cpu, cuda or cuda:<number>
@@ -165,7 +166,7 @@ class CalibrateConfig(BaseConfig):
 
 
 class StudyConfig(BaseConfig):
-    """What every command that drives vehicles shares."""
+    """Settings of all commands that drive vehicles."""
 
     variant: str
     drivers: Described

@@ -32,7 +32,7 @@ class OpenAccSource(TrajectorySource):
     """
 
     path: str | Sequence[str]  # a file, several files, or a pattern
-    driver: Literal["human", "acc"] | None = None  # only followers of whom Driver<i> says so
+    driver: Literal["human", "acc"] | None = None  # only followers whose Driver<i> says so
 
     def load(self) -> LoadedEpisodes:
         """Read and extract.
@@ -77,7 +77,7 @@ def _cars(table: TableFile, driver: str | None, report: ReadReport) -> pd.DataFr
     report.notes.append(f"{table.path}: {len(numbers)} cars{': ' if named else ''}{named}")
     report.notes.append(f"{table.path}: {_marked(table, followers, read)}")
     if unknown:
-        report.notes.append(f"{table.path}: {unknown:,} samples with a blank gap follow nobody")
+        report.notes.append(f"{table.path}: {unknown:,} samples with a blank gap follow no vehicle")
     if driver is not None:
         none = np.full(rows, "")
         who = np.concatenate([read.get(f"Driver{n}", none) for n in numbers])
@@ -113,7 +113,7 @@ def _driven_by(driver: str, gap: pd.Series, who: NDArray) -> tuple[pd.Series, st
 
 
 def _marked(table: TableFile, followers: Iterable[int], read: Mapping[str, NDArray]) -> str:
-    """Words on who drives the followers: as their column ``Driver`` says, and the header."""
+    """Describe the drivers of the followers by their column ``Driver`` and the header."""
     marks = [
         " and ".join(sorted({*np.unique(read.get(f"Driver{n}", [""]))} - {""})) or "unmarked"
         for n in followers

@@ -60,7 +60,7 @@ class LoadedEpisodes:
 
 
 class Source(Settings):
-    """Base of sources of recorded episodes: what is done with any of them."""
+    """Base of sources of recorded episodes: steps that all of them share."""
 
     LATER = ("average_s",)
 

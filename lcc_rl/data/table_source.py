@@ -143,8 +143,8 @@ def _report_blank_gaps(table: TableFile, read: Mapping[str, NDArray]) -> None:
     if blank.any():
         first = table.fault(int(read["row"][np.argmax(blank)]), "gap", "is blank")
         table.notes.append(
-            f"{int(blank.sum()):,} samples with a leader but a blank gap follow nobody, the first: "
-            f"{first}"
+            f"{int(blank.sum()):,} samples with a leader but a blank gap follow no vehicle, "
+            f"the first: {first}"
         )
 
 
@@ -252,7 +252,7 @@ def _samples(rows: pd.DataFrame, frame: Integers, report: ReadReport) -> Traject
     columns, zero = {str(name): rows[name].to_numpy() for name in rows}, np.zeros(len(rows))
     leader = columns["leader"] if "leader" in columns else _next_ahead(rows, frame)
     given, gap = "gap" in columns, columns.get("gap", zero)
-    if given:  # a vehicle without a gap follows nobody
+    if given:  # a vehicle without a gap follows no vehicle
         leader = np.where(np.isnan(gap), 0, leader)
     length = np.nan_to_num(columns.get("length", zero))
     headway = {}

@@ -1,4 +1,4 @@
-"""Vehicle trajectories in SI units, the report on reading them, and who is ahead of whom."""
+"""Vehicle trajectories in SI units, the report on reading them, and vehicles ahead of others."""
 
 from __future__ import annotations
 

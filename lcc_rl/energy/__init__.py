@@ -1,8 +1,8 @@
-"""Energy models: what driving draws from a battery or a tank, and who has which."""
+"""Energy models: the power that driving draws, and which vehicle has which model."""
 
 from lcc_rl.energy.base import AVERAGED, AVERAGES, BURNT, EnergyModel
 from lcc_rl.energy.electric import ElectricCar, PaperMotor
-from lcc_rl.energy.fleet import Fleet, as_fleet
+from lcc_rl.energy.fleet import Fleet, VehicleClass, as_fleet
 from lcc_rl.energy.fuel import CirclesFuel
 
 __all__ = [
@@ -14,5 +14,6 @@ __all__ = [
     "EnergyModel",
     "Fleet",
     "PaperMotor",
+    "VehicleClass",
     "as_fleet",
 ]

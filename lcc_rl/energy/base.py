@@ -82,6 +82,11 @@ class EnergyModel(Settings, ABC):
         """Return what accelerating loses for good [W]; None where the model has no such part."""
         return None
 
+    def strongest(self, speed: Tensor) -> Tensor | None:
+        """Return the largest acceleration at a speed [m/s²]; None where the model is silent."""
+        return None
+
     def infeasible(self, speed: Tensor, acceleration: Tensor) -> Tensor | None:
         """Return where the vehicle cannot accelerate like this; None where the model is silent."""
-        return None
+        strongest = self.strongest(speed)
+        return None if strongest is None else acceleration > strongest

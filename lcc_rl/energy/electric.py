@@ -37,11 +37,21 @@ class ElectricCar(EnergyModel):
     regeneration_limit: NonNegative = 50_000.0  # braking power that the motor takes [W]
     fade_speed: Positive = 5.0  # below it recuperation fades in proportion to it [m/s]
     grade: Grade = 0.0  # of the road [rad]
+    power_limit: Positive | None = None  # at the wheels; None: no limit [W]
+
+    LATER = ("power_limit",)
 
     def validate(self) -> None:
         self.resistance = 0.5 * AIR * self.drag * self.area  # of the air [N/(m/s)²]
         slope = self.rolling * math.cos(self.grade) + math.sin(self.grade)
         self.rolling_force = self.mass * GRAVITY * slope  # [N]
+
+    def strongest(self, speed: Tensor) -> Tensor | None:
+        """Return the acceleration at the power limit, less the resistances [m/s²]."""
+        if self.power_limit is None:
+            return None
+        force = self.power_limit / speed.clamp(min=1e-3) - self.resistance * speed.square()
+        return (force - self.rolling_force) / self.inertia
 
     def power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the power drawn from the battery [W], negative where it is charged."""

@@ -1,27 +1,65 @@
-"""Which vehicle has which energy model: one for all, or classes drawn by share."""
+"""Which vehicle is of which class: what it draws, how long it is, and what it can do."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from copy import copy
 from functools import partial
-from typing import Any
+from typing import Annotated, Any, Self
 
 import torch
+from pydantic import Field, InstanceOf
 from torch import Tensor
 
 from lcc_rl.energy.base import BURNT, EnergyModel
 from lcc_rl.energy.electric import PaperMotor
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.guard import unchanged
+from lcc_rl.functional.pattern import HUMAN
+from lcc_rl.settings import Positive, Settings, values
 
 Quantity = Callable[[EnergyModel, Tensor, Tensor], Tensor]
+# By how much commands stay below the largest acceleration, so that the rounding of speeds does
+# not exceed it [m/s²].
+ROUNDING = 1e-3
+
+
+class VehicleClass(Settings):
+    """A class of vehicles: the vehicle of its energy model, its length and its limits.
+
+    It accelerates as hard as that vehicle can (:meth:`lcc_rl.energy.EnergyModel.strongest`: power
+    over mass and speed, less the resistances), and drives no faster than its speed limit.
+    """
+
+    energy: InstanceOf[EnergyModel]  # its mass, power, resistances, and what it draws
+    share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0  # of the vehicles of its roles
+    # Of the vehicles that are of this class.
+    roles: Annotated[tuple[str, ...], Field(strict=False, min_length=1)] = (HUMAN,)
+    length: Positive = 5.0  # [m]
+    speed_limit: Positive | None = None  # None: as fast as its power allows [m/s]
+    bounded: bool = True  # False: it accelerates as commanded, whatever its power
+
+    def within(self, command: Tensor, speed: Tensor, time_step: float) -> Tensor:
+        """Return commands within what the vehicle can do, and within its speed limit [m/s²].
+
+        Args:
+            command: commanded acceleration, any shape [m/s²].
+            speed: speed at the start of the step, same shape [m/s].
+            time_step: duration of the step [s].
+        """
+        strongest = self.energy.strongest(speed) if self.bounded else None
+        if strongest is not None:
+            command = torch.minimum(command, strongest - ROUNDING)
+        if self.speed_limit is not None:
+            command = torch.minimum(command, (self.speed_limit - speed) / time_step)
+        return command
 
 
 class Fleet:
-    """The energy models of the vehicles of a string.
+    """The classes of the vehicles of a string.
 
     Args:
-        models: by the name of the class.
+        models: energy models by the name of the class; such a class knows no limits.
         shares: share of each class among the vehicles; None for equal shares.
         roles: shares among the vehicles of a role, where they differ.
     """
@@ -34,8 +72,7 @@ class Fleet:
     ) -> None:
         if not models:
             raise ConfigError("energy.models is empty: a mixture needs at least one model")
-        self.names = list(models)
-        self.models = list(models.values())
+        self.classes = {x: VehicleClass(energy=own, bounded=False) for x, own in models.items()}
         shares = dict.fromkeys(self.names, 1.0) if shares is None else shares
         self.shares = self._checked(shares, "energy.shares")
         self.roles = {
@@ -51,6 +88,76 @@ class Fleet:
         if not total > 0.0 or min(shares.values()) < 0.0:
             raise ConfigError(f"{where}: shares must not be negative, and one must be above 0")
         return [shares.get(name, 0.0) / total for name in self.names]
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the classes, by number."""
+        return list(self.classes)
+
+    @property
+    def models(self) -> list[EnergyModel]:
+        """The energy models of the classes, by number."""
+        return [one.energy for one in self.classes.values()]
+
+    def extended(self, classes: Mapping[str, VehicleClass], length: float) -> Self:
+        """Return the fleet with further classes.
+
+        Args:
+            classes: by name; what their shares leave of a role is divided as before.
+            length: of the vehicles of all other classes [m].
+
+        Raises:
+            ConfigError: if a name is taken, or the shares of a role exceed 1.
+        """
+        if taken := set(classes) & set(self.names):
+            raise ConfigError(f"scenario.fleet: energy has a class {min(taken)}, too; rename one")
+        found, none = copy(self), [0.0] * len(classes)
+        old = {
+            x: VehicleClass(**values(one) | {"length": length}) for x, one in self.classes.items()
+        }
+        found.classes = {**old, **classes}
+        found.shares = [*self.shares, *none]
+        found.roles = {role: [*own, *none] for role, own in self.roles.items()}
+        for role in dict.fromkeys(role for one in classes.values() for role in one.roles):
+            added = [one.share * (role in one.roles) for one in classes.values()]
+            if (rest := 1.0 - sum(added)) < -1e-6:
+                raise ConfigError(
+                    f"scenario.fleet: the shares of {role} must not exceed 1, got {sum(added):g}"
+                )
+            own = self.roles.get(role, self.shares)
+            found.roles[role] = [*(max(rest, 0.0) * share for share in own), *added]
+        return found
+
+    @property
+    def limited(self) -> bool:
+        """Whether a class has limits."""
+        return any(one.bounded or one.speed_limit for one in self.classes.values())
+
+    def longest(self, role: str) -> float:
+        """Return the length of the longest vehicle that a role may have [m]."""
+        shares = self.roles.get(role, self.shares)
+        met = zip(self.classes.values(), shares, strict=True)
+        return max(one.length for one, share in met if share > 0.0)
+
+    def within(self, command: Tensor, speed: Tensor, time_step: float, kind: Tensor) -> Tensor:
+        """Return commands within the limits of each vehicle, see :meth:`VehicleClass.within`."""
+        found = command
+        for number, one in enumerate(self.classes.values()):
+            found = torch.where(kind == number, one.within(command, speed, time_step), found)
+        return found
+
+    def lengths(self, kind: Tensor) -> Tensor:
+        """Return the length of each vehicle by its class, same shape [m]."""
+        return self._of_class([one.length for one in self.classes.values()], kind)
+
+    def speed_limits(self, kind: Tensor) -> Tensor:
+        """Return the speed limit of each vehicle by its class, same shape; infinite for none."""
+        limits = [one.speed_limit or torch.inf for one in self.classes.values()]
+        return self._of_class(limits, kind)
+
+    @staticmethod
+    def _of_class(numbers: list[float], kind: Tensor) -> Tensor:
+        return torch.tensor(numbers, device=kind.device)[kind]
 
     def power(self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None) -> Tensor:
         """Return the power drawn [W], see :meth:`EnergyModel.power`.
@@ -97,8 +204,8 @@ class Fleet:
 
     def _known(self, name: str, enough: Any, *motion: Any) -> Tensor | None:
         """Return what models define, false of the others; None unless enough define it."""
-        base = getattr(EnergyModel, name)
-        if not enough(getattr(type(model), name) is not base for model in self.models):
+        nothing = torch.empty(0)
+        if not enough(getattr(x, name)(nothing, nothing) is not None for x in self.models):
             return None
 
         def of(model: EnergyModel, speed: Tensor, acceleration: Tensor) -> Tensor:

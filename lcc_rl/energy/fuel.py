@@ -15,9 +15,9 @@ from lcc_rl.settings import Positive
 
 FUEL = "circles_fuel.csv"
 GASOLINE, DIESEL = 0.745, 0.832  # [kg/L]
-# Carbon dioxide per gram of fuel: 69.3 g/MJ of 44.3 kJ/g, 74.1 g/MJ of 43.0 kJ/g (IPCC Guidelines
-# 2006, Vol. 2, Tables 1.2 and 3.2.1).
-CARBON_DIOXIDE = {GASOLINE: 3.07, DIESEL: 3.186}
+# Carbon dioxide of burnt fuel [kg/L]: 8,887 and 10,180 g per US gallon (US EPA, Greenhouse Gas
+# Emissions from a Typical Passenger Vehicle, EPA-420-F-11-041, 2011).
+CARBON_DIOXIDE = {GASOLINE: 2.348, DIESEL: 2.689}
 TRUCKS = ("Class4PND", "Class8Tractor")
 STANDSTILL, STILL = 0.1, 0.01  # slower than the first [m/s], weaker than the second [m/s²]: idle
 # Fuel that gives a vehicle its kinetic energy: 15.4 kJ of it per gram, 35 % of 44 kJ.
@@ -57,7 +57,7 @@ class CirclesFuel(EnergyModel):
         self.heating_value = self.own["gs2kW"] * KILOWATT
         self.truck = self.vehicle in TRUCKS
         self.density = DIESEL if self.truck else GASOLINE
-        self.carbon_dioxide = CARBON_DIOXIDE[self.density]
+        self.carbon_dioxide = CARBON_DIOXIDE[self.density] / self.density
         self.mass, self.efficiency = self.own["mass_kg"], KINETIC / self.heating_value
 
     def power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
@@ -84,13 +84,9 @@ class CirclesFuel(EnergyModel):
             rate = rate.masked_fill(cut, 0.0)
         return rate.masked_fill(idle, own["fc_idle"])
 
-    def infeasible(self, speed: Tensor, acceleration: Tensor) -> Tensor:
-        """Return where the vehicle cannot accelerate like this."""
-        return acceleration > self._strongest(speed.clamp(min=0.0))
-
-    def _strongest(self, speed: Tensor) -> Tensor:
+    def strongest(self, speed: Tensor) -> Tensor:
         """Return the largest acceleration that is feasible [m/s²]."""
-        own = self.own
+        own, speed = self.own, speed.clamp(min=0.0)
         force = own["b2"] / speed.clamp(min=1e-6) - own["b3"] * speed.square()
         uphill = (own["b5"] + own["b6"] * speed).clamp(max=own["b4"])
         return force.clamp(max=own["b1"]) - uphill * self.grade
@@ -98,7 +94,7 @@ class CirclesFuel(EnergyModel):
     def _rate(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the fuel rate [g/s] of an engine that gets fuel."""
         own, grade = self.own, self.grade
-        acceleration = torch.minimum(acceleration, self._strongest(speed).clamp(min=0.0))
+        acceleration = torch.minimum(acceleration, self.strongest(speed).clamp(min=0.0))
         linear = own["p0"] + speed * (own["p1"] + speed * own["p2"])
         quadratic = own["q0"] + own["q1"] * speed
         vertex = -linear / (2.0 * quadratic).clamp(min=1e-9)

@@ -160,7 +160,7 @@ def _compare(piece: Piece, found: Mapping[Key, Tensor], when: str) -> None:
 
 
 def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
-    """Check that every entry read is written by somebody, and none by two pieces.
+    """Check that a piece writes every entry that is read, and no two write one.
 
     Raises:
         ConfigError: naming the entry and the piece.

@@ -191,6 +191,8 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
     named = {name: node for name, node in scenario.pieces.items() if node is not None}
     pieces = _leader(scenario, named.pop("leader", None), world)
     drivers = _drivers(scenario, world)
+    for name, one in energy.classes.items():
+        _check_roles(one.roles if one.share else (), f"scenario.fleet.{name}.roles", scenario)
     _check_roles(energy.roles, "energy.roles", scenario)
     classes = [EnergyClasses().bind(world)] if len(energy.models) > 1 else []
     actuators, sensors = (

@@ -17,7 +17,7 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.leaders import Case, TrajectoryLeaders
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.data.sources import LoadedEpisodes
-from lcc_rl.energy import Fleet, as_fleet
+from lcc_rl.energy import Fleet, VehicleClass, as_fleet
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.pattern import RING
@@ -74,12 +74,16 @@ def build_drivers(cfg: StudyConfig) -> Population:
 
 
 def build_energy(cfg: StudyConfig) -> Fleet:
-    """Build the energy models of a configuration; without the node, that of the ALCC paper.
+    """Build the classes of vehicles of a configuration: those of ``energy``, then of the scenario.
+
+    Without the node ``energy``, its only class has the energy model of the ALCC paper.
 
     Raises:
         ConfigError: naming the option at fault.
     """
-    return as_fleet(cfg.energy and cfg.energy.made(MEANT))
+    fleet, nodes = as_fleet(cfg.energy and cfg.energy.made(MEANT)), cfg.scenario.fleet
+    classes = {name: node.made(VehicleClass) for name, node in nodes.items() if node is not None}
+    return fleet.extended(classes, cfg.scenario.vehicle_length)
 
 
 def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
@@ -128,7 +132,7 @@ def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
 
 
 def described(population: Population, cfg: StudyConfig) -> str:
-    """Return a line on who drives, and behind whom."""
+    """Return a line on the human drivers and their leaders."""
     speed, gap = population.desired_speed, population.time_gap
     own = cfg.leader is not None and "source" not in cfg.leader.settings
     leaders = cfg.leader if own else cfg.data

@@ -195,7 +195,8 @@ class Goal:
         self.task, self.string = cfg.task is not None, scenario.vehicles
         self.length, self.time_step = scenario.vehicle_length, scenario.time_step
         whose = self.string if own else None
-        self.counted = (self.time_step, whose, build_energy(cfg), exact and self.task)
+        self.fleet = build_energy(cfg)
+        self.counted = (self.time_step, whose, self.fleet, exact and self.task)
         self.first: tuple[Tensor, Tensor] | None = None
 
     def __call__(self, data: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -205,7 +206,9 @@ class Goal:
             return energy, misses(data, self.string)
         speed, gap = (data.get(next_key((VEHICLES, x))).flatten(1) for x in ("speed", "gap"))
         distance = speed.sum(1) * self.time_step
-        flow = speed.mean(1) / (gap.mean(1) + self.length)
+        kinds = data.get(CLASS, None)
+        own = self.length if kinds is None else self.fleet.lengths(kinds).flatten(1).mean(1)
+        flow = speed.mean(1) / (gap.mean(1) + own)
         if self.first is None:
             self.first = (energy / distance).detach(), flow.detach()
         per_metre, least = self.first

@@ -143,7 +143,7 @@ class Episodes:
     for every strategy, and the batch size changes a row by no more than rounding.
 
     Args:
-        strategy: who drives, and its environment's configuration.
+        strategy: what drives, and its environment's configuration.
         inputs: held-out windows and drivers.
         plan: which episodes.
         seed: seed of the noise.
@@ -196,6 +196,8 @@ class Episodes:
         record, alive = self.player.play(options, named)
         crashed = (alive.unsqueeze(-2) & (record["vehicles", "gap"] <= 0.0)).any(0).any(-2)
         record, alive = {key: x[self.begun :] for key, x in record.items()}, alive[self.begun :]
+        if self.cfg.scenario.fleet:
+            record["vehicles", "length"] = self.energy.lengths(record[CLASS])
         groups = grouped(record, self.cfg.scenario.vehicles)
         described = describe(
             self.strategy,
@@ -209,13 +211,13 @@ class Episodes:
         described[FASTER] = leader_faster(inputs.evaluation, profile, desired, self.warm_up)
         time_step = self.cfg.scenario.time_step
         leader = leader_measures(inputs.evaluation, profile, self.energy, self.warm_up)
-        if self.cfg.scenario.road == RING:  # where nobody leads
+        if self.cfg.scenario.road == RING:  # without a leader
             leader[:] = np.nan
         # Drivers are recorded by sensors, whose noise costs energy in what they drove.
         recorded = RECORDED in self.cfg.evaluation.baselines
         measured = measures(groups, alive, time_step, self.energy, recorded)
         length, free = self.cfg.scenario.vehicle_length, inputs.population.desired_speed[driver]
-        measured |= traffic(record, alive, length, time_step, free)
+        measured |= traffic(record, alive, length, time_step, free, self.energy)
         rows = pd.concat([described, leader, as_frame(measured, crashed)], axis=1)
         rows = rows.iloc[:count]
         inside = [index - block * plan.size for index in sorted(self.samples)]

@@ -149,6 +149,13 @@ def other_drivers(cfg: StudyConfig) -> str:
     )
 
 
+def classes(cfg: StudyConfig) -> str:
+    """Return a sentence on the classes of ``scenario.fleet`` and their shares; else nothing."""
+    nodes = {name: node.settings for name, node in cfg.scenario.fleet.items() if node is not None}
+    each = (f"{x['share']:.0%} of {' and '.join(x['roles'])}: {name}" for name, x in nodes.items())
+    return f"Classes of vehicles (scenario.fleet): {', '.join(each)}." if nodes else ""
+
+
 def check_width(policy: TensorDictModule, weights: Mapping[str, Any], path: str) -> None:
     """Check that a trained network observes as many entries as one of this string.
 

@@ -27,7 +27,7 @@ INITIAL = "is_init"  # where recurrent modules of TorchRL read that an episode b
 
 
 class GivenPolicy(TensorDictModuleBase):
-    """A policy of somebody else that drives every automated vehicle, without exploration.
+    """A policy from another library that drives every automated vehicle, without exploration.
 
     The module reads ``"observation"``, ``[rows, n]``, and writes ``"action"``, ``[rows, 1]``, a row
     per vehicle; or these entries of the group ``"automated"``, ``[*batch, vehicles, …]``. It may

@@ -199,7 +199,7 @@ METRICS: dict[str, Callable[..., Tensor]] = {
         _turned(over, safe) & (promised > 0.0)
     ),
 }
-# Measures of all vehicles of a string, likewise; ``free`` is v0 [m/s], ``[*batch, 1]``.
+# Measures of all vehicles of a string, likewise; ``free`` is v0 [m/s].
 ROAD_METRICS: dict[str, Callable[..., Tensor]] = {
     "brakings_below_2": lambda over, acceleration: over.begun(acceleration < -2.0),
     "brakings_below_3": lambda over, acceleration: over.begun(acceleration < -3.0),
@@ -243,7 +243,7 @@ def string_measures(
     speed: Tensor,
     gap: Tensor,
     alive: Tensor,
-    length: float,
+    length: float | Tensor,
     time_step: float,
     leader: Tensor | None = None,
 ) -> dict[str, Tensor]:
@@ -253,7 +253,7 @@ def string_measures(
         speed: of every vehicle after each step, ``[time, *batch, N, 1]`` [m/s].
         gap: to the vehicle ahead, likewise [m].
         alive: whether the episode was still running, ``[time, *batch, 1]``.
-        length: of a vehicle [m].
+        length: of a vehicle; a mean over those of an episode, ``[*batch, 1]`` [m].
         time_step: duration of a step [s].
         leader: speed of the vehicle ahead of the string, ``[time, *batch, 1]`` [m/s].
 

@@ -56,7 +56,7 @@ def rules() -> tuple[str, ...]:
 def is_shipped(name: str) -> bool:
     """Whether a name in tables is that of a baseline or a controller of the package.
 
-    A variant's, such as ``alcc``, says who learned; a user's own controller never has such a name.
+    Names of variants, such as ``alcc``, stand for learned policies and are reserved.
     """
     return name.removesuffix(FILTERED) in {DIRECT, PEOPLE, *OF_CACC, *BASELINES, *_files()}
 

@@ -46,7 +46,7 @@ class Player:
         env: the environment, without the single-agent view.
         policy: writes the action; None where none is needed.
         keys: entries to keep; those that the environment lacks are left out.
-        who: who drives, for messages.
+        who: name of the strategy, for messages.
         compiled: compile the step, policy included; where there is no compiler, one line of the
             log says so and the plain step is used.
 

@@ -157,21 +157,27 @@ def as_frame(columns: dict[str, Tensor], collided: Tensor) -> pd.DataFrame:
 
 
 def traffic(
-    record: Record, alive: Tensor, length: float, time_step: float, free: Tensor
+    record: Record, alive: Tensor, length: float, time_step: float, free: Tensor, fleet: Fleet
 ) -> dict[str, Tensor]:
     """Return what the whole string did, each ``[batch, 1]``.
 
-    It is :func:`string_measures` and :data:`ROAD_METRICS`; ``free`` is v0 by episode ``[batch]``.
+    It is :func:`string_measures` and :data:`ROAD_METRICS`; ``free`` is v0 by episode ``[batch]``,
+    and ``length`` that of vehicles without a class [m].
     """
     steps, leader = len(alive), record.get(("leader", "speed"))
     series = {name: entry for (space, name), entry in record.items() if space == "vehicles"}
     series["free"] = free.to(alive.device).view(-1, 1, 1)
+    mean: float | Tensor = length
+    if CLASS in record:
+        kinds = record[CLASS][0]
+        series["free"] = torch.minimum(series["free"], fleet.speed_limits(kinds))
+        mean = length + (fleet.lengths(kinds) - length).mean(-2)
     found = safety_measures(series, alive.unsqueeze(-2), time_step, ROAD_METRICS)
     return found | string_measures(
         record["vehicles", "speed"][-steps:],
         record["vehicles", "gap"],
         alive,
-        length,
+        mean,
         time_step,
         None if leader is None else leader[-steps:],
     )
@@ -252,7 +258,7 @@ def sample(
         columns: dict[str, np.ndarray] = {"time_s": np.arange(1, steps + 1) * time_step}
         for group, series in groups.items():
             for name, values in series.items():
-                rows = values[-alive.shape[0] :][:steps, index].reshape(steps, -1)
+                rows = values[-alive.shape[0] :][:steps, index].flatten(1)
                 rows = measured_ttc(rows) if name == "ttc" else rows
                 for place in range(rows.shape[1]):
                     label = group if rows.shape[1] == 1 else f"{group}{place + 1}"

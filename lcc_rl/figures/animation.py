@@ -19,6 +19,7 @@ from PIL import Image  # comes with matplotlib
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.figures.drawing import INK, legend_above, new_figure, style
 from lcc_rl.figures.ring_picture import ring_picture
+from lcc_rl.figures.unrolled import unroll
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.results.motion import MotionSeries, SampleMotion
@@ -36,7 +37,8 @@ def animate(motions: Mapping[str, SampleMotion], path: str | Path) -> Path:
     """Write an animation; the ending chooses the form.
 
     A page (``.html``) plays in any browser, with a slider; a ``.gif`` or ``.mp4`` plays a long
-    episode faster and says so. They show one episode. An ``.svg`` shows rings side by side.
+    episode faster and says so. They show one episode. An ``.svg`` shows rings side by side. Of an
+    open road an ``.svg``, or a ``.gif`` of several, shows space-time diagrams that unroll.
 
     Args:
         motions: episodes of two moments or more, by what they are for the reader.
@@ -56,8 +58,10 @@ def animate(motions: Mapping[str, SampleMotion], path: str | Path) -> Path:
     with atomic_path(path) as temporary:
         if path.suffix == ".html":
             temporary.write_text(page(motion, title), encoding="utf-8")
-        elif path.suffix == ".svg":
+        elif path.suffix == ".svg" and motion.circumference is not None:
             temporary.write_text(ring_picture(motions), encoding="utf-8")
+        elif path.suffix == ".svg" or len(motions) > 1:
+            unroll(motions, temporary, path.suffix)
         elif path.suffix == ".gif":
             _write_gif(motion, title, temporary)
         else:
@@ -69,8 +73,8 @@ def check_ending(path: Path, episodes: int = 1) -> None:
     """Check that an animation can be written in the form that its file's ending means."""
     if path.suffix not in ANIMATION_FORMATS:
         raise unknown_name("ending of an animation", path.suffix, ANIMATION_FORMATS)
-    if episodes > 1 and path.suffix != ".svg":
-        raise ConfigError(f"{path.suffix} shows one strategy; of a ring, an .svg shows several")
+    if episodes > 1 and path.suffix not in (".svg", ".gif"):
+        raise ConfigError(f"{path.suffix} shows one strategy; an .svg or a .gif shows several")
     if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
         raise ConfigError("an .mp4 needs ffmpeg, which is not installed; write a .html or .gif")
 
@@ -88,7 +92,7 @@ def page(motion: SampleMotion, title: str) -> str:
         "gap": [_numbers(column) for column in short.gap.T],
         "front": _numbers(short.front),
         "leader": None if short.leader is None else _numbers(short.leader),
-        "length": motion.length,
+        "length": motion.lengths.tolist(),
         "circumference": motion.circumference,
         "colours": ROLE_COLOURS,
         "names": {"leader": "leader", AUTOMATED: ROLE_WORDS[1], HUMAN: ROLE_WORDS[0]},
@@ -179,10 +183,11 @@ def _lines(
 def _along(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int) -> None:
     """Place the cars on an open road, in a view that moves with the leader."""
     front = float(motion.front[moment])
-    fronts = [*motion.position[moment], front]
-    cars.set_segments([[(x - motion.length, 0.0), (x, 0.0)] for x in fronts])
-    longest = float((motion.gap + motion.length).sum(axis=1).max())
-    axis.set_xlim(front - longest - 2 * motion.length, front + motion.length)
+    fronts, first = [*motion.position[moment], front], motion.lengths[0]
+    placed = zip(fronts, np.roll(motion.lengths, -1), strict=True)
+    cars.set_segments([[(x - length, 0.0), (x, 0.0)] for x, length in placed])
+    longest = float((motion.gap + motion.lengths[1:]).sum(axis=1).max())
+    axis.set_xlim(front - longest - 2 * first, front + first)
     axis.set_ylim(-1.0, 1.0)
     axis.set_yticks([])
     axis.spines[["left", "right", "top"]].set_visible(False)
@@ -192,7 +197,7 @@ def _along(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int) 
 def _around(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int) -> None:
     """Place the cars on a circle."""
     turn = 2.0 * np.pi / float(motion.circumference or 1.0)
-    reach = np.linspace(-motion.length, 0.0, 5)
+    reach = np.linspace(-motion.lengths[1:], 0.0, 5, axis=1)
     angles = turn * (motion.position[moment][:, None] + reach)
     cars.set_segments(list(np.stack([np.cos(angles), np.sin(angles)], -1)))
     axis.set_aspect("equal")

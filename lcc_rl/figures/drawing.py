@@ -59,7 +59,7 @@ OWN_COLOURS = (
     "#cc79a7",
     "#882255",
     "#117733",
-)  # of the user's own; none of whom they are compared with
+)  # of the user's own; no colour of a baseline
 
 
 def colour(strategy: str) -> str:

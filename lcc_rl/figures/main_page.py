@@ -1,4 +1,4 @@
-"""The page of the main job: who saves energy, within which limits."""
+"""The page of the main job: energy saved by strategy, within which limits."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ HELD_TO = (
     "time; rows with more save by falling back."
 )
 AS_RECORDED = (
-    "The networks and the IDM tuned on these data may have long time gaps as often as the recorded "
-    "drivers of the training recordings; rows with more save by falling back."
+    "The share of long time gaps of the networks and of the IDM tuned on these data may not exceed "
+    "that of the recorded drivers in training; rows with more save by falling back."
 )
 # Files of figures, in the job's folder and without their ending, and their captions.
 RESULT_FIGURES = {

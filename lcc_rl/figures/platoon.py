@@ -185,7 +185,7 @@ def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
     axis.set_yticks(raster.index)
     style(axis, "time [s]", "follower")
     share = float(np.nanmean(raster.to_numpy()))
-    title = f"{case}: who drives in {in_words(strategy)} (DDPG {100 * share:.0f} %)"
+    title = f"{case}: controller in use, {in_words(strategy)} (DDPG {100 * share:.0f} %)"
     axis.set_title(title, loc="right")
     legend_above(axis)
     return figure

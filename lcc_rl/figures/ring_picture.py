@@ -48,7 +48,7 @@ def ring_picture(motions: Mapping[str, SampleMotion]) -> str:
         ConfigError: if a motion is not of a ring road.
     """
     if any(motion.circumference is None for motion in motions.values()):
-        raise ConfigError("an .svg shows the ring road only; write an .html, .gif or .mp4")
+        raise ConfigError("an .svg shows rings or open roads, not both")
     top = max(float(motion.speed.max()) for motion in motions.values())
     panels = [_panel(*item, place, top) for place, item in enumerate(motions.items())]
     wide = WIDE * len(motions)
@@ -63,10 +63,10 @@ def _panel(name: str, motion: SampleMotion, place: int, top: float) -> str:
     step = float(motion.time[1] - motion.time[0])
     shown = motion.at(slice(None, None, max(round(KEY_STEP / step), 1)))
     turn = 360.0 / float(motion.circumference or 1.0)  # of a metre [degrees]
-    angles = -turn * (shown.position - 0.5 * motion.length)
-    long = math.radians(turn) * RADIUS * motion.length
+    angles = -turn * (shown.position - 0.5 * motion.lengths[1:])
+    long = math.radians(turn) * RADIUS * motion.lengths[1:]
     cars = [
-        _car(role != HUMAN, angles[:, car], shown.speed[:, car] / top, long, _time_of(motion))
+        _car(role != HUMAN, angles[:, car], shown.speed[:, car] / top, long[car], _time_of(motion))
         for car, role in enumerate(motion.roles)
     ]
     last = motion.speed[motion.time > motion.time[-1] - 60.0]

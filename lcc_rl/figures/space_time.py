@@ -20,7 +20,7 @@ from lcc_rl.results.motion import SampleMotion, motion_of, sample_episodes, tell
 FEWEST = 3  # vehicles; of fewer, speeds over time show all
 POINT_STEPS = 5  # steps between the points of a line
 MOST_PANELS = 3  # panels
-RIMS = {True: "controlled", False: "human"}  # the fewer of both
+RIMS = {True: "controlled cars", False: "human drivers"}  # the fewer of both
 # Red stands, blue drives: ends that differ without red and green, and nothing fades into white.
 SPEED_COLOURS = LinearSegmentedColormap.from_list(
     "speed", ["#a50f15", "#f0a202", "#2ca25f", "#08519c"]
@@ -53,22 +53,26 @@ def space_time(
             continue
     most = max((len(motion.roles) for motion in found.values()), default=0)
     # Strategies that drive all of the string.
-    whole = [name for name, m in found.items() if len(m.roles) == most >= FEWEST][:MOST_PANELS]
-    if not whole:
-        return None
-    speeds = np.concatenate([found[name].speed.ravel() for name in whole])
+    whole = {name: m for name, m in found.items() if len(m.roles) == most >= FEWEST}
+    return side_by_side(dict([*whole.items()][:MOST_PANELS])) if whole else None
+
+
+@paper
+def side_by_side(motions: Mapping[str, SampleMotion], high: float = 2.6) -> Figure:
+    """Return a diagram of each motion, by what stands above it; ``high`` in inches."""
+    speeds = np.concatenate([motion.speed.ravel() for motion in motions.values()])
     low, top = float(speeds.min()), float(speeds.max())
-    scale = (low if low > 0.3 * top else 0.0, top)  # nobody nearly stands: colours tell more
-    figure = new_figure(COLUMN_WIDTH if len(whole) == 1 else PAGE_WIDTH, 2.6)
-    axes = figure.subplots(1, len(whole), sharey=True, squeeze=False)[0]
-    for axis, name in zip(axes, whole, strict=True):
-        lines = _panel(axis, found[name], scale)
+    scale = (low if low > 0.3 * top else 0.0, top)  # if no car nearly stands, colours tell more
+    figure = new_figure(COLUMN_WIDTH if len(motions) == 1 else PAGE_WIDTH, high)
+    axes = figure.subplots(1, len(motions), sharey=True, squeeze=False)[0]
+    for axis, (name, motion) in zip(axes, motions.items(), strict=True):
+        lines = _panel(axis, motion, scale)
         axis.set_title(lines_of(name))
         unbox(axis)
         axis.set_xlabel("time [s]")
     axes[0].set_ylabel("position [m]")
-    first = found[whole[0]]
-    rims = f"; black rim: {RIMS[_few(first)]}" if len(set(first.roles)) > 1 else ""
+    first = next(iter(motions.values()))
+    rims = f"; black rim: places of {RIMS[_few(first)]}" if len(set(first.roles)) > 1 else ""
     figure.colorbar(lines, ax=axes, label=f"speed [m/s]{rims}")
     return figure
 

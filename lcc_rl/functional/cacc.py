@@ -19,7 +19,7 @@ from lcc_rl.functional.string import gather
 
 
 class Errors(NamedTuple):
-    """What a vehicle knows of its place in the platoon, each ``[*batch, N, 1]``.
+    """Errors of a vehicle's place in the platoon, each ``[*batch, N, 1]``.
 
     gap: e_x(i,i−1) [m]; speed: e_v(i,i−1) [m/s]; leader_gap: e_x(i,0) [m]; leader_speed:
     e_v(i,0) [m/s].

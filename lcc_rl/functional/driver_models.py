@@ -176,7 +176,7 @@ class DriverConstants(ABC):
 
 @dataclass(frozen=True)
 class Reaction:
-    """How drivers lag behind their model and stray from it; all drivers of a population share it.
+    """Reaction delay and noises of a driver model, shared by all drivers of a population.
 
     Args:
         delay: age of the speed, gap and relative speed that a driver reacts to [s].

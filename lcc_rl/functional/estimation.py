@@ -26,7 +26,7 @@ REFERENCE_SPEED = 15.0  # v_ref [m/s]; only scales q so that it is of order one
 
 @dataclass(frozen=True)
 class Belief:
-    """What is believed of a driver: (q, T) and the upper triangle of their covariance.
+    """Estimate of a driver: (q, T) and the upper triangle of their covariance.
 
     Args:
         estimate: (q, T), shape ``[*, 2]``.

@@ -97,7 +97,7 @@ class PlatoonReward:
 
 
 class Decision(NamedTuple):
-    """What the hybrid strategy decides, each ``[*batch, N, 1]``.
+    """Decision of the hybrid strategy, each ``[*batch, N, 1]``.
 
     acceleration [m/s²]; winner: 0 for the rule, 1 for the learned policy; switched, clamped,
     capped: whether the winner changed, the jerk bound cut a candidate, the safe cap cut one.

@@ -56,7 +56,7 @@ class Agreement:
     """By how much the rate of the measured gap differs from the measured relative speed.
 
     A gap is measured by another instrument than speeds are, or replayed from other columns of a
-    record. Where they disagree, nobody knows which is right: each limit is kept by the worse.
+    record. Where they disagree, each limit uses the worse of both.
 
     Args:
         sensing: bounds of errors, which explain some of the difference.

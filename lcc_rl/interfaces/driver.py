@@ -29,6 +29,7 @@ from lcc_rl.interfaces.exported import (
     program,
 )
 from lcc_rl.pieces import CBFFilter, Controller
+from lcc_rl.pieces.controllers import Population
 
 # Own motion, that of the vehicle ahead and of the one behind.
 MEASURED = (
@@ -40,7 +41,7 @@ WIDEST = 200  # numbers remembered in machine code
 
 
 class Driver:
-    """Computes the accelerations of any number of cars, and keeps what each remembers.
+    """Computes the accelerations of any number of cars, and keeps the memory of each.
 
     Args:
         name: a run, a run folder, a policy file, ``pretrained/<name>``, or a controller by name
@@ -51,6 +52,8 @@ class Driver:
         safety: the safety filter behind which it drives; None: a policy's own, and for rules whose
             name ends in ``_filtered`` that of ``+filter=cbf``.
         seed: seed of the drivers' noise; each car that begins draws by the next one.
+        drivers: of the rules that drive as people do, such as ``"human"``, with their reaction, see
+            :mod:`lcc_rl.drivers.population`; None: the shipped ones.
 
     Attributes:
         names: what :meth:`step` reads, SI units: ``"self.gap"`` …
@@ -75,6 +78,7 @@ class Driver:
         trust: Sequence[str] = (),
         safety: CBFFilter | None = None,
         seed: int = 0,
+        drivers: Population | None = None,
     ) -> None:
         usable = isinstance(time_step, (int, float)) and 0.0 < time_step < math.inf
         require(usable, f"time_step must be a positive number of seconds, got {time_step!r}")
@@ -82,6 +86,7 @@ class Driver:
         self.name = who if isinstance(who, str) else label_of(who)
         self.time_step, self.seed = time_step, seed
         if is_policy(who):
+            require(drivers is None, f"drivers are of rules; {self.name} is a policy")
             self.program = program(who, trust, safety=safety)
             trained = self.program.controller.time_step
             if abs(trained - time_step) > 1e-9:
@@ -90,18 +95,20 @@ class Driver:
                     f"{time_step!r} s (in SUMO, --step-length {trained:g} sets it)"
                 )
         else:
-            self.program = self._rule(who, safety)
+            self.program = self._rule(who, safety, drivers)
         self.names = self.program.names
         self.behind = {x for x in self.names if x.startswith("behind.")} - {BEHIND_PRESENT}
         self._check()
         self.reset()
 
-    def _rule(self, who: Any, safety: CBFFilter | None) -> DrivingProgram:
+    def _rule(
+        self, who: Any, safety: CBFFilter | None, drivers: Population | None
+    ) -> DrivingProgram:
         if safety is None and isinstance(who, str) and who.endswith(FILTERED):
             filters = load("evaluate", ["variant=idm", "+filter=cbf"]).scenario.filters
             safety = filters[AUTOMATED].made(CBFFilter)
         node = controller_of(who, safety is not None and safety.time_gap is not None)
-        return driving([node.made(Controller)], safety, measuring(self.time_step))
+        return driving([node.made(Controller)], safety, measuring(self.time_step, True, drivers))
 
     def _check(self) -> None:
         for name in self.names:

@@ -55,7 +55,8 @@ def export(
             ``[batch, 1]``.
         path: the file to write.
         trust: modules outside this package that the policy may name.
-        variant, overrides: of the environment in which a model or module was trained.
+        variant, overrides: of the environment in which a model or module was trained; of a page
+            overrides are settings of its ring.
         normalize: ``VecNormalize`` of a model; by default that of its own environment.
 
     Returns:
@@ -70,9 +71,9 @@ def export(
         >>> export("pretrained/alcc_limits", "alcc.pt2")  # doctest: +SKIP
     """
     path = new_file(path, "name")
-    if path.suffix not in EXPORTERS:
-        raise unknown_name("ending", path.suffix, EXPORTERS)
-    cfg = None
+    if path.suffix not in (*EXPORTERS, PAGE):
+        raise unknown_name("ending", path.suffix, [*EXPORTERS, PAGE])
+    cfg, page = None, path.suffix == PAGE
     if not isinstance(policy, (str, PathLike)):
         given = policy
         if (policy := network_of(given, normalize)) is None:
@@ -84,7 +85,15 @@ def export(
         f"{policy} is a rule; only a trained policy can be exported: give a run folder, a policy "
         f"file or {PRETRAINED}/<name>",
     )
-    content = EXPORTERS[path.suffix](policy, trust, cfg)
+    require(
+        cfg is not None or page or not overrides,
+        f"{' '.join(overrides)}: a program ({path.suffix}) has no road; a page ({PAGE}) has",
+    )
+    require(cfg is None or not page, f"a page ({PAGE}) needs a run or a policy file")
+    if page:
+        content = ring_page(policy, trust, overrides).encode()
+    else:
+        content = EXPORTERS[path.suffix](policy, trust, cfg)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path
@@ -99,17 +108,13 @@ def _program(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> tupl
         "lcc_rl": __version__,
         "inputs": inputs,
     }
+    about["time_step_s"] = module.controller.time_step
     about |= {"output": "acceleration [m/s²]", "filter": module.safety is not None}
     widths = [len(module.names), module.width][: 1 + (module.width > 0)]
     batch = dict(zip(TAKES, [{0: torch.export.Dim("batch", min=1)}] * len(widths), strict=False))
     examples = tuple(torch.ones(2, width) for width in widths)
     made = torch.export.export(module, examples, dynamic_shapes=batch)
     return made, json.dumps(about, ensure_ascii=False)
-
-
-def _as_page(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> bytes:
-    require(cfg is None, "a page (.html) needs a run or a policy file; write .onnx or .pt2")
-    return ring_page(policy, trust).encode()
 
 
 def _as_pt2(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> bytes:
@@ -148,7 +153,8 @@ def _as_onnx(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> byte
     return content
 
 
-EXPORTERS = {".onnx": _as_onnx, ".pt2": _as_pt2, ".html": _as_page}
+PAGE = ".html"
+EXPORTERS = {".onnx": _as_onnx, ".pt2": _as_pt2}
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -157,9 +163,11 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("policy", help="run folder, policy.pt or pretrained/<name>")
     parser.add_argument("path", help="file to write: a program (.onnx, .pt2) or a page (.html)")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
+    what = "of a page: settings of the ring, such as scenario.circumference=300"
+    parser.add_argument("settings", nargs="*", help=what)
     options = parser.parse_args(words)
-    path = export(options.policy, options.path, options.trust)
-    if path.suffix == ".html":
+    path = export(options.policy, options.path, options.trust, overrides=options.settings)
+    if path.suffix == PAGE:
         print(f"{path}: the ring road in the browser, with {options.policy}")
         return 0
     for item in map(described_input, program(options.policy, options.trust).names):

@@ -41,6 +41,7 @@ from lcc_rl.pieces.base import (
     declared,
     next_key,
 )
+from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.knowledge import ObservationMemory
 from lcc_rl.pieces.views import BEHIND, VEHICLES
 from lcc_rl.pieces.world import World
@@ -177,7 +178,7 @@ class DrivingProgram(nn.Module):
             value = torch.cat([columns[name] for name in names], -1)
             if names == DERIVED_INPUTS.get(".".join(key)):
                 value = columns[names[0]] - columns[names[1]]
-                if key[0] == BEHIND and BEHIND_PRESENT in columns:  # zero where there is nobody
+                if key[0] == BEHIND and BEHIND_PRESENT in columns:  # zero where there is none
                     value = value * columns[BEHIND_PRESENT]
             found[key] = value
         return found
@@ -194,13 +195,14 @@ def described_input(name: str) -> Input:
     return Input(name, "–", f"{entry} ({whose.get(view, view)})")
 
 
-def measuring(time_step: float, behind: bool = True) -> World:
+def measuring(time_step: float, behind: bool = True, population: Population | None = None) -> World:
     """Return the world of a vehicle that measures its neighbours, by steps of so many seconds.
 
-    Without ``behind``, there is not always a vehicle behind.
+    Without ``behind``, there is not always a vehicle behind. Human drivers are of the population,
+    by default the shipped one.
     """
     string = VehicleString((AUTOMATED, HUMAN)[: 1 + behind], ring=True, measured=True)
-    return World(string, time_step, population=bootstrap())
+    return World(string, time_step, population=population or bootstrap())
 
 
 def program(
@@ -219,7 +221,8 @@ def program(
         safety: the filter behind which it drives; None: its own.
 
     Raises:
-        ConfigError: if no network drives, or its filter knows the faults of a scenario.
+        ConfigError: if no network drives, its filter knows the faults of a scenario, or its
+            vehicles have a class with limits.
         ResultsError: if the policy cannot be read.
     """
     population, weights = bootstrap(), None
@@ -232,6 +235,12 @@ def program(
     found = {kind: [p for p in pieces if isinstance(p, kind)] for kind in (Observation, Action)}
     if not all(found.values()):
         raise ConfigError(f"{policy}: no network drives its vehicles; nothing to export")
+    for name, node in scenario.fleet.items():
+        if node is not None and AUTOMATED in node.settings["roles"]:
+            raise ConfigError(
+                f"{policy}: it drives vehicles of the class {name} (scenario.fleet), whose limits "
+                "only an environment knows: it cannot drive in SUMO or a file"
+            )
     safety = safety or next((p for p in pieces if isinstance(p, CBFFilter)), None)
     if safety is not None and any(vars(safety).get("remembers", {}).values()):
         raise ConfigError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 
 from lcc_rl.envs.arrays import ArrayEpisodes
 from lcc_rl.envs.step import pieces_of
@@ -12,6 +13,7 @@ from lcc_rl.errors import require
 from lcc_rl.figures.animation import road_picture
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import RolePlaces, StringMotion
+from lcc_rl.pieces.features import CLASS
 from lcc_rl.results.motion import SampleMotion
 
 
@@ -42,19 +44,23 @@ class Film:
         """Return the present moment, ``[height, width, 3]``, uint8."""
         require(bool(self.moments), "call reset before render")
         speed, gap, ahead = map(np.asarray, zip(*self.moments, strict=True))
-        string, length = self.motion.string, self.motion.vehicle_length
+        string, length = self.motion.string, np.array(self.motion.vehicle_length)
+        if CLASS in self.episodes.keys:
+            own = self.motion.fleet.lengths(torch.from_numpy(self._look(*CLASS)).long()).numpy()
+            length = np.array([own[-1] if string.ring else length, *own])
+        lengths = np.broadcast_to(length, len(string) + 1)
         time = np.arange(len(ahead)) * self.motion.time_step
         front, around = np.cumsum(ahead) * self.motion.time_step, None
         if string.ring:
-            around = float(gap[0].sum() + length * len(string))
-            front = np.cumsum(speed[:, 0]) * self.motion.time_step + gap[:, 0] + length
+            around = float(gap[0].sum() + lengths[1:].sum())
+            front = np.cumsum(speed[:, 0]) * self.motion.time_step + gap[:, 0] + lengths[0]
         roles = string.roles
         if self.drawn:
             own = set(self._look(AUTOMATED, "index"))
             others = iter(sorted(roles, key=AUTOMATED.__eq__))
             roles = tuple(AUTOMATED if i in own else next(others) for i in range(len(string)))
         leader = None if string.ring else ahead
-        return road_picture(SampleMotion(time, roles, speed, gap, front, leader, length, around))
+        return road_picture(SampleMotion(time, roles, speed, gap, front, leader, lengths, around))
 
     def _look(self, *key: str) -> Any:
         """Return an entry of the present state."""

@@ -58,7 +58,7 @@ class ProgramInput(Settings):
 
 
 class ProgramFacts(Settings):
-    """What the metadata of a program say."""
+    """Contents of a program's metadata."""
 
     inputs: Annotated[tuple[given_as(ProgramInput), ...], Field(strict=False, min_length=1)]  # type: ignore[valid-type]
     output: Literal["acceleration [m/s²]"]
@@ -160,12 +160,12 @@ def _facts(text: str, path: str) -> ProgramFacts:
 
 
 def _line(error: Exception) -> str:
-    """Return an error of somebody else as one line that is not too long."""
+    """Return an error of another library as one line that is not too long."""
     return one_line(str(error))[:300]
 
 
 class OnnxPolicy(Controller):
-    """Commands what an ONNX program computes from what its metadata name; see the module.
+    """A controller that is an ONNX program; its metadata name its inputs, see the module.
 
     A program that remembers keeps its memory in ``(role, "program")``, ``[*batch, n, width]``. It
     passes no gradient.

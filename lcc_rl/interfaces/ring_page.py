@@ -1,13 +1,14 @@
-"""The ring road of ``task=ring-22`` as a page in which a policy drives, in any browser.
+"""A ring road as a page in which a policy drives, in any browser.
 
 The page needs no server and no other file. It computes the equations of this package with the
-settings of the task, the weights of the policy and the package's random numbers: a seed means the
-same drive in both.
+ring, drivers and cars of the policy's training, or else of ``task=ring-22``, the weights of the
+policy and the package's random numbers: a seed means the same drive in both.
 """
 
 from __future__ import annotations
 
 import json
+import shlex
 from base64 import b64encode
 from collections.abc import Sequence
 from importlib.resources import files
@@ -16,87 +17,131 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from lcc_rl.config import load
+from lcc_rl.config import key_of, load, top_key
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.energy.fuel import STANDSTILL, STILL, CirclesFuel
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import build_energy, load_inputs
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.pattern import AUTOMATED, HUMAN
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.functional.random import stream_id
 from lcc_rl.interfaces.driver import Driver
 from lcc_rl.interfaces.exported import NetworkController
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.cbf import SLOWEST
 from lcc_rl.pieces.controllers import stream_name
-from lcc_rl.pieces.drivers import DriverModel
+from lcc_rl.pieces.drivers import IDM, Drivers
 from lcc_rl.pieces.knowledge import ObservationMemory
+from lcc_rl.results.policies import load_policy
 from lcc_rl.settings import values
 
 RING_TASK = ("variant=alcc", "task=ring-22")
+OF_RING = ("circumference", "string", "vehicle_length", "initial_speed", "time_step")
+OF_RING += ("sensors", "actuators")
+OF_DRIVERS = ("drivers", "controllers.human")
+DRAWS = ("noise", "wiener", "acceleration_noise", "acceleration_noise.before", "driver")
 RING_RULES = ("follower_stopper", "pi_saturation")
 # What the page computes.
 LAYERS, VIEWS = (nn.Linear, nn.ReLU, nn.Tanh), ("self", "ahead", "behind", "memory")
 
 
-def ring_page(policy: str | Path, trust: Sequence[str] = ()) -> str:
+def ring_page(policy: str | Path, trust: Sequence[str] = (), overrides: Sequence[str] = ()) -> str:
     """Return the page, all data inside.
 
     Args:
         policy: a run folder, a policy file, or ``pretrained/<name>``.
         trust: modules outside this package that the policy may name.
+        overrides: settings of the ring, its drivers and cars.
 
     Raises:
-        LccError: if the policy cannot be read, or the page cannot compute it.
+        LccError: if the policy cannot be read, or the page cannot compute it or the ring.
     """
-    text = json.dumps(page_data(policy, trust), ensure_ascii=False, separators=(",", ":"))
+    data = page_data(policy, trust, overrides)
+    text = json.dumps(data, ensure_ascii=False, separators=(",", ":"))
     template = files("lcc_rl.assets").joinpath("ring.html").read_text(encoding="utf-8")
     # Within a script no tag may begin.
     return template.replace("DATA", text.replace("<", "\\u003c"), 1)
 
 
-def page_data(policy: str | Path, trust: Sequence[str] = ()) -> dict[str, Any]:
+def page_data(
+    policy: str | Path, trust: Sequence[str] = (), overrides: Sequence[str] = ()
+) -> dict[str, Any]:
     """Return all numbers of the page; arguments as of :func:`ring_page`."""
-    cfg = load("evaluate", RING_TASK)
-    scenario, energy = cfg.scenario, build_energy(cfg).models[0]
-    assert isinstance(energy, CirclesFuel)
+    cfg = ring_of(policy, trust, overrides)
+    scenario, energy = cfg.scenario, build_energy(cfg).models
+    vehicles = scenario.vehicles
+    car = energy[0] if len(energy) == 1 and isinstance(energy[0], CirclesFuel) else None
+    strange = [f"role {name}" for name in vehicles.names if name not in (HUMAN, AUTOMATED)]
+    strange += [f"scenario.{x}" for x in ("sensors", "actuators") if getattr(scenario, x)]
+    if car is None or car.truck or car.grade:
+        strange.append("energy (it takes one car on a level road: energy=compact)")
+    human = _human(cfg)
+    if human is None:
+        strange.append("drivers (it takes IDM drivers who share a, b and s0, without gap_noise)")
+    if strange or car is None:
+        raise ConfigError(f"{policy}: a page of the ring cannot carry {', '.join(strange)}")
     rules = {name: Driver(name, scenario.time_step).program.controller for name in RING_RULES}
+    count, some = len(vehicles), vehicles.count(AUTOMATED)
+    spread = [k * count // some for k in range(some)]
     return {
         "policy": str(policy),
+        "command": shlex.join(["lcc-rl", "export", str(policy), "ring.html", *overrides]),
         "time_step": scenario.time_step,
         "circumference": scenario.circumference,
         "length": scenario.vehicle_length,
         "initial_speed": scenario.initial_speed,
-        "count": len(scenario.vehicles),
-        "human": _human(cfg),
+        "count": count,
+        "automated": spread if vehicles.drawn else vehicles.places(AUTOMATED),
+        "human": human,
         "streams": {
-            role: {kind: stream_id(f"{stream_name(role)}.{kind}") for kind in ("noise", "wiener")}
+            role: {kind: stream_id(f"{stream_name(role)}.{kind}") for kind in DRAWS}
             for role in (HUMAN, AUTOMATED)
         },
         "rules": {name: {**values(rule), "samples": rule.samples} for name, rule in rules.items()},
         "network": _network(policy, scenario.time_step, trust),
-        "vehicle": energy.vehicle,
-        "fuel": {**energy.own, "standstill": STANDSTILL, "still": STILL},
+        "vehicle": car.vehicle,
+        "fuel": {**car.own, "standstill": STANDSTILL, "still": STILL},
     }
 
 
-def _human(cfg: StudyConfig) -> dict[str, float]:
-    """Return what drives the human drivers."""
+def ring_of(policy: str | Path, trust: Sequence[str], overrides: Sequence[str]) -> StudyConfig:
+    """Return the ring of a policy's training, or else that of the task, with the overrides."""
+    cfg: StudyConfig = load("evaluate", [*RING_TASK, *overrides])
+    own, given = load_policy(policy, trust=trust)[1], [key_of(item) for item in overrides]
+    if own.scenario.road != RING:
+        return cfg
+    for name in OF_RING:
+        if not any(key.startswith(f"scenario.{name}") for key in given):
+            setattr(cfg.scenario, name, getattr(own.scenario, name))
+    if own.drivers is not None and not any(x in key for x in OF_DRIVERS for key in given):
+        cfg.drivers = own.drivers
+        cfg.scenario.controllers[HUMAN] = own.scenario.controllers[HUMAN]
+    if own.energy is not None and "energy" not in map(top_key, given):
+        cfg.energy = own.energy
+    return cfg
+
+
+def _human(cfg: StudyConfig) -> dict[str, Any] | None:
+    """Return what drives the human drivers; None of those whom the page cannot compute."""
     inputs = load_inputs(cfg)
     pieces = pieces_of(build_env(cfg, inputs.evaluation, inputs.population, nominal=True))
-    (human,) = (piece for piece in pieces if isinstance(piece, DriverModel))
+    people = [piece for piece in pieces if isinstance(piece, Drivers)]
+    if [type(piece) for piece in people] != [IDM] or people[0].gap_spread:
+        return None
+    human = people[0]
     own = {"desired_speed": human.desired_speeds, "time_gap": human.time_gaps}
     noise = {"noise": human.noise, "wiener": human.wiener, "spread": human.spreads[0]}
-    return {**{name: float(x) for name, x in own.items()}, **vars(human.drivers), **noise}
+    late = {"late": human.late, "stray": human.noise_spread, **vars(human.noise_step)}
+    drivers = {name: x.tolist() for name, x in own.items()}
+    return {"drivers": drivers, **vars(human.drivers), **noise, **late}
 
 
 def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict[str, Any]:
     """Return weights, scales and memory of a policy, and its safety filter."""
     program = Driver(policy, time_step, trust).program
     controller = program.controller
-    if not isinstance(controller, NetworkController):
-        raise ConfigError(f"{policy}: a rule; a page needs a policy")
+    assert isinstance(controller, NetworkController)
     observation: Any = program.observation
     memory = [piece for piece in program.pieces if isinstance(piece, ObservationMemory)]
     layers = [x for x in controller.layers.modules() if not list(x.children())]

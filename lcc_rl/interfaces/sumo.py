@@ -19,6 +19,7 @@ from unittest.mock import patch
 from lcc_rl.errors import ConfigError, Diverged, how_to_install
 from lcc_rl.interfaces.driver import MEASURED, Driver
 from lcc_rl.pieces import CBFFilter
+from lcc_rl.pieces.controllers import Population
 
 UNCHECKED, RELEASED = 0, -1.0  # SUMO's speed mode without checks, and the speed that releases
 
@@ -42,15 +43,15 @@ class Bridge:
     """Lets a policy or a rule drive vehicles of the SUMO simulation that runs in libsumo.
 
     The commands are executed exactly: SUMO's checks of speeds, right of way and traffic lights are
-    off for the driven vehicles (speed mode 0). SUMO's own model drives a vehicle that sees nobody
-    ahead within ``sight``; its memory then begins anew. If nobody is behind and the policy does
+    off for the driven vehicles (speed mode 0). SUMO's own model drives a vehicle that sees none
+    ahead within ``sight``; its memory then begins anew. If none is behind and the policy does
     not observe that, a vehicle at the own speed and gap is assumed. SUMO changes lanes.
 
     Args:
         driver: a policy or a rule, as :class:`lcc_rl.interfaces.driver.Driver` takes it.
         vehicles: ids of the driven vehicles, which may enter later, or a predicate on ids.
         sight: distance at which a vehicle ahead is seen, bumper to bumper [m].
-        trust, safety, seed: see :class:`lcc_rl.interfaces.driver.Driver`.
+        trust, safety, seed, drivers: see :class:`lcc_rl.interfaces.driver.Driver`.
 
     Raises:
         LccError: if libsumo is missing or runs no simulation, or the driver cannot drive there.
@@ -64,12 +65,13 @@ class Bridge:
         trust: Sequence[str] = (),
         seed: int = 0,
         safety: CBFFilter | None = None,
+        drivers: Population | None = None,
     ) -> None:
         self.sumo = load_sumo()
         if not self.sumo.isLoaded():
             raise ConfigError("SUMO runs no simulation: call libsumo.start([…]) first")
         delta = self.sumo.simulation.getDeltaT()
-        self.driver = Driver(driver, delta, trust, safety, seed)
+        self.driver = Driver(driver, delta, trust, safety, seed, drivers)
         names = {vehicles} if isinstance(vehicles, str) else vehicles
         self.chosen = names if callable(names) else set(names).__contains__
         self.sight = sight
@@ -123,7 +125,7 @@ class Bridge:
             self.sumo.vehicle.setSpeed(car, RELEASED)
 
     def _measured(self, car: str) -> tuple[float, ...] | None:
-        """Return what :data:`MEASURED` names of a vehicle; None if it sees nobody ahead."""
+        """Return what :data:`MEASURED` names of a vehicle; None if it sees no vehicle ahead."""
         cars = self.sumo.vehicle
         ahead, free = cars.getLeader(car, self.sight) or ("", 0.0)
         gap = free + cars.getMinGap(car)  # SUMO's gaps are without the least one desired

@@ -57,7 +57,7 @@ def torch_device(name: torch.device | str) -> torch.device:
 
 
 def available(device: torch.device | str = "cpu") -> int | None:
-    """Return the bytes that can be allocated on a device; None where nobody knows.
+    """Return the bytes that can be allocated on a device; None if it is not known.
 
     On the CPU the least of what the system calls available and what the process's control groups
     leave (Linux); the physical memory where the system says no more (macOS).

@@ -1,4 +1,4 @@
-"""Reads small text files that may come from somebody else: YAML and JSON."""
+"""Reads small text files that may be foreign: YAML and JSON."""
 
 from __future__ import annotations
 

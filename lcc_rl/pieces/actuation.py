@@ -11,7 +11,7 @@ from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
 
 ACTUATION = "actuation"
-HARDEST = 1e3  # braking that nobody commands [m/s²]
+HARDEST = 1e3  # above any braking that is commanded [m/s²]
 
 
 class Actuation(RoleTransform):

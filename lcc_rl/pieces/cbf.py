@@ -65,10 +65,10 @@ class CBFFilter(RoleTransform):
     Where it is, half of the acceleration suffices to keep it, so that the other half can answer a
     vehicle ahead that accelerates. Limits of nearness win.
 
-    Behind a leader at standstill both limits are about the same number, gap / speed, so who comes
-    from afar must break one. With a ``full_speed``, ``longest(v)`` is ``time_gap·v`` from there on
-    and falls with the square of the speed below: the vehicle is near before its leader stands, and
-    pays for it with energy.
+    Behind a leader at standstill both limits are about the same number, gap / speed, so that a
+    vehicle from farther away violates one of them. With a ``full_speed``, ``longest(v)`` is
+    ``time_gap·v`` from there on and falls with the square of the speed below: the vehicle is near
+    before its leader stands, at a cost of energy.
 
     A ``robust`` filter reckons with the scenario's actuators and sensors (:class:`Actuation`,
     :class:`Sensors`). It starts from the worst state within the errors of the measurement, moves it
@@ -260,7 +260,7 @@ class Corrected(RoleTransform):
 
 
 class CBFGuarantee(RoleTransform):
-    """Writes for which steps a filter answers, ``(role, "promised")``, ``[*batch, n, 1]``.
+    """Writes which steps a filter's guarantee covers, ``(role, "promised")``, ``[*batch, n, 1]``.
 
     1 where the vehicle was safe when the step began and the vehicle ahead braked no harder than
     is reckoned with, in the step and since the oldest measurement that may be in use:
@@ -275,9 +275,7 @@ class CBFGuarantee(RoleTransform):
     safety: InstanceOf[CBFFilter]  # the filter, bound
 
     writes = (
-        Entry(
-            "role.promised", "–", "1 where the safety filter answers for the step: see CBFFilter"
-        ),
+        Entry("role.promised", "–", "1 if the guarantee of the safety filter covers the step"),
         Entry("role.safe", "–", "1 where full braking keeps the limit when the step begins"),
     )
 

@@ -32,7 +32,7 @@ PLATOON_ERRORS = ("gap_error", "speed_error", "leader_gap_error", "leader_speed_
 
 
 class Communication(Feature):
-    """Writes what vehicles know of their platoon by radio (HCFS H1–H2).
+    """Writes the errors that vehicles receive from their platoon by radio (HCFS H1–H2).
 
     A connected vehicle hears the connected vehicles ahead of it without a gap in the chain. The
     vehicle ahead of the first of them is the chain's leader; if it is not connected, the first
@@ -58,7 +58,7 @@ class Communication(Feature):
     hearing: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
-        """Find who hears whom.
+        """Find which vehicle receives messages from which.
 
         Raises:
             ConfigError: if a chain goes all the way round a ring.

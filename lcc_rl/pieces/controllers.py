@@ -41,7 +41,7 @@ def stream_name(role: str) -> str:
 
 
 class Population(Protocol):
-    """What the pieces need to know of a driver population."""
+    """Parameters of a driver population that pieces read."""
 
     @property
     def desired_speed(self) -> Tensor:
@@ -123,7 +123,7 @@ class Controller(RoleTransform):
 class Action(Controller):
     """The action of a policy, in [−1, 1], times the largest acceleration.
 
-    Reads ``(role, "action")``, ``[*batch, n, 1]``; like everybody who reads it by its name, it
+    Reads ``(role, "action")``, ``[*batch, n, 1]``; like every piece that reads this entry, it
     sees actions beyond the range as its ends (:mod:`lcc_rl.pieces.views`).
     """
 

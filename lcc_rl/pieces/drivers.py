@@ -25,6 +25,7 @@ from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.functional.random import between, choose, normal, stream_id, uniform
 from lcc_rl.pieces.base import SEED, Entry, require_option
 from lcc_rl.pieces.controllers import Controller, stream_name
+from lcc_rl.pieces.features import first_speeds, of_role, speed_limits
 from lcc_rl.pieces.leader import LEADER_SPEED
 from lcc_rl.pieces.views import MOTION_READS
 from lcc_rl.pieces.world import MOST_LATE, World
@@ -91,7 +92,7 @@ class Drivers(Controller):
 
     def setup(self, world: World) -> None:
         """Take the drivers, and choose what is read and written by the settings."""
-        role = self.name
+        role, self.fleet = self.name, world.energy
         speeds, time_gaps, self.drivers = self.described(world, f"scenario.controllers.{role}")
         reaction = self.reaction(world)
         late, spread, sight = self.delay, self.acceleration_noise, self.gap_noise
@@ -241,9 +242,13 @@ class Drivers(Controller):
         else:
             require_option(self.reset_options[0], driver, count)
         factor = between(self.time_gap_factors, start.get(SEED).unsqueeze(-2), TIME_GAP_STREAM)
-        values = [driver, self.desired_speeds[driver], factor * self.time_gaps[driver]]
+        desired, limits = self.desired_speeds[driver], speed_limits(start, self.fleet)
+        if limits is not None:
+            desired = torch.minimum(desired, of_role(limits, start, self.string, self.name))
+        values = [driver, desired, factor * self.time_gaps[driver]]
         if self.starts:
-            speed = start.get(LEADER_SPEED).unsqueeze(-2).expand_as(values[1])
+            speed = first_speeds(start.get(LEADER_SPEED), len(self.string), limits)
+            speed = of_role(speed, start, self.string, self.name)
             values.append(self.equilibrium_gap(speed, values[1], values[2], driver))
         for key, value in zip(self.constants, values, strict=True):
             start.set(key, value)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.functional.safety import time_gap, time_to_collision
+from lcc_rl.functional.string import gather
 from lcc_rl.pieces.base import SEED, Entry, Feature, StepTransform
 from lcc_rl.pieces.views import NEXT, SELF, VEHICLES
 from lcc_rl.pieces.world import World
@@ -51,12 +54,14 @@ CLASS = (VEHICLES, "energy_class")
 class EnergyClasses(StepTransform):
     """Draws the class of every vehicle at reset, ``("vehicles", "energy_class")``, int64.
 
-    By the episode's seed, so that whoever drives meets the same vehicles; numbers are those of
+    By the episode's seed, so that all strategies meet the same vehicles; numbers are those of
     the fleet's models.
     """
 
     role = VEHICLES
-    keeps = (Entry(CLASS, "–", "number of the vehicle's energy model, of a mixture", whole=True),)
+    keeps = (
+        Entry(CLASS, "–", "number of the vehicle's class, where there are several", whole=True),
+    )
 
     def setup(self, world: World) -> None:
         """Take the classes and their shares from the world."""
@@ -78,6 +83,28 @@ class EnergyClasses(StepTransform):
                 own = (place == index.unsqueeze(-2)).any(-1, keepdim=True)
                 kinds = torch.where(own, _drawn(draw, shares), kinds)
         start.set(CLASS, kinds.expand(*start.batch_size, count, 1).clone())
+
+
+def speed_limits(start: TensorDictBase, fleet: Any) -> Tensor | None:
+    """Return the speed limit of every vehicle at reset, ``[*batch, N, 1]`` [m/s]; None for none."""
+    kinds = start.get(CLASS, None)
+    return None if kinds is None or fleet is None else fleet.speed_limits(kinds)
+
+
+def first_speeds(leader: Tensor, count: int, limits: Tensor | None) -> Tensor:
+    """Return the speed at which each vehicle starts, ``[*batch, N, 1]`` [m/s].
+
+    It is the leader's, ``[*batch, 1]``, or the lowest limit of the vehicle and those ahead of it.
+    """
+    speed = leader.unsqueeze(-2).expand(*leader.shape[:-1], count, 1)
+    return speed if limits is None else torch.minimum(speed, limits.cummin(-2).values)
+
+
+def of_role(entry: Tensor, start: TensorDictBase, string: VehicleString, role: str) -> Tensor:
+    """Return the rows of a role at reset, ``[*batch, n, 1]``, of ``[*batch, N, 1]``."""
+    if string.drawn:
+        return gather(entry, start.get((role, "index")))
+    return entry[..., list(string.places(role)), :]
 
 
 def _drawn(draw: Tensor, shares: Sequence[float]) -> Tensor:

@@ -19,12 +19,12 @@ def _followers(world: World, where: str) -> Tensor:
     """Return speed [m/s] and gap [m] of the recorded drivers, ``[samples, 2]``.
 
     Raises:
-        ConfigError: if nobody was recorded behind the leaders.
+        ConfigError: if no driver was recorded behind the leaders.
     """
     found = None if world.profiles is None else world.profiles.followers
     if found is None:
         raise ConfigError(
-            f"{where}: nobody was recorded behind these leaders; use trajectories of several "
+            f"{where}: no driver was recorded behind these leaders; use trajectories of several "
             "vehicles, such as data=ngsim, data=openacc, data=table or data=episodes"
         )
     followers: Tensor = found
@@ -32,7 +32,7 @@ def _followers(world: World, where: str) -> Tensor:
 
 
 class RecordedDriver(Controller):
-    """Drives as the driver who was recorded behind the leader; for the first place of a string.
+    """Drives as the recorded driver behind the leader; for the first place of a string.
 
     The speeds are those of the record, where gaps are the integral of the relative speed. Those of
     two instruments differ by up to 1 %, which would take the car tens of metres from its recorded

@@ -4,7 +4,7 @@ A term of your own is a class with its settings (:mod:`lcc_rl.settings`), what i
 (:mod:`lcc_rl.pieces.views`) and its formula::
 
     class Comfort(RewardTerm):
-        limit: Positive = 2.0    # jerk that nobody feels [m/s³]
+        limit: Positive = 2.0    # jerk below notice [m/s³]
         reads = ("self.jerk",)
         def reward(self, jerk): return -(jerk.abs() - self.limit).clamp(min=0.0)
 

@@ -16,6 +16,7 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import between, stream_id, uniform
 from lcc_rl.functional.string import advance_string, entries_ahead, selector
 from lcc_rl.pieces.base import SEED, Entry, StepTransform, next_key
+from lcc_rl.pieces.features import CLASS, first_speeds, of_role, speed_limits
 from lcc_rl.pieces.leader import LEADER_SPEED
 from lcc_rl.pieces.views import EPISODE, VEHICLES
 from lcc_rl.pieces.world import Part, World
@@ -76,12 +77,16 @@ class Start(Protocol):
 
 
 class StringMotion(StepTransform):
-    """Moves all vehicles by their commands (A18): the one place with physics."""
+    """Moves all vehicles by their commands (A18): the one place with physics.
+
+    Commands are held within what the vehicles of a class can do, see
+    :class:`lcc_rl.energy.VehicleClass`.
+    """
 
     start: Mapping[str, Any] = field(default_factory=dict)  # by role: a :class:`Start`
     circumference: Positive | None = None  # of a ring road [m]
     circumference_range: Factors = (1.0, 1.0)  # factor of it in training; evaluation takes 1
-    vehicle_length: Positive = 5.0  # of every vehicle, for the flow, and on a ring for the gaps [m]
+    vehicle_length: Positive = 5.0  # of vehicles without a class, on a ring for the gaps [m]
     # Speed of all vehicles at the start on a ring road, where there is no leader [m/s].
     initial_speed: Speed = 0.0
 
@@ -109,7 +114,9 @@ class StringMotion(StepTransform):
         own = [(VEHICLES, name) for name in ("speed", "gap", "acceleration")]
         leader = [] if string.ring else [LEADER_SPEED, next_key(LEADER_SPEED)]
         indices = [(role, "index") for role in string.names] if string.drawn else []
-        self.declare(world, [*own, *leader, *commands, *indices])
+        self.fleet = world.energy
+        self.limited = self.fleet is not None and self.fleet.limited
+        self.declare(world, [*own, *leader, *commands, *indices, *[CLASS] * self.limited])
         self.starts: dict[str, Any] = {
             role: start.bind(world, role) if isinstance(start, Part) else start
             for role, start in self.start.items()
@@ -122,16 +129,22 @@ class StringMotion(StepTransform):
         self.arrange = selector([order.index(place) for place in range(len(order))], len(order))
 
     def _ring_gaps(self, world: World) -> tuple[float, float]:
-        """Return the least and the largest gap at which vehicles spread evenly over a ring [m]."""
+        """Return the least and the largest gap at which vehicles spread evenly over a ring [m].
+
+        They are those without classes, whose lengths :meth:`begin` regards.
+        """
         if self.circumference is None:
             raise ConfigError("scenario.road=ring needs scenario.circumference [m]")
         count, length = len(self.string), self.vehicle_length
         factors = world.deviations(self.circumference_range)
         least, largest = (self.circumference * factor / count - length for factor in factors)
-        if least <= 0:
+        longest = [
+            length if self.fleet is None else self.fleet.longest(x) for x in self.string.roles
+        ]
+        if least + length <= sum(longest) / count:
             raise ConfigError(
                 f"scenario.circumference={self.circumference} (times {factors[0]:g}) is too short "
-                f"for {count} vehicles of {length} m: it must exceed {count * length} m"
+                f"for {count} vehicles of {max(longest)} m: it must exceed {sum(longest)} m"
             )
         return least, largest
 
@@ -140,7 +153,10 @@ class StringMotion(StepTransform):
         leader, reached = (None, None) if self.string.ring else more[:2]
         parts = more[0 if self.string.ring else 2 :]
         roles = len(self.string.names)
-        command = self._assemble(parts[:roles], parts[roles:])
+        indices = parts[roles : 2 * roles] if self.string.drawn else ()
+        command = self._assemble(parts[:roles], indices)
+        if self.limited:
+            command = self.fleet.within(command, speed, self.time_step, parts[-1])
         motion = advance_string(speed, gap, acceleration, command, leader, reached, self.time_step)
         return (*motion, command)
 
@@ -155,28 +171,30 @@ class StringMotion(StepTransform):
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         shape = (*start.batch_size, len(self.string), 1)
+        limits = speed_limits(start, self.fleet)
         if self.ring_gaps is not None:
             speed = torch.full(shape, self.initial_speed, device=start.device)
             gap = between(self.ring_gaps, start.get(SEED).unsqueeze(-2), RING_GAP)
             gap = gap.to(speed.dtype).expand(shape)
+            if limits is not None:
+                longer = self.fleet.lengths(start.get(CLASS)) - self.vehicle_length
+                gap = gap - longer.mean(-2, keepdim=True)
+                speed = torch.minimum(speed, limits.amin(-2, keepdim=True))
             relative = torch.zeros_like(speed)
         else:
-            leader = start.get(LEADER_SPEED)
-            roles = self.string.names
+            leader, roles = start.get(LEADER_SPEED), self.string.names
+            ahead = first_speeds(leader, len(self.string), limits)
             placed = [
-                self.starts[role](start, role, _spread(leader, self.string.count(role)))
+                self.starts[role](start, role, of_role(ahead, start, self.string, role))
                 for role in roles
             ]
             indices = [start.get((role, "index")) for role in roles] if self.string.drawn else []
             speed, gap = (
                 self._assemble(tuple(part), tuple(indices)) for part in zip(*placed, strict=True)
             )
+            speed = speed if limits is None else torch.minimum(speed, limits)
             relative = entries_ahead(leader, speed) - speed
         still = torch.zeros_like(speed)
         values = (speed, gap, relative, still, still.clone(), still.clone())
         for key, value in zip(self.targets, values, strict=True):
             start.set(key, value)
-
-
-def _spread(leader: Tensor, count: int) -> Tensor:
-    return leader.unsqueeze(-2).expand(*leader.shape[:-1], count, 1)

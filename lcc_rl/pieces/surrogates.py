@@ -99,7 +99,7 @@ class Smoothness(RewardTerm):
 
 
 class SpeedSpread(RewardTerm):
-    """Minus the standard deviation of the speeds of all vehicles: how much of a wave there is."""
+    """Minus the standard deviation of the speeds of all vehicles, a measure of waves."""
 
     weight: NonNegative = 0.2  # price of 1 m/s in a step
     floor: Positive = 0.05  # spread of no wave, where the slope ends [m/s]
@@ -113,7 +113,7 @@ class SpeedSpread(RewardTerm):
 
 
 class Correction(RewardTerm):
-    """Minus the square of what the safety filter changes: draws a policy to the filter's limits.
+    """Minus the square of the safety filter's change of the command: draws a policy to its limits.
 
     When the filter overrides the policy, no gradient reaches it, so a policy that starts by
     braking never learns. Only of use with a filter that writes the correction.
@@ -153,7 +153,7 @@ class ExcessSpacing(RewardTerm):
 
 
 class PathEnergy(RewardTerm):
-    """−P/scale · T of the energy that a path takes: without what the motion stores.
+    """−P/scale · T of the path energy: energy without the kinetic energy that is stored.
 
     Of A2's three parts (:func:`lcc_rl.functional.power.acceleration_loss`) the steady power of the
     speeds driven and what accelerating loses; of another model what is drawn less what the

@@ -48,7 +48,7 @@ def as_key(key: NestedKey) -> Key:
 
 
 class Views:
-    """What vehicles of one role see, as tensors of one row per vehicle.
+    """Views of the vehicles of one role, as tensors of one row per vehicle.
 
     Args:
         string: the string of vehicles.
@@ -146,7 +146,7 @@ class Views:
         if distance < 0:
             entry = entries_ahead(entries[lead] if lead >= 0 else None, entry)
         elif distance > 0:
-            # The first vehicles come round to the end on a ring; elsewhere nobody is there.
+            # The first vehicles come round to the end on a ring; elsewhere there is none.
             wrapped = entry[..., :distance, :]
             end = wrapped if self.string.ring else torch.zeros_like(wrapped)
             entry = join([entry[..., distance:, :], end], -2)[..., : len(self.string), :]

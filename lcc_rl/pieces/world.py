@@ -34,7 +34,7 @@ class World:
         horizon: steps of an episode.
         profiles: speed profiles of the leader.
         population: the human drivers.
-        energy: the energy models of the vehicles, :class:`lcc_rl.energy.Fleet`.
+        energy: the classes of the vehicles, :class:`lcc_rl.energy.Fleet`.
         nominal: leaders and starts as in an evaluation, without the deviations of training.
         actuators: settings of the :class:`lcc_rl.pieces.Actuation` of roles that have one.
         sensors: settings of the :class:`lcc_rl.pieces.Sensors` of roles that have some.
@@ -103,7 +103,7 @@ def _sensed(role: str, name: str) -> str:
 
 
 class Part(Settings):
-    """Settings of a part of an environment, and what follows from them in a world."""
+    """Settings of a part of an environment, bound to a world."""
 
     name: ClassVar[str] = ""  # by default; that of a part in an environment is its own
 

@@ -110,7 +110,7 @@ def _cells(row: BoardRow) -> dict[str, str]:
 
 
 def leaderboard(documents: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a Markdown table for each task: on each source, who was scored and what was saved.
+    """Return a Markdown table for each task: policies and savings by source.
 
     Args:
         documents: contents of the files of ``lcc-rl score``, by their names.

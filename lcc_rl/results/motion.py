@@ -28,10 +28,10 @@ class SampleMotion:
         roles: of the N vehicles, front to back.
         speed: ``[T, N]`` [m/s].
         gap: to the vehicle ahead, bumper to bumper, ``[T, N]`` [m].
-        front: front bumper of what the first vehicle follows, ``[T]`` [m]: of the leader, who
+        front: front bumper of what the first vehicle follows, ``[T]`` [m]: of the leader, which
             begins at 0; on a ring of the last vehicle, a round further on.
         leader: the leader's speed, ``[T]`` [m/s]; None on a ring.
-        length: of every vehicle [m].
+        length: of every vehicle; or ``[N + 1]``, of what the first one follows, then of each [m].
         circumference: of a ring [m]; None on an open road.
     """
 
@@ -41,13 +41,18 @@ class SampleMotion:
     gap: MotionSeries
     front: MotionSeries
     leader: MotionSeries | None
-    length: float
+    length: float | MotionSeries
     circumference: float | None
+
+    @property
+    def lengths(self) -> MotionSeries:
+        """Length of what the first vehicle follows, then of each, ``[N + 1]`` [m]."""
+        return np.broadcast_to(self.length, len(self.roles) + 1)
 
     @property
     def position(self) -> MotionSeries:
         """Front bumper of every vehicle, ``[T, N]`` [m]."""
-        found: MotionSeries = self.front[:, None] - np.cumsum(self.gap + self.length, axis=1)
+        found: MotionSeries = self.front[:, None] - np.cumsum(self.gap + self.lengths[:-1], axis=1)
         return found
 
     @property
@@ -119,11 +124,14 @@ def motion_of(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> SampleMotion:
         ResultsError: if the rows lack the place of a vehicle.
     """
     read = _of_platoon if "follower" in rows else _of_string
-    time, leader, speed, gap, roles = read(rows, scenario)
-    length = float(scenario["vehicle_length"])
+    time, leader, speed, gap, roles, own = read(rows, scenario)
+    first = float(scenario["vehicle_length"])
+    if scenario["road"] == RING and own is not None:
+        first = own[-1]
+    length: Any = first if own is None else np.array([first, *own])
     step = np.diff(time, prepend=time[0])
     if scenario["road"] == RING:
-        front = np.cumsum(speed[:, 0] * step) + gap[:, 0] + length
+        front = np.cumsum(speed[:, 0] * step) + gap[:, 0] + first
         around = float(scenario["circumference"])
         return SampleMotion(time, roles, speed, gap, front, None, length, around)
     if leader is None:
@@ -132,7 +140,9 @@ def motion_of(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> SampleMotion:
     return SampleMotion(time, roles, speed, gap, front, leader, length, None)
 
 
-Found = tuple[MotionSeries, MotionSeries | None, MotionSeries, MotionSeries, tuple[str, ...]]
+Series = MotionSeries | None
+# Time, leader's speed, speeds, gaps and roles, and, where vehicles have classes, their lengths.
+Found = tuple[MotionSeries, Series, MotionSeries, MotionSeries, tuple[str, ...], Series]
 
 
 def _of_platoon(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
@@ -144,7 +154,7 @@ def _of_platoon(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
     # A case of a platoon has its own number of vehicles, all automated.
     roles = roles if len(roles) == count else (AUTOMATED,) * count
     leader, own = speed[0].to_numpy(float), speed.drop(columns=0).to_numpy(float)
-    return speed.index.to_numpy(float), leader, own, gap.to_numpy(float), roles
+    return speed.index.to_numpy(float), leader, own, gap.to_numpy(float), roles, None
 
 
 def _driver_of(scenario: Mapping[str, Any]) -> Callable[[str], str]:
@@ -172,7 +182,10 @@ def _of_string(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
     speed, gap = (rows[[f"{x}_{entry}" for x in names]] for entry in ("speed", "gap"))
     leader = rows.get("leader_speed")
     ahead = None if leader is None or leader.isna().any() else leader.to_numpy(float)
-    return time, ahead, speed.to_numpy(float), gap.to_numpy(float), roles
+    own_length = [f"{x}_length" for x in names]
+    given = set(own_length) <= set(rows)
+    length = rows[own_length].iloc[0].to_numpy(float) if given else None
+    return time, ahead, speed.to_numpy(float), gap.to_numpy(float), roles, length
 
 
 def _vehicles(rows: pd.DataFrame, group: str) -> list[str]:

@@ -56,7 +56,7 @@ def check_weights(weights: dict[str, Any]) -> dict[str, Any]:
 
 
 class PolicyFile(Settings):
-    """What a policy's file holds."""
+    """Contents of a policy file."""
 
     weights: Annotated[dict[str, Any], Field(min_length=1), AfterValidator(check_weights)]
     config: str  # of its training, YAML

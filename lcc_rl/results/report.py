@@ -33,7 +33,7 @@ from lcc_rl.results.task import Task
 from lcc_rl.results.units import burns_one_fuel, check_unit, in_unit
 from lcc_rl.results.windows import DISTANCE, DRIVE, TRAINED, WAYS, savings, windows_of
 
-# Whom tables compare with, and whom the verdict compares a network with: the first that there is.
+# Baselines of tables and of the verdict on a network, in order: the first that there is.
 AGAINST = (HUMAN, "idm", "idm_acc_filtered", "idm_acc", "rule", "reference")
 RULE = "rule"  # the IDM tuned on the same data, by the gradient
 RULE_ROWS = (RULE, "idm_acc_filtered", "idm_acc")
@@ -439,8 +439,8 @@ def remarks(windows: pd.DataFrame) -> list[str]:
         )
     if names := named(means[BROKEN], 0.0):
         found.append(
-            f"Steps turn unsafe though the safety filter promises them ({names}): brakes, delays "
-            "or sensors are not as scenario.actuators and scenario.sensors declare."
+            f"Steps that the filter's guarantee covers turn unsafe ({names}): brakes, delays or "
+            "sensors are not as scenario.actuators and scenario.sensors declare."
         )
     return found
 
@@ -448,7 +448,7 @@ def remarks(windows: pd.DataFrame) -> list[str]:
 def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
     """Return a warning for every driver whose desired speed the leaders mostly exceed.
 
-    Such a driver drops back, whoever drives ahead: energies then compare distances, not ways of
+    Such a driver drops back behind any strategy: energies then compare distances, not ways of
     driving. Behind a safety filter a desired speed means other things; networks have none of
     their own, and the share of the drivers behind them.
 

@@ -32,7 +32,7 @@ Bound = Annotated[float | str, BeforeValidator(_bound)]
 
 
 class Task(Settings):
-    """What a task asks for."""
+    """Score, baseline and limits of a task."""
 
     name: str
     # What is minimised: energy, net_energy or path_energy of all vehicles over their distance, or

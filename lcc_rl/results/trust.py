@@ -109,5 +109,11 @@ def own_modules(cfg: Any) -> list[str]:
     return sorted(module for module in modules if not _within_registry(module))
 
 
+def said_again(cfg: Any) -> str:
+    """Return how a command that resumes a run names the modules outside the registry."""
+    own = own_modules(cfg)
+    return f" trust=[{','.join(own)}]" if own else ""
+
+
 def _within_registry(module: str) -> bool:
     return any(module == room or module.startswith(f"{room}.") for room in REGISTRY)

@@ -1,4 +1,4 @@
-"""Energy per distance in the units of whoever reads it."""
+"""Energy per distance in several units."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from lcc_rl.errors import ConfigError, unknown_name
 KJ_PER_WH = 3.6
 MPG = 235.215  # miles per US gallon times litres per 100 km
 ELECTRIC = {"kJ/km": 1.0, "Wh/km": 1.0 / KJ_PER_WH}
-ENERGY_UNITS = (*ELECTRIC, "g/km", "L/100km", "mpg")
+OF_FUEL = ("g/km", "L/100km", "mpg")  # of vehicles that all burn one fuel
+ENERGY_UNITS = (*ELECTRIC, *OF_FUEL)
 
 
 def in_unit(kj_per_km: float, unit: str, energy: Fleet) -> float:
@@ -37,7 +38,7 @@ def check_unit(unit: str, energy: Fleet) -> None:
     """Check that a unit is known and means something for all vehicles, see :func:`in_unit`."""
     if unit not in ENERGY_UNITS:
         raise unknown_name("unit (task.unit)", unit, ENERGY_UNITS)
-    if unit not in ELECTRIC and not burns_one_fuel(energy):
+    if unit in OF_FUEL and not burns_one_fuel(energy):
         raise ConfigError(
             f"task.unit={unit} needs vehicles that all burn one fuel; these burn several, or some "
             "none (energy=…): choose kJ/km or Wh/km"

@@ -24,7 +24,7 @@ RecordColumns = Annotated[dict[str, Any], AfterValidator(check_columns)]
 
 
 class Checkpoint(Settings):
-    """What a checkpoint holds."""
+    """Contents of a checkpoint."""
 
     identity: str
     iteration: Whole

@@ -1,4 +1,4 @@
-"""What a command writes to the terminal, which somebody may stop reading, and what to its log."""
+"""What a command writes to the terminal, whose reader may stop, and what to its log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, cast
 
 from rich import box
 
-# Between INFO, the details, and WARNING: what somebody who waits wants to know.
+# Between INFO, the details, and WARNING: what a waiting user wants to know.
 HEADLINE = 25
 logging.addLevelName(HEADLINE, "NOTE")
 
@@ -98,13 +98,13 @@ class Unbroken:
 
 @contextmanager
 def unbroken_output() -> Iterator[None]:
-    """Let no output end a command: it is dropped where nobody reads it or nothing takes it.
+    """Let no output end a command: it is dropped if it is not read or cannot be written.
 
     A stream that was closed (``>&-``) becomes one to nowhere, and a sign that the terminal's
     encoding lacks is written as its code.
 
     Raises:
-        OSError: at the end, if output could not be written although somebody reads it.
+        OSError: at the end, if output could not be written although it is read.
     """
     own, end = {}, None
     with ExitStack() as stack:

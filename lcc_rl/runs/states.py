@@ -79,7 +79,7 @@ def claim(folder: Path) -> Iterator[None]:
         str(folder.resolve()).encode()  # pyarrow knows names in UTF-8 only
         made = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
-        lock.acquire(timeout=0.3)  # who asks whether it runs holds the lock for a moment
+        lock.acquire(timeout=0.3)  # a query of the state holds the lock for a moment
     except Timeout:
         raise busy(folder) from None
     except (OSError, NotImplementedError, ValueError) as error:  # the last one: of a name

@@ -7,6 +7,7 @@
   lcc-rl reproduce alcc --recipe smoke --seeds 1  # everything once, in seconds
   lcc-rl reproduce hcfs                           # platoon: DDPG, CACC, hybrids
   lcc-rl reproduce ring                           # one automated car in a wave
+  lcc-rl reproduce road data=table data.path=...  # what 5, 10, 20 % would bring
 
 The same command resumes where it stopped: finished runs are skipped, interrupted trainings are
 resumed. results.md in the study's folder shows every table and figure.
@@ -25,7 +26,7 @@ from lcc_rl.config.schemas import FORMATS
 from lcc_rl.io.atomic import own_folder
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.states import claim
-from lcc_rl.studies import ring
+from lcc_rl.studies import ring, road
 from lcc_rl.studies.alcc import results as alcc_results
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.hcfs import results as hcfs_results
@@ -47,7 +48,7 @@ MADE = {
     "figures",
     "ddpg",
 }
-MADE |= {f"{name}.parquet" for name in ("trajectories", "episodes", "steps", "training")}
+MADE |= {f"{name}.parquet" for name in ("trajectories", "leaders", "episodes", "steps", "training")}
 OWN_FOLDER_WORDS = (
     "every run has its own; --seeds is their number, counted from 0, and options of this command "
     "choose the variants"
@@ -56,6 +57,7 @@ STUDY_RESULTS: dict[str, Callable[..., StudyResults]] = {
     "alcc": alcc_results.study_results,
     "hcfs": hcfs_results.study_results,
     "ring": ring.study_results,
+    "road": road.study_results,
 }
 
 
@@ -73,6 +75,11 @@ def run_hcfs(arguments: Namespace) -> None:
 def run_ring(arguments: Namespace) -> None:
     """Evaluate controllers on a ring after a handover."""
     ring.run(arguments.out, arguments.overrides)
+
+
+def run_road(arguments: Namespace) -> None:
+    """Evaluate shares of automated cars among drivers of recorded trajectories."""
+    road.run(arguments.out, arguments.overrides, arguments.shares)
 
 
 def _study(arguments: Namespace, recipe: str | None) -> Study:
@@ -93,6 +100,9 @@ def parser() -> ArgumentParser:
     two.set_defaults(run=run_hcfs)
     three = _subcommand(commands, "ring", "field experiment on a ring (Stern et al. 2018)")
     three.set_defaults(run=run_ring)
+    four = _subcommand(commands, "road", "what automated cars would bring on a recorded road")
+    four.set_defaults(run=run_road)
+    _listing(four, "--shares", road.ROAD_SHARES, "of automated cars [%]: 5,10,20")
     return top
 
 

@@ -165,7 +165,7 @@ def test_samples_left_out_are_described_by_their_rows(tmp_path) -> None:
     vehicle = frame["id"].iloc[700]
     assert f"data row 701, vehicle {vehicle}, column 'v' holds 90 m/s" in report
     blank = f"the first: {path}: data row 801, column 'gap' is blank"
-    assert f"1 samples with a leader but a blank gap follow nobody, {blank}" in report
+    assert f"1 samples with a leader but a blank gap follow no vehicle, {blank}" in report
 
 
 @pytest.mark.parametrize(("step", "columns"), [(0.04, BY_GAP), (1.0, BY_LANE)])

@@ -71,6 +71,19 @@ def test_a_truck_pays_for_the_speed_that_it_cannot_hold() -> None:
     assert per_km.tolist() == pytest.approx([14776.0, 18421.0, 27529.0], rel=1e-4)
 
 
+def test_a_trucks_steady_fuel_grows_with_speed_as_published() -> None:
+    def litres(kmh: float) -> float:
+        speed = torch.tensor(kmh / 3.6)
+        energy = MODELS["Class8Tractor"].power(speed, torch.zeros(())) / speed * 1e5
+        return float(MODELS["Class8Tractor"].burnt(energy)[0])
+
+    assert [litres(kmh) for kmh in (80, 100, 120)] == pytest.approx([29.3, 37.8, 48.5], abs=0.1)
+    slow, middle, fast = (litres(1.609344 * mph) for mph in (55, 65, 75))
+    # A US combination truck: 20 % less (EPA), 27 % more (ATA), see docs/energy.md.
+    assert slow / middle == pytest.approx(0.80, abs=0.03)
+    assert fast / middle == pytest.approx(1.27, abs=0.06)
+
+
 def test_electric_cars_use_what_their_label_says(subtests) -> None:
     for cycle, place in [("udds", 0), ("hwfet", 1)]:
         for car in CARS:

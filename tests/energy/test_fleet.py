@@ -2,13 +2,20 @@
 
 import pytest
 import torch
-from helpers import check_refused, slow_but
+from helpers import check_refused, compose, make_agent, slow_but, small_env, steady, string
 
 import lcc_rl
-from lcc_rl.config import load
-from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet, PaperMotor
+from lcc_rl.agents.actor import shared_policy
+from lcc_rl.commands.evaluation import task_of
+from lcc_rl.config import identity, load
+from lcc_rl.config.nodes import as_plain
+from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet, PaperMotor, VehicleClass
+from lcc_rl.envs import DifferentiableRollout, StringCollector
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.fit import classes
+from lcc_rl.evaluation.rows import traffic
+from lcc_rl.interfaces.exported import program
 from lcc_rl.pieces.features import CLASS
 
 MODELS = {
@@ -111,6 +118,195 @@ def test_fuel_and_carbon_dioxide_are_those_of_each_class() -> None:
     petrol, diesel = 1e6 / 42360.0, 1e6 / MODELS["truck"].heating_value
     litres = [petrol / 745.0, diesel / 832.0, 0.0, petrol / 745.0]
     assert found["fuel_l"].tolist() == pytest.approx(litres)
-    grams = [3.07 * petrol, 3.186 * diesel, 0.0, 3.07 * petrol]
+    grams = [2.348 / 0.745 * petrol, 2.689 / 0.832 * diesel, 0.0, 2.348 / 0.745 * petrol]
     assert found["co2_g"].tolist() == pytest.approx(grams)
     assert Fleet({"electric": ElectricCar()}).burnt(energy) == {}
+
+
+# -- classes with limits ---------------------------------------------------------------------------
+
+TRUCK = MODELS["truck"]
+LIMIT = 9.0  # which the wavy leaders, up to 14 m/s, exceed [m/s]
+TRUCKS = ["+fleet=trucks", f"scenario.fleet.truck.speed_limit={LIMIT}"]
+HALF = [*TRUCKS, "scenario.fleet.truck.share=0.5"]
+ALL = [*HALF, "scenario.fleet.truck.roles=[automated,human]"]
+
+
+def test_a_class_is_bounded_by_power_over_mass_and_speed_less_the_resistances() -> None:
+    speed, full = torch.tensor([5.0, 20.0, 25.0, 30.0]), torch.full((4,), 3.0)
+    lorry = ElectricCar(mass=40e3, drag=0.6, area=10.0, rolling=0.006, power_limit=300e3)
+    drag = 0.5 * 1.2 * 0.6 * 10.0 * speed.square() + 40e3 * 9.81 * 0.006
+    wanted = (300e3 / speed - drag) / (40e3 * 1.03)
+    torch.testing.assert_close(lorry.strongest(speed), wanted)
+    found = VehicleClass(energy=lorry).within(full, speed, 0.1)
+    torch.testing.assert_close(found, wanted, atol=2e-3, rtol=0.0)
+    assert not lorry.infeasible(speed, found).any()
+    assert lorry.infeasible(speed, full).all()
+    # The diesel truck: 212 kW for 25 t, at 30 m/s less than 0.05 m/s².
+    found = VehicleClass(energy=TRUCK, speed_limit=25.0).within(full, speed, 0.1)
+    torch.testing.assert_close(found[1], TRUCK.strongest(speed)[1] - 1e-3)
+    assert 0.2 < found[1] < 0.4
+    assert found[2:].tolist() == pytest.approx([0.0, -50.0])  # the limit
+    braking = -full
+    assert VehicleClass(energy=TRUCK).within(braking, speed, 0.1).equal(braking)
+    assert VehicleClass(energy=TRUCK, bounded=False).within(full, speed, 0.1).equal(full)
+    for without in (PaperMotor(), ElectricCar()):  # no power limit is known
+        assert VehicleClass(energy=without).within(full, speed, 0.1).equal(full)
+
+
+def test_a_trucks_bound_has_the_gradient_of_its_power() -> None:
+    speed = torch.tensor([10.0, 20.0], dtype=torch.float64, requires_grad=True)
+    command = torch.tensor([0.1, 3.0], dtype=torch.float64, requires_grad=True)
+    one = VehicleClass(energy=TRUCK, speed_limit=29.0)
+    assert torch.autograd.gradcheck(lambda a, v: one.within(a, v, 0.1), (command, speed))
+    one.within(command, speed, 0.1).sum().backward()
+    assert command.grad.tolist() == [1.0, 0.0]  # the second is bounded by its speed alone
+    assert speed.grad[0] == 0.0 > speed.grad[1]
+
+
+STRINGS_OF_TRUCKS = [string("automated*2 human*4"), "scenario.string={size: 6, penetration: 0.4}"]
+
+
+@pytest.mark.parametrize("pattern", STRINGS_OF_TRUCKS)
+def test_trucks_keep_their_limits_whatever_is_commanded(pattern) -> None:
+    env = small_env("alcc", 16, [pattern, *ALL, "energy=fuel", "scenario.pieces.collision=null"])
+    data = env.rollout(120, steady(1.0, env), break_when_any_done=False)  # full throttle
+    before, after, kinds = data["vehicles"], data["next", "vehicles"], data[CLASS]
+    trucks = (kinds == 1).expand_as(after["speed"])
+    assert 0.3 < trucks.double().mean() < 0.7
+    assert after["speed"][trucks].max() <= LIMIT + 1e-5
+    assert after["speed"][~trucks].max() > LIMIT + 2.0
+    assert data["vehicles", "speed"][:, 0][trucks[:, 0]].max() <= LIMIT
+    beyond = build_energy(compose("alcc", *ALL, "energy=fuel")).infeasible(
+        before["speed"], after["acceleration"], kinds
+    )
+    assert not beyond[trucks].any()
+    desired = data["human", "desired_speed"]
+    assert (desired == LIMIT).double().mean() > 0.2  # the driver of a truck expects it
+    assert desired.max() > LIMIT + 10.0
+    # Nobody starts faster than the trucks ahead of it.
+    first, kinds = data["vehicles", "speed"][:, 0], kinds[:, 0]
+    behind = (kinds == 1).cumsum(-2) > 0
+    assert first[behind].max() <= LIMIT < first[~behind].max()
+
+
+def test_every_path_drives_trucks_alike() -> None:
+    overrides = [string("automated human*3"), *ALL, "training.gap_range=[0.8,1.5]"]
+    overrides += ["energy=fuel", "scenario.horizon=40"]
+    policy = make_agent(compose("alcc", *overrides)).policy
+    keys = [("vehicles", name) for name in ("speed", "gap", "acceleration", "command", "power")]
+    with torch.no_grad():
+        rolled = small_env("alcc", 8, overrides, seed=3).rollout(
+            40, shared_policy(policy), break_when_any_done=False
+        )
+        unrolled = DifferentiableRollout(small_env("alcc", 8, overrides, seed=3), keys, ())
+        _, record = unrolled.play(unrolled.start(), policy.module, 40)
+        steps = unrolled.assemble(record)["next"]
+    env = small_env("alcc", 8, overrides, seed=3)
+    collector = StringCollector(
+        env, shared_policy(policy), frames_per_batch=320, keys=[("next", *key) for key in keys]
+    )
+    collected = next(iter(collector))["next"]
+    loose = [*overrides, "scenario.fleet.truck.speed_limit=null"]
+    free = small_env("alcc", 8, loose, seed=3)
+    free = free.rollout(40, shared_policy(policy), break_when_any_done=False)["next"]
+    for key in keys:
+        assert torch.equal(steps[key], rolled["next", *key]), key
+        assert torch.equal(collected[key], rolled["next", *key]), key
+    assert not torch.equal(free["vehicles", "speed"], rolled["next", "vehicles", "speed"])
+
+
+def test_a_filter_keeps_its_promise_in_a_truck() -> None:
+    # Full throttle behind the filter: what it allows, a truck may not be able to do.
+    words = [string("automated human*2"), *ALL, "scenario.fleet.truck.share=1", "+filter=cbf"]
+    env = small_env("alcc", 24, [*words, "scenario.pieces.collision=null"], nominal=True)
+    data = env.rollout(200, steady(1.0, env), break_when_any_done=False)["next"]
+    promised = data["automated", "promised"] == 1.0
+    assert promised.double().mean() > 0.9
+    assert (data["vehicles", "ttc"][..., :1, :][promised] >= 4.0).all()
+    assert (data["automated", "safe"][:, 1:][promised[:, :-1]] == 1.0).all()
+
+
+def test_lengths_count_in_flow_and_in_the_gaps_of_a_ring() -> None:
+    motion = {("vehicles", "speed"): torch.full((6, 2, 3, 1), 10.0)}
+    motion["vehicles", "gap"] = motion["vehicles", "speed"][1:]
+    kinds = torch.tensor([[0, 0, 0], [1, 0, 1]]).view(2, 3, 1)
+    fleet = Fleet({"car": MODELS["car"]}).extended(
+        {"truck": VehicleClass(energy=TRUCK, share=0.5, length=20.0, speed_limit=8.0)}, 5.0
+    )
+    record = {**motion, CLASS: kinds.expand(5, 2, 3, 1)}
+    alive = torch.ones(5, 2, 1, dtype=torch.bool)
+    found = traffic(record, alive, 5.0, 0.1, torch.tensor([40.0, 40.0]), fleet)
+    # One car and two trucks of 20 m: 15 m on average.
+    assert found["flow_vph"].flatten().tolist() == pytest.approx([36e3 / 15.0, 36e3 / 25.0])
+    # v0 of a truck is its limit, below which none of them is late.
+    late = [3 * 0.5 * (1 - 10 / 40), 0.5 * (1 - 10 / 40) + 2 * 0.5 * (1 - 10 / 8)]
+    assert found["delay_s"].flatten().tolist() == pytest.approx(late)
+    ring = ["scenario=ring", "drivers=ring", "scenario.circumference=100", "reward=reference"]
+    ring += [string("automated human*3"), "+fleet=trucks", "scenario.fleet.truck.share=0.5"]
+    start = small_env("reference", 8, ring, nominal=True).reset()
+    longer = 16.0 * start[CLASS].double().sum(-2)  # 21 m instead of 5 m
+    gaps = start["vehicles", "gap"]
+    wanted = (100.0 - 20.0 - longer) / 4.0
+    torch.testing.assert_close(gaps.double(), wanted.unsqueeze(-1).expand_as(gaps))
+    with pytest.raises(ConfigError, match=r"it must exceed 68\.0 m"):
+        small_env("reference", 1, [*ring, "scenario.circumference=60"])
+
+
+def test_what_does_not_use_classes_is_what_it_was() -> None:
+    cfg = load("evaluate", ["task=i24-mixed"])
+    content = as_plain(cfg)
+    assert content["scenario"].pop("fleet") == {}
+    assert identity(content) == identity(cfg)
+    assert task_of(cfg).unit == "g/km"
+    trucks = load("evaluate", ["task=i24-mixed", "+fleet=trucks"])  # petrol and diesel
+    assert identity(trucks) != identity(cfg)
+    assert task_of(trucks).unit == "kJ/km"
+    assert (classes(cfg), classes(trucks)) == (
+        "",
+        "Classes of vehicles (scenario.fleet): 15% of human: truck.",
+    )
+    fleet = build_energy(trucks)
+    assert fleet.shares == [1.0, 0.0]
+    assert fleet.roles["human"] == pytest.approx([0.85, 0.15])
+    mixed = build_energy(load("evaluate", ["energy=mixture", "+fleet=trucks"]))
+    assert mixed.names[-1] == "truck"
+    assert mixed.roles["human"] == pytest.approx([*(0.85 * x for x in mixed.shares[:-1]), 0.15])
+
+
+def test_mistakes_in_classes_are_named() -> None:
+    def built(*words):
+        return lambda: small_env("alcc", 1, words)
+
+    check_refused(
+        lambda make: make(),
+        [
+            (built(*TRUCKS, "scenario.fleet.truck.share=2"), "scenario.fleet.truck.share must be"),
+            (built(*TRUCKS, "scenario.fleet.truck.length=0"), "scenario.fleet.truck.length must"),
+            (
+                built(*TRUCKS, "scenario.fleet.truck.roles=[human,lorry]"),
+                r"role \(scenario.fleet.truck.roles\).*lorry.*automated, human",
+            ),
+            (
+                built(*TRUCKS, string("automated")),
+                "fleet.truck.speed_limit=9.0 has no effect: no vehicle of the string is human",
+            ),
+            (built("scenario.fleet={truck: {share: 0.1}}"), r"scenario.fleet.*truck.*_target_"),
+            (
+                built(
+                    *HALF,
+                    "+scenario.fleet.van=${scenario.fleet.truck}",
+                    "scenario.fleet.truck.share=0.8",
+                ),
+                "scenario.fleet: the shares of human must not exceed 1, got 1.6",
+            ),
+            (
+                built("energy=mixture", "+scenario.fleet.suv=${scenario.fleet.truck}", *TRUCKS),
+                "scenario.fleet: energy has a class suv, too",
+            ),
+        ],
+        ConfigError,
+    )
+    cfg = compose("alcc", *ALL)
+    with pytest.raises(ConfigError, match=r"class truck \(scenario.fleet\).*cannot drive in SUMO"):
+        program(make_agent(cfg).policy.module, cfg=cfg)

@@ -71,9 +71,17 @@ def in_float64(population: Any, profiles: Profiles) -> tuple[Any, Profiles]:
     return drivers, replace(profiles, speeds=profiles.speeds.double())
 
 
-def test_gradient_equals_finite_differences() -> None:
+# Half of the vehicles are trucks, which keep to 9 m/s.
+TRUCKS = (
+    *("+fleet=trucks", "scenario.fleet.truck.share=0.5", "scenario.fleet.truck.speed_limit=9"),
+    "scenario.fleet.truck.roles=[automated,human]",
+)
+
+
+@pytest.mark.parametrize("fleet", [(), TRUCKS])
+def test_gradient_equals_finite_differences(fleet) -> None:
     # 20 steps of leader, car, three human drivers and the observation, in float64.
-    cfg = compose("alcc", followers(3))
+    cfg = compose("alcc", followers(3), *fleet)
     population, profiles = in_float64(POPULATION, wavy_profiles())
     with patch("lcc_rl.envs.factory.check_pieces"):  # whose specs are those of float32
         env = build_env(cfg, profiles, population, 4)
@@ -110,12 +118,13 @@ def test_gradients_are_finite_through_contact_and_standstill() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("fleet", [(), TRUCKS])
 @pytest.mark.filterwarnings("ignore")  # the compiler warns of much
-def test_compiled_equals_eager_over_an_episode() -> None:
+def test_compiled_equals_eager_over_an_episode(fleet) -> None:
     network = make_actor(7, 1, (16,), 0).module
     plain, fast = (
         DifferentiableRollout(
-            small_env("alcc", 8, ["scenario.horizon=100"]), WANTED, OBSERVED, compiled=c
+            small_env("alcc", 8, ["scenario.horizon=100", *fleet]), WANTED, OBSERVED, compiled=c
         )
         for c in (False, True)
     )

@@ -12,7 +12,7 @@ import pytest
 import torch
 from commands import DATA
 from helpers import single_env
-from page_blocks import ROOT, blocks
+from page_blocks import ROOT
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
@@ -91,17 +91,11 @@ def test_single_agent_ddpg() -> None:
     assert not torch.equal(vector(actor), before)
 
 
-# -- the page of learners --------------------------------------------------------------------------
+# -- docs/recipes ----------------------------------------------------------------------------------
 
-PAGE = [block.text for block in blocks(ROOT / "docs" / "learners.md")]
-# What marks the program of each recipe.
-RECIPES = {
-    "ppo": '{"PPO": policy}',
-    "recurrent": "GRUModule",
-    "frames": "CatFrames, N=4",
-    "mappo": "centralised = True",
-    "ippo": "centralised = True",
-}
+FOLDER = ROOT / "docs" / "recipes"
+RECIPES = {name: f"{name}.py" for name in ("ppo", "recurrent", "frames", "mappo")}
+RECIPES |= {"ippo": "mappo.py"}
 SMALL = {"19200": str(FRAMES), "768000": str(ITERATIONS * FRAMES), '1.2]"]': f'1.2]", *{DATA}]'}
 
 
@@ -114,10 +108,9 @@ def run_recipe(monkeypatch, kind: str, changes: dict[str, str]) -> dict[str, Any
         return text
 
     shared = ModuleType("my_ppo")
-    (text,) = (text for text in PAGE if text.startswith("# my_ppo.py"))
-    exec(changed(text), vars(shared))
+    exec(changed((FOLDER / "my_ppo.py").read_text()), vars(shared))
     monkeypatch.setitem(sys.modules, "my_ppo", shared)
-    (text,) = (text for text in PAGE if RECIPES[kind] in text and "my_ppo import" in text)
+    text = (FOLDER / RECIPES[kind]).read_text()
     text = text.replace("centralised = True", f"centralised = {kind != 'ippo'}")
     space: dict[str, Any] = {}
 
@@ -167,7 +160,7 @@ def test_the_recipes_of_the_page_drive(monkeypatch, kind) -> None:
 def test_two_workers_train_as_the_page_says(tmp_path) -> None:
     small = {**SMALL, 'alcc", 32': 'alcc", 4'}
     for name in ("my_ppo", "two_workers"):
-        (text,) = (text for text in PAGE if text.startswith(f"# {name}.py"))
+        text = (FOLDER / f"{name}.py").read_text()
         for much, little in small.items():
             text = text.replace(much, little)
         text = text.replace('"evaluation.drivers=24"', repr([*DATA, "experiment=smoke"])[1:-1])

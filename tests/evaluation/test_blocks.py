@@ -117,12 +117,20 @@ def test_resuming_equals_never_having_stopped(whole, tmp_path, monkeypatch, coun
 
 
 def test_an_interrupted_command_names_the_one_that_goes_on(tmp_path, monkeypatch) -> None:
-    words = (*NO_AGENT, "variant=idm", "evaluation.drivers=2", "hydra.run.dir=run")  # one block
+    (tmp_path / "mine.py").write_text(
+        "from lcc_rl.pieces import RewardTerm\n\n\nclass Nothing(RewardTerm):\n"
+        "    reads = ('self.speed',)\n\n    def reward(self, speed):\n        return 0.0 * speed\n"
+    )
+    own = "+reward.terms.nothing={_target_: mine.Nothing, weight: 1.0}"
+    words = (*NO_AGENT, "variant=idm", own, "evaluation.drivers=2", "hydra.run.dir=run")  # a block
     with monkeypatch.context() as patched:
         stop_after(patched, 2)
+        patched.syspath_prepend(tmp_path)
         done = run_command("lcc_rl.cli.evaluate", *words, cwd=tmp_path)
     assert done.returncode == 130
-    assert re.search(r"stopped; go on with: lcc-rl evaluate resume=\S*run$", done.stderr.strip())
+    assert re.search(
+        r"stopped; go on with: lcc-rl evaluate resume=\S*run trust=\[mine\]$", done.stderr.strip()
+    )
 
 
 @pytest.mark.slow

@@ -121,7 +121,9 @@ def test_a_warm_up_is_driven_and_not_counted() -> None:
 def test_a_collision_counts_in_the_warm_up() -> None:
     cfg = compose("alcc", "scenario.horizon=100", "evaluation.warm_up=9.5")
     rammer = steady(1.0, build_env(cfg, PROFILES, POPULATION, len(PROFILES) * 3))
-    rows, _ = evaluate(Strategy("rammer", cfg, rammer), INPUTS, 3, 64, 1)
+    count = len(PROFILES) * 3
+    rows, steps = evaluate(Strategy("rammer", cfg, rammer), INPUTS, 3, 64, 1, count)
     assert rows["collided"].all()
     assert (rows["steps"] == 0).any()
     assert rows.loc[rows["steps"] == 0, ["min_gap_m", "total_energy_kj"]].isna().all(axis=None)
+    assert len(steps) == rows["steps"].sum()  # of every episode, also of those without any

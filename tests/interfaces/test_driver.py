@@ -12,6 +12,7 @@ from helpers import POPULATION, check_refused, wavy_profiles
 from page_blocks import ROOT, blocks
 
 from lcc_rl.config import load
+from lcc_rl.drivers.population import fixed
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.evaluation.strategies import baseline, trained
@@ -144,6 +145,19 @@ def test_a_rule_of_ones_own_drives_behind_a_filter_of_ones_own() -> None:
     assert Driver(f"{__name__}.hold_filtered", 0.1).step(near) == found[0]
     driver = Driver(by_numpy, 0.5)
     assert [driver.step({"self.gap": gap}) for gap in (20.0, 30.0)] == pytest.approx([1.0, 2.0])
+
+
+def test_own_drivers_drive_as_people_do() -> None:
+    """They react late to what was, by their own time gap; other drivers command something else."""
+    start, later = {"self.speed": 12.0, "self.gap": 20.0, "ahead.speed": 13.0}, {"self.gap": 9.0}
+    people = Driver("human", 0.1, drivers=fixed(45.0, 0.83, reaction_delay=0.3))
+    found = [people.step(start | (later if step else {})) for step in range(5)]
+    assert max(found[:4]) == pytest.approx(min(found[:4]), rel=0.05)  # noise is up to 5 %
+    assert found[4] < 0.6 * found[0]
+    gentle = Driver("human", 0.1, drivers=fixed(45.0, 2.0))
+    assert gentle.step(start) < found[0] - 0.3
+    with pytest.raises(ConfigError, match=f"drivers are of rules; {POLICY} is a policy"):
+        Driver(POLICY, 0.1, drivers=POPULATION)
 
 
 def test_bad_input_is_one_clear_error() -> None:

@@ -20,12 +20,13 @@ from lcc_rl.config.nodes import Node
 from lcc_rl.energy import CirclesFuel
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import load_inputs
+from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.named import controller_of
 from lcc_rl.evaluation.rollout import play
 from lcc_rl.evaluation.strategies import by_people, driven_by, trained
 from lcc_rl.functional.pattern import parse_string
 from lcc_rl.interfaces.export import export
-from lcc_rl.interfaces.ring_page import RING_TASK, filter_data, ring_page
+from lcc_rl.interfaces.ring_page import RING_TASK, filter_data, ring_of, ring_page
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.cbf import REMEMBERS
@@ -35,13 +36,16 @@ STEPS, EPISODE = 600, 976413892
 LOUDER = 10.0  # times the task's noise: in a minute a wave grows
 RING, FOLLOW = "pretrained/ring-22", "pretrained/i80-follow"  # with memory; with all of the filter
 ALONE, PAIR = "automated human*21", "automated human*9 automated human*9"
+# Drivers of a table with a reaction, on another ring.
+OTHERS = ("drivers=i80_energy", "scenario.circumference=300")
 # Whose page, who drives, from which step on, in which string.
 CASES = [
-    (RING, "human", 0, ALONE),
-    (RING, "follower_stopper", 200, ALONE),
-    (RING, "pi_saturation", 200, ALONE),
-    (RING, "network", 0, ALONE),
-    (FOLLOW, "network", 0, PAIR),
+    (RING, "human", 0, ALONE, ()),
+    (RING, "follower_stopper", 200, ALONE, ()),
+    (RING, "pi_saturation", 200, ALONE, ()),
+    (RING, "network", 0, ALONE, ()),
+    (FOLLOW, "network", 0, PAIR, ()),
+    (RING, "follower_stopper", 200, ALONE, OTHERS),
 ]
 DRIVE = """<script>
 d.human.spread *= LOUDER;
@@ -94,10 +98,12 @@ def browser(tmp_path_factory):
     return run
 
 
-def driven(policy: str, driver: str, start: int, string: str) -> tuple[torch.Tensor, float]:
+def driven(
+    policy: str, driver: str, start: int, string: str, more: tuple[str, ...]
+) -> tuple[torch.Tensor, float]:
     """Positions of all cars after each step of the package [m], and the fuel of all [g]."""
     settings = [f"scenario.horizon={STEPS}", f"scenario.string={string}"]
-    cfg, actor = load("evaluate", [*RING_TASK, *settings]), None
+    cfg, actor = load("evaluate", [*RING_TASK, *settings, *more]), None
     human, inputs = cfg.scenario.controllers["human"], load_inputs(cfg)
     human = human.changed(wiener=LOUDER * human.made().wiener)
     cfg.scenario.controllers["human"] = human
@@ -131,14 +137,18 @@ def double_precision() -> Iterator[None]:
         torch.set_default_dtype(torch.float32)
 
 
-@pytest.mark.parametrize(("policy", "driver", "start", "string"), slow_but(CASES[3:4], CASES))
+@pytest.mark.parametrize(
+    ("policy", "driver", "start", "string", "settings"), slow_but((CASES[3], CASES[-1]), CASES)
+)
 def test_all_cars_of_the_page_drive_as_those_of_the_package(
-    policy, driver, start, string, browser
+    policy, driver, start, string, settings, browser
 ) -> None:
     case = {"louder": LOUDER, "roles": parse_string(string).roles, "driver": driver, "start": start}
-    ways, fuel = browser(ring_page(policy), DRIVE, **case, steps=STEPS, episode=EPISODE)
+    ways, fuel = browser(
+        ring_page(policy, (), settings), DRIVE, **case, steps=STEPS, episode=EPISODE
+    )
     with double_precision():
-        found, burnt = driven(policy, driver, start, string)
+        found, burnt = driven(policy, driver, start, string, settings)
     apart = (found - 1e-6 * torch.tensor(ways)).abs().max()
     assert apart < 1e-3
     assert fuel == pytest.approx(burnt, rel=1e-5)
@@ -167,6 +177,47 @@ def test_readings_name_their_time_and_the_skip_ends_in_a_wave(browser) -> None:
     assert counts == [22, 18]  # of the lead
 
 
+def test_a_page_has_the_ring_of_the_training_but_for_what_is_given(monkeypatch) -> None:
+    own = (
+        "scenario.circumference=300",
+        "drivers.time_gap=0.83",
+        "scenario.string=automated*2 human*20",
+    )
+    trained_there = {}, load("train", [*RING_TASK, *own, "energy.vehicle=midSUV"])
+    monkeypatch.setattr("lcc_rl.interfaces.ring_page.load_policy", lambda *_, **__: trained_there)
+
+    def found(*given: str) -> tuple[Any, ...]:
+        cfg = ring_of("run", (), given)
+        ring, settings = cfg.scenario, cfg.drivers.settings
+        vehicle = cfg.energy.settings["vehicle"]
+        return ring.circumference, len(ring.vehicles), settings.get("time_gap"), vehicle
+
+    assert found() == (300.0, 22, 0.83, "midSUV")
+    assert found("scenario.circumference=400")[:3] == (400.0, 22, 0.83)
+    assert found("drivers=i80", "energy=compact") == (300.0, 22, None, "Compact")
+
+
+def test_settings_in_the_address(browser) -> None:
+    page = ring_page(RING).replace(
+        "location.search", '"?length=300&T=0.83&delay=x&cars=25&other=1"'
+    )
+    found = "[d.circumference, d.human.drivers.time_gap, ring.cars.length, strange]"
+    script = f"<script>document.title = JSON.stringify({found})</script>"
+    assert browser(page, script) == [300, [0.83], 25, ["delay", "other"]]
+
+
 def test_what_the_page_cannot_compute_is_one_clear_error(tmp_path) -> None:
     cases = [(policy, policy) for policy in ("pretrained/ddpg", "idm_acc")]
     check_refused(lambda policy: export(policy, tmp_path / "ring.html"), cases)
+    settings = {
+        "energy": "energy=mixture",
+        "drivers": "drivers.gap_noise=0.1",
+        "scenario.sensors": "+faults=sensors",
+        "role truck": "scenario.string=automated human truck",
+    }
+    for words, given in settings.items():
+        ring = [given, *("+controller@scenario.controllers.truck=idm",) * ("truck" in given)]
+        with pytest.raises(ConfigError, match=f"cannot carry {words}"):
+            export(RING, tmp_path / "ring.html", overrides=ring)
+    with pytest.raises(ConfigError, match="has no road"):
+        export(RING, tmp_path / "ring.onnx", overrides=["scenario.circumference=300"])

@@ -235,7 +235,7 @@ def test_steps_that_turn_unsafe_show_wrong_actuators(
     assert (alone["share_turned_unsafe"].mean() > 0.0) == turns
     assert (alone["share_promise_broken"].mean() > 0.0) == turns
     assert (alone["share_ttc_unsafe"].mean() > 0.0) == turns
-    assert ("Steps turn unsafe though the safety filter promises" in caplog.text) == turns
+    assert ("Steps that the filter's guarantee covers turn unsafe" in caplog.text) == turns
 
 
 def test_a_leader_beyond_the_bound_breaks_no_promise() -> None:

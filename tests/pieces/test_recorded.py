@@ -95,7 +95,7 @@ def test_the_strategy_starts_and_drives_as_recorded() -> None:
 )
 def test_leaders_without_followers_are_refused(what, overrides) -> None:
     cfg = compose("idm", *overrides)
-    with pytest.raises(ConfigError, match=rf"scenario\.{what}\.automated: nobody was recorded"):
+    with pytest.raises(ConfigError, match=rf"scenario\.{what}\.automated: no driver was recorded"):
         build_env(cfg, wavy_profiles(), POPULATION, 2)
 
 
@@ -134,7 +134,7 @@ def test_followers_stay_beside_their_leaders() -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["leader=udds"], "compare=recorded: nobody was recorded behind these leaders"),
+        (["leader=udds"], "compare=recorded: no driver was recorded behind these leaders"),
         (
             ["scenario=ring", "scenario.string=automated human*3"],
             "compare=recorded: it has no vehicle to drive in this string",
@@ -149,4 +149,4 @@ def test_a_recorded_driver_that_cannot_be_played_is_never_silent(words, message,
     cfg.compare, cfg.evaluation.baselines = [], ["idm", "recorded"]
     with caplog.at_level(logging.WARNING, logger="lcc_rl"):
         assert "recorded" not in [one.name for one in strategies_of(cfg)[0]]
-    assert "recorded is left out: nobody was recorded behind these leaders" in caplog.text
+    assert "recorded is left out: no driver was recorded behind these leaders" in caplog.text

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 import yaml
 from matplotlib.colors import to_rgb
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from lcc_rl.commands import animate as command
 from lcc_rl.errors import ConfigError, ResultsError
@@ -90,6 +90,22 @@ def drifting(vehicles: int = 2, ring: bool = False, seconds: float = 1.2) -> Sam
     )
 
 
+def test_vehicles_of_a_class_have_its_length() -> None:
+    steps = pd.DataFrame({"time_s": [0.1, 0.2], "leader_speed": 10.0})
+    for name, length in (("cav", 5.0), ("hdv", 20.0)):
+        steps = steps.assign(**{f"{name}_{x}": 10.0 for x in ("speed", "gap")})
+        steps[f"{name}_length"] = length
+    for road, lengths in (("open", [5.0, 5.0, 20.0]), ("ring", [20.0, 5.0, 20.0])):
+        scenario = {**OPEN, "road": road, "circumference": 45.0}
+        moved = motion_of(steps, scenario)
+        assert moved.lengths.tolist() == lengths
+        apart = moved.position[0, 0] - moved.position[0, 1]
+        assert apart == pytest.approx(15.0)  # a gap of 10 m and the car ahead
+        assert data_of(page(moved, "trucks"))["length"] == lengths
+        before = moved.front[0] - moved.position[0, 0]
+        assert before == pytest.approx(10.0 + lengths[0])
+
+
 def data_of(text: str) -> dict:
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
     assert found is not None
@@ -148,9 +164,27 @@ def test_an_svg_turns_each_car_by_its_way_and_shows_rings_side_by_side(tmp_path)
     found = np.array([text.split(";") for text in turns[:3]], float).T
     assert found == pytest.approx(-360.0 / 500.0 * middle, abs=0.051)
     assert len(list(root.iter(f"{SVG}circle"))) == 2 + 2  # two roads, two marks
-    for wrong, ending in (({"a": drifting()}, "svg"), ({"a": moved, "b": moved}, "gif")):
+    two = {"a": moved, "b": moved}
+    for wrong, ending in (({"a": moved, "b": drifting()}, "svg"), (two, "gif"), (two, "html")):
         with pytest.raises(ConfigError, match=ending):
             animate(wrong, tmp_path / f"x.{ending}")
+
+
+def test_diagrams_of_open_roads_unroll_side_by_side(tmp_path) -> None:
+    both = {"a < b": drifting(3, seconds=6.0), "c": drifting(4, seconds=6.0)}
+    root = ElementTree.parse(animate(both, tmp_path / "waves.svg")).getroot()
+    covers = [[x.get("values").split(";") for x in rect] for rect in root.iter(f"{SVG}rect")]
+    assert len(covers) == 2
+    for (left, right, _), (wide, *nothing) in covers:
+        assert float(wide) == pytest.approx(float(right) - float(left), abs=0.11)
+        assert nothing == ["0", "0"]
+    with Image.open(animate(both, tmp_path / "waves.gif")) as image:
+        inks = [np.asarray(frame.convert("L")) < 128 for frame in ImageSequence.Iterator(image)]
+    drawn = [
+        [int(ink[:, part].sum()) for ink in inks]
+        for part in np.array_split(range(inks[0].shape[1]), 2)
+    ]
+    assert all(counts == sorted(counts) and counts[-1] > counts[0] for counts in drawn)
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from lcc_rl.studies.results import StudyResults
 LENGTHS = "lengths.parquet"  # rows of the windows of studies with trainings of several lengths
 SOURCES_FILE = "sources.parquet"  # rows of the windows of other sources of leaders
 HCFS_TITLE = "Hybrid Car-Following Strategy: the study"
-# The paper's table and figures of each case: speeds, jerk, and who drives.
+# The paper's table and figures of each case: speeds, jerk, and the controller in use.
 CASES = {
     "case 1": ("Table IV", 4, 5, 6),
     "case 2": ("Table V", 7, 8, 9),
@@ -89,8 +89,8 @@ def _case(found: StudyResults, episodes: pd.DataFrame, steps: pd.DataFrame, case
     pictures = {
         ("velocities", f"speeds (Fig. {speeds})"): platoon.velocities(steps, case),
         ("jerk", f"jerk and its bound (Fig. {jerk})"): platoon.jerks(steps, case, 30.0),
-        ("switching_hcfs", f"who drives, hcfs (Fig. {who})"): platoon.switching(steps, case),
-        ("switching_hcfs_oracle", "who drives, hcfs oracle"): platoon.switching(
+        ("switching_hcfs", f"controller in use, hcfs (Fig. {who})"): platoon.switching(steps, case),
+        ("switching_hcfs_oracle", "controller in use, hcfs oracle"): platoon.switching(
             steps, case, "hcfs oracle"
         ),
     }

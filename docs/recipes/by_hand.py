@@ -1,17 +1,12 @@
-# How to compose an environment by hand
+"""An environment composed of its pieces, from trajectories to a rollout, and CACC as a policy."""
 
-`lcc_rl.make_env` reads the configuration. The same [pieces](pieces.md) compose in Python without it:
-each is a TorchRL transform that is appended to a clock.
-
-## From a trajectory file to a rollout
-
-```python
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from lcc_rl import pieces
+from lcc_rl.agents.controller import ControllerPolicy
 from lcc_rl.data.profiles import leader_profiles
 from lcc_rl.drivers.population import fixed
 from lcc_rl.energy import PaperMotor, as_fleet
@@ -51,36 +46,6 @@ network = torch.nn.Sequential(torch.nn.Linear(3, 1), torch.nn.Tanh())
 policy = TensorDictModule(network, [("automated", "observation")], [ACTION])
 data = env.rollout(300, policy, break_when_any_done=False)
 print(data["next", "vehicles", "gap"].shape, *data["next", "automated", "reward_terms"].keys())
-```
-
-```text
-torch.Size([16, 300, 2, 1]) safety energy
-```
-
-**Clock.** The clock is the only environment; everything else is a transform. It counts steps, ends
-episodes at the horizon and gives each episode a seed, from which the pieces draw all random numbers.
-`actions` gives the shape of the action: one automated vehicle, one number in [−1, 1].
-
-**World.** A piece is constructed from its settings alone. `bind(world)` returns it with everything
-that depends on the string, the time step, the leader's records, the drivers and the energy models.
-
-**Leader.** `leader_profiles` takes the leaders of a table of episodes; `NgsimSource` reads one from
-trajectory files in any published NGSIM layout, plain or `.gz`. `NGSIMLeader` plays a random window of `horizon` steps of a random vehicle and
-skips shorter records. [data.md](data.md) has other sources.
-
-**Order.** A piece reads what those before it wrote: leader, controllers, motion, measurements, end,
-observation, reward. `string` lists the vehicles on the road ([patterns](strings.md#the-pattern));
-each of its roles needs a controller and a start. A piece that reads an entry which no piece writes is
-an error before the first step.
-
-**Reward.** Each term writes `("automated", "reward_terms", name)` times its weight, which is at
-least 0; `TotalReward` names the terms in the sum. In an environment of `make_env`, a term appended with
-`append_transform` joins the sum without being named. Any transform of TorchRL may follow, here `RewardSum`.
-
-## The CACC policy
-
-```python
-from lcc_rl.agents.controller import ControllerPolicy
 
 rule = pieces.CACC().bind(world)
 for name, driver in (("network", policy), ("CACC", ControllerPolicy(rule))):
@@ -90,15 +55,3 @@ for name, driver in (("network", policy), ("CACC", ControllerPolicy(rule))):
     print(f"{name}: {count} collisions, reward {reward:.2f} a step")
 advice = rule(data.clone())["next", "command", "automated"]
 print(advice.shape)
-```
-
-```text
-network: 5 collisions, reward -0.13 a step
-CACC: 0 collisions, reward -0.03 a step
-torch.Size([16, 300, 1, 1])
-```
-
-A controller is a transform, too. As a policy it writes the action (`ControllerPolicy`). Appended in
-place of `Action` it drives, and `Clock` needs no `actions`. Called with a stored rollout it writes
-what it would have commanded. CACC reads the deviations of the gap from `headway` that `Communication`
-writes. Its gains are settings; unstable ones are refused.

@@ -1,0 +1,199 @@
+"""What automated cars would bring on a recorded road: lcc-rl reproduce road.
+
+Drivers are calibrated to trajectories. Strings of them drive behind the recorded leaders, with
+shares of automated cars and without any.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from lcc_rl.commands.evaluation import complete
+from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, read_once
+from lcc_rl.config import key_of, load, quoted, top_key, with_inputs
+from lcc_rl.config.schemas import EvaluateConfig
+from lcc_rl.figures.evaluation import measures_of
+from lcc_rl.functional.pattern import HUMAN
+from lcc_rl.io.files import parquet_metadata, read_parquet, write_parquet
+from lcc_rl.results.bootstrap import LEAST_DRIVES, Estimate
+from lcc_rl.results.measures import MEASURES, Shown
+from lcc_rl.results.names import in_words, several
+from lcc_rl.results.report import Report, windows_for
+from lcc_rl.results.runs import EPISODES, stored_config
+from lcc_rl.results.windows import DRIVE, savings
+from lcc_rl.studies.alcc.study import DRIVERS_FILE
+from lcc_rl.studies.results import StudyResults
+
+ROAD_TITLE = "Automated cars on this road"
+ROAD_SHARES = ("5", "10", "20")  # of automated cars [%]
+# Drivers who keep up: a desired speed below that of the leaders would leave a string behind.
+FITTED = (
+    "data=platoons",
+    "calibration=energy",
+    "calibration.objective=both",
+    "calibration.bounds.desired_speed=[45,50]",
+)
+DRIVEN = (
+    "variant=alcc",
+    "energy=compact",
+    "scenario.string={size: 20, penetration: 0.05}",
+    "scenario.horizon=3000",
+    "evaluation={baselines: [human], behind_filter: [], warm_up: 20, profiles: 100, drivers: 4}",
+    "evaluation.batch_size=128",
+    "compare={network: pretrained/i24-mixed, idm_acc: idm_acc, "
+    "ACC: {_target_: lcc_rl.pieces.LinearACC, desired_speed: 45}}",
+)
+LEADERS_FILE, SHARES_FOLDER = "leaders.parquet", "evaluation"
+OF_DRIVE = " leader "  # between recording and leader in the name of a drive
+LONGEST = 4000  # steps of a window at most
+# Columns of the table, and headings of those that the figure shows.
+COMPARED = {
+    "fuel_l_per_100km": "fuel\n[L/100 km]",
+    "co2_g_per_km": "",
+    "flow_vph": "flow\n[vehicles/h]",
+    "brakings_below_2_per_100km": "brakings < −2 m/s²\n[1/100 km]",
+    "brakings_below_3_per_100km": "",
+    "share_time_gap_short": "time gap < 1 s\n[%]",
+    "travel_time_s_per_km": "",
+}
+SAVED = "fuel_saved_pct"
+
+
+def run(folder: Path, overrides: Sequence[str], shares: Sequence[str] = ROAD_SHARES) -> None:
+    """Calibrate drivers and evaluate every share; finished parts are skipped.
+
+    Args:
+        folder: the study's folder.
+        overrides: options of ``lcc-rl calibrate`` (data, calibration) and ``lcc-rl evaluate``.
+        shares: of automated cars [%].
+
+    Raises:
+        LccError: one clear error for wrong settings or files.
+    """
+    of_data = [item for item in overrides if top_key(item) in ("data", "calibration")]
+    driven = [item for item in overrides if item not in of_data]
+    given, found = {top_key(item) for item in driven}, []
+    cfg = load("pipeline", ["~experiment", *_beside(FITTED, of_data)])
+    first, *_ = [_evaluation(driven, share) for share in shares]  # refused before data are read
+    read_once(cfg, folder, learns=False)
+    if "leader" not in given:
+        drives = leader_drives(read_parquet(folder / TRAJECTORIES), cfg.scenario.time_step)
+        write_parquet(drives, folder / LEADERS_FILE)
+        begun = round(first.evaluation.warm_up / cfg.scenario.time_step)
+        steps = window_steps(drives.groupby("drive").size().to_numpy(), begun)
+        found += ["leader=drives", f"leader.path={quoted(folder / LEADERS_FILE)}"]
+        found += ["leader.evaluation_share=1", "leader.least_variation=0"]
+        found += [f"leader.together='.*(?={OF_DRIVE})'", f"scenario.horizon={steps}"]
+    if "drivers" not in given:
+        path = calibrate_once(cfg, folder)
+        found += ["drivers=calibrated", f"drivers.path={quoted(path)}"]
+    for share in shares:
+        part = with_inputs(_evaluation([*found, *driven], share))
+        complete(part, folder / SHARES_FOLDER / share)
+
+
+def _evaluation(words: Sequence[str], share: str) -> EvaluateConfig:
+    part = f"scenario.string.penetration={share}e-2"
+    cfg: EvaluateConfig = load("evaluate", [*_beside(DRIVEN, words), part])
+    return cfg
+
+
+def _beside(defaults: Sequence[str], words: Sequence[str]) -> list[str]:
+    given = set(map(key_of, words))
+    return [*(item for item in defaults if key_of(item) not in given), *words]
+
+
+def leader_drives(episodes: pd.DataFrame, time_step: float) -> pd.DataFrame:
+    """Return ``drive``, ``time_s`` and ``speed_mps`` of all leaders, whoever followed.
+
+    A drive is as long as its leader was seen, at steps of ``time_step`` [s].
+    """
+    keys = ["recording", "leader_id"]
+    rows = episodes.sort_values([*keys, "time_s"]).drop_duplicates([*keys, "time_s"])
+    begins = ~(rows.groupby(keys)["time_s"].diff() < 1.5 * time_step)
+    since = rows["time_s"].where(begins).ffill().map(" from {:.1f} s".format)
+    names = rows["recording"] + OF_DRIVE + rows["leader_id"].astype(str) + since
+    found = {"drive": names, "time_s": rows["time_s"], "speed_mps": rows["leader_speed_mps"]}
+    return pd.DataFrame(found)
+
+
+def window_steps(samples: np.ndarray, begun: int) -> int:
+    """Return the steps of the windows that count the most time of all drives.
+
+    Args:
+        samples: of every drive.
+        begun: first steps of a window, which do not count.
+    """
+    sizes = np.unique(np.minimum(samples, LONGEST + 1))
+    counted = [(samples // size).sum() * (size - 1 - begun) for size in sizes]
+    return int(sizes[np.argmax(counted)]) - 1
+
+
+def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
+    """Write the study's table and figure, and what was found in data and drivers.
+
+    Raises:
+        ResultsError: if a table is missing or cannot be read.
+    """
+    found = StudyResults(folder, formats)
+    places = sorted((folder / SHARES_FOLDER).iterdir(), key=lambda place: float(place.name))
+    parts = {place.name: windows_for(read_parquet(place / EPISODES)) for place in places}
+    table = pd.DataFrame(row for share, part in parts.items() for row in rows_of(share, part))
+    windows, cfg = parts[places[0].name], stored_config(places[0])
+    drives, scenario, settings = windows[DRIVE].nunique(), cfg["scenario"], cfg["evaluation"]
+    over = "windows of one recording (too few drives: too narrow)"
+    if drives > 1:
+        over = f"{drives} recordings" + " (t-intervals: few drives)" * (drives < LEAST_DRIVES)
+    found.table(
+        "road",
+        f"{scenario['string']['size']} vehicles, {settings['drivers']} times behind each of "
+        f"{several(len(windows['profile_id'].unique()), 'window')} of "
+        f"{scenario['horizon'] * scenario['time_step']:g} s, the first {settings['warm_up']:g} s "
+        "not counted. Brackets: the value of human drivers alone, changed by the 95 % interval of "
+        f"the change, over {over}",
+        table,
+    )
+    shown = [Shown(_column(key), head) for key, head in COMPARED.items() if head]
+    of = [f"{x:g} %" for x in table["automated_pct"]]
+    named = table.assign(of=of, who=[in_words(str(name)) for name in table["strategy"]])
+    one = Report("", table, named, tuple(shown), (), "", "")
+    found.figure("road", "The same values and intervals", measures_of(one))
+    for name, file in (("Data", folder / TRAJECTORIES), ("Drivers", folder / DRIVERS_FILE)):
+        if file.is_file():
+            lines = [f"* {line}" for line in parquet_metadata(file)["report"].splitlines()]
+            new = [line for line in lines if line not in "\n".join(found.blocks)]
+            found.blocks.append("\n".join([f"## {name}\n", *new]))
+    found.write(ROAD_TITLE)
+    return found
+
+
+def _column(key: str) -> str:
+    return f"{key.removeprefix('share_')}_pct" if key.startswith("share_") else key
+
+
+def rows_of(share: str, windows: pd.DataFrame) -> Iterator[dict[str, Any]]:
+    """Yield a row per strategy: measures, and what is left of the humans' by the intervals.
+
+    Args:
+        share: of automated cars [%].
+        windows: of :func:`lcc_rl.results.report.windows_for`.
+    """
+    parts = {str(name): part for name, part in windows.groupby("strategy", sort=False)}
+    for name, part in parts.items():
+        row: dict[str, Any] = {"automated_pct": float(share), "strategy": name}
+        for one in (one for one in MEASURES if one.key in COMPARED):
+            column, *per = one.columns
+            found = savings(windows, column, name, HUMAN, per)
+            low, high = found.over_drives or (found.low, found.high)
+            low, high = (low, high) if name != HUMAN else (np.nan, np.nan)
+            humans = one.value(parts[HUMAN])
+            left = Estimate(one.value(part), humans * (1.0 - high), humans * (1.0 - low))
+            row |= left.columns(_column(one.key), one.scale)
+            if one.key == next(iter(COMPARED)):
+                row |= Estimate(found.value, low, high).columns(SAVED, 100.0)
+        yield row | {"collisions": int(part["collisions"].sum())}

@@ -1,0 +1,67 @@
+"""The road study: one command from trajectories to the table, on the recordings of the package."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from lcc_rl.errors import ResultsError
+from lcc_rl.io.files import read_parquet
+from lcc_rl.studies import road
+from lcc_rl.studies.reproduce import main
+
+SMALL = (
+    "calibration=local",
+    "scenario.string.size=4",
+    "scenario.horizon=60",
+    "evaluation.warm_up=1",
+    "evaluation.profiles=2",
+    "evaluation.drivers=1",
+    "compare=[idm_acc]",
+)
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_one_command_writes_table_figure_and_reports(tmp_path) -> None:
+    command = ["road", "--out", str(tmp_path / "road"), "--shares", "25,50", *SMALL]
+    assert main(command) == 0
+    table = read_parquet(tmp_path / "road" / "tables" / "road.parquet")
+    assert table["automated_pct"].tolist() == [25.0, 25.0, 50.0, 50.0]
+    humans, rule = table.iloc[0], table.iloc[1]
+    assert (humans["strategy"], rule["strategy"]) == ("human", "idm_acc")
+    share = 100.0 * (1.0 - rule["fuel_l_per_100km"] / humans["fuel_l_per_100km"])
+    assert rule["fuel_saved_pct"] == pytest.approx(share)
+    assert humans["co2_g_per_km"] == pytest.approx(23.48 * humans["fuel_l_per_100km"])
+    page = (tmp_path / "road" / "results.md").read_text(encoding="utf-8")
+    assert "4 vehicles, 1 times behind each of 2 windows of 6 s, the first 1 s not counted" in page
+    assert "## Data\n\n* read 33 episodes" in page
+    assert "## Drivers" in page
+    assert "RMSPE of 33 records" in page
+    again = read_parquet(tmp_path / "road" / "leaders.parquet")
+    assert again.groupby("drive").size().max() == 4209  # seven minutes, recorded minute by minute
+    with pytest.raises(ResultsError, match="of other data; choose another folder"):
+        road.run(tmp_path / "road", [*SMALL, "data=stream"])
+
+
+def test_a_leader_is_one_drive_whoever_follows() -> None:
+    rows = {
+        "recording": ["a"] * 8,
+        "leader_id": [1, 1, 1, 1, 1, 2, 2, 1],
+        "time_s": [0.0, 0.1, 0.1, 0.2, 9.0, 0.0, 0.1, 9.1],
+        "leader_speed_mps": [5.0, 6.0, 6.0, 7.0, 1.0, 2.0, 3.0, 4.0],
+    }
+    found = road.leader_drives(pd.DataFrame(rows), 0.1)
+    drives = {str(name): part["speed_mps"].tolist() for name, part in found.groupby("drive")}
+    assert drives == {
+        "a leader 1 from 0.0 s": [5.0, 6.0, 7.0],
+        "a leader 1 from 9.0 s": [1.0, 4.0],
+        "a leader 2 from 0.0 s": [2.0, 3.0],
+    }
+
+
+def test_windows_count_as_much_time_as_they_can() -> None:
+    cases = [([3611] * 4 + [506, 546, 4209], 200, 3610), ([601] * 9, 200, 600)]
+    cases += [([9000] * 3, 200, 4000), ([100, 5000], 50, 4000)]
+    for samples, begun, steps in cases:
+        assert road.window_steps(np.array(samples), begun) == steps
