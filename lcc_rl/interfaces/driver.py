@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -226,7 +226,7 @@ class Driver:
     @cached_property
     def _rows(self) -> Rowwise:
         """The program by rows, once it is needed."""
-        make = kept if self.program.width <= WIDEST else _by_tensors
+        make = partial(kept, fused=True) if self.program.width <= WIDEST else _by_tensors
         return Rowwise(self.program.step, self._examples(1), self.name, make)
 
 
