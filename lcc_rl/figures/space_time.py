@@ -72,7 +72,7 @@ def side_by_side(motions: Mapping[str, SampleMotion], high: float = 2.6) -> Figu
         axis.set_xlabel("time [s]")
     axes[0].set_ylabel("position [m]")
     first = next(iter(motions.values()))
-    rims = f"; black rim: places of {RIMS[_few(first)]}" if len(set(first.roles)) > 1 else ""
+    rims = f"\nblack rim: places of {RIMS[_few(first)]}" if len(set(first.roles)) > 1 else ""
     figure.colorbar(lines, ax=axes, label=f"speed [m/s]{rims}")
     return figure
 

@@ -18,7 +18,7 @@ from lcc_rl.results.motion import SampleMotion
 DPI, HIGH = 160, 3.4  # of the picture [1/inch], [inches]
 POINTS = 400  # of the line of a vehicle, at most
 SECONDS, HELD, FRAMES = 12.0, 3.0, 60  # until all is seen, and how long it stays; frames of a GIF
-PAPER, COLOURS = "#ffffff", 128
+PAPER, COLOURS = "#ffffff", 255
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom [px]
 
