@@ -9,11 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, compile
 from torch._dynamo.exc import TorchDynamoException
-from torch._guards import TracingContext, tracing
 from torch._inductor.exc import CppCompileError, InductorError
-from torch._subclasses import FakeTensorMode
-from torch.fx.experimental.proxy_tensor import make_fx
-from torch.fx.experimental.symbolic_shapes import ShapeEnv
 
 from lcc_rl.functional.recorder import TensorsOnly
 
@@ -79,9 +75,15 @@ class Traced:
         return self.function(*tensors)
 
     def _compiled(self, *tensors: Tensor) -> Sequence[Tensor]:
-        # Graphs traced without symbols of shapes are not kept for later processes.
-        context = TracingContext(FakeTensorMode(shape_env=ShapeEnv()))
         try:
+            # Here, since a later torch may lack some.
+            from torch._guards import TracingContext, tracing
+            from torch._subclasses import FakeTensorMode
+            from torch.fx.experimental.proxy_tensor import make_fx
+            from torch.fx.experimental.symbolic_shapes import ShapeEnv
+
+            # Graphs traced without symbols of shapes are not kept for later processes.
+            context = TracingContext(FakeTensorMode(shape_env=ShapeEnv()))
             with torch.no_grad(), tracing(context):
                 with TensorsOnly():
                     graph = make_fx(self.plain)(*tensors)
