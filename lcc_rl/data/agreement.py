@@ -19,26 +19,17 @@ from lcc_rl.errors import Concern, DataError
 
 OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
 PAIR_SIGNALS = {"gap": "gap_m", "leader": "leader_speed_mps", "follower": "follower_speed_mps"}
-CHANGE_S, EVERY_S, LONGEST_LAG = (
-    2.0,
-    1.0,
-    3.0,
-)  # changes compared, time between them, longest lag [s]
+CHANGE_S, EVERY_S = 2.0, 1.0  # changes compared, and the time between them [s]
+LONGEST_LAG = 3.0  # [s]
 # Of changes [s], share explained, relative motion in a window [m]: less is too little to tell.
 LEAST_S, LEAST_FIT, LEAST_MOTION, LEAST_ALL_S = 6.0, 0.9, 0.15, 100.0
 GAIN, FLOOR = 6.0, 2e-4  # a lag leaves so much less unexplained; what exact data leave
 RIDGE = np.diag([1e-6, 1e-6, 0.1])  # [m²]: of a bias of speeds, which steady traffic leaves open
 LEAST_WAY = 50.0  # a shorter way says nothing of the unit of a speed [m]
-NEAR_MISTAKE, ALIKE = (
-    1.25,
-    1.05,
-)  # a mistake is so near to the coefficients, or as near as another one
+NEAR_MISTAKE, ALIKE = 1.25, 1.05  # a mistake so near to the coefficients; to another mistake
 LOUD = 0.3  # lag that is reported [s]
-STANDING, LEAST_STANDING, FAR_STANDING = (
-    0.5,
-    300,
-    15.0,
-)  # speed [m/s], samples; gap that may be in feet [m]
+STANDING, LEAST_STANDING = 0.5, 300  # speed [m/s], samples
+FAR_STANDING = 15.0  # gap that may be in feet [m]
 
 
 def agreement(episodes: pd.DataFrame) -> pd.DataFrame:

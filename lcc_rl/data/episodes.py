@@ -43,9 +43,8 @@ PAIR_FIELDS = (
     Column("gap", "length", blank=True),
 )
 PAIR_MEASURED = [column.key for column in PAIR_FIELDS if column.blank]  # a blank cell costs the row
-EPISODE_NAMES = dict(
-    zip((column.key for column in PAIR_FIELDS), SCHEMA, strict=True)
-)  # names by default
+# Names by default.
+EPISODE_NAMES = dict(zip((column.key for column in PAIR_FIELDS), SCHEMA, strict=True))
 EPISODE_ALIASES = {"event": "episode", "period": "recording"}
 DERIVED_POSITIONS = "no positions given: those of leaders are the integral of their speeds"
 MOTION_COLUMNS = [name for name in SCHEMA if name.endswith(("_position_m", "_speed_mps", "gap_m"))]

@@ -26,12 +26,12 @@ from lcc_rl.data.profiles import (
     nothing,
     resample,
 )
-from lcc_rl.data.sources import NgsimSource, find_files
+from lcc_rl.data.sources import find_files
 from lcc_rl.data.speed_records import DRIVE_COLUMNS, DRIVE_FIELDS, read_drives, read_speed_record
 from lcc_rl.data.tables import check_map
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.errors import ConfigError, DataError, require_positive, unknown_name
-from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, checked, parse
+from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, parse
 
 LISTED = 8  # names in a line
 WHOLE_RECORD = "full length"  # a case that is a whole record, before the record's name
@@ -202,22 +202,6 @@ class RecordLeaders(Settings):
         if not settings.path:
             raise ConfigError(f"{where}.path is required: the name of a cycle or a file")
         return settings
-
-
-@checked
-def from_trajectories(path: str | Path | Sequence[str], time_step: Positive) -> Profiles:
-    """Read the speed profiles of the leaders in car-following episodes of NGSIM files.
-
-    Args:
-        path: one or several files of any published NGSIM layout, or a pattern; see
-            :class:`lcc_rl.data.sources.NgsimSource`, whose default criteria apply.
-        time_step: step of the profiles [s]; the records are interpolated to it.
-
-    Raises:
-        DataError: if a file cannot be read or holds no car-following episode.
-    """
-    episodes = NgsimSource(path=path).load().episodes
-    return at_step(leader_profiles(episodes, FRAME), time_step)
 
 
 class TrajectoryLeaders(Settings):
