@@ -264,7 +264,8 @@ def one_run(setting: str, choice: int) -> str:
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     """An empty folder whose modules are found, and forgotten afterwards."""
-    monkeypatch.syspath_prepend(str(tmp_path))
+    for place in (ROOT / "docs" / "recipes", tmp_path):
+        monkeypatch.syspath_prepend(str(place))
     yield tmp_path
     for path in tmp_path.glob("*.py"):
         sys.modules.pop(path.stem, None)

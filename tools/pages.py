@@ -111,7 +111,7 @@ def study(name: str, reference: Path, docs: Path) -> None:
 
 
 def tasks(reference: Path, docs: Path) -> None:
-    """Write the tables of docs/{fleets,leaderboard,limits}.md."""
+    """Write the tables of docs/{fleets,leaderboard,limits,notes/results}.md."""
     tables = {path.stem: read_parquet(path) for path in sorted((reference / "tasks").glob("*"))}
     parts = [task_table(name, tables[name]) for name in TASKS_SHOWN]
     rows = tables["fleets_fronts"]
@@ -122,7 +122,8 @@ def tasks(reference: Path, docs: Path) -> None:
     documents = {path.name: read_json(path) for path in files}
     with naming_run(reference / "scores"):
         table = board.leaderboard(documents)
-    fill(docs / "leaderboard.md", {"board": table, "tasks": "\n\n".join(parts)})
+    fill(docs / "leaderboard.md", {"board": table})
+    fill(docs / "notes" / "results.md", {"tasks": "\n\n".join(parts)})
     kept = read_parquet(reference / "averaged.parquet")
     fill(docs / "limits.md", {"averaged": averaged(kept)})
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -26,9 +27,15 @@ from lcc_rl.drivers.parameters import (
     find_law,
     fitted,
 )
-from lcc_rl.drivers.twins import HELD, accelerate, compare_twins
+from lcc_rl.drivers.twins import HELD, accelerate, compare_twins, measure_recorded
 from lcc_rl.errors import Concern, ConfigError, DataError, unknown_name
-from lcc_rl.functional.driver_models import INDIVIDUAL, PARAMETERS, DriverConstants, Parameter
+from lcc_rl.functional.driver_models import (
+    INDIVIDUAL,
+    PARAMETERS,
+    DriverConstants,
+    Parameter,
+    Reaction,
+)
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.settings import Positive, Settings
 
@@ -51,14 +58,24 @@ class Calibration:
 
     Args:
         drivers: one row per driver, in the order of the episodes in the input.
+        compared: returns the two below; the drivers are driven when one of them is asked for.
+
+    Attributes:
         report: what was dropped, chosen and found, in plain lines.
         twins: what :func:`lcc_rl.drivers.twins.compare_twins` measured of the recorded and of the
             calibrated drivers, with the column mode.
     """
 
     drivers: pd.DataFrame
-    report: list[str]
-    twins: pd.DataFrame
+    compared: Callable[[], tuple[list[str], pd.DataFrame]]
+
+    @property
+    def report(self) -> list[str]:
+        return self.compared()[0]
+
+    @property
+    def twins(self) -> pd.DataFrame:
+        return self.compared()[1]
 
 
 # The parameters that the local mode does not fit; None: the default of the driver model.
@@ -142,22 +159,32 @@ class Calibrator(Settings):
         observed = episodes
         if not isinstance(observed, Observed):
             observed = observe(observed, self.selection)
-        if self.reaction and not accelerate(observed):
+        if self.reaction and not accelerate(measure_recorded(observed)):
             raise DataError(f"{HELD}: too little to choose a reaction by; use calibration=local")
-        parts, twins, report = [], [], list(observed.report)
-        for mode in dict.fromkeys(self.modes):
-            drivers, lines = _Fit(self, mode, observed, seed, device, progress).drivers()
-            reaction, measured, more = compare_twins(
-                observed, drivers, self.reaction, progress, self.perception
-            )
-            twins.append(measured.assign(mode=mode))
-            if self.reaction:
-                own = {REACTION[name][0]: value for name, value in vars(reaction).items()}
-                drivers = drivers.assign(**own)
-            parts.append(drivers)
-            report += [type(line)(f"{mode}: {line}") for line in [*lines, *more]]
-        tables = (pd.concat(tables, ignore_index=True) for tables in (parts, twins))
-        return Calibration(next(tables), report, next(tables))
+        fits = {
+            mode: _Fit(self, mode, observed, seed, device, progress).drivers()
+            for mode in dict.fromkeys(self.modes)
+        }
+
+        @cache
+        def twins(mode: str) -> tuple[Reaction, pd.DataFrame, list[str]]:
+            return compare_twins(observed, fits[mode][0], self.reaction, progress, self.perception)
+
+        @cache
+        def compared() -> tuple[list[str], pd.DataFrame]:
+            lines = [
+                type(line)(f"{mode}: {line}")
+                for mode, (_, found) in fits.items()
+                for line in [*found, *twins(mode)[2]]
+            ]
+            parts = [twins(mode)[1].assign(mode=mode) for mode in fits]
+            return [*observed.report, *lines], pd.concat(parts, ignore_index=True)
+
+        parts = []
+        for mode, (drivers, _) in fits.items():
+            own = vars(twins(mode)[0]) if self.reaction else {}
+            parts.append(drivers.assign(**{REACTION[name][0]: x for name, x in own.items()}))
+        return Calibration(pd.concat(parts, ignore_index=True), compared)
 
 
 class _Fit:

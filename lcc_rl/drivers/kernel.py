@@ -65,7 +65,7 @@ def squared_errors(
         Untranslatable: if the law has an operation without a counterpart on numbers.
     """
     constants = {name: x for name, x in vars(law).items() if name not in law.shared()}
-    return kept(_source(type(law), tuple(constants.items()), time_step, dtype))
+    return kept(_source(type(law), tuple(constants.items()), time_step, dtype), fused=True)
 
 
 @cache

@@ -432,7 +432,7 @@ def compare_twins(
             TWINS: drive_twins(observed, drivers, [Reaction()], 1)[0],
         }
         line = f"{HELD}: too little to tell how true calibrated ones are in energy"
-        if accelerate(observed):
+        if accelerate(records):
             line = _line(TWINS, found, one_step_error(observed, drivers, 0.0))
         return Reaction(), _together(found, observed), [line]
     tries = tried(observed, drivers, progress, perception)
@@ -456,9 +456,8 @@ def compare_twins(
     return reaction, _together(found, observed), lines
 
 
-def accelerate(observed: Observed) -> bool:
-    """Whether drivers lose a measurable part of their energy to accelerating."""
-    records = measure_recorded(observed)
+def accelerate(records: pd.DataFrame) -> bool:
+    """Whether measured drivers lose a measurable part of their energy to accelerating."""
     lost, energy = (records[f"{x}_{AVERAGES[0]}s_j"].sum() for x in ("lost", "energy"))
     return bool(lost > LEAST_LOST * energy)
 

@@ -6,9 +6,16 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from torch import compile
+import torch
+from torch import Tensor, compile
 from torch._dynamo.exc import TorchDynamoException
+from torch._guards import TracingContext, tracing
 from torch._inductor.exc import CppCompileError, InductorError
+from torch._subclasses import FakeTensorMode
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx.experimental.symbolic_shapes import ShapeEnv
+
+from lcc_rl.functional.recorder import TensorsOnly
 
 log = logging.getLogger("lcc_rl")
 
@@ -47,6 +54,43 @@ class Compiled:
             log.info("not compiling %s: %s", self.what, str(error).strip().splitlines()[0])
             self.function = self.plain
             return self.plain(*arguments)
+
+
+class Traced:
+    """A function of tensors alone, compiled at its first call for their shapes and strides.
+
+    Nothing is checked before later calls, which takes four times as long as a step of 128 episodes:
+    what the function keeps must not change. Where it cannot be compiled, it is called as it is.
+
+    Args:
+        function: maps tensors to a sequence of tensors.
+        what: its name in the line of the log that says that it is not compiled.
+        compiled: False for the plain function.
+    """
+
+    def __init__(
+        self, function: Callable[..., Sequence[Tensor]], what: str, compiled: bool
+    ) -> None:
+        self.plain, self.what = function, what
+        self.function = self._compiled if compiled else function
+
+    def __call__(self, *tensors: Tensor) -> Sequence[Tensor]:
+        """Call the function."""
+        return self.function(*tensors)
+
+    def _compiled(self, *tensors: Tensor) -> Sequence[Tensor]:
+        # Graphs traced without symbols of shapes are not kept for later processes.
+        context = TracingContext(FakeTensorMode(shape_env=ShapeEnv()))
+        try:
+            with torch.no_grad(), tracing(context):
+                with TensorsOnly():
+                    graph = make_fx(self.plain)(*tensors)
+                self.function = torch._inductor.compile(graph, list(tensors))
+            return self.function(*tensors)
+        except Exception as error:  # of many kinds; the plain function raises its own anew
+            log.info("not compiling %s: %s", self.what, str(error).strip().splitlines()[0])
+            self.function = self.plain
+        return self.plain(*tensors)
 
 
 def _checked(guards: Sequence[Any]) -> list[bool]:

@@ -18,7 +18,7 @@ from lcc_rl.config.schemas import AUTO, ScenarioConfig, StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.clock import Clock, Traffic, batch_shape
-from lcc_rl.envs.inputs import build_energy, load_inputs
+from lcc_rl.envs.inputs import build_energy, shared_inputs
 from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError, require, unknown_name
@@ -290,7 +290,7 @@ def make_env(
         torch.Size([1024, 300, 1])
     """
     cfg = load("train", [f"variant={variant}", *overrides])
-    inputs = load_inputs(cfg)
+    inputs = shared_inputs(cfg)
     profiles = inputs.evaluation if held_out else inputs.to_learn_from()
     env = build_env(cfg, profiles, inputs.population, batch_size, seed, device, held_out)
     count = cfg.scenario.vehicles.count(AUTOMATED)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -165,9 +165,28 @@ def constant_profiles(
     return from_records(records, list(names), list(names), time_step)
 
 
-# Of the sweep that this process works on: its runs mostly differ in other things than the data.
-_loaded: dict[str, LoadedEpisodes] = {}
+# What this process read last: its key and the value, by what it is.
+_last: dict[str, tuple[str, Any]] = {}
 SHARED = "data: read once, by an earlier run of this process; the lines of that reading:"
+
+
+def _once(what: str, plain: dict[str, Any], make: Callable[[], Any]) -> tuple[Any, bool]:
+    """Return what settings and the files that they name make, and whether it was at hand."""
+    key = json.dumps([plain, inputs_of(plain)], default=str)
+    known = what in _last and _last[what][0] == key
+    if not known:
+        _last[what] = key, make()
+    return _last[what][1], known
+
+
+def shared_inputs(cfg: StudyConfig) -> Inputs:
+    """Load inputs as :func:`load_inputs`; environments made in a row of equal settings share them.
+
+    Raises:
+        DataError, ConfigError: naming the file, row or option at fault.
+    """
+    inputs: Inputs = _once("inputs", as_plain(cfg), lambda: load_inputs(cfg))[0]
+    return inputs
 
 
 def load_episodes(node: Node) -> LoadedEpisodes:
@@ -181,14 +200,9 @@ def load_episodes(node: Node) -> LoadedEpisodes:
     """
     if not is_sweep():
         return cast(LoadedEpisodes, node.made(LOADS).load())
-    plain = as_plain(node)
-    key = json.dumps([plain, inputs_of({"data": plain})])
-    if key in _loaded:
-        return replace(_loaded[key], report=[SHARED, *_loaded[key].report])
-    loaded: LoadedEpisodes = node.made(LOADS).load()
-    _loaded.clear()
-    _loaded[key] = loaded
-    return loaded
+    plain = {"data": as_plain(node)}
+    loaded, known = _once("episodes", plain, lambda: node.made(LOADS).load())
+    return replace(loaded, report=[SHARED, *loaded.report]) if known else loaded
 
 
 def shortfalls(cfg: StudyConfig, available: Mapping[str, int]) -> list[str]:

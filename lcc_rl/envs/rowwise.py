@@ -16,7 +16,7 @@ import torch
 from numba.core.errors import NumbaError
 from torch import Tensor
 
-from lcc_rl.functional.machine_code import compiled
+from lcc_rl.functional.machine_code import kept
 from lcc_rl.functional.recorder import Recorder, TensorsOnly, Untranslatable
 
 log = logging.getLogger("lcc_rl")
@@ -45,7 +45,7 @@ class Rowwise:
         function: TensorFunction,
         examples: Sequence[Tensor],
         what: str,
-        make: Callable[[str], Callable[..., None]] = compiled,
+        make: Callable[[str], Callable[..., None]] = kept,
     ) -> None:
         self.function = function
         with torch.no_grad():

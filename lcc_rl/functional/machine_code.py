@@ -72,8 +72,10 @@ def _made(source: str, file: str, name: str) -> Callable[..., None]:
 
 
 @cache
-def kept(source: str) -> Callable[..., None]:
+def kept(source: str, fused: bool = False) -> Callable[..., None]:
     """Return the function ``kernel`` of a source as machine code that is kept for later processes.
+
+    If ``fused``, a product and a sum may be rounded once; nothing else is changed for speed.
 
     numba keeps the machine code beside this file or, where that is read-only, in the user's cache
     folder (``NUMBA_CACHE_DIR``), under a name that contains a hash of the source. If it cannot be
@@ -81,15 +83,15 @@ def kept(source: str) -> Callable[..., None]:
     """
     if "ndtri(" in source:  # a pointer into this process
         return compiled(source)
-    # Sums may be fused with products; nothing else is changed for speed.
-    compile_it = partial(numba.njit, fastmath={"contract"}, error_model="numpy", nogil=True)
-    name = f"kernel_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
+    fastmath = {"contract"} if fused else False
+    compile_it = partial(numba.njit, fastmath=fastmath, error_model="numpy", nogil=True)
+    name = f"{'fused' if fused else 'kernel'}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     function = _made(source, __file__, name)
     uncached = compile_it()(function)
     try:
         chosen = compile_it(cache=True)(function)
     except RuntimeError as error:  # there is no place for the code
-        log.info("compiling the drivers' simulation for this run only: %s", error)
+        log.info("compiling a simulation for this run only: %s", error)
         return uncached
 
     def call(*arguments: Any) -> None:
@@ -97,7 +99,7 @@ def kept(source: str) -> Callable[..., None]:
         try:
             chosen(*arguments)
         except Exception as error:  # a damaged file raises whatever unpickling it meets
-            log.info("compiling the drivers' simulation for this run only: %r", error)
+            log.info("compiling a simulation for this run only: %r", error)
             chosen = uncached
             chosen(*arguments)
 

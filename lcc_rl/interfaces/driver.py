@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ from lcc_rl.interfaces.exported import (
 )
 from lcc_rl.pieces import CBFFilter, Controller
 from lcc_rl.pieces.controllers import Population
+from lcc_rl.pieces.world import World
 
 # Own motion, that of the vehicle ahead and of the one behind.
 MEASURED = (
@@ -95,20 +96,18 @@ class Driver:
                     f"{time_step!r} s (in SUMO, --step-length {trained:g} sets it)"
                 )
         else:
-            self.program = self._rule(who, safety, drivers)
+            self.program = self._rule(who, safety, measuring(time_step, True, drivers))
         self.names = self.program.names
         self.behind = {x for x in self.names if x.startswith("behind.")} - {BEHIND_PRESENT}
         self._check()
         self.reset()
 
-    def _rule(
-        self, who: Any, safety: CBFFilter | None, drivers: Population | None
-    ) -> DrivingProgram:
+    def _rule(self, who: Any, safety: CBFFilter | None, world: World) -> DrivingProgram:
         if safety is None and isinstance(who, str) and who.endswith(FILTERED):
             filters = load("evaluate", ["variant=idm", "+filter=cbf"]).scenario.filters
             safety = filters[AUTOMATED].made(CBFFilter)
         node = controller_of(who, safety is not None and safety.time_gap is not None)
-        return driving([node.made(Controller)], safety, measuring(self.time_step, True, drivers))
+        return driving([node.made(Controller)], safety, world)
 
     def _check(self) -> None:
         for name in self.names:
@@ -227,7 +226,7 @@ class Driver:
     @cached_property
     def _rows(self) -> Rowwise:
         """The program by rows, once it is needed."""
-        make = kept if self.program.width <= WIDEST else _by_tensors
+        make = partial(kept, fused=True) if self.program.width <= WIDEST else _by_tensors
         return Rowwise(self.program.step, self._examples(1), self.name, make)
 
 

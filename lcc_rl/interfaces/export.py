@@ -85,15 +85,11 @@ def export(
         f"{policy} is a rule; only a trained policy can be exported: give a run folder, a policy "
         f"file or {PRETRAINED}/<name>",
     )
-    require(
-        cfg is not None or page or not overrides,
-        f"{' '.join(overrides)}: a program ({path.suffix}) has no road; a page ({PAGE}) has",
-    )
     require(cfg is None or not page, f"a page ({PAGE}) needs a run or a policy file")
-    if page:
-        content = ring_page(policy, trust, overrides).encode()
-    else:
-        content = EXPORTERS[path.suffix](policy, trust, cfg)
+    words = f"{' '.join(overrides)}: a program ({path.suffix}) has no road, a page ({PAGE}) has"
+    require(cfg is not None or page or not overrides, words)
+    make = EXPORTERS.get(path.suffix)
+    content = make(policy, trust, cfg) if make else ring_page(policy, trust, overrides).encode()
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path
@@ -163,8 +159,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("policy", help="run folder, policy.pt or pretrained/<name>")
     parser.add_argument("path", help="file to write: a program (.onnx, .pt2) or a page (.html)")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
-    what = "of a page: settings of the ring, such as scenario.circumference=300"
-    parser.add_argument("settings", nargs="*", help=what)
+    parser.add_argument("settings", nargs="*", help="of a page's ring, such as drivers=i80")
     options = parser.parse_args(words)
     path = export(options.policy, options.path, options.trust, overrides=options.settings)
     if path.suffix == PAGE:

@@ -37,8 +37,8 @@ from lcc_rl.results.policies import load_policy
 from lcc_rl.settings import values
 
 RING_TASK = ("variant=alcc", "task=ring-22")
-OF_RING = ("circumference", "string", "vehicle_length", "initial_speed", "time_step")
-OF_RING += ("sensors", "actuators")
+NOT_ON_PAGE = ("sensors", "actuators", "fleet")
+OF_RING = (*NOT_ON_PAGE, "circumference", "string", "vehicle_length", "initial_speed", "time_step")
 OF_DRIVERS = ("drivers", "controllers.human")
 DRAWS = ("noise", "wiener", "acceleration_noise", "acceleration_noise.before", "driver")
 RING_RULES = ("follower_stopper", "pi_saturation")
@@ -64,20 +64,17 @@ def ring_page(policy: str | Path, trust: Sequence[str] = (), overrides: Sequence
     return template.replace("DATA", text.replace("<", "\\u003c"), 1)
 
 
-def page_data(
-    policy: str | Path, trust: Sequence[str] = (), overrides: Sequence[str] = ()
-) -> dict[str, Any]:
+def page_data(policy: Any, trust: Sequence[str], overrides: Sequence[str]) -> dict[str, Any]:
     """Return all numbers of the page; arguments as of :func:`ring_page`."""
     cfg = ring_of(policy, trust, overrides)
-    scenario, energy = cfg.scenario, build_energy(cfg).models
-    vehicles = scenario.vehicles
+    scenario, vehicles, energy = cfg.scenario, cfg.scenario.vehicles, build_energy(cfg).models
     car = energy[0] if len(energy) == 1 and isinstance(energy[0], CirclesFuel) else None
     strange = [f"role {name}" for name in vehicles.names if name not in (HUMAN, AUTOMATED)]
-    strange += [f"scenario.{x}" for x in ("sensors", "actuators") if getattr(scenario, x)]
+    strange += [f"scenario.{x}" for x in NOT_ON_PAGE if getattr(scenario, x)]
     if car is None or car.truck or car.grade:
         strange.append("energy (it takes one car on a level road: energy=compact)")
-    human = _human(cfg)
-    if human is None:
+    human = None if strange else _human(cfg)
+    if human is None and not strange:
         strange.append("drivers (it takes IDM drivers who share a, b and s0, without gap_noise)")
     if strange or car is None:
         raise ConfigError(f"{policy}: a page of the ring cannot carry {', '.join(strange)}")
@@ -112,8 +109,9 @@ def ring_of(policy: str | Path, trust: Sequence[str], overrides: Sequence[str]) 
     if own.scenario.road != RING:
         return cfg
     for name in OF_RING:
-        if not any(key.startswith(f"scenario.{name}") for key in given):
-            setattr(cfg.scenario, name, getattr(own.scenario, name))
+        value = getattr(own.scenario, name)
+        if value != {} and not any(key.startswith(f"scenario.{name}") for key in given):
+            setattr(cfg.scenario, name, value)
     if own.drivers is not None and not any(x in key for x in OF_DRIVERS for key in given):
         cfg.drivers = own.drivers
         cfg.scenario.controllers[HUMAN] = own.scenario.controllers[HUMAN]
@@ -130,10 +128,9 @@ def _human(cfg: StudyConfig) -> dict[str, Any] | None:
     if [type(piece) for piece in people] != [IDM] or people[0].gap_spread:
         return None
     human = people[0]
-    own = {"desired_speed": human.desired_speeds, "time_gap": human.time_gaps}
+    drivers = {"desired_speed": human.desired_speeds.tolist(), "time_gap": human.time_gaps.tolist()}
     noise = {"noise": human.noise, "wiener": human.wiener, "spread": human.spreads[0]}
     late = {"late": human.late, "stray": human.noise_spread, **vars(human.noise_step)}
-    drivers = {name: x.tolist() for name, x in own.items()}
     return {"drivers": drivers, **vars(human.drivers), **noise, **late}
 
 

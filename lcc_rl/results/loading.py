@@ -29,7 +29,7 @@ from lcc_rl.io.files import (
     texts_of,
     unified,
 )
-from lcc_rl.results.runs import CONFIG, FINAL, PARTS, flatten, read_settings, told_apart
+from lcc_rl.results.runs import CONFIG, FINAL, PARTS, flat_settings, told_apart
 
 log = logging.getLogger("lcc_rl")
 
@@ -176,7 +176,7 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
     root = Path(root)
     rows = load(root, settings=())
     names = list(rows["run"].unique())
-    stored = [dict(flatten(read_settings(root / name / CONFIG))) for name in names]
+    stored = [flat_settings(root / name / CONFIG) for name in names]
     settings = [{k: x for k, x in one.items() if not f"{k}.".startswith(SHARED)} for one in stored]
     labels = dict(zip(names, told_apart(settings), strict=True))
     rows = rows.assign(run=rows["run"].astype(str), strategy=rows["strategy"].astype(str))
@@ -223,7 +223,7 @@ def _surveyed(root: Path, table: str, damaged: Damaged) -> tuple[Runs, pa.Schema
     for path in _files(root, f"{table}.parquet", damaged):
         with damaged.noting(path.parent):
             schema, config = schema_of(path, TABLES[table]), path.parent / CONFIG
-            own = dict(flatten(read_settings(config))) if config.exists() else {}
+            own = flat_settings(config) if config.exists() else {}
             runs[path] = {"run": str(path.parent.relative_to(root)), **own}
             schemas[path] = schema
     # Columns are as most tables have them, whichever comes first.

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ log = logging.getLogger("lcc_rl")
 EPISODES = "episodes.parquet"  # a run's last file: with it the run is finished
 STEPS = "steps.parquet"
 PARTS, FINAL = ".parts", "evaluation"  # of a job of lcc-rl run: its parts' settings; its last part
+SECTION = re.compile(r"^(?=[a-z])", re.MULTILINE)  # before the name of a section of settings
 # What no command of other settings may replace: results, and what a stopped run resumes from.
 RUN_FILES = (EPISODES, "drivers.parquet", "checkpoint.pt", "command.txt", "blocks")
 
@@ -107,11 +110,33 @@ def read_settings(path: Path) -> dict[str, Any]:
     Raises:
         ResultsError: if it is missing or damaged.
     """
-    content = parse_yaml(read_text(path), str(path))
+    return _settings(read_text(path), str(path))
+
+
+def flat_settings(path: Path) -> dict[str, Any]:
+    """Read a stored configuration as a flat mapping; sections that many runs share are parsed once.
+
+    Raises:
+        ResultsError: if it is missing or damaged.
+    """
+    text = read_text(path)
+    with suppress(ResultsError):  # not written in sections, or damaged
+        return {key: x for part in SECTION.split(text) if part for key, x in _section(part)}
+    return dict(flatten(_settings(text, str(path))))
+
+
+@lru_cache(maxsize=256)
+def _section(text: str) -> list[tuple[str, Any]]:
+    return list(flatten(_settings(text, "")))
+
+
+def _settings(text: str, where: str) -> dict[str, Any]:
+    """Parse settings, or a section of them."""
+    content = parse_yaml(text, where)
     for name in SECTIONS:
         if not isinstance(content.get(name, {}), Mapping):
             got = f"must be a mapping of settings, got {content[name]!r}"
-            raise ResultsError(f"{path}: damaged: {name} {got}")
+            raise ResultsError(f"{where}: damaged: {name} {got}")
     return content
 
 

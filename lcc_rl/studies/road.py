@@ -16,11 +16,10 @@ import pandas as pd
 from lcc_rl.commands.evaluation import complete
 from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, read_once
 from lcc_rl.config import key_of, load, quoted, top_key, with_inputs
-from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.figures.evaluation import measures_of
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import parquet_metadata, read_parquet, write_parquet
-from lcc_rl.results.bootstrap import LEAST_DRIVES, Estimate
+from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING, Estimate
 from lcc_rl.results.measures import MEASURES, Shown
 from lcc_rl.results.names import in_words, several
 from lcc_rl.results.report import Report, windows_for
@@ -29,7 +28,6 @@ from lcc_rl.results.windows import DRIVE, savings
 from lcc_rl.studies.alcc.study import DRIVERS_FILE
 from lcc_rl.studies.results import StudyResults
 
-ROAD_TITLE = "Automated cars on this road"
 ROAD_SHARES = ("5", "10", "20")  # of automated cars [%]
 # Drivers who keep up: a desired speed below that of the leaders would leave a string behind.
 FITTED = (
@@ -51,17 +49,9 @@ DRIVEN = (
 LEADERS_FILE, SHARES_FOLDER = "leaders.parquet", "evaluation"
 OF_DRIVE = " leader "  # between recording and leader in the name of a drive
 LONGEST = 4000  # steps of a window at most
-# Columns of the table, and headings of those that the figure shows.
-COMPARED = {
-    "fuel_l_per_100km": "fuel\n[L/100 km]",
-    "co2_g_per_km": "",
-    "flow_vph": "flow\n[vehicles/h]",
-    "brakings_below_2_per_100km": "brakings < −2 m/s²\n[1/100 km]",
-    "brakings_below_3_per_100km": "",
-    "share_time_gap_short": "time gap < 1 s\n[%]",
-    "travel_time_s_per_km": "",
-}
-SAVED = "fuel_saved_pct"
+FUEL = "fuel_l_per_100km"
+DRAWN = (FUEL, "flow_vph", "brakings_below_2_per_100km", "share_time_gap_short")
+COMPARED = (*DRAWN, "co2_g_per_km", "brakings_below_3_per_100km", "travel_time_s_per_km")
 
 
 def run(folder: Path, overrides: Sequence[str], shares: Sequence[str] = ROAD_SHARES) -> None:
@@ -90,22 +80,18 @@ def run(folder: Path, overrides: Sequence[str], shares: Sequence[str] = ROAD_SHA
         found += ["leader.evaluation_share=1", "leader.least_variation=0"]
         found += [f"leader.together='.*(?={OF_DRIVE})'", f"scenario.horizon={steps}"]
     if "drivers" not in given:
-        path = calibrate_once(cfg, folder)
-        found += ["drivers=calibrated", f"drivers.path={quoted(path)}"]
+        found += ["drivers=calibrated", f"drivers.path={quoted(calibrate_once(cfg, folder))}"]
     for share in shares:
-        part = with_inputs(_evaluation([*found, *driven], share))
-        complete(part, folder / SHARES_FOLDER / share)
+        complete(with_inputs(_evaluation([*found, *driven], share)), folder / SHARES_FOLDER / share)
 
 
-def _evaluation(words: Sequence[str], share: str) -> EvaluateConfig:
+def _evaluation(words: Sequence[str], share: str) -> Any:
     part = f"scenario.string.penetration={share}e-2"
-    cfg: EvaluateConfig = load("evaluate", [*_beside(DRIVEN, words), part])
-    return cfg
+    return load("evaluate", [*_beside(DRIVEN, words), part])
 
 
 def _beside(defaults: Sequence[str], words: Sequence[str]) -> list[str]:
-    given = set(map(key_of, words))
-    return [*(item for item in defaults if key_of(item) not in given), *words]
+    return [*(item for item in defaults if key_of(item) not in map(key_of, words)), *words]
 
 
 def leader_drives(episodes: pd.DataFrame, time_step: float) -> pd.DataFrame:
@@ -118,8 +104,8 @@ def leader_drives(episodes: pd.DataFrame, time_step: float) -> pd.DataFrame:
     begins = ~(rows.groupby(keys)["time_s"].diff() < 1.5 * time_step)
     since = rows["time_s"].where(begins).ffill().map(" from {:.1f} s".format)
     names = rows["recording"] + OF_DRIVE + rows["leader_id"].astype(str) + since
-    found = {"drive": names, "time_s": rows["time_s"], "speed_mps": rows["leader_speed_mps"]}
-    return pd.DataFrame(found)
+    rows = rows.assign(drive=names, speed_mps=rows["leader_speed_mps"])
+    return rows[["drive", "time_s", "speed_mps"]]
 
 
 def window_steps(samples: np.ndarray, begun: int) -> int:
@@ -146,34 +132,28 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     table = pd.DataFrame(row for share, part in parts.items() for row in rows_of(share, part))
     windows, cfg = parts[places[0].name], stored_config(places[0])
     drives, scenario, settings = windows[DRIVE].nunique(), cfg["scenario"], cfg["evaluation"]
-    over = "windows of one recording (too few drives: too narrow)"
-    if drives > 1:
-        over = f"{drives} recordings" + " (t-intervals: few drives)" * (drives < LEAST_DRIVES)
+    few = " (few drives: t-intervals, of one recording over its windows)" * (drives < LEAST_DRIVES)
     found.table(
         "road",
         f"{scenario['string']['size']} vehicles, {settings['drivers']} times behind each of "
         f"{several(len(windows['profile_id'].unique()), 'window')} of "
         f"{scenario['horizon'] * scenario['time_step']:g} s, the first {settings['warm_up']:g} s "
         "not counted. Brackets: the value of human drivers alone, changed by the 95 % interval of "
-        f"the change, over {over}",
+        f"the change, over {several(drives, 'recording')}{few}",
         table,
     )
-    shown = [Shown(_column(key), head) for key, head in COMPARED.items() if head]
+    shown = [Shown(x.shown.key, x.label.replace(" [", "\n[")) for x in MEASURES if x.key in DRAWN]
     of = [f"{x:g} %" for x in table["automated_pct"]]
     named = table.assign(of=of, who=[in_words(str(name)) for name in table["strategy"]])
     one = Report("", table, named, tuple(shown), (), "", "")
-    found.figure("road", "The same values and intervals", measures_of(one))
+    found.figure("road", "The same values and intervals; shares of time in %", measures_of(one))
     for name, file in (("Data", folder / TRAJECTORIES), ("Drivers", folder / DRIVERS_FILE)):
         if file.is_file():
             lines = [f"* {line}" for line in parquet_metadata(file)["report"].splitlines()]
             new = [line for line in lines if line not in "\n".join(found.blocks)]
             found.blocks.append("\n".join([f"## {name}\n", *new]))
-    found.write(ROAD_TITLE)
+    found.write("Automated cars on this road")
     return found
-
-
-def _column(key: str) -> str:
-    return f"{key.removeprefix('share_')}_pct" if key.startswith("share_") else key
 
 
 def rows_of(share: str, windows: pd.DataFrame) -> Iterator[dict[str, Any]]:
@@ -188,12 +168,11 @@ def rows_of(share: str, windows: pd.DataFrame) -> Iterator[dict[str, Any]]:
         row: dict[str, Any] = {"automated_pct": float(share), "strategy": name}
         for one in (one for one in MEASURES if one.key in COMPARED):
             column, *per = one.columns
-            found = savings(windows, column, name, HUMAN, per)
+            found = NOTHING if name == HUMAN else savings(windows, column, name, HUMAN, per)
             low, high = found.over_drives or (found.low, found.high)
-            low, high = (low, high) if name != HUMAN else (np.nan, np.nan)
             humans = one.value(parts[HUMAN])
             left = Estimate(one.value(part), humans * (1.0 - high), humans * (1.0 - low))
-            row |= left.columns(_column(one.key), one.scale)
-            if one.key == next(iter(COMPARED)):
-                row |= Estimate(found.value, low, high).columns(SAVED, 100.0)
+            row |= left.columns(one.shown.key, one.scale)
+            if one.key == FUEL:
+                row |= Estimate(found.value, low, high).columns("fuel_saved_pct", 100.0)
         yield row | {"collisions": int(part["collisions"].sum())}

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from helpers import check_refused, check_resuming, small_env, small_loop, weights
-from page_blocks import ROOT, blocks
+from page_blocks import ROOT
 from tensordict import TensorDict
 from torch import nn
 
@@ -29,9 +29,8 @@ EACH = pytest.mark.parametrize("agent", AGENTS)
 
 @pytest.fixture(autouse=True)
 def my_learner(monkeypatch) -> Any:
-    """The module that docs/learners.md tells to write."""
-    page = (block.text for block in blocks(ROOT / "docs" / "learners.md"))
-    (text,) = (text for text in page if text.startswith("# my_learner.py"))
+    """The learner of docs/recipes."""
+    text = (ROOT / "docs" / "recipes" / "my_learner.py").read_text()
     module = ModuleType("my_learner")
     monkeypatch.setitem(sys.modules, "my_learner", module)
     module.text = text

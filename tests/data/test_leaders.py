@@ -25,7 +25,6 @@ from lcc_rl.data.leaders import (
 from lcc_rl.data.profiles import Split, at_step, joined, leader_profiles
 from lcc_rl.data.sources import SHIPPED_FILES, NgsimSource
 from lcc_rl.data.speed_records import read_speed_record
-from lcc_rl.data.trajectories import FRAME
 from lcc_rl.envs import load_inputs
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.random import choose, stream_id
@@ -185,7 +184,7 @@ def test_leaders_of_a_trajectory_file_at_any_step(tmp_path: Path, step: float) -
     leader = [cells(9, k, Local_Y=10.0 * k + 60, v_Vel=round(20 + 0.2 * k, 1)) for k in range(201)]
     (tmp_path / "file.txt").write_text(csv_text(pair(range(201), v_Vel=40)[:201] + leader))
     episodes = NgsimSource(path=tmp_path / "file.txt").load().episodes
-    profiles = at_step(leader_profiles(episodes, FRAME), step)
+    profiles = at_step(leader_profiles(episodes, 0.1), step)
     assert profiles.names == ("2005-04-13T22:58:55Z/9@0.0s",)
     time = step * np.arange(round(20 / step) + 1)
     expected = torch.tensor((20 + 2 * time) * FOOT, dtype=torch.float32)

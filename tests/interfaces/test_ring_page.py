@@ -213,10 +213,11 @@ def test_what_the_page_cannot_compute_is_one_clear_error(tmp_path) -> None:
         "energy": "energy=mixture",
         "drivers": "drivers.gap_noise=0.1",
         "scenario.sensors": "+faults=sensors",
+        "scenario.fleet": "+fleet=trucks",
         "role truck": "scenario.string=automated human truck",
     }
     for words, given in settings.items():
-        ring = [given, *("+controller@scenario.controllers.truck=idm",) * ("truck" in given)]
+        ring = [given, *("+controller@scenario.controllers.truck=idm",) * given.endswith("truck")]
         with pytest.raises(ConfigError, match=f"cannot carry {words}"):
             export(RING, tmp_path / "ring.html", overrides=ring)
     with pytest.raises(ConfigError, match="has no road"):

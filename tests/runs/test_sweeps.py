@@ -78,7 +78,7 @@ def test_a_sweep_that_is_interrupted_names_the_way_to_resume(tmp_path, monkeypat
 
 
 def test_a_sweep_is_read_as_one_table(tmp_path, capsys) -> None:
-    inputs._loaded.clear()  # what other sweeps of this process have read
+    inputs._last.clear()  # what other sweeps of this process have read
     words = [*TINY, "variant=alcc", "seed=0,1", "reward.terms.safety.weight=0,2", "sweep=mine"]
     done = run_command("lcc_rl.cli.train", "-m", *words, cwd=tmp_path, check=True)
     assert done.stdout.count(inputs.SHARED) == 3  # by all runs but the first

@@ -18,8 +18,10 @@ REFERENCE = ROOT / pages.REFERENCE
 @pytest.fixture
 def docs(tmp_path) -> Path:
     (tmp_path / "figures").mkdir()
-    for page in (ROOT / "docs").glob("*.md"):
-        shutil.copy(page, tmp_path)
+    (tmp_path / "notes").mkdir()
+    for page in (ROOT / "docs").rglob("*.md"):
+        if page.parent.name in ("docs", "notes"):
+            shutil.copy(page, tmp_path / page.relative_to(ROOT / "docs"))
     return tmp_path
 
 
@@ -31,7 +33,7 @@ def same(docs: Path, *names: str) -> None:
 def test_the_pages_hold_the_scores_kept(docs) -> None:
     pages.tasks(REFERENCE, docs)
     pages.learners(REFERENCE, docs)
-    same(docs, "fleets.md", "leaderboard.md", "limits.md", "learners.md")
+    same(docs, "fleets.md", "leaderboard.md", "limits.md", "learners.md", "notes/results.md")
 
 
 @pytest.mark.slow
