@@ -210,8 +210,9 @@ def comparison_figure(windows: pd.DataFrame) -> Figure:
     names, strategies = (list(dict.fromkeys(table[name])) for name in ("ablation", "strategy"))
     figure = new_figure(PAGE_WIDTH, 1.0 + 0.32 * len(names))
     axes = figure.subplots(1, len(PANELS), sharey=True, width_ratios=(2, 1, 1))
+    abreast = 0.18 * np.linspace(-1.0, 1.0, len(strategies)) * (len(strategies) > 1)
     for axis, (column, (label, line)) in zip(axes, PANELS.items(), strict=True):
-        for strategy, offset in zip(strategies, _abreast(len(strategies), 0.18), strict=True):
+        for strategy, offset in zip(strategies, abreast, strict=True):
             part, hue = table[table["strategy"] == strategy], colour(strategy)
             rows = [names.index(name) + offset for name in part["ablation"]]
             dots(axis, rows, part, column, hue, label=in_words(strategy))
@@ -232,8 +233,3 @@ def _how_many(seeds: pd.Series) -> str:
     """Return the distinct numbers of seeds in a column, in words."""
     counts = sorted({int(count) for count in seeds if str(count).isdigit()})
     return f"{' or '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"
-
-
-def _abreast(count: int, reach: float) -> np.ndarray:
-    """Return evenly spaced offsets in ±``reach``; zero for a single one."""
-    return reach * np.linspace(-1.0, 1.0, count) * (count > 1)
