@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lcc_rl.arrays import Floats
 from lcc_rl.data.grid import Place
-from lcc_rl.data.tables import SI, SPEEDS, UNITS
+from lcc_rl.data.tables import SI, SPEEDS, UNITS, Units
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.errors import Concern, DataError
 
@@ -112,7 +112,7 @@ def _fit(
     return found, np.nan_to_num(rest, nan=9.0).clip(FLOOR, 9.0), sums
 
 
-def mistakes(units: Mapping[str, str]) -> Iterator[tuple[bool, str, str, float, float]]:
+def mistakes(units: Units) -> Iterator[tuple[bool, str, str, float, float]]:
     """Yield what may be wrong with a pair.
 
     Args:
@@ -140,11 +140,7 @@ def mistakes(units: Mapping[str, str]) -> Iterator[tuple[bool, str, str, float, 
 
 
 def check_pairs(
-    episodes: pd.DataFrame,
-    place: Place,
-    units: Mapping[str, str],
-    max_mismatch: float,
-    max_lag: float,
+    episodes: pd.DataFrame, place: Place, units: Units, max_mismatch: float, max_lag: float
 ) -> tuple[list[str], bool]:
     """Check that the gaps of each pair agree with its speeds.
 
@@ -198,7 +194,7 @@ def check_pairs(
 
 
 def _mistaken(
-    pair: Mapping[Any, Any], units: Mapping[str, str], max_mismatch: float
+    pair: Mapping[Any, Any], units: Units, max_mismatch: float
 ) -> list[tuple[int, str, str]]:
     """Row, signal and words on the mistakes nearest to a pair; nothing if none is near.
 
@@ -232,9 +228,7 @@ def _mistaken(
     return [(pair["row"], near[0][2], f"{words}; {questions}")]
 
 
-def medians(
-    episodes: pd.DataFrame, told: pd.DataFrame, pairs: int, units: Mapping[str, str]
-) -> str:
+def medians(episodes: pd.DataFrame, told: pd.DataFrame, pairs: int, units: Units) -> str:
     """Return the line by which a user sees whether units and clocks are right.
 
     ``told`` are the rows of :func:`agreement` that tell something, of so many ``pairs``.
