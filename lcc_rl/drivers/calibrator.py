@@ -167,7 +167,7 @@ class Calibrator(Settings):
         }
 
         @cache
-        def twins(mode: str) -> tuple[Reaction, pd.DataFrame, list[str]]:
+        def twins(mode: Mode) -> tuple[Reaction, pd.DataFrame, list[str]]:
             return compare_twins(observed, fits[mode][0], self.reaction, progress, self.perception)
 
         @cache
