@@ -76,6 +76,9 @@ class ExtractionReport:
     first: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
     def lines(self) -> list[str]:
         """Return the report as plain lines."""
         minutes = self.rows * FRAME / 60

@@ -69,6 +69,9 @@ class ReadReport:
     empty_columns: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
     @property
     def source(self) -> str:
         """The files, and how they were read: the subject of messages in which units matter."""

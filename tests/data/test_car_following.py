@@ -144,9 +144,7 @@ def test_each_criterion_removes_its_candidates_in_order(tmp_path: Path) -> None:
     assert report.left_out["gap beyond min_gap_m=1"] == 30
     assert report.left_out["gap beyond max_gap_m=100"] == 30
     assert episodes["follower_id"].unique().tolist() == [11]
-    assert "left out 30 samples: gap beyond min_gap_m=1, the first: recording" in "\n".join(
-        report.lines()
-    )
+    assert "left out 30 samples: gap beyond min_gap_m=1, the first: recording" in str(report)
 
 
 def test_a_gap_beyond_the_limits_cuts(tmp_path: Path) -> None:

@@ -197,7 +197,7 @@ def test_real_native_file(shared_data: Path) -> None:
     assert list(report.recordings) == ["i80_coifman_li_2017_native#1"]
     assert (report.headways_given, report.headways_derived) == (0, 156_382)
     assert {"v_Class", "v_Length", "Space_Headway", "Global_Time"} == set(report.empty_columns)
-    assert "nothing to filter vehicle classes on" in "\n".join(report.lines())
+    assert "nothing to filter vehicle classes on" in str(report)
 
 
 def test_real_rows_with_gaps_and_reused_ids(shared_data: Path) -> None:
