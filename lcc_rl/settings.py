@@ -35,7 +35,6 @@ from typing import (
 
 from pydantic import (
     AfterValidator,
-    BeforeValidator,
     ConfigDict,
     Field,
     ValidationError,
@@ -68,7 +67,7 @@ def _increasing(ends: tuple[float, float]) -> tuple[float, float]:
 Increasing = AfterValidator(_increasing)  # of the two ends of a range
 
 # Least and largest factor that a training episode draws by its seed; an evaluation takes 1.
-Factors = Annotated[tuple[Positive, Positive], Field(strict=False), Increasing]
+Factors = Annotated[tuple[Positive, Positive], Increasing]
 
 TARGET = "_target_"  # the key that names the class of a node
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -91,7 +90,7 @@ class Settings:
         @wraps(construct)
         def checked(self: Any, **given: Any) -> None:
             try:
-                construct(self, **given)
+                construct(self, **_converted(cls, given, cls.__name__))
                 self.validate()
             except LccError:
                 raise
@@ -120,18 +119,19 @@ def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
     Raises:
         ConfigError: naming the first setting that is unknown or wrong.
     """
-    wanted = {name: field.annotation for name, field in kind.__pydantic_fields__.items()}  # type: ignore[attr-defined]
-    own = {
-        key: _as_declared(wanted.get(key), value, f"{where}.{key}")
-        for key, value in given.items()
-        if value != "???"
-    }
+    own = {key: value for key, value in given.items() if value != "???"}
     try:
-        return kind(**own)
+        return kind(**_converted(kind, own, where))
     except RefusedSetting as error:
         if error.__cause__ is None:  # its place is named already
             raise
         raise refused(error.__cause__, kind, where) from None
+
+
+def _converted(kind: type[Settings], given: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return settings as their annotations declare them."""
+    wanted = {name: field.annotation for name, field in kind.__pydantic_fields__.items()}  # type: ignore[attr-defined]
+    return {name: _as_declared(wanted.get(name), x, f"{where}.{name}") for name, x in given.items()}
 
 
 def _as_declared(annotation: Any, value: Any, where: str) -> Any:
@@ -146,15 +146,18 @@ def _as_declared(annotation: Any, value: Any, where: str) -> Any:
         each = inner if len(inner) == len(value) and ... not in inner else inner[:1] * len(value)
         found = [_as_declared(one, x, where) for one, x in zip(each, value, strict=True)]
         return tuple(found) if kind is tuple else found
-    if not isinstance(value, Mapping) or not inspect.isclass(kind) or inspect.isabstract(kind):
+    if not isinstance(value, Mapping) or not inspect.isclass(kind):
+        return value
+    if issubclass(kind, Mapping):
+        of = inner[1] if inner else Any
+        return {key: _as_declared(of, x, f"{where}.{key}") for key, x in value.items()}
+    if inspect.isabstract(kind):
         return value
     if issubclass(kind, Settings):
         return parse(kind, value, where)
     if dataclasses.is_dataclass(kind):
         hints = get_type_hints(kind)
         return kind(**{name: _as_declared(hints.get(name), x, where) for name, x in value.items()})
-    if len(inner) == 2:
-        return {key: _as_declared(inner[1], x, f"{where}.{key}") for key, x in value.items()}
     return value
 
 
@@ -212,34 +215,28 @@ def defaults(kind: type[Settings]) -> dict[str, Any]:
     for field in dataclasses.fields(kind):  # type: ignore[arg-type]
         if isinstance(field.default, FieldInfo):
             if not field.default.is_required():
-                found[field.name] = _plain(field.default.get_default(call_default_factory=True))
+                found[field.name] = as_plain(field.default.get_default(call_default_factory=True))
         elif field.default is not dataclasses.MISSING:
-            found[field.name] = _plain(field.default)
+            found[field.name] = as_plain(field.default)
         elif field.default_factory is not dataclasses.MISSING:
-            found[field.name] = _plain(field.default_factory())
+            found[field.name] = as_plain(field.default_factory())
     return found
 
 
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
+def as_plain(value: Any, places: bool = True) -> Any:
+    """Return settings as plain containers, as files store them.
+
+    Args:
+        value: a configuration, a part of one or a node.
+        places: with the places that it names to write to; else they are null.
+    """
+    if hasattr(value, "stored"):  # a node
+        value = value.stored(places)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = values(value)
     if isinstance(value, Mapping):
-        return {name: _plain(held) for name, held in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
-
-
-def given_as(kind: type[Settings]) -> Any:
-    """Return the annotation of a setting that has settings itself, given as a mapping."""
-
-    def made(value: Any) -> Any:
-        if not isinstance(value, Mapping):
-            return value
-        try:
-            return kind(**value)
-        except ConfigError as error:
-            raise ValueError(str(error)) from error
-
-    return Annotated[kind, BeforeValidator(made)]
+        return {key: as_plain(item, places) for key, item in value.items()}
+    return [as_plain(x, places) for x in value] if isinstance(value, (list, tuple)) else value
 
 
 def path_of(kind: Any) -> str:

@@ -16,7 +16,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import averaged
 import fleets
 import measured_energy
 import numpy as np
@@ -26,7 +25,9 @@ from matplotlib.figure import Figure
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.config import load
 from lcc_rl.config.nodes import as_plain
+from lcc_rl.config.words import RECORDED
 from lcc_rl.data.leaders import stretch
+from lcc_rl.energy import AVERAGED, AVERAGES
 from lcc_rl.errors import require
 from lcc_rl.figures.calibration import twins_figure
 from lcc_rl.figures.drawing import COLUMN_WIDTH, footnote, new_figure, paper, save, style
@@ -39,10 +40,11 @@ from lcc_rl.results import board
 from lcc_rl.results.fronts import ENERGY, FRONT_KINDS, LONG_SHARE, points
 from lcc_rl.results.measures import AT_LEAST, FLOW, Measure
 from lcc_rl.results.measures import SHARE as IS_SHARE
-from lcc_rl.results.names import in_words, worded
+from lcc_rl.results.names import NETWORK, in_words, worded
 from lcc_rl.results.render import as_markdown, markdown_row, saved_text, signed
 from lcc_rl.results.runs import naming_run
 from lcc_rl.results.task import Task
+from lcc_rl.results.windows import DISTANCE, savings
 from lcc_rl.studies.alcc.results import narrow
 from lcc_rl.studies.reproduce import STUDY_RESULTS
 
@@ -68,6 +70,14 @@ KINDS_SHOWN = {  # variant and policy, how it is named, its colour and whether i
     ("alcc", "memory"): ("network with memory", "#56b4e9", True),
     ("alcc", "preview"): ("network with preview", "#009e73", True),
 }
+# Sources of what is kept for averaged energies, for readers.
+SOURCES = {
+    "i80": "I-80",
+    "ring": "ring",
+    "openacc": "OpenACC, test track and low speed",
+    "platoons": "OpenACC, motorways (`data=platoons`)",
+}
+RIVALS = (RECORDED, "idm_acc_filtered")
 
 
 def fill(page: Path, tables: Mapping[str, str]) -> None:
@@ -115,7 +125,30 @@ def tasks(reference: Path, docs: Path) -> None:
     fill(docs / "leaderboard.md", {"board": table})
     fill(docs / "notes" / "results.md", {"tasks": "\n\n".join(parts)})
     kept = read_parquet(reference / "averaged.parquet")
-    fill(docs / "limits.md", {"averaged": averaged.averaged(kept)})
+    fill(docs / "limits.md", {"averaged": averaged(kept)})
+
+
+def averaged(rows: pd.DataFrame) -> str:
+    """Return a Markdown table: what the network saves by source, longest time gap and rival.
+
+    Args:
+        rows: ``source``, ``time_gap`` of the filter [s], ``average_s`` of the leaders [s],
+            strategy and window, with the energies of raw and of averaged speeds, distance and flow.
+    """
+    energies = [f"all_{name}" for name in ("path_energy_kj", *AVERAGED)]
+    head = ["traffic, longest time gap", "against", "raw"]
+    head += [f"{seconds:g} s" for seconds in AVERAGES]
+    lines = [[*head, "flow"], ["---"] * (len(head) + 1)]
+    raw = rows[rows["average_s"] == 0.0]
+    for source, words in SOURCES.items():
+        for gap, part in raw[raw["source"] == source].groupby("time_gap", sort=False):
+            flow = part.groupby("strategy")[FLOW].mean()
+            for rival in RIVALS:
+                gained = signed(100.0 * (flow[NETWORK] / flow[rival] - 1.0))
+                found = (savings(part, x, NETWORK, rival, [DISTANCE]) for x in energies)
+                cells = [f"{words}, {gap:g} s", in_words(rival), *map(fleets.percent, found)]
+                lines.append([*cells, f"{gained} %"])
+    return "\n".join(map(markdown_row, lines))
 
 
 def learners(reference: Path, docs: Path) -> None:

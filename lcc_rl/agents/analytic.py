@@ -172,15 +172,6 @@ class Analytic(Agent):
                 target.lerp_(online, self.tau)
         return loss.detach()
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything that :meth:`load_state_dict` needs to resume bit for bit."""
-        return {name: part.state_dict() for name, part in self._parts().items()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
-        for name, part in self._parts().items():
-            part.load_state_dict(state[name])
-
     def _parts(self) -> dict[str, Any]:
         own = {"policy": self.policy, "optimizer": self.optimizer, "limits": self.objective.limits}
         if self.bootstrap:

@@ -6,7 +6,6 @@ import time
 from abc import abstractmethod
 from collections.abc import Mapping
 
-import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
@@ -15,7 +14,7 @@ from torchrl.collectors import BaseCollector, Collector
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.checks import check_batch, check_learner
-from lcc_rl.agents.loop import REPORTED, AgentT, TrainingLoop, episode_statistics
+from lcc_rl.agents.loop import REPORTED, AgentT, TrainingLoop
 from lcc_rl.envs import StringCollector
 from lcc_rl.errors import require
 from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD
@@ -113,19 +112,8 @@ class CollectingLoop(TrainingLoop[AgentT]):
             check_learner(self.agent.policy, losses[-1], self.advice)
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected
-        self.iteration += 1
-        row = {
-            "iteration": float(self.iteration),
-            "episodes": float(self.iteration * self.env.batch_size[0]),
-            "transitions": float(self.iteration * size * len(played)),
-            "updates": float(self.updates),
-            "exploration_sigma": sigma,
-            "learning_rate": rate,
-            **episode_statistics(torch.cat(played, dim=1)),
-            **{name: sum(loss[name] for loss in losses) / len(losses) for name in losses[0]},
-        }
-        self._record(row, *spent)
-        return row
+        begin = {"exploration_sigma": sigma, "learning_rate": rate}
+        return self._record(played, losses, spent, size * len(played), begin)
 
 
 def transitions(batch: TensorDictBase) -> TensorDictBase:

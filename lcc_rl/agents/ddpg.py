@@ -38,13 +38,11 @@ class DDPG(OffPolicy):
             batch = batch.clone(False)
             ended = batch["next", "terminated"]
             batch["next", "terminated"] = torch.zeros_like(ended)
-        losses = (
-            self._by_loss(batch) if self.written is None else self._by_hand(batch, self.written)
-        )
+        losses = self._losses(batch)
         self._step("all")
         every = {"actor": self.target_every["actor"], "value": self.target_every["critic"]}
         self._follow(*(name for name, count in every.items() if self.count % count == 0))
-        return dict(zip(("loss_actor", "loss_value"), losses, strict=True))
+        return losses
 
     def _by_loss(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Write the gradient by TorchRL's loss; return the losses."""

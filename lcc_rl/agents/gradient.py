@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.checks import check_batch
-from lcc_rl.agents.loop import REPORTED, TrainingLoop, episode_statistics
+from lcc_rl.agents.loop import REPORTED, TrainingLoop, mean_of
 from lcc_rl.agents.objective import Objective
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
@@ -54,13 +54,8 @@ class GradientLoop(TrainingLoop[Any]):
         if compiled is None:
             compiled = self.settings.compiled
         if compiled is None:
-            compiled = (
-                self.iterations >= COMPILED_ITERATIONS
-            )  # of the whole: resuming changes nothing
-        return self._rollout(compiled)
-
-    def _rollout(self, compiled: bool = False) -> DifferentiableRollout:
-        """Return what plays episodes for the objective, and records the reward's terms."""
+            # Of the whole: resuming changes nothing.
+            compiled = self.iterations >= COMPILED_ITERATIONS
         known = set(map(as_key, self.env.full_observation_spec.keys(True, True)))
         return DifferentiableRollout(
             self.env,
@@ -99,24 +94,12 @@ class GradientLoop(TrainingLoop[Any]):
             state = {key: value.detach() for key, value in state.items()}
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected
-        self.iteration += 1
         self.updates += len(losses)
-        shares = _mean(missed)
+        shares = mean_of(missed)
         limits = self._limits_row(shares)
         self.objective.limits.update(shares)
-        episodes = torch.cat(played, dim=1)
-        row = {
-            "iteration": float(self.iteration),
-            "episodes": float(self.iteration * self.env.batch_size[0]),
-            "transitions": float(self.iteration * episodes.numel()),
-            "updates": float(self.updates),
-            "learning_rate": rate,
-            **episode_statistics(episodes),
-            **_mean(losses),
-            **limits,
-        }
-        self._record(row, *spent)
-        return row
+        count = sum(part.numel() for part in played)
+        return self._record(played, losses, spent, count, {"learning_rate": rate}, limits)
 
     def _learn(self, data: TensorDictBase, running: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Take a gradient step on a segment; return which episodes go on after each step."""
@@ -126,8 +109,3 @@ class GradientLoop(TrainingLoop[Any]):
         ahead = data.get(next_key(OBSERVATION))
         moments = torch.cat([data.get(OBSERVATION), ahead[:, -1:]], 1)
         return after, self.agent.update(self.objective.score(data) * before, after, moments)
-
-
-def _mean(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Return the mean of each entry."""
-    return {name: sum(float(row[name]) for row in rows) / len(rows) for name in rows[0]}

@@ -8,7 +8,7 @@ counter, and a resumed training equals one that never stopped, bit for bit.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -133,12 +133,43 @@ class TrainingLoop(ABC, Generic[AgentT]):
             state = f"the last good state is in {good}" if good.exists() else "nothing is saved"
             raise Diverged(f"{error.what} {where}; {state}", error.advice) from error
 
-    def _record(self, row: dict[str, float], collect_s: float, learn_s: float) -> None:
-        """Append an iteration to the record; raise Diverged where a value is not finite."""
+    def _record(
+        self,
+        played: Sequence[TensorDictBase],
+        losses: Sequence[Mapping[str, Any]],
+        spent: Sequence[float],
+        transitions: int,
+        begin: Mapping[str, float],
+        end: Mapping[str, float] | None = None,
+    ) -> dict[str, float]:
+        """End an iteration: append it to the record and return its row.
+
+        Args:
+            played: the entries :data:`REPORTED` of each segment, ``[environments, steps]``.
+            losses: of each segment; their means are recorded.
+            spent: time in which episodes were played, and in which was learned [s].
+            transitions: of the iteration.
+            begin, end: further columns, before and after those of episodes and losses.
+
+        Raises:
+            Diverged: if a value is not finite.
+        """
+        self.iteration += 1
+        row = {
+            "iteration": float(self.iteration),
+            "episodes": float(self.iteration * self.env.batch_size[0]),
+            "transitions": float(self.iteration * transitions),
+            "updates": float(self.updates),
+            **begin,
+            **episode_statistics(torch.cat(list(played), dim=1)),
+            **mean_of(losses),
+            **(end or {}),
+        }
         check_learner(self.agent.policy, row, self.advice)
         self.rows.append(row)
-        spent = {"collect_s": collect_s, "learn_s": learn_s}
-        self.times.append({"iteration": row["iteration"], **spent})
+        times = dict(zip(("collect_s", "learn_s"), spent, strict=True))
+        self.times.append({"iteration": row["iteration"], **times})
+        return row
 
     # -- state ---------------------------------------------------------------------------------
 
@@ -216,6 +247,11 @@ def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
         **{f"reward_{name}": per_episode(terms[name]) for name in terms.keys()},  # noqa: SIM118
         "collisions": float((batch["next", "terminated"] & alive).sum()),
     }
+
+
+def mean_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Return the mean of each entry."""
+    return {name: sum(float(row[name]) for row in rows) / len(rows) for name in rows[0]}
 
 
 def _columns(frame: pd.DataFrame) -> dict[str, Tensor]:

@@ -23,7 +23,7 @@ from lcc_rl.agents.fused import ActorCritic
 from lcc_rl.agents.replay import ReplayLoop
 from lcc_rl.agents.vectors import as_vector, take_step, vector_adam, views
 from lcc_rl.errors import ConfigError
-from lcc_rl.settings import Count, NonNegative, Positive, Settings, Share, Whole, given_as
+from lcc_rl.settings import Count, NonNegative, Positive, Settings, Share, Whole
 
 
 class Exploration(Settings):
@@ -77,7 +77,7 @@ class OffPolicy(Agent):
     learning_starts: Whole = 0  # transitions in the buffer before the first update
     # Episodes whose mean reward rates the policy; the best one becomes the run's. None: the last.
     best_window: Count | None = None
-    exploration: given_as(Exploration) = field(default_factory=Exploration)  # type: ignore[valid-type]
+    exploration: Exploration = field(default_factory=Exploration)
     # Compute the gradient as written out, which gives the numbers of TorchRL's loss up to rounding
     # in less time; False, and networks without ReLU, differentiate the loss itself.
     fused: bool = True
@@ -187,6 +187,12 @@ class OffPolicy(Agent):
         return [
             torch.randn(like.shape, generator=generator, device=like.device) for _ in range(count)
         ]
+
+    def _losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Write the gradient, by hand where it is written out; return the losses."""
+        by_loss = self.written is None
+        losses = self._by_loss(batch) if by_loss else self._by_hand(batch, self.written)
+        return dict(zip(("loss_actor", "loss_value"), losses, strict=True))
 
     def _penalty(self, batch: TensorDictBase) -> Tensor:
         """Return the penalty on the actor's output before its tanh."""

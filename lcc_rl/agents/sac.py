@@ -20,7 +20,7 @@ from lcc_rl.agents.fused import ActorCritic, Network
 from lcc_rl.agents.off_policy import Exploration, OffPolicy
 from lcc_rl.functional.random import stream_id
 from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP
-from lcc_rl.settings import Number, Positive, given_as
+from lcc_rl.settings import Number, Positive
 
 ONE = 1.0 - 1e-6  # the largest action whose inverse tanh exists in single precision
 
@@ -84,7 +84,7 @@ class SAC(OffPolicy):
     Its exploration is a factor of the policy's own standard deviation.
     """
 
-    exploration: given_as(Exploration) = field(  # type: ignore[valid-type]
+    exploration: Exploration = field(
         default_factory=lambda: Exploration(initial=1.0, final=1.0, decay_share=1.0)
     )
     alpha_init: Positive = 0.1  # temperature at the start
@@ -118,13 +118,11 @@ class SAC(OffPolicy):
         self.spread = Network([*spread.parameters()])
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        losses = (
-            self._by_loss(batch) if self.written is None else self._by_hand(batch, self.written)
-        )
+        losses = self._losses(batch)
         self._step("all")
         self._follow("value")
         self.count += 1
-        return dict(zip(("loss_actor", "loss_value"), losses, strict=True))
+        return losses
 
     def _by_loss(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Write the gradient by TorchRL's loss; return the losses."""

@@ -11,7 +11,7 @@ from rich.console import Console
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.errors import ConfigError
 from lcc_rl.runs.arguments import Arguments
-from lcc_rl.runs.overview import counts, left, live, overview_line, progress, states_table
+from lcc_rl.runs.overview import EVERY, counts, left, live, overview_line, progress, states_table
 from lcc_rl.runs.states import clean, survey
 from lcc_rl.runs.sweeps import read_plan
 
@@ -28,19 +28,19 @@ def show_states(root: Path, console: Console) -> None:
     console.print(overview_line(root, states, planned), markup=False, soft_wrap=True)
 
 
-def watch_folder(root: Path, console: Console, every: float = 2.0) -> None:
+def watch_folder(root: Path, console: Console) -> None:
     """Update the table until no run is running or waiting."""
 
     def planned() -> int:
         return read_plan(root).runs
 
     survey(root)  # raises for a missing folder before the table is drawn
-    with live(root, planned, console, every):
+    with live(root, planned, console):
         while True:
             numbers = counts(survey(root), planned())
             if not numbers["running"] and not numbers["waiting"]:
                 return
-            time.sleep(every)
+            time.sleep(EVERY)
 
 
 def look(folder: str, console: Console, watching: bool) -> None:

@@ -349,11 +349,7 @@ def _lacking_record(cfg: EvaluateConfig, inputs: Inputs) -> str:
 
 
 def evaluate_and_write(
-    strategies: Sequence[Strategy],
-    cfg: StudyConfig,
-    inputs: Inputs,
-    folder: Path,
-    quiet: bool = False,
+    strategies: Sequence[Strategy], cfg: StudyConfig, inputs: Inputs, folder: Path, quiet: bool
 ) -> Rows:
     """Evaluate strategies on the held-out windows, write the rows and print the summary.
 

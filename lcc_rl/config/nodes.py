@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import is_dataclass
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Self
 
 from lcc_rl.errors import LARGEST, ConfigError, LccError, require, unknown_name
 from lcc_rl.settings import TARGET, Settings, defaults, find_target, parse, values
+from lcc_rl.settings import as_plain as as_plain
 
 MISSING = "???"
 STORED = (str, int, float, type(None), list, Mapping)
@@ -98,6 +98,10 @@ class Node:
         """The settings that name a place to write; a class lists them as ``WRITES``."""
         named = getattr(self.kind, "WRITES", ())
         return [name for name in named if self.settings.get(name) is not None]
+
+    def stored(self, places: bool = True) -> dict[str, Any]:
+        """Return the settings; without ``places`` those that name one to write to are null."""
+        return {**self.settings, **dict.fromkeys(() if places else self.places)}
 
     def made(self, needed: type | Sequence[str] = object) -> Any:
         """Return the object: of a class with :class:`Settings` always the same, else a new one.
@@ -183,24 +187,6 @@ def as_nodes(value: Any, where: str = "") -> Any:
         return value
     found = {key: as_nodes(x, f"{where}.{key}".removeprefix(".")) for key, x in value.items()}
     return Node(found, where) if TARGET in found else found
-
-
-def as_plain(value: Any, places: bool = True) -> Any:
-    """Return settings as plain containers, as files store them.
-
-    Args:
-        value: a configuration, a part of one or a node.
-        places: with the places that it names to write to; else they are null.
-    """
-    if isinstance(value, Node):
-        hidden = () if places else value.places
-        found = {key: as_plain(item, places) for key, item in value.settings.items()}
-        return found | dict.fromkeys(hidden)
-    if is_dataclass(value) and not isinstance(value, type):
-        value = values(value)
-    if isinstance(value, Mapping):
-        return {key: as_plain(item, places) for key, item in value.items()}
-    return [as_plain(x, places) for x in value] if isinstance(value, (list, tuple)) else value
 
 
 def without_defaults(value: Any) -> Any:

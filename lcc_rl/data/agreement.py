@@ -13,32 +13,23 @@ from numpy.typing import NDArray
 
 from lcc_rl.arrays import Floats
 from lcc_rl.data.grid import Place
-from lcc_rl.data.tables import SI, SPEEDS, UNITS
+from lcc_rl.data.tables import SI, SPEEDS, UNITS, Units
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.errors import Concern, DataError
 
 OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
 PAIR_SIGNALS = {"gap": "gap_m", "leader": "leader_speed_mps", "follower": "follower_speed_mps"}
-CHANGE_S, EVERY_S, LONGEST_LAG = (
-    2.0,
-    1.0,
-    3.0,
-)  # changes compared, time between them, longest lag [s]
+CHANGE_S, EVERY_S = 2.0, 1.0  # changes compared, and the time between them [s]
+LONGEST_LAG = 3.0  # [s]
 # Of changes [s], share explained, relative motion in a window [m]: less is too little to tell.
 LEAST_S, LEAST_FIT, LEAST_MOTION, LEAST_ALL_S = 6.0, 0.9, 0.15, 100.0
 GAIN, FLOOR = 6.0, 2e-4  # a lag leaves so much less unexplained; what exact data leave
 RIDGE = np.diag([1e-6, 1e-6, 0.1])  # [m²]: of a bias of speeds, which steady traffic leaves open
 LEAST_WAY = 50.0  # a shorter way says nothing of the unit of a speed [m]
-NEAR_MISTAKE, ALIKE = (
-    1.25,
-    1.05,
-)  # a mistake is so near to the coefficients, or as near as another one
+NEAR_MISTAKE, ALIKE = 1.25, 1.05  # a mistake so near to the coefficients; to another mistake
 LOUD = 0.3  # lag that is reported [s]
-STANDING, LEAST_STANDING, FAR_STANDING = (
-    0.5,
-    300,
-    15.0,
-)  # speed [m/s], samples; gap that may be in feet [m]
+STANDING, LEAST_STANDING = 0.5, 300  # speed [m/s], samples
+FAR_STANDING = 15.0  # gap that may be in feet [m]
 
 
 def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
@@ -121,7 +112,7 @@ def _fit(
     return found, np.nan_to_num(rest, nan=9.0).clip(FLOOR, 9.0), sums
 
 
-def mistakes(units: Mapping[str, str]) -> Iterator[tuple[bool, str, str, float, float]]:
+def mistakes(units: Units) -> Iterator[tuple[bool, str, str, float, float]]:
     """Yield what may be wrong with a pair.
 
     Args:
@@ -149,11 +140,7 @@ def mistakes(units: Mapping[str, str]) -> Iterator[tuple[bool, str, str, float, 
 
 
 def check_pairs(
-    episodes: pd.DataFrame,
-    place: Place,
-    units: Mapping[str, str],
-    max_mismatch: float,
-    max_lag: float,
+    episodes: pd.DataFrame, place: Place, units: Units, max_mismatch: float, max_lag: float
 ) -> tuple[list[str], bool]:
     """Check that the gaps of each pair agree with its speeds.
 
@@ -207,7 +194,7 @@ def check_pairs(
 
 
 def _mistaken(
-    pair: Mapping[Any, Any], units: Mapping[str, str], max_mismatch: float
+    pair: Mapping[Any, Any], units: Units, max_mismatch: float
 ) -> list[tuple[int, str, str]]:
     """Row, signal and words on the mistakes nearest to a pair; nothing if none is near.
 
@@ -241,9 +228,7 @@ def _mistaken(
     return [(pair["row"], near[0][2], f"{words}; {questions}")]
 
 
-def medians(
-    episodes: pd.DataFrame, told: pd.DataFrame, pairs: int, units: Mapping[str, str]
-) -> str:
+def medians(episodes: pd.DataFrame, told: pd.DataFrame, pairs: int, units: Units) -> str:
     """Return the line by which a user sees whether units and clocks are right.
 
     ``told`` are the rows of :func:`agreement` that tell something, of so many ``pairs``.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.data.grid import Places, continuous, on_grid, places, stretches
-from lcc_rl.data.tables import LARGEST_ID, Column, TableFile, lacking, whole_numbers
+from lcc_rl.data.tables import LARGEST_ID, Column, Names, TableFile, Units, lacking, whole_numbers
 from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
@@ -43,18 +43,15 @@ PAIR_FIELDS = (
     Column("gap", "length", blank=True),
 )
 PAIR_MEASURED = [column.key for column in PAIR_FIELDS if column.blank]  # a blank cell costs the row
-EPISODE_NAMES = dict(
-    zip((column.key for column in PAIR_FIELDS), SCHEMA, strict=True)
-)  # names by default
+# Names by default.
+EPISODE_NAMES = dict(zip((column.key for column in PAIR_FIELDS), SCHEMA, strict=True))
 EPISODE_ALIASES = {"event": "episode", "period": "recording"}
 DERIVED_POSITIONS = "no positions given: those of leaders are the integral of their speeds"
 MOTION_COLUMNS = [name for name in SCHEMA if name.endswith(("_position_m", "_speed_mps", "gap_m"))]
 
 
 def read_episodes(
-    paths: Sequence[str],
-    columns: Mapping[str, str | None] | None = None,
-    units: Mapping[str, str] | None = None,
+    paths: Sequence[str], columns: Names | None = None, units: Units | None = None
 ) -> tuple[pd.DataFrame, list[str]]:
     """Read tables of pairs: a row per pair and moment, at any rate and with holes.
 
@@ -87,11 +84,7 @@ def read_episodes(
 
 
 def _table(
-    path: str,
-    number: int,
-    columns: Mapping[str, str | None],
-    units: Mapping[str, str],
-    place: Places,
+    path: str, number: int, columns: Names, units: Units, place: Places
 ) -> tuple[pd.DataFrame, list[str]]:
     """Read one file, the ``number``-th, and bring it to the grid."""
     file = TableFile(path)
@@ -118,7 +111,7 @@ def _table(
 
 
 def _rows(
-    file: TableFile, number: int, names: Mapping[str, str | None], units: Mapping[str, str]
+    file: TableFile, number: int, names: Names, units: Units
 ) -> tuple[pd.DataFrame, NDArray[np.int64]]:
     """Rows of a file with episodes counted from 0, and the file's numbers of these."""
     read = file.read(PAIR_FIELDS, names, units, "data.columns", PAIR_MEASURED)
@@ -151,7 +144,7 @@ def _numbered(episode: NDArray, numbers: NDArray[np.int64]) -> NDArray[np.int64]
     return np.append(numbers, more)[episode]
 
 
-def _names(file: TableFile, columns: Mapping[str, str | None]) -> dict[str, str | None]:
+def _names(file: TableFile, columns: Names) -> dict[str, str | None]:
     """What a file calls the columns, by the keys of ``FIELDS``."""
     names: dict[str, str | None] = {
         key: own for key, own in EPISODE_NAMES.items() if own in file.header

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Annotated
 
 import numpy as np
@@ -13,6 +13,7 @@ from pydantic import Field
 from lcc_rl.arrays import Mask
 from lcc_rl.data.agreement import OF_PAIRS, check_pairs
 from lcc_rl.data.grid import ORIGIN, Place, Places, divided
+from lcc_rl.data.tables import Units
 from lcc_rl.data.trajectories import starts_of
 from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
@@ -56,7 +57,7 @@ class Plausible(Settings):
         place: Places,
         setting: str = "data.plausible",
         remedy: str = "",
-        units: Mapping[str, str] | None = None,
+        units: Units | None = None,
     ) -> tuple[pd.DataFrame, list[str]]:
         """Cut records where a sample is implausible; parts of less than 10 s go as well.
 

@@ -20,6 +20,7 @@ from typing import Annotated
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import savgol_filter
@@ -61,8 +62,7 @@ class SavitzkyGolay(Settings):
         samples = trajectories.samples
         starts, lengths = stretches(samples["segment"].to_numpy())
         kinematics = self.smooth(samples["position_m"].to_numpy(dtype=float))
-        place = np.arange(len(samples)) - np.repeat(starts, lengths)
-        inner = np.minimum(place, np.repeat(lengths, lengths) - 1 - place) >= self.margin
+        inner = _within(starts, lengths) >= self.margin
         if not inner.any():
             raise DataError(
                 f"{', '.join(trajectories.report.files)}: no stretch is long enough for {self}: "
@@ -118,6 +118,12 @@ class SavitzkyGolay(Settings):
         return smoothed, speed, acceleration
 
 
+def _within(starts: NDArray[np.intp], lengths: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return how many rows of its stretch lie between each row and the nearer end."""
+    place = np.arange(lengths.sum()) - np.repeat(starts, lengths)
+    return np.minimum(place, np.repeat(lengths, lengths) - 1 - place)
+
+
 def averaged(episodes: pd.DataFrame, seconds: float, source: str) -> tuple[pd.DataFrame, str]:
     """Return centred moving averages of the motion of episodes, and a line on what was left out.
 
@@ -134,8 +140,7 @@ def averaged(episodes: pd.DataFrame, seconds: float, source: str) -> tuple[pd.Da
     """
     width = round(seconds / FRAME) | 1
     starts, lengths = stretches(episodes["episode"].to_numpy())
-    place = np.arange(len(episodes)) - np.repeat(starts, lengths)
-    inner = np.minimum(place, np.repeat(lengths, lengths) - 1 - place) >= width // 2
+    inner = _within(starts, lengths) >= width // 2
     if not inner.any():
         longest = FRAME * lengths.max()
         raise DataError(

@@ -26,7 +26,7 @@ from lcc_rl.data.grid import Places, places
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.smoothing import averaged
-from lcc_rl.data.tables import SI, Column, Names, check_map
+from lcc_rl.data.tables import SI, Column, Names, Units, check_map
 from lcc_rl.data.trajectories import Trajectories
 from lcc_rl.errors import DataError
 from lcc_rl.settings import Settings
@@ -76,7 +76,7 @@ class Source(Settings):
         lines: list[str],
         remedy: str = "",
         place: Places = places,
-        units: Mapping[str, str] | None = None,
+        units: Units | None = None,
     ) -> LoadedEpisodes:
         """Return the plausible episodes, averaged; see :meth:`Plausible.select`."""
         thresholds = self.plausible or Plausible()
@@ -172,7 +172,7 @@ class EpisodesSource(Source):
         return self.select(episodes, source, lines, place=place, units=units)
 
 
-def read_as(columns: Iterable[Column], names: Names, units: Mapping[str, str]) -> str:
+def read_as(columns: Iterable[Column], names: Names, units: Units) -> str:
     """Return words on measured columns that a user names, and their units, for messages on both.
 
     Args:
@@ -187,7 +187,7 @@ def read_as(columns: Iterable[Column], names: Names, units: Mapping[str, str]) -
     return f", with data.units={{{option}}} for {', '.join(repr(names[key]) for key in found)}"
 
 
-def units_of(columns: Iterable[Column], names: Names, units: Mapping[str, str]) -> dict[str, str]:
+def units_of(columns: Iterable[Column], names: Names, units: Units) -> dict[str, str]:
     """Return the units of measured columns that have a name, by key; see :func:`read_as`."""
     found = [x for x in columns if x.quantity in SI and names.get(x.key)]
     return {x.key: units.get(x.key, SI[x.quantity]) for x in found}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from os.path import expanduser
 from pathlib import Path
@@ -14,7 +14,7 @@ from lcc_rl.data.grid import continuous, places
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
 from lcc_rl.data.sources import SHIPPED_FILES, find_files
-from lcc_rl.data.tables import Column, TableFile
+from lcc_rl.data.tables import Column, Names, TableFile, Units
 from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
@@ -65,10 +65,10 @@ def read_speed_record(
 
 def read_drives(
     path: str | Sequence[str],
-    columns: Mapping[str, str | None],
+    columns: Names,
     time_step: float,
     plausible: Plausible | None = None,
-    units: Mapping[str, str] | None = None,
+    units: Units | None = None,
 ) -> tuple[Profiles, list[str]]:
     """Read the speed records of tables.
 
@@ -106,11 +106,7 @@ def read_drives(
 
 
 def _read(
-    table: TableFile,
-    columns: Mapping[str, str | None],
-    plausible: Plausible | None,
-    units: Mapping[str, str],
-    divide: bool = True,
+    table: TableFile, columns: Names, plausible: Plausible | None, units: Units, divide: bool = True
 ) -> tuple[pd.DataFrame, list[str]]:
     """Name, drive, time and speed of the plausible samples of one file, and the report."""
     samples, report = _samples(table, columns, units), ReadReport([str(table.path)])
@@ -129,9 +125,7 @@ def _read(
     return kept, [line, *table.notes, *report.left_out(), *report.notes, *lines]
 
 
-def _samples(
-    table: TableFile, columns: Mapping[str, str | None], units: Mapping[str, str]
-) -> pd.DataFrame:
+def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:
     """Drive, as recording, time and speed of every row that has a speed."""
     fields: Sequence[Column] = DRIVE_FIELDS
     if table.preamble:

@@ -64,7 +64,8 @@ UNIT_WORDS = {
     "length": {"ft": "ft|feet|foot", "cm": "cm", "km": "km"},
 }
 Cells = Any  # a pyarrow array, chunked or not
-Names = Mapping[str, str | None]
+Names = Mapping[str, str | None]  # of columns in a file, by key
+Units = Mapping[str, str]  # of columns, by key
 Fault = Callable[[int, str], DataError]  # the error for a row and words
 
 
@@ -97,7 +98,7 @@ class Column:
         return f"{kind} from {self.least:g} to {self.most:g}{unit}"
 
 
-def check_map(columns: Iterable[Column], names: Names, units: Mapping[str, str], at: str) -> None:
+def check_map(columns: Iterable[Column], names: Names, units: Units, at: str) -> None:
     """Check the columns and units of a file as a configuration names them.
 
     Args:
@@ -186,7 +187,7 @@ class TableFile:
         self,
         columns: Iterable[Column],
         names: Names,
-        units: Mapping[str, str] | None = None,
+        units: Units | None = None,
         option: str = "",
         measured: Iterable[str] = (),
     ) -> dict[str, NDArray]:
@@ -241,7 +242,7 @@ class TableFile:
         self.notes.append(line)
         return {key: values[~wrong] for key, values in read.items()}
 
-    def _scale(self, column: Column, units: Mapping[str, str], option: str) -> float:
+    def _scale(self, column: Column, units: Units, option: str) -> float:
         """The size in SI of the unit that a column is read in, unless its name says another."""
         unit, name = units.get(column.key, SI.get(column.quantity, "")), self.names[column.key]
         scale = (unit and unit_size(column.quantity, unit)) or 1.0

@@ -37,7 +37,7 @@ from lcc_rl.functional.driver_models import (
     Reaction,
 )
 from lcc_rl.functional.laws import LAWS
-from lcc_rl.settings import Positive, Settings, given_as
+from lcc_rl.settings import Positive, Settings
 
 # Genetic algorithms of the choice of constants: over constants, and within each over (v0, T).
 OUTER = GeneticSettings(population=12, generations=12, founders=2, patience=4)
@@ -82,10 +82,6 @@ class Calibration:
 DEFAULT_CONSTANTS = dict.fromkeys(list(PARAMETERS)[len(INDIVIDUAL) :])
 
 
-def _wide() -> GeneticSettings:
-    return GeneticSettings(population=64, generations=60)
-
-
 class Calibrator(Settings):
     """Calibration of one driver per episode in one or both modes (A6), all of them at once.
 
@@ -110,12 +106,10 @@ class Calibrator(Settings):
     reaction: bool = False
     perception: bool = False  # also try noises of the perceived gap, and weigh rough leaders
     choose_constants: bool = False  # local: choose them by the mean error of all drivers first
-    selection: given_as(Selection) = field(default_factory=Selection)  # type: ignore[valid-type]
-    local_genetic: given_as(GeneticSettings) = field(  # type: ignore[valid-type]
-        default_factory=GeneticSettings
-    )
-    global_genetic: given_as(GeneticSettings) = field(  # type: ignore[valid-type]
-        default_factory=_wide
+    selection: Selection = field(default_factory=Selection)
+    local_genetic: GeneticSettings = field(default_factory=GeneticSettings)
+    global_genetic: GeneticSettings = field(
+        default_factory=lambda: GeneticSettings(population=64, generations=60)
     )
 
     def validate(self) -> None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from lcc_rl.config.nodes import find_target
 from lcc_rl.errors import ConfigError, unknown_name
@@ -28,7 +27,7 @@ MODEL = "model"  # the column that names a driver's model; a table without it is
 BOUND_TOLERANCE = 0.005
 
 Mode = Literal["local", "global"]
-BoundPair = Annotated[tuple[Number, Number], Field(strict=False)]  # lower and upper
+BoundPair = tuple[Number, Number]  # lower and upper
 DEFAULT_BOUNDS: dict[str, BoundPair] = {name: one.bounds for name, one in PARAMETERS.items()}
 
 

@@ -160,7 +160,8 @@ def bootstrap(
     if law is not None:
         find_law(law)
     table = load_drivers(path, mode)
-    found = replace(from_table(table), mode=mode_of(table))
+    calibrated = str(table["mode"].iloc[0]) if "mode" in table else None
+    found = replace(from_table(table), mode=calibrated)
     given = {"delay": reaction_delay, "noise": acceleration_noise, "gap_noise": gap_noise}
     changes = {name: value for name, value in given.items() if value is not None}
     found = replace(found, reaction=replace(found.reaction, **changes))
@@ -201,11 +202,6 @@ def from_table(table: pd.DataFrame) -> DriverPopulation:
         if name not in INDIVIDUAL
     }
     return replace(found, models=tuple(models), own=more)
-
-
-def mode_of(table: pd.DataFrame) -> str | None:
-    """Return the mode of calibration in a driver table; None without that column."""
-    return str(table["mode"].iloc[0]) if "mode" in table else None
 
 
 def _tensor(values: np.ndarray | pd.Series) -> Tensor:

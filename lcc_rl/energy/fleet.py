@@ -34,7 +34,7 @@ class VehicleClass(Settings):
     energy: InstanceOf[EnergyModel]  # its mass, power, resistances, and what it draws
     share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0  # of the vehicles of its roles
     # Of the vehicles that are of this class.
-    roles: Annotated[tuple[str, ...], Field(strict=False, min_length=1)] = (HUMAN,)
+    roles: Annotated[tuple[str, ...], Field(min_length=1)] = (HUMAN,)
     length: Positive = 5.0  # [m]
     speed_limit: Positive | None = None  # None: as fast as its power allows [m/s]
     bounded: bool = True  # False: it accelerates as commanded, whatever its power

@@ -163,11 +163,6 @@ class Reductions:
         return torch.where(self.alive, entry, -torch.inf).amax(0).amax(-2)
 
 
-def _moving(time_gap: Tensor, speed: Tensor) -> Tensor:
-    """Whether a time gap is long above walking pace."""
-    return (time_gap > LONG_TIME_GAP) & (speed[1:] > PACE)
-
-
 def _turned(over: Reductions, safe: Tensor) -> Tensor:
     """Whether a safe step is followed by an unsafe one; that after the last step is not known."""
     turned = torch.zeros_like(safe, dtype=torch.bool)
@@ -186,7 +181,9 @@ METRICS: dict[str, Callable[..., Tensor]] = {
     "max_time_gap_s": lambda over, time_gap: over.highest(time_gap),
     "share_ttc_unsafe": lambda over, ttc: over.mean(ttc < UNSAFE_TTC),
     "share_time_gap_long": lambda over, time_gap: over.mean(time_gap > LONG_TIME_GAP),
-    "share_time_gap_long_moving": lambda over, time_gap, speed: over.mean(_moving(time_gap, speed)),
+    "share_time_gap_long_moving": lambda over, time_gap, speed: over.mean(
+        (time_gap > LONG_TIME_GAP) & (speed[1:] > PACE)
+    ),
     "rms_jerk_mps3": lambda over, jerk: over.mean(jerk**2).sqrt(),
     "duration_s": lambda over: over.steps * over.time_step,
     "share_filter_acts": lambda over, command, wanted: over.mean((command - wanted).abs() > ACTS),

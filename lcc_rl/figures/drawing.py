@@ -55,11 +55,7 @@ COLOURS = {
     "human": "#b0a080",
     "direct": INK,
 }
-OWN_COLOURS = (
-    "#cc79a7",
-    "#882255",
-    "#117733",
-)  # of the user's own; no colour of a baseline
+OWN_COLOURS = ("#cc79a7", "#882255", "#117733")  # of the user's own; no colour of a baseline
 
 
 def colour(strategy: str) -> str:

@@ -15,13 +15,8 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.figures.drawing import INK, PAGE_WIDTH, legend_above, new_figure, paper, style, unbox
 from lcc_rl.results.names import in_words
 
-PANEL_STRATEGIES = (
-    "cacc paper_like",
-    "cacc tuned",
-    "cacc",
-    "ddpg",
-    "hcfs",
-)  # strategies with a panel
+# Strategies with a panel.
+PANEL_STRATEGIES = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")
 PANEL_HYBRIDS = ("hcfs", "hcfs oracle")
 NEAR_COLOUR, FAR_COLOUR = np.array([0.0, 0.45, 0.70]), np.array([0.90, 0.62, 0.0])
 BOUND = "#b00020"

@@ -14,13 +14,8 @@ from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.results.motion import MotionSeries, SampleMotion
 
 SPEED_UP, KEY_STEP = 20.0, 1.5  # times as fast as it was driven; between two key frames [s]
-WIDE, HIGH, RADIUS, ROAD, CAR_SIZE = (
-    330,
-    380,
-    118,
-    24,
-    12,
-)  # of a panel, its ring, road and cars [px]
+WIDE, HIGH = 330, 380  # of a panel [px]
+RADIUS, ROAD, CAR_SIZE = 118, 24, 12  # of its ring, road and cars [px]
 SVG_FRAME = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {high}" width="{wide}" \
 height="{high}" font-family="system-ui, 'Segoe UI', Roboto, sans-serif" text-anchor="middle">
 <title>{title}</title>

@@ -16,6 +16,8 @@ from torch import Tensor
 from lcc_rl.errors import require_positive
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 
+Each = Tensor | float  # a number of each driver, or one of all
+
 
 class Parameter(NamedTuple):
     """A parameter that a calibration may fit, of one driver model or several.
@@ -90,12 +92,7 @@ class DriverConstants(ABC):
 
     @abstractmethod
     def wish(
-        self,
-        speed: Tensor,
-        gap: Tensor,
-        approach_rate: Tensor,
-        desired_speed: Tensor | float,
-        time_gap: Tensor | float,
+        self, speed: Tensor, gap: Tensor, approach_rate: Tensor, desired_speed: Each, time_gap: Each
     ) -> Tensor:
         """Return the acceleration that the driver wishes [m/s²]; arguments as of a call."""
 
@@ -104,12 +101,7 @@ class DriverConstants(ABC):
         """Return the gap of :meth:`equilibrium_gap` without its cap [m]."""
 
     def __call__(
-        self,
-        speed: Tensor,
-        gap: Tensor,
-        approach_rate: Tensor,
-        desired_speed: Tensor | float,
-        time_gap: Tensor | float,
+        self, speed: Tensor, gap: Tensor, approach_rate: Tensor, desired_speed: Each, time_gap: Each
     ) -> Tensor:
         """Return the acceleration of the law, held within physical limits.
 
@@ -164,7 +156,7 @@ class DriverConstants(ABC):
         """Return the names of the parameters besides v0 and T."""
         return tuple(cls.table())[len(INDIVIDUAL) :]
 
-    def with_(self, **changes: Tensor | float) -> Self:
+    def with_(self, **changes: Each) -> Self:
         """Return a copy in which some constants vary by driver (tensors, for calibration)."""
         return replace(self, **changes)  # type: ignore[arg-type]
 

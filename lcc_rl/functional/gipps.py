@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lcc_rl.functional.driver_models import DriverConstants
+from lcc_rl.functional.driver_models import DriverConstants, Each
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,7 @@ class GippsConstants(DriverConstants):
     leader_deceleration: float = 3.2
 
     def wish(
-        self,
-        speed: Tensor,
-        gap: Tensor,
-        approach_rate: Tensor,
-        desired_speed: Tensor | float,
-        time_gap: Tensor | float,
+        self, speed: Tensor, gap: Tensor, approach_rate: Tensor, desired_speed: Each, time_gap: Each
     ) -> Tensor:
         """Return (v_G − v)/τ, which reaches Gipps' speed v_G after the reaction time τ = 2T/3.
 

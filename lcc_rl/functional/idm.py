@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from lcc_rl.functional.driver_models import DriverConstants
+from lcc_rl.functional.driver_models import DriverConstants, Each
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class IDMConstants(DriverConstants):
     exponent: float = 4.0
     gap_floor: float = 0.1
 
-    def desired_gap(self, speed: Tensor, approach_rate: Tensor, time_gap: Tensor | float) -> Tensor:
+    def desired_gap(self, speed: Tensor, approach_rate: Tensor, time_gap: Each) -> Tensor:
         """Return the desired gap s* = s0 + max(0, vT + vΔv / (2√(ab))) (A4) [m].
 
         Args:
@@ -39,12 +39,7 @@ class IDMConstants(DriverConstants):
         return self.min_gap + (speed * (time_gap + approach_rate / root)).clamp(min=0.0)
 
     def wish(
-        self,
-        speed: Tensor,
-        gap: Tensor,
-        approach_rate: Tensor,
-        desired_speed: Tensor | float,
-        time_gap: Tensor | float,
+        self, speed: Tensor, gap: Tensor, approach_rate: Tensor, desired_speed: Each, time_gap: Each
     ) -> Tensor:
         """Return a(1 − (v/v0)^δ − (s*/s)²) (A3)."""
         free_road = power(speed / desired_speed, self.exponent)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lcc_rl.functional.driver_models import DriverConstants
+from lcc_rl.functional.driver_models import DriverConstants, Each
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,7 @@ class OVMConstants(DriverConstants):
     sensitivity: float = 1.0
     form: float = 1.5
 
-    def optimal_speed(
-        self, gap: Tensor, desired_speed: Tensor | float, time_gap: Tensor | float
-    ) -> Tensor:
+    def optimal_speed(self, gap: Tensor, desired_speed: Each, time_gap: Each) -> Tensor:
         """Return V(s) = A (tanh((s − s0)/(A T) − β) + tanh β), A = v0/(1 + tanh β).
 
         Bando's function by quantities that other models have, too: it is 0 at s0 and v0 far
@@ -52,18 +50,13 @@ class OVMConstants(DriverConstants):
         shift = (gap - self.min_gap) / (scale * time_gap) - self.form
         return scale * (shift.tanh() + offset)
 
-    def _scale(self, desired_speed: Tensor | float, like: Tensor) -> tuple[Tensor, Tensor]:
+    def _scale(self, desired_speed: Each, like: Tensor) -> tuple[Tensor, Tensor]:
         """Return A and tanh β."""
         offset = torch.as_tensor(self.form, dtype=like.dtype, device=like.device).tanh()
         return desired_speed / (1.0 + offset), offset
 
     def wish(
-        self,
-        speed: Tensor,
-        gap: Tensor,
-        approach_rate: Tensor,
-        desired_speed: Tensor | float,
-        time_gap: Tensor | float,
+        self, speed: Tensor, gap: Tensor, approach_rate: Tensor, desired_speed: Each, time_gap: Each
     ) -> Tensor:
         """Return κ (V(s) − v); this model ignores the approach rate."""
         return self.sensitivity * (self.optimal_speed(gap, desired_speed, time_gap) - speed)
@@ -90,12 +83,7 @@ class FVDMConstants(OVMConstants):
     speed_gain: float = 0.5
 
     def wish(
-        self,
-        speed: Tensor,
-        gap: Tensor,
-        approach_rate: Tensor,
-        desired_speed: Tensor | float,
-        time_gap: Tensor | float,
+        self, speed: Tensor, gap: Tensor, approach_rate: Tensor, desired_speed: Each, time_gap: Each
     ) -> Tensor:
         """Return κ (V(s) − v) − λ Δv."""
         adapting = super().wish(speed, gap, approach_rate, desired_speed, time_gap)

@@ -25,7 +25,7 @@ from lcc_rl.pieces.base import Entry, Piece, declared
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, VEHICLES
 from lcc_rl.pieces.world import MAX_ACCELERATION, World
-from lcc_rl.settings import Positive, Settings, given_as, parse
+from lcc_rl.settings import Positive, Settings, parse
 
 ABOUT = "lcc_rl"  # key of the metadata
 STATE_INPUT, MEMORY_INPUT = TAKES = ("state", "memory")
@@ -60,7 +60,7 @@ class ProgramInput(Settings):
 class ProgramFacts(Settings):
     """Contents of a program's metadata."""
 
-    inputs: Annotated[tuple[given_as(ProgramInput), ...], Field(strict=False, min_length=1)]  # type: ignore[valid-type]
+    inputs: Annotated[tuple[ProgramInput, ...], Field(min_length=1)]
     output: Literal["acceleration [m/s²]"]
 
 

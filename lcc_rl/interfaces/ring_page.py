@@ -15,7 +15,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor, nn
+from torch import nn
 
 from lcc_rl.config import key_of, load, top_key
 from lcc_rl.config.schemas import StudyConfig
@@ -162,12 +162,11 @@ def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict
 
 
 def _layer(layer: nn.Module) -> dict[str, str]:
-    numbers = {name: _encoded(weights) for name, weights in layer.named_parameters()}
+    numbers = {
+        name: b64encode(weights.detach().numpy().astype("<f4").tobytes()).decode()
+        for name, weights in layer.named_parameters()
+    }
     return {"kind": type(layer).__name__, **numbers}
-
-
-def _encoded(numbers: Tensor) -> str:
-    return b64encode(numbers.detach().numpy().astype("<f4").tobytes()).decode()
 
 
 def filter_data(safety: CBFFilter) -> dict[str, Any]:

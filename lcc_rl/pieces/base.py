@@ -170,9 +170,8 @@ class Piece(Part, TensorDictModuleBase, Transform):
             names = world.sensed(self.role, names) if self.measures else names
             reads = Views(string, self.role, names)
         self.views = reads
-        # Whether of the moment reached, and the key, as a plain tuple: TorchRL's properties convert
-        # at every access.
-        self.needs = [(True, key) for key in reads.keys]
+        # As plain tuples: TorchRL's properties convert at every access.
+        self.needs = [self.read_at(key) for key in reads.keys]
         self.read_names = [".".join(key) for key in reads.keys]
         count = len(string) if self.role == VEHICLES else string.count(self.role)
         self.rows = () if self.role == EPISODE else (count,)
@@ -180,8 +179,12 @@ class Piece(Part, TensorDictModuleBase, Transform):
         self.targets = self._declared(self.writes if writes is None else writes)
         self.constants = self._declared(self.keeps if keeps is None else keeps)
         self.reset_options = [key for key in self.constants if self.entries[key].option]
-        self.in_keys, self.out_keys = list(reads.keys), list(self.targets)
+        self.in_keys = list(reads.keys)
+        self.out_keys = [self.written_at(key) for key in self.targets]
         self.event_shape = self.shape_of(self.targets[0]) if self.targets else (*self.rows, 1)
+
+    read_at = staticmethod(lambda key: (True, key))  # whether of the moment reached, and its key
+    written_at = staticmethod(root_key)  # where a TensorDict of a step has what is written
 
     def _declared(self, entries: Sequence[Entry | NestedKey]) -> list[Key]:
         """Take entries of the piece; return their keys."""
@@ -295,17 +298,8 @@ class StepTransform(Piece):
 
     compute: ClassVar[Callable[..., Any]] = staticmethod(lambda: ())  # of one that only keeps
 
-    def declare(
-        self,
-        world: World,
-        reads: Sequence[NestedKey] | Views | None = None,
-        writes: Sequence[Entry | NestedKey] | None = None,
-        keeps: Sequence[Entry] | None = None,
-    ) -> None:
-        """Set what the piece reads, under ``next.`` of the moment reached, and what it writes."""
-        super().declare(world, reads, writes, keeps)
-        self.needs = [(key[0] == NEXT, root_key(key)) for _, key in self.needs]
-        self.out_keys = [next_key(key) for key in self.targets]
+    read_at = staticmethod(lambda key: (key[0] == NEXT, root_key(key)))
+    written_at = staticmethod(next_key)
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         """Set the written entries and the constants at reset; zeros unless overridden.

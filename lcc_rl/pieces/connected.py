@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
-from pydantic import Field
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
@@ -40,7 +39,7 @@ class Communication(Feature):
     refer to the vehicle ahead.
     """
 
-    connected: Annotated[tuple[str, ...], Field(strict=False)] = (AUTOMATED,)  # send and hear
+    connected: tuple[str, ...] = (AUTOMATED,)  # send and hear
     leader_sends: bool = True  # the vehicle ahead of the whole string sends, too
     headway: NonNegative = 5.0  # h, the gap to be kept [m]
     delay: NonNegative = 0.005  # of messages; it acts on the positions received [s]

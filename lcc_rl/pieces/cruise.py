@@ -7,12 +7,11 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
+from lcc_rl.functional.driver_models import Each
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.world import MAX_ACCELERATION
 from lcc_rl.settings import Positive, defaults
-
-Constant = Tensor | float
 
 
 class Cruise(Controller):
@@ -32,7 +31,7 @@ class Cruise(Controller):
 
     @staticmethod
     @abstractmethod
-    def law(speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Constant) -> Tensor:
+    def law(speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Each) -> Tensor:
         """Return the acceleration [m/s²].
 
         Args:
@@ -58,7 +57,7 @@ class IDMACC(Cruise):
     min_gap: Positive = 2.0  # s0 [m]
 
     @staticmethod
-    def law(speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Constant) -> Tensor:
+    def law(speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Each) -> Tensor:
         """Return the acceleration of the model [m/s²]."""
         desired_speed, time_gap, *shared = constants
         model = IDMConstants(*shared)  # type: ignore[arg-type]
@@ -80,7 +79,7 @@ class LinearACC(Cruise):
     speed_gain: Positive = 0.5  # k_v [1/s]
 
     @staticmethod
-    def law(speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Constant) -> Tensor:
+    def law(speed: Tensor, gap: Tensor, relative_speed: Tensor, *constants: Each) -> Tensor:
         """Return the acceleration of the formula [m/s²]."""
         desired_speed, time_gap, min_gap, gap_gain, speed_gain = constants
         following = gap_gain * (gap - min_gap - time_gap * speed) + speed_gain * relative_speed

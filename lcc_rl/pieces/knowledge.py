@@ -20,7 +20,7 @@ from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative
 
 Seconds = Annotated[float, Field(ge=0.0, le=3600.0)]  # what is remembered or known ahead
-Times = Annotated[tuple[Seconds, ...], Field(strict=False, min_length=1)]
+Times = Annotated[tuple[Seconds, ...], Field(min_length=1)]
 
 
 class LeaderPreview(Feature):
@@ -79,7 +79,7 @@ class ObservationMemory(StepTransform):
     """
 
     # What is remembered, views one number wide, dotted: "self.gap".
-    sources: Annotated[tuple[str, ...], Field(strict=False, min_length=1)] = ("ahead.speed",)
+    sources: Annotated[tuple[str, ...], Field(min_length=1)] = ("ahead.speed",)
     seconds: Times = (0.5, 1.0, 2.0, 5.0)  # time constants or ages, at least a step [s]
     kind: Literal["filtered", "stacked"] = "filtered"
 

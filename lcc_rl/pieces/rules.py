@@ -16,9 +16,9 @@ from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
 
 Window = Annotated[float, Field(gt=0.0, le=3600.0)]
-Pair = Annotated[tuple[NonNegative, NonNegative], Field(strict=False)]
-Three = Annotated[tuple[Positive, Positive, Positive], Field(strict=False)]
-ThreeTimes = Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)]
+Pair = tuple[NonNegative, NonNegative]
+Three = tuple[Positive, Positive, Positive]
+ThreeTimes = tuple[NonNegative, NonNegative, NonNegative]
 
 
 class Averaging(Controller):

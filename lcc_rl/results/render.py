@@ -234,8 +234,6 @@ def print_table(table: RenderableType) -> None:
     """Print a table or a text, as wide as the terminal or ``COLUMNS``; else as its content."""
     console = Console()
     if not console.is_terminal and "COLUMNS" not in os.environ:
-        wide = (
-            Console(width=UNLIMITED).measure(table).maximum
-        )  # a console measures within its width
+        wide = Console(width=UNLIMITED).measure(table).maximum  # it measures within its width
         console = Console(width=max(wide, console.width))
     console.print(table)

@@ -15,6 +15,7 @@ from lcc_rl.runs.progress import clock
 from lcc_rl.runs.states import STATES, RunState, survey
 
 STATE_COLOURS = {"finished": "green", "running": "cyan", "stopped": "yellow", "failed": "red"}
+EVERY = 2.0  # between two looks at the folder [s]
 URGENCY = ("running", "failed", "stopped", "finished")
 
 
@@ -89,11 +90,11 @@ def states_table(
     return Group(table, escape(overview_line(root, states, planned)))
 
 
-def live(root: Path, planned: Callable[[], int], console: Console, every: float = 2.0) -> Live:
-    """Return a live table for a terminal, updated every ``every`` seconds."""
+def live(root: Path, planned: Callable[[], int], console: Console) -> Live:
+    """Return a live table for a terminal, updated every :data:`EVERY` seconds."""
 
     def picture() -> Group:
         # Seven lines: heading, borders and summary; a long error may still wrap.
         return states_table(root, survey(root), planned(), max(1, console.height - 7))
 
-    return Live(get_renderable=picture, console=console, refresh_per_second=1 / every)
+    return Live(get_renderable=picture, console=console, refresh_per_second=1 / EVERY)

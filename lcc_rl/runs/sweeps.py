@@ -151,7 +151,8 @@ class SweepCallback(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Write the plan and log the folder; exit with one line where it cannot be run."""
-        if needs_slurm(config) and which("srun") is None:
+        launcher = str(config.hydra.launcher.get("_target_"))
+        if launcher.endswith(".SlurmLauncher") and which("srun") is None:
             refuse("there is no SLURM here (no srun); use hydra/launcher=lcc_submitit_local")
         limit_batches(config)
         folder = Path(config.hydra.sweep.dir)
@@ -193,11 +194,6 @@ def refuse(reason: object) -> NoReturn:
     """Exit with one line; Hydra turns any other exception of a callback into a warning."""
     print(f"lcc_rl: error: {reason}", file=sys.stderr)
     sys.exit(BAD_INPUT)
-
-
-def needs_slurm(config: DictConfig) -> bool:
-    """Whether a sweep's launcher is that of SLURM."""
-    return str(config.hydra.launcher.get("_target_")).endswith(".SlurmLauncher")
 
 
 def mute() -> None:

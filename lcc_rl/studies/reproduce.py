@@ -61,30 +61,21 @@ STUDY_RESULTS: dict[str, Callable[..., StudyResults]] = {
 }
 
 
-def run_alcc(arguments: Namespace) -> None:
-    """Run the ALCC study."""
-    recipe = arguments.recipe or alcc.default_recipe(arguments.overrides)
-    alcc.run(_study(arguments, recipe), arguments.parts, arguments.ablations)
+def run(given: Namespace) -> None:
+    """Run the study that was named."""
+    if given.study == "ring":
+        ring.run(given.out, given.overrides)
+    elif given.study == "road":
+        road.run(given.out, given.overrides, given.shares)
+    elif given.study == "hcfs":
+        hcfs.run(_study(given, hcfs.RECIPE))
+    else:
+        alcc.run(_study(given, alcc.default_recipe(given.overrides)), given.parts, given.ablations)
 
 
-def run_hcfs(arguments: Namespace) -> None:
-    """Run the HCFS study."""
-    hcfs.run(_study(arguments, arguments.recipe or hcfs.RECIPE))
-
-
-def run_ring(arguments: Namespace) -> None:
-    """Evaluate controllers on a ring after a handover."""
-    ring.run(arguments.out, arguments.overrides)
-
-
-def run_road(arguments: Namespace) -> None:
-    """Evaluate shares of automated cars among drivers of recorded trajectories."""
-    road.run(arguments.out, arguments.overrides, arguments.shares)
-
-
-def _study(arguments: Namespace, recipe: str | None) -> Study:
-    overrides = tuple(arguments.overrides)
-    return Study(arguments.out, recipe, arguments.seeds, overrides, arguments.jobs)
+def _study(given: Namespace, recipe: str | None) -> Study:
+    overrides = tuple(given.overrides)
+    return Study(given.out, given.recipe or recipe, given.seeds, overrides, given.jobs)
 
 
 def parser() -> ArgumentParser:
@@ -92,17 +83,13 @@ def parser() -> ArgumentParser:
     top = Arguments(description=__doc__)
     commands = top.add_subparsers(required=True, dest="study")
     one = _trained(commands, "alcc", "Adaptive Leading Cruise Control (arXiv 2210.02147)")
-    one.set_defaults(run=run_alcc)
     _listing(one, "--parts", alcc.STUDY_PARTS, "which parts to run: " + ",".join(alcc.STUDY_PARTS))
     names = f"all by default: {','.join(alcc.ABLATIONS)}; or your own as name:override"
     _listing(one, "--ablations", (), f"which ablations; {names}")
-    two = _trained(commands, "hcfs", "Hybrid Car-Following Strategy (IEEE T-ASE 2021)")
-    two.set_defaults(run=run_hcfs)
-    three = _subcommand(commands, "ring", "field experiment on a ring (Stern et al. 2018)")
-    three.set_defaults(run=run_ring)
-    four = _subcommand(commands, "road", "what automated cars would bring on a recorded road")
-    four.set_defaults(run=run_road)
-    _listing(four, "--shares", road.ROAD_SHARES, "of automated cars [%]: 5,10,20")
+    _trained(commands, "hcfs", "Hybrid Car-Following Strategy (IEEE T-ASE 2021)")
+    _subcommand(commands, "ring", "field experiment on a ring (Stern et al. 2018)")
+    two = _subcommand(commands, "road", "what automated cars would bring on a recorded road")
+    _listing(two, "--shares", road.ROAD_SHARES, "of automated cars [%]: 5,10,20")
     return top
 
 
@@ -140,7 +127,7 @@ def main(words: list[str]) -> int:
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     arguments.out = own_folder(arguments.out, "--out", MADE.issuperset)
     with claim(arguments.out):
-        arguments.run(arguments)
+        run(arguments)
         STUDY_RESULTS[arguments.study](arguments.out, arguments.formats)
     log.info("tables and figures: %s", arguments.out / RESULTS_PAGE)
     return 0

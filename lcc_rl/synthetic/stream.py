@@ -29,12 +29,12 @@ from lcc_rl.data.trajectories import (
 )
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
 from lcc_rl.errors import ConfigError
-from lcc_rl.settings import Seed, Settings, Share, given_as
+from lcc_rl.settings import Seed, Settings, Share
 from lcc_rl.synthetic.lane import Stream, drive_platoons
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
 Duration = Annotated[float, Field(ge=1.0, le=36_000.0)]
-Range = Annotated[tuple[Duration, Duration], Field(strict=False)]
+Range = tuple[Duration, Duration]
 FIRST_START = datetime(2005, 1, 1, 12, tzinfo=UTC)
 
 
@@ -55,10 +55,10 @@ class StreamSource(Settings):
     duration_s: Range = (60.0, 90.0)  # of how long a platoon is seen [s]
     seed: Seed = 0  # of the data; the run's own seed leaves them alone
     noise: Share = 0.05  # drivers execute a(1 + ξ), ξ ~ U(0, noise) (A18)
-    leader: given_as(StopAndGo) = field(default_factory=StopAndGo)  # type: ignore[valid-type]
+    leader: StopAndGo = field(default_factory=StopAndGo)
     drivers: InstanceOf[DriverPopulation] | None = None  # None: the shipped I-80 drivers
     # What counts as car following; the default is that of real files.
-    criteria: given_as(Criteria) = field(default_factory=Criteria)  # type: ignore[valid-type]
+    criteria: Criteria = field(default_factory=Criteria)
     keep: None = None  # no file is written; the hashes of runs hold this setting
 
     def validate(self) -> None:

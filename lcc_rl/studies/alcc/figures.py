@@ -30,7 +30,13 @@ from lcc_rl.functional.power import motor_power
 from lcc_rl.results.names import in_words
 from lcc_rl.results.render import signed
 from lcc_rl.results.windows import by_driver, savings
-from lcc_rl.studies.alcc.paper_tables import PAPER_GENERALIZATION, generalization
+from lcc_rl.studies.alcc.paper_tables import (
+    BASELINE,
+    PAIR,
+    PAPER_GENERALIZATION,
+    STRATEGY,
+    generalization,
+)
 from lcc_rl.studies.alcc.tables import comparison
 
 REWARD_LABELS = {
@@ -135,30 +141,28 @@ def _flat_box(axis: Axes, values: np.ndarray, place: int, hue: str) -> None:
 
 
 @paper
-def generalization_figure(
-    windows: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
-) -> Figure:
+def generalization_figure(windows: pd.DataFrame) -> Figure:
     """Path energy of both vehicles on every held-out window, and its saving (Fig. 12)."""
-    table = generalization(windows, strategy, baseline).sort_values("path_saving_pct")
+    table = generalization(windows).sort_values("path_saving_pct")
     figure = new_figure(PAGE_WIDTH, 4.4)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
-    _energies_by_profile(above, windows, table["profile_id"].tolist(), (baseline, strategy))
+    _energies_by_profile(above, windows, table["profile_id"].tolist(), (BASELINE, STRATEGY))
     values, places = table["path_saving_pct"].to_numpy(float), np.arange(len(table))
-    seeds = windows.loc[windows["strategy"] == strategy, "training_seed"].nunique()
+    seeds = windows.loc[windows["strategy"] == STRATEGY, "training_seed"].nunique()
     sure = f"mean of {seeds} seeds, 95 % interval" if seeds > 1 else "1 seed (no interval)"
     look: dict[str, Any] = {"upright": True, "ms": 2.5, "label": f"this study, {sure}"}
-    dots(below, places, table, "path_saving_pct", colour(strategy), **look)
+    dots(below, places, table, "path_saving_pct", colour(STRATEGY), **look)
     beyond = len(table) + 1.0 + np.arange(len(PAPER_GENERALIZATION))
     label = "paper, 4 profiles, energy as drawn"
     below.plot(beyond, PAPER_GENERALIZATION, "s", mfc="none", color=INK, label=label)
     below.axhline(0.0, color=INK, lw=0.8)
-    together = 100 * savings(windows, "total_path_energy_kj", strategy, baseline).value
+    together = 100 * savings(windows, "total_path_energy_kj", *PAIR).value
     line = f"all windows together {signed(together)} %"
-    below.axhline(together, color=colour(strategy), lw=0.8, ls="--", label=line)
+    below.axhline(together, color=colour(STRATEGY), lw=0.8, ls="--", label=line)
     _cut_outliers(below, places, values)
     below.set_xticks([])
     words = f"held-out windows, sorted by the saving (n = {len(table)}); right: the paper's"
-    style(below, words, f"saved by {in_words(strategy)}\nagainst {in_words(baseline)} [%]")
+    style(below, words, f"saved by {in_words(STRATEGY)}\nagainst {in_words(BASELINE)} [%]")
     legend_above(below, 2)
     return figure
 
@@ -206,8 +210,9 @@ def comparison_figure(windows: pd.DataFrame) -> Figure:
     names, strategies = (list(dict.fromkeys(table[name])) for name in ("ablation", "strategy"))
     figure = new_figure(PAGE_WIDTH, 1.0 + 0.32 * len(names))
     axes = figure.subplots(1, len(PANELS), sharey=True, width_ratios=(2, 1, 1))
+    abreast = 0.18 * np.linspace(-1.0, 1.0, len(strategies)) * (len(strategies) > 1)
     for axis, (column, (label, line)) in zip(axes, PANELS.items(), strict=True):
-        for strategy, offset in zip(strategies, _abreast(len(strategies), 0.18), strict=True):
+        for strategy, offset in zip(strategies, abreast, strict=True):
             part, hue = table[table["strategy"] == strategy], colour(strategy)
             rows = [names.index(name) + offset for name in part["ablation"]]
             dots(axis, rows, part, column, hue, label=in_words(strategy))
@@ -228,8 +233,3 @@ def _how_many(seeds: pd.Series) -> str:
     """Return the distinct numbers of seeds in a column, in words."""
     counts = sorted({int(count) for count in seeds if str(count).isdigit()})
     return f"{' or '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"
-
-
-def _abreast(count: int, reach: float) -> np.ndarray:
-    """Return evenly spaced offsets in ±``reach``; zero for a single one."""
-    return reach * np.linspace(-1.0, 1.0, count) * (count > 1)

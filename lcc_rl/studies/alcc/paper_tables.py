@@ -12,6 +12,7 @@ from lcc_rl.results.bootstrap import share_saved
 from lcc_rl.results.windows import Means, by_driver, driver_savings, per_seed, savings
 from lcc_rl.studies.alcc.tables import ENERGY_KINDS
 
+PAIR = STRATEGY, BASELINE = "alcc", "reference"  # that are compared
 PAPER_ROW, STUDY_ROW = "paper", "this study"
 ENERGY_WORDS = {"path_": "path energy", "": "as drawn"}  # of the keys of KINDS
 # Wang et al., arXiv 2210.02147: Table IV, Fig. 9 and the generalization experiment.
@@ -36,16 +37,13 @@ PAPER_HUMAN = {
 }
 
 
-def table_iv(
-    drivers: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
-) -> pd.DataFrame:
+def table_iv(drivers: pd.DataFrame) -> pd.DataFrame:
     """Energies behind the mean, best and worst driver (Table IV of the paper).
 
     The best driver is the one with the largest saving of total energy over profiles and seeds.
 
     Args:
         drivers: of :class:`lcc_rl.results.windows.Means`.
-        strategy, baseline: the controllers that are compared.
 
     Returns:
         Rows for both controllers and each driver, this study's and the paper's: CAV, HDV and
@@ -56,34 +54,34 @@ def table_iv(
         f"{vehicle}_{x}" for vehicle in ("cav", "hdv", "total") for x in ENERGY_KINDS.values()
     ]
     energies = {column: by_driver(drivers, column) for column in columns}
-    saved = driver_savings(drivers, "total_energy_kj", strategy, baseline)
+    saved = driver_savings(drivers, "total_energy_kj", *PAIR)
     chosen: dict[str, Any] = {"mean": None, "best": saved.idxmax(), "worst": saved.idxmin()}
     rows = []
     for label, driver in chosen.items():
         own = {x: t.mean() if driver is None else t.loc[driver] for x, t in energies.items()}
-        for name in (baseline, strategy):
+        for name in (BASELINE, STRATEGY):
             row: dict[str, object] = {"driver": label, "strategy": name, "from": STUDY_ROW}
             row |= {column: energy[name] for column, energy in own.items()}
             for kind, column in ENERGY_KINDS.items():
                 energy = own[f"total_{column}"]
-                share = 100.0 * share_saved(energy[strategy], energy[baseline])
-                row[f"{kind}saving_pct"] = share if name == strategy else np.nan
+                share = 100.0 * share_saved(energy[STRATEGY], energy[BASELINE])
+                row[f"{kind}saving_pct"] = share if name == STRATEGY else np.nan
             rows.append(row)
             if (label, name) in PAPER_TABLE_IV:
                 row = {"driver": label, "strategy": name, "from": PAPER_ROW}
                 keys = ("cav_energy_kj", "hdv_energy_kj", "total_energy_kj")
                 row |= dict(zip(keys, PAPER_TABLE_IV[label, name], strict=True))
-                row["saving_pct"] = PAPER_IMPROVEMENT[label] if name == strategy else np.nan
+                row["saving_pct"] = PAPER_IMPROVEMENT[label] if name == STRATEGY else np.nan
                 rows.append(row)
     return _with_its_decimals(rows)
 
 
-def holistic(means: Means, strategy: str = "alcc", baseline: str = "reference") -> pd.DataFrame:
+def holistic(means: Means) -> pd.DataFrame:
     """Saving of the total energy per driver beside the paper's (Fig. 10): one row each."""
     rows = []
     for kind, column in ENERGY_KINDS.items():
-        found = savings(means.windows, f"total_{column}", strategy, baseline)
-        saved = 100.0 * driver_savings(means.drivers, f"total_{column}", strategy, baseline)
+        found = savings(means.windows, f"total_{column}", *PAIR)
+        saved = 100.0 * driver_savings(means.drivers, f"total_{column}", *PAIR)
         row = {
             "from": f"{STUDY_ROW}, {ENERGY_WORDS[kind]}",
             **found.columns("mean_saving_pct", 100.0),
@@ -97,9 +95,7 @@ def holistic(means: Means, strategy: str = "alcc", baseline: str = "reference") 
     return pd.DataFrame(rows)
 
 
-def generalization(
-    windows: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
-) -> pd.DataFrame:
+def generalization(windows: pd.DataFrame) -> pd.DataFrame:
     """Energies and savings on every held-out window (Fig. 12).
 
     Returns:
@@ -112,18 +108,16 @@ def generalization(
     for profile, part in windows.groupby("profile_id", sort=True):
         row: dict[str, object] = {"profile_id": profile, "profile": part["profile"].iloc[0]}
         energy = per_seed(part, path)
-        row |= {f"{name}_path_energy_kj": energy[name].mean() for name in (baseline, strategy)}
+        row |= {f"{name}_path_energy_kj": energy[name].mean() for name in (BASELINE, STRATEGY)}
         for kind, column in ENERGY_KINDS.items():
-            found = savings(part, f"total_{column}", strategy, baseline)
+            found = savings(part, f"total_{column}", *PAIR)
             row |= found.columns(f"{kind}saving_pct", 100.0)
-        against = savings(part, path, strategy, "idm")
+        against = savings(part, path, STRATEGY, "idm")
         rows.append(row | against.columns("path_saving_against_idm_pct", 100.0))
     return pd.DataFrame(rows)
 
 
-def generalization_row(
-    windows: pd.DataFrame, strategy: str = "alcc", baseline: str = "reference"
-) -> pd.DataFrame:
+def generalization_row(windows: pd.DataFrame) -> pd.DataFrame:
     """Distribution of the savings over held-out windows, beside the paper's four profiles.
 
     Returns:
@@ -131,10 +125,10 @@ def generalization_row(
         ``together_pct``, the saving of the energy of all profiles, and the least, median and
         largest of a profile.
     """
-    table = generalization(windows, strategy, baseline)
+    table = generalization(windows)
     rows = []
     for kind, column in ENERGY_KINDS.items():
-        together = savings(windows, f"total_{column}", strategy, baseline)
+        together = savings(windows, f"total_{column}", *PAIR)
         row = {
             "from": f"{STUDY_ROW}, {ENERGY_WORDS[kind]}",
             **together.columns("together_pct", 100.0),

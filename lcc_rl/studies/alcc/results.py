@@ -19,13 +19,13 @@ from lcc_rl.results.report import sample_of
 from lcc_rl.results.runs import EPISODES, STEPS
 from lcc_rl.results.windows import LEADER_COLUMNS, WINDOWS, Means
 from lcc_rl.studies.alcc import figures, paper_tables, tables
+from lcc_rl.studies.alcc.paper_tables import PAIR
 from lcc_rl.studies.alcc.study import ABLATIONS, DRIVERS_FILE, EVALUATION_FOLDER
 from lcc_rl.studies.results import StudyResults
 
 ALCC_TITLE = "Adaptive Leading Cruise Control: the study"
 CURVES = "training.parquet"  # learning curves of the main trainings, if these are not there
 ITSELF = "this study"
-ALCC_PAIR = {"alcc", "reference"}
 SHARE_COLUMNS = [
     f"{which}_{name}"
     for name in ("unsafe_ttc_pct", tables.LONG)
@@ -92,12 +92,12 @@ def add_main(found: StudyResults, means: Means) -> None:
         found.figure("sample_episode", caption, run_figures.sample_episode(steps, "alcc"))
     found.table("constraints", f"Safety and efficiency, {size}", tables.constraints(windows))
     found.table("constraints_by_seed", "Every seed", tables.constraints_by_seed(windows))
-    if set(windows["strategy"]) >= ALCC_PAIR:
+    if set(windows["strategy"]) >= {*PAIR}:
         _awareness(found, means)
         _generalization(found, windows)
     table = paper_tables.human_energy(means)
     found.table("human_energy", f"Human driver's energy with and without the car, {size}", table)
-    for name in sorted(ALCC_PAIR & set(windows["strategy"])):
+    for name in sorted({*PAIR} & set(windows["strategy"])):
         caption = f"Human driver's path energy behind {in_words(name)} (Fig. 9)"
         found.figure(f"human_energy_{name}", caption, run_figures.human_energy_figure(means, name))
 
@@ -107,7 +107,7 @@ def _awareness(found: StudyResults, means: Means) -> None:
     found.table("table_iv", caption, paper_tables.table_iv(means.drivers))
     found.table("holistic", "Saving per driver", paper_tables.holistic(means))
     caption = "Path energy of both vehicles and its saving, by driver behind (Fig. 10)"
-    figure = run_figures.paired_improvement(means, "alcc", "reference")
+    figure = run_figures.paired_improvement(means, *PAIR)
     found.figure("improvement", caption, figure)
 
 
