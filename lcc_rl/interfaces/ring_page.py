@@ -38,7 +38,7 @@ from lcc_rl.settings import values
 
 RING_TASK = ("variant=alcc", "task=ring-22")
 OF_RING = ("circumference", "string", "vehicle_length", "initial_speed", "time_step")
-OF_RING += ("sensors", "actuators")
+OF_RING += ("sensors", "actuators", "fleet")
 OF_DRIVERS = ("drivers", "controllers.human")
 DRAWS = ("noise", "wiener", "acceleration_noise", "acceleration_noise.before", "driver")
 RING_RULES = ("follower_stopper", "pi_saturation")
@@ -73,7 +73,7 @@ def page_data(
     vehicles = scenario.vehicles
     car = energy[0] if len(energy) == 1 and isinstance(energy[0], CirclesFuel) else None
     strange = [f"role {name}" for name in vehicles.names if name not in (HUMAN, AUTOMATED)]
-    strange += [f"scenario.{x}" for x in ("sensors", "actuators") if getattr(scenario, x)]
+    strange += [f"scenario.{x}" for x in OF_RING[-3:] if getattr(scenario, x)]
     if car is None or car.truck or car.grade:
         strange.append("energy (it takes one car on a level road: energy=compact)")
     human = _human(cfg)
@@ -111,8 +111,11 @@ def ring_of(policy: str | Path, trust: Sequence[str], overrides: Sequence[str]) 
     own, given = load_policy(policy, trust=trust)[1], [key_of(item) for item in overrides]
     if own.scenario.road != RING:
         return cfg
+    task: StudyConfig = load("evaluate", [*RING_TASK])
     for name in OF_RING:
-        if not any(key.startswith(f"scenario.{name}") for key in given):
+        # A group such as +faults=sensors sets them, too, under another key.
+        same = getattr(cfg.scenario, name) == getattr(task.scenario, name)
+        if same and not any(key.startswith(f"scenario.{name}") for key in given):
             setattr(cfg.scenario, name, getattr(own.scenario, name))
     if own.drivers is not None and not any(x in key for x in OF_DRIVERS for key in given):
         cfg.drivers = own.drivers

@@ -210,13 +210,16 @@ def test_what_the_page_cannot_compute_is_one_clear_error(tmp_path) -> None:
     cases = [(policy, policy) for policy in ("pretrained/ddpg", "idm_acc")]
     check_refused(lambda policy: export(policy, tmp_path / "ring.html"), cases)
     settings = {
-        "energy": "energy=mixture",
-        "drivers": "drivers.gap_noise=0.1",
-        "scenario.sensors": "+faults=sensors",
-        "role truck": "scenario.string=automated human truck",
+        "energy": ["energy=mixture"],
+        "drivers": ["drivers.gap_noise=0.1"],
+        "scenario.sensors": ["+faults=sensors"],
+        "scenario.fleet": ["+fleet=trucks", "scenario.circumference=600"],
+        "role truck": [
+            "scenario.string=automated human truck",
+            "+controller@scenario.controllers.truck=idm",
+        ],
     }
-    for words, given in settings.items():
-        ring = [given, *("+controller@scenario.controllers.truck=idm",) * ("truck" in given)]
+    for words, ring in settings.items():
         with pytest.raises(ConfigError, match=f"cannot carry {words}"):
             export(RING, tmp_path / "ring.html", overrides=ring)
     with pytest.raises(ConfigError, match="has no road"):
