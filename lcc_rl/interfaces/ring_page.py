@@ -37,8 +37,8 @@ from lcc_rl.results.policies import load_policy
 from lcc_rl.settings import values
 
 RING_TASK = ("variant=alcc", "task=ring-22")
-OF_RING = ("circumference", "string", "vehicle_length", "initial_speed", "time_step")
-OF_RING += ("sensors", "actuators", "fleet")
+UNCARRIED = ("sensors", "actuators", "fleet")  # sections of a scenario that no page has
+OF_RING = ("circumference", "string", "vehicle_length", "initial_speed", "time_step", *UNCARRIED)
 OF_DRIVERS = ("drivers", "controllers.human")
 DRAWS = ("noise", "wiener", "acceleration_noise", "acceleration_noise.before", "driver")
 RING_RULES = ("follower_stopper", "pi_saturation")
@@ -73,7 +73,7 @@ def page_data(
     vehicles = scenario.vehicles
     car = energy[0] if len(energy) == 1 and isinstance(energy[0], CirclesFuel) else None
     strange = [f"role {name}" for name in vehicles.names if name not in (HUMAN, AUTOMATED)]
-    strange += [f"scenario.{x}" for x in OF_RING[-3:] if getattr(scenario, x)]
+    strange += [f"scenario.{x}" for x in UNCARRIED if getattr(scenario, x)]
     if car is None or car.truck or car.grade:
         strange.append("energy (it takes one car on a level road: energy=compact)")
     human = _human(cfg)
