@@ -372,7 +372,7 @@ def _labels(strategies: Sequence[Strategy], marks: Sequence[tuple[str, int]]) ->
 
 def _place(strategy: Strategy, of_sweep: bool) -> str:
     """Return the name of a policy's file or run, or of the folder that holds its runs."""
-    path = Path(strategy.source)
+    path = Path(strategy.source).absolute()  # a run beside the command has a folder, too
     path = path.parent if path.name == POLICY else path
     name = path.parent.name if of_sweep else path.name.removesuffix(".pt")
     return DATED.sub(r"\1", name)  # of a run's folder the time of day

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -75,6 +76,9 @@ def test_rows_are_told_apart_by_whatever_differs_but_the_seed() -> None:
     seeds = [run(s, f"day{s}/run", f"evaluation.drivers={s + 2}", "table=all") for s in (0, 1)]
     assert [one.name for one in named_apart(seeds)] == ["alcc", "alcc"]
     assert [x.name for x in named_apart([*seeds, own[0]])] == ["alcc day0", "alcc day0", "alcc w0"]
+    beside = [replace(one, source=f"run-{one.seed}") for one in seeds]
+    here = f"alcc {Path.cwd().name}"
+    assert [x.name for x in named_apart([*beside, own[0]])] == [here, here, "alcc w0"]
 
 
 def test_policies_of_one_training_are_named_by_their_files_and_one_file_is_refused() -> None:
