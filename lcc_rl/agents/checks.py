@@ -3,16 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from typing import Any, SupportsFloat
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from lcc_rl.errors import Diverged
+from lcc_rl.errors import Diverged, require
 from lcc_rl.functional.finite import lost_weight, require_finite
 from lcc_rl.pieces.base import ACTION, NEXT, as_key, root_key
+
+
+def check_state(policy: TensorDictModule, state: Mapping[str, Any]) -> None:
+    """Check that the state of an agent, by which a training resumes, holds the policy's weights."""
+    held = list(_tensors(state))
+    for name, weight in policy.state_dict().items():
+        same = any(x.shape == weight.shape and torch.equal(x, weight) for x in held)
+        words = "an agent's state_dict lacks the policy's weight"
+        require(same, f"{words} {name}; extend super().state_dict() and load_state_dict, too")
+
+
+def _tensors(state: Any) -> Iterator[Tensor]:
+    if isinstance(state, Mapping):
+        for value in state.values():
+            yield from _tensors(value)
+    elif isinstance(state, Tensor):
+        yield state
 
 
 def check_learner(
@@ -29,6 +47,8 @@ def check_learner(
         Diverged: naming the first that is not.
     """
     for name, value in values.items():
+        words = "learn returns numbers by name, anneal the policy's learning rate"
+        require(isinstance(value, (SupportsFloat, Tensor)), f"{name} is {value!r}; {words}")
         if not math.isfinite(value):
             raise Diverged(f"{name} became {float(value)}", advice)
     found = lost_weight(policy.state_dict())

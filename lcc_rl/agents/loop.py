@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.agent import Agent
-from lcc_rl.agents.checks import check_learner
+from lcc_rl.agents.checks import check_learner, check_state
 from lcc_rl.agents.vectors import denormals_flushed
 from lcc_rl.config.schemas import TrainingConfig
 from lcc_rl.errors import Diverged, Interrupted, ResultsError
@@ -76,6 +76,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
         # Told every row (lcc_rl.runs.loggers), and every iteration whose policy is to be kept.
         self.on_row: Callable[[dict[str, float]], None] = lambda row: None
         self.on_keep: Callable[[int], None] = lambda iteration: None
+        check_state(agent.policy, agent.state_dict())
         self._prepare()
 
     def _prepare(self) -> None:

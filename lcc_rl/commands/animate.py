@@ -3,7 +3,7 @@
 lcc-rl animate RUN                           # the last strategy, RUN/figures
 lcc-rl animate RUN --strategy idm_acc --episode 1 --out idm.gif
 lcc-rl animate RUN --start 60 --duration 30 --out wave.mp4   # needs ffmpeg
-lcc-rl animate RUN --strategy human --strategy "alcc: a network" --out waves.svg  # or .gif
+lcc-rl animate RUN --strategy human --strategy "alcc: a network" --out r.svg
 """
 
 from __future__ import annotations

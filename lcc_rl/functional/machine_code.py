@@ -93,14 +93,22 @@ def kept(source: str, fused: bool = False) -> Callable[..., None]:
     except RuntimeError as error:  # there is no place for the code
         log.info("compiling a simulation for this run only: %s", error)
         return uncached
+    return _Kept((source, fused), chosen, uncached)
 
-    def call(*arguments: Any) -> None:
-        nonlocal chosen
+
+class _Kept:
+    """Calls machine code that is kept, or, where its file is damaged, code made anew."""
+
+    def __init__(self, made_of: tuple[str, bool], chosen: Any, uncached: Any) -> None:
+        self.made_of, self.chosen, self.uncached = made_of, chosen, uncached
+
+    def __call__(self, *arguments: Any) -> None:
         try:
-            chosen(*arguments)
+            self.chosen(*arguments)
         except Exception as error:  # a damaged file raises whatever unpickling it meets
             log.info("compiling a simulation for this run only: %r", error)
-            chosen = uncached
-            chosen(*arguments)
+            self.chosen = self.uncached
+            self.chosen(*arguments)
 
-    return call
+    def __reduce__(self) -> tuple[Any, ...]:
+        return kept, self.made_of

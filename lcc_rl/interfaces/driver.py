@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from lcc_rl.config import load
 from lcc_rl.config.words import FILTERED
+from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.checks import BATCH, check_step
 from lcc_rl.envs.rowwise import Array, Rowwise
 from lcc_rl.errors import ConfigError, Diverged, require, unknown_name
@@ -52,9 +54,11 @@ class Driver:
         trust: modules outside this package that a policy may name.
         safety: the safety filter behind which it drives; None: a policy's own, and for rules whose
             name ends in ``_filtered`` that of ``+filter=cbf``.
-        seed: seed of the drivers' noise; each car that begins draws by the next one.
-        drivers: of the rules that drive as people do, such as ``"human"``, with their reaction, see
-            :mod:`lcc_rl.drivers.population`; None: the shipped ones.
+        seed: seed of the drivers' noise; each new car draws by the next one, and keeps it if it
+            leaves and returns.
+        drivers: of the rules that drive as people do, such as ``"human"``, with their reaction: a
+            table of ``lcc-rl calibrate`` or one of :mod:`lcc_rl.drivers.population`; None: the
+            shipped ones.
 
     Attributes:
         names: what :meth:`step` reads, SI units: ``"self.gap"`` …
@@ -79,7 +83,7 @@ class Driver:
         trust: Sequence[str] = (),
         safety: CBFFilter | None = None,
         seed: int = 0,
-        drivers: Population | None = None,
+        drivers: Population | str | Path | None = None,
     ) -> None:
         usable = isinstance(time_step, (int, float)) and 0.0 < time_step < math.inf
         require(usable, f"time_step must be a positive number of seconds, got {time_step!r}")
@@ -96,7 +100,8 @@ class Driver:
                     f"{time_step!r} s (in SUMO, --step-length {trained:g} sets it)"
                 )
         else:
-            self.program = self._rule(who, safety, measuring(time_step, True, drivers))
+            own = bootstrap(drivers) if isinstance(drivers, (str, Path)) else drivers
+            self.program = self._rule(who, safety, measuring(time_step, True, own))
         self.names = self.program.names
         self.behind = {x for x in self.names if x.startswith("behind.")} - {BEHIND_PRESENT}
         self._check()
@@ -131,7 +136,8 @@ class Driver:
         """
         if cars is None:
             self.cars: Sequence[Any] = ()
-            self.memory, self.begun = np.zeros((0, self.program.width)), 0
+            self.memory = np.zeros((0, self.program.width))
+            self.numbers: dict[Hashable, int] = {}  # of all cars, in their order
             return
         stay = [place for place, car in enumerate(self.cars) if car not in cars]
         self.cars, self.memory = [self.cars[place] for place in stay], self.memory[stay]
@@ -181,10 +187,11 @@ class Driver:
             memory = np.zeros((len(state), self.program.width))
             memory[stay] = self.memory[[places[cars[row]] for row in stay]]
             given = torch.from_numpy(state[new]).double()
-            seeds = self.seed + self.begun + torch.arange(len(new)).unsqueeze(-1)
+            own = [self.numbers.setdefault(cars[row], len(self.numbers)) for row in new]
+            seeds = self.seed + torch.tensor(own, dtype=torch.long).unsqueeze(-1)
             memory[new] = self.program.begin(given, seeds).numpy()
             self.memory = memory
-        self.cars, self.begun = cars, self.begun + len(new)
+        self.cars = cars
 
     def _state(self, measured: Mapping[str, Any]) -> tuple[Array, bool]:
         """Return what the program reads, ``[cars, names]``, and whether numbers were given."""

@@ -89,7 +89,7 @@ def parser() -> ArgumentParser:
     _trained(commands, "hcfs", "Hybrid Car-Following Strategy (IEEE T-ASE 2021)")
     _subcommand(commands, "ring", "field experiment on a ring (Stern et al. 2018)")
     two = _subcommand(commands, "road", "what automated cars would bring on a recorded road")
-    _listing(two, "--shares", road.ROAD_SHARES, "of automated cars [%]: 5,10,20")
+    _listing(two, "--shares", road.ROAD_SHARES, "of automated cars, in per cent: 5,10,20")
     return top
 
 

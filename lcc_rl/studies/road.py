@@ -6,6 +6,7 @@ shares of automated cars and without any.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import pandas as pd
 from lcc_rl.commands.evaluation import complete
 from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, read_once
 from lcc_rl.config import key_of, load, quoted, top_key, with_inputs
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.figures.evaluation import measures_of
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import parquet_metadata, read_parquet, write_parquet
@@ -69,7 +71,8 @@ def run(folder: Path, overrides: Sequence[str], shares: Sequence[str] = ROAD_SHA
     driven = [item for item in overrides if item not in of_data]
     given, found = {top_key(item) for item in driven}, []
     cfg = load("pipeline", ["~experiment", *_beside(FITTED, of_data)])
-    first, *_ = [_evaluation(driven, share) for share in shares]  # refused before data are read
+    first = _evaluation(driven, "50")  # refused before data are read
+    check_shares(shares, first.scenario.string["size"])
     read_once(cfg, folder, learns=False)
     if "leader" not in given:
         drives = leader_drives(read_parquet(folder / TRAJECTORIES), cfg.scenario.time_step)
@@ -83,6 +86,25 @@ def run(folder: Path, overrides: Sequence[str], shares: Sequence[str] = ROAD_SHA
         found += ["drivers=calibrated", f"drivers.path={quoted(calibrate_once(cfg, folder))}"]
     for share in shares:
         complete(with_inputs(_evaluation([*found, *driven], share)), folder / SHARES_FOLDER / share)
+
+
+def check_shares(shares: Sequence[str], size: int) -> None:
+    """Refuse shares [%] of a string that are no whole number of its cars.
+
+    Raises:
+        ConfigError: naming the share, and a size that has it.
+    """
+    for share in shares:
+        try:
+            number = float(share)
+        except ValueError:
+            number = math.nan
+        words = f"--shares takes per cent above 0 and at most 100, got {share!r} (humans alone are "
+        require(0.0 < number <= 100.0, words + "in every table)")
+        sizes = (n for n in range(size, 100 * size) if (number * n / 100.0 + 1e-9) % 1.0 < 1e-6)
+        if (enough := next(sizes, size)) != size:
+            words = f"{size} vehicles have no {share} %; scenario.string.size={enough} has"
+            raise ConfigError(f"--shares {','.join(shares)}: {words}")
 
 
 def _evaluation(words: Sequence[str], share: str) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from types import ModuleType
 from typing import Any
+from zlib import crc32
 
 import pytest
 from helpers import check_refused, check_resuming, small_env, small_loop, weights
@@ -86,12 +87,16 @@ def test_the_clipped_ratio_is_of_the_policy_that_played() -> None:
 
 
 # What a learner of one's own has wrong, as what replaces what on the page, and the error.
+STATE = "    def state_dict(self):\n        return {'best': 1.0}\n\n"
+RATE = "    def anneal(self, share):\n        self.rate = share\n\n"
 WRONG = [
     ("self.noise = GaussianExploration", "self.sound = abs", "must make noise, the exploration"),
     ("loop = ReinforceLoop", "loop = dict", "loop must be a class derived .* got <class 'dict'>"),
     ("lr=self.learning_rate)", "lr=1.0); self.policy = len", "policy must be .* got builtin"),
     ('"loss_value": returns', '"loss": returns', "must return numbers .* 'loss_value' among them"),
     ("(Agent)", "(Settings)", "expected a subclass of .*Agent, got my_learner.Reinforce"),
+    ("    def setup(", f"{STATE}    def setup(", "lacks the policy's weight .*extend super"),
+    ("    def setup(", f"{RATE}    def setup(", "learning_rate is None; .*anneal the policy's"),
 ]
 
 
@@ -100,7 +105,7 @@ def test_what_a_learner_of_ones_own_lacks_is_one_line(tmp_path, my_learner) -> N
         text = my_learner.text.replace(old, new)
         assert text != my_learner.text
         exec(f"from lcc_rl.settings import Settings\n{text}", vars(my_learner))
-        other = f"seed={len(old)}"  # composed anew: the class is another one
+        other = f"seed={crc32(new.encode())}"  # composed anew: the class is another one
         small_loop(tmp_path, *AGENTS["own"], *SMALL, other).run()
 
     check_refused(run, WRONG, ConfigError)

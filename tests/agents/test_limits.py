@@ -42,7 +42,7 @@ def test_a_limit_is_that_of_the_recorded_drivers() -> None:
     assert 0.0 < limits.largest["efficiency"] < 1.0
     near = gap < 4.0 * (speed - profiles.speeds)
     assert limits.largest["safety"] == pytest.approx(float(near.double().mean()))
-    with pytest.raises(ConfigError, match=r"agent\.limits\.efficiency=recorded: nobody was rec"):
+    with pytest.raises(ConfigError, match=r"agent\.limits\.efficiency=recorded: no driver was rec"):
         limits.take(wavy_profiles())
 
 

@@ -33,7 +33,7 @@ def test_a_training_takes_over_where_humans_are(tmp_path) -> None:
     cfg = load("train", [*RING, *SHORT, *sizes])
     inputs = load_inputs(cfg)
     trainer = make_trainer(cfg, make_agent(cfg), inputs.training, inputs.population, tmp_path)
-    source = trainer._rollout()
+    source = trainer._source()
     trainer.env.set_seed(3)
     begun = source.skip(source.start(), trainer.agent.burn_in)
     cfg.scenario.controllers["automated"] = cfg.scenario.controllers["human"]

@@ -89,7 +89,7 @@ def test_specs_of_the_single_agent_view(subtests) -> None:
 
 def test_who_may_ask_for_the_single_agent_view(monkeypatch) -> None:
     inputs = Inputs(wavy_profiles(), wavy_profiles(), POPULATION)
-    monkeypatch.setattr("lcc_rl.envs.factory.load_inputs", lambda cfg: inputs)
+    monkeypatch.setattr("lcc_rl.envs.factory.shared_inputs", lambda cfg: inputs)
     tiny = ["scenario.horizon=20"]
     assert "action" in make_env("alcc", 2, tiny).full_action_spec.keys(True, True)
     # Where a rule drives, there is an observation and a reward, but no action.

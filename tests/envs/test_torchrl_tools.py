@@ -384,7 +384,8 @@ def test_collectors_in_processes(subtests) -> None:
             batches = forked()[kind]
             assert sum(batch.numel() for batch in batches) == SIZE["total_frames"]
             seeds = torch.cat([batch[SEED].flatten() for batch in batches])
-            assert len(seeds.unique()) >= (1 if kind == "AsyncCollector" else 2)
+            # Where workers do not wait for each other, one may have played all batches.
+            assert len(seeds.unique()) >= (2 if kind == "MultiSyncCollector" else 1)
 
 
 @pytest.mark.filterwarnings("ignore")

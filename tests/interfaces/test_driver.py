@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 from functools import cache
+from importlib.resources import files
 from time import perf_counter
 
 import numpy as np
@@ -93,6 +95,18 @@ def test_cars_come_and_go_and_begin_anew() -> None:
             np.testing.assert_allclose(kept, past.memory[place], rtol=1e-5)
     assert (abs(whole.memory[[1, 3]] - fresh.memory) > 0.01).any(1).all()
     assert driver.step({name: [] for name in driver.names}, []).shape == (0,)
+
+
+def test_a_person_who_leaves_and_returns_is_the_same_person(tmp_path) -> None:
+    table = tmp_path / "drivers.parquet"
+    table.write_bytes((files("lcc_rl.assets") / "i80_drivers.parquet").read_bytes())
+    driver = pickle.loads(pickle.dumps(Driver("human", 0.1, drivers=table)))
+    seen = {"self.speed": 12.0, "self.gap": 20.0, "ahead.speed": 11.0}
+    two = {name: [value] * 2 for name, value in seen.items()}
+    first = driver.step(two, ["a", "b"])
+    assert first[0] != first[1]
+    driver.step({name: [value] for name, value in seen.items()}, ["b"])
+    assert driver.step(two, ["a", "b"])[0] == first[0]
 
 
 def test_a_car_begins_anew_after_a_measurement_that_is_no_number() -> None:

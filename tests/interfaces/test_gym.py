@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
 
 import numpy as np
@@ -60,6 +61,7 @@ def test_gymnasium_accepts_it() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped)
+    pickle.dumps(env)  # also one that was played
 
 
 @pytest.mark.parametrize(

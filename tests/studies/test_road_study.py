@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+from helpers import check_refused
 
-from lcc_rl.errors import ResultsError
+from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.studies import road
 from lcc_rl.studies.reproduce import main
@@ -41,7 +42,14 @@ def test_one_command_writes_table_figure_and_reports(tmp_path) -> None:
     again = read_parquet(tmp_path / "road" / "leaders.parquet")
     assert again.groupby("drive").size().max() == 4209  # seven minutes, recorded minute by minute
     with pytest.raises(ResultsError, match="of other data; choose another folder"):
-        road.run(tmp_path / "road", [*SMALL, "data=stream"])
+        road.run(tmp_path / "road", [*SMALL, "data=stream"], ("25",))
+
+
+def test_shares_that_no_string_has_are_refused_by_name() -> None:
+    road.check_shares(["5", "10", "12.5", "100"], 40)
+    cases = [(share, f"got {share!r}") for share in ("0", "101", "abc", "")]
+    cases += [("2", "--shares 2: 20 vehicles have no 2 %; scenario.string.size=50 has")]
+    check_refused(lambda share: road.check_shares([share], 20), cases, ConfigError)
 
 
 def test_a_leader_is_one_drive_whoever_follows() -> None:
