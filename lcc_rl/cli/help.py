@@ -80,8 +80,9 @@ def text(entry: str, overrides: Sequence[str] = ()) -> str:
         [
             *lines,
             "",
-            f"What conf/ sets: lcc-rl {name} --cfg job; defaults of all classes: docs/settings.md",
-            "(python tools/settings.py writes it); all groups: --help-all; pages: docs/. -m makes a sweep of all combinations: a=1,2 b=3,4.",
+            f"What conf/ sets: lcc-rl {name} --cfg job. Defaults of all classes: python",
+            "tools/settings.py writes docs/settings.md. All groups: --help-all. Pages: docs/.",
+            "-m makes a sweep of all combinations: a=1,2 b=3,4.",
         ]
     )
 
