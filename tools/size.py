@@ -27,7 +27,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # Above these make lint fails; what is built next may take the difference to what there is.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 40_100, "code": 26_100},
+    "lcc_rl + tools": {"lines": 40_100, "code": 26_150},
     "tests": {"lines": 21_500},
     "conf": {"yaml": 147},
 }
