@@ -154,14 +154,14 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     table = pd.DataFrame(row for share, part in parts.items() for row in rows_of(share, part))
     windows, cfg = parts[places[0].name], stored_config(places[0])
     drives, scenario, settings = windows[DRIVE].nunique(), cfg["scenario"], cfg["evaluation"]
-    few = " (few drives: t-intervals, of one recording over its windows)" * (drives < LEAST_DRIVES)
+    few = ", by t since these are few (of one recording over its windows)" * (drives < LEAST_DRIVES)
     found.table(
         "road",
         f"{scenario['string']['size']} vehicles, {settings['drivers']} times behind each of "
         f"{several(len(windows['profile_id'].unique()), 'window')} of "
         f"{scenario['horizon'] * scenario['time_step']:g} s, the first {settings['warm_up']:g} s "
-        "not counted. Brackets: the value of human drivers alone, changed by the 95 % interval of "
-        f"the change, over {several(drives, 'recording')}{few}",
+        "not counted. Brackets: the value of human drivers times the 95 % interval of the ratio to "
+        f"it, over {several(drives, 'recording')}{few}",
         table,
     )
     shown = [Shown(x.shown.key, x.label.replace(" [", "\n[")) for x in MEASURES if x.key in DRAWN]
