@@ -56,7 +56,7 @@ docs: $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --constraint constraints/extras.txt --editable ".[docs]"
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs site $(ARGS)
 
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml constraints.txt lcc_rl/version.py
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and "lcc_rl needs Python 3.11 or newer, %s is %d.%d; use make PYTHON=python3.12" % (sys.executable, v[0], v[1]))'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip

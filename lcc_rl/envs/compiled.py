@@ -87,6 +87,10 @@ class Traced:
             with torch.no_grad(), tracing(context):
                 with TensorsOnly():
                     graph = make_fx(self.plain)(*tensors)
+                for node in graph.graph.nodes:  # other strides than in this trace may need a copy
+                    if node.target is torch.ops.aten.view.default:
+                        node.target = torch.ops.aten.reshape.default
+                graph.recompile()
                 self.function = torch._inductor.compile(graph, list(tensors))
             return self.function(*tensors)
         except Exception as error:  # of many kinds; the plain function raises its own anew
