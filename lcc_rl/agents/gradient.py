@@ -59,6 +59,7 @@ class GradientLoop(TrainingLoop[Any]):
         known = set(map(as_key, self.env.full_observation_spec.keys(True, True)))
         return DifferentiableRollout(
             self.env,
+            self.agent.policy.module,
             wanted=self.objective.wanted(known),
             observed=[REWARD, *(term.targets[0] for term in self.terms)],
             compiled=compiled,
@@ -83,7 +84,7 @@ class GradientLoop(TrainingLoop[Any]):
         missed: list[dict[str, float]] = []
         for _ in range(self.horizon // self.settings.segment):
             begun = time.perf_counter()
-            state, record = source.play(state, self.agent.policy.module, self.settings.segment)
+            state, record = source.play(state, self.settings.segment)
             data = source.assemble(record)
             check_batch(data)
             collected = time.perf_counter()

@@ -20,6 +20,9 @@ COMPILER_ERRORS = (TorchDynamoException, InductorError, CppCompileError)
 # Attributes in which an object with a compiled method keeps the environment and its pieces.
 CONSTANT = ("self.env", "self.step", "self.first", "_modules['transforms']._modules[")
 
+# Of Traced: calls between kernels in C++, half the time of a step; no check of sizes.
+OPTIONS = {"cpp_wrapper": True, "size_asserts": False}
+
 
 class Compiled:
     """A function compiled at its first call; where there is no compiler, the plain function.
@@ -91,7 +94,7 @@ class Traced:
                     if node.target is torch.ops.aten.view.default:
                         node.target = torch.ops.aten.reshape.default
                 graph.recompile()
-                self.function = torch._inductor.compile(graph, list(tensors))
+                self.function = torch._inductor.compile(graph, list(tensors), OPTIONS)
             return self.function(*tensors)
         except Exception as error:  # of many kinds; the plain function raises its own anew
             log.info("not compiling %s: %s", self.what, str(error).strip().splitlines()[0])

@@ -87,9 +87,10 @@ def clairvoyant(
     """
     require(iterations >= 1, f"iterations must be at least 1, got {iterations}")
     env, given = _episodes(strategy, inputs, drivers, seed)
-    source = DifferentiableRollout(env, [(VEHICLES, name) for name in CONSTRAINED], (), compiled)
     policy: Any = strategy.policy
     network, steps = policy.module.requires_grad_(False), env.base_env.horizon
+    keys = [(VEHICLES, name) for name in CONSTRAINED]
+    source = DifferentiableRollout(env, network, keys, (), compiled)
     # Plans follow the smooth energy; the best one is chosen by the energy that is measured.
     goal, measured = Goal(strategy.cfg, own), Goal(strategy.cfg, own, exact=True)
     cars = strategy.cfg.scenario.vehicles.count(AUTOMATED)
@@ -99,7 +100,7 @@ def clairvoyant(
     for iteration in range(iterations):
         share = iteration / iterations
         every = shifts.repeat_interleave(hold, 0)[:steps]
-        _, record = source.play(source.start(given), network, steps, every)
+        _, record = source.play(source.start(given), steps, every)
         data = source.assemble(record)
         check_batch(data, who=strategy.title)
         price, missed = goal(data)
