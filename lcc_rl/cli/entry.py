@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import logging
 import os
 import sys
@@ -65,8 +64,6 @@ def entry_point(
             cfg = parsed(config, config_name, list(HydraConfig.get().overrides.task), is_sweep())
             with ending_quietly():
                 import_module(work)
-            gc.freeze()  # modules stay: later searches for garbage leave them out
-            gc.enable()
             return function(cfg)
 
         @wraps(function)
@@ -84,13 +81,10 @@ def entry_point(
             if HELP.intersection(sys.argv):
                 print(help_text(config_name, sys.argv[1:]))
                 return
-            gc.disable()  # while modules are loaded: a fifth of the time
-            try:
-                if SWEEP.intersection(sys.argv):
+            if SWEEP.intersection(sys.argv):
+                with ending_quietly():
                     import_module(work)
-                start_command(command)
-            finally:
-                gc.enable()
+            start_command(command)
 
         return main
 

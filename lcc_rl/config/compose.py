@@ -7,6 +7,8 @@ import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from copy import deepcopy
 from functools import cache, lru_cache
 from importlib.resources import files
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
@@ -14,8 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_module
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -102,18 +106,23 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
 
 def composed(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
     """Return what Hydra composes."""
+    hydra, meant = GlobalHydra.instance(), as_meant(overrides)
     try:
-        if GlobalHydra.instance().is_initialized():
-            return compose(entry, overrides=as_meant(overrides))
-        return _composed(entry, tuple(as_meant(overrides)))
+        where = str(hydra.config_loader().get_search_path()) if hydra.is_initialized() else ""
+        cfg = deepcopy(_composed(entry, tuple(filter(_is_choice, meant)), where))
+        read = OverridesParser.create().parse_overrides([x for x in meant if not _is_choice(x)])
+        ConfigLoaderImpl.validate_sweep_overrides_legal(read, RunMode.RUN, from_shell=False)
+        ConfigLoaderImpl._apply_overrides_to_config(read, cfg)
+        return cfg
     except (*HYDRA_ERRORS, ValueError, TypeError) as error:  # Hydra raises some as plain ones
         raise explained(error, overrides) from None
 
 
-@lru_cache(maxsize=512)  # an evaluation asks for its baselines several times
-def _composed(entry: str, overrides: tuple[str, ...]) -> DictConfig:
-    with initialize_config_module(CONF, version_base="1.3"):
-        return compose(entry, overrides=list(overrides))
+@lru_cache(maxsize=512)  # Hydra takes 0.1 s to read and merge the files, settings a hundredth
+def _composed(entry: str, chosen: tuple[str, ...], where: str) -> DictConfig:
+    """Compose files; ``where`` Hydra looks for them is empty if it has not been initialised."""
+    with nullcontext() if where else initialize_config_module(CONF, version_base="1.3"):
+        return compose(entry, overrides=list(chosen))
 
 
 def as_meant(overrides: Sequence[str]) -> list[str]:
@@ -138,19 +147,18 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
         elif key in ("compare", "policy", "resume"):  # a sweep's folders are named seed=0_…
             quoted = "'" in value or '"' in value
             found.append(f"++{key}{equals}{value if quoted else NAMED.sub(QUOTED, value)}")
-        elif key[:1] in "+~" or not equals or not _is_setting(key, value):
+        elif key[:1] in "+~" or not equals or _is_choice(item):
             found.append(item)
         else:
-            found.append(f"++{item}")
+            found.append(f"++{item}" if key.partition(".")[0] in _top_level() else item)
     return found
 
 
-def _is_setting(key: str, value: str) -> bool:
-    """Whether a setting of this package is typed, such as a node, and not a file of a group."""
-    if key.startswith("hydra") or "/" in key or "@" in key:
-        return False
-    own = key.partition(".")[0] in _top_level()
-    return own and (key not in _groups() or value.startswith("{"))
+def _is_choice(item: str) -> bool:
+    """Whether Hydra reads files for an override, or its own settings; other ones follow on them."""
+    key, _, value = item.lstrip("+~").partition("=")
+    group = key.partition("@")[0]
+    return "/" in group or group.startswith("hydra") or (value[:1] != "{" and bool(choices(group)))
 
 
 def choices(group: str) -> list[str]:

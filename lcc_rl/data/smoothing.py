@@ -22,8 +22,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import uniform_filter1d
-from scipy.signal import savgol_filter
 
 from lcc_rl.arrays import Floats
 from lcc_rl.data.episodes import MOTION_COLUMNS
@@ -111,6 +109,8 @@ class SavitzkyGolay(Settings):
             Position [m], speed [m/s] and acceleration [m/s²], each ``[rows]``; values within
             ``margin`` rows of an end are not used.
         """
+        from scipy.signal import savgol_filter  # here: it loads for a second
+
         settings = {"polyorder": self.order, "delta": FRAME, "mode": "nearest"}
         smoothed, speed, acceleration = (
             savgol_filter(position, self.window, deriv=order, **settings) for order in range(3)
@@ -138,6 +138,8 @@ def averaged(episodes: pd.DataFrame, seconds: float, source: str) -> tuple[pd.Da
     Raises:
         DataError: if no episode is long enough.
     """
+    from scipy.ndimage import uniform_filter1d  # here: it loads for a second
+
     width = round(seconds / FRAME) | 1
     starts, lengths = stretches(episodes["episode"].to_numpy())
     inner = _within(starts, lengths) >= width // 2

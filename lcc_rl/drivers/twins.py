@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -133,9 +134,10 @@ def _spectrum(speed: _Array, samples: NDArray[np.int64], time_step: float) -> di
 
 def densities(table: pd.DataFrame) -> pd.DataFrame:
     """Return the densities of measured drivers, by frequency [Hz]; without short records."""
-    found = [name for name in table if str(name).startswith(DENSITY)]
-    named = {name: float(str(name)[len(DENSITY) : -len(HERTZ)]) for name in found}
-    return table[found].rename(columns=named).dropna()
+    found = [str(name) for name in table if str(name).startswith(DENSITY)]
+    values = table[found].to_numpy()
+    hertz = [float(name[len(DENSITY) : -len(HERTZ)]) for name in found]
+    return pd.DataFrame(values[~np.isnan(values).any(1)], columns=hertz)
 
 
 def measure_recorded(observed: Observed) -> pd.DataFrame:
@@ -292,35 +294,34 @@ def ratios(
         ``slope`` of these three, and ``spectrum`` of both densities, 0 if all records are too
         short.
     """
-    share = twins.sum(numeric_only=True) / records.sum(numeric_only=True)
+
+    def over(column: str, rows: Any = slice(None)) -> Any:
+        own, recorded = (table[column].to_numpy()[rows].sum() for table in (twins, records))
+        return own / recorded
+
     energy, lost, distance = (
-        share[name]
-        for name in (f"energy_{smoothing}s_j", f"lost_{smoothing}s_j", f"distance_{smoothing}s_m")
+        f"{name}_{smoothing}s_{unit}"
+        for name, unit in (("energy", "j"), ("lost", "j"), ("distance", "m"))
     )
-    by_third = _lost_by_third(twins, records, smoothing)
-    density = densities(twins).sum() / densities(records).sum()
-    apart = np.log(density.fillna(1.0).to_numpy())
+    by_third = [over(lost, rows) / over(distance, rows) for rows in _thirds(records)]
+    own, recorded = (densities(table).to_numpy().sum(0) for table in (twins, records))
+    apart = np.log(np.divide(own, recorded, out=np.ones_like(own), where=recorded > 0.0))
     return {
-        "energy": float(energy / distance),
-        "lost": float(lost / distance),
-        "distance": float(distance),
-        **{f"lost_{number}": value for number, value in enumerate(by_third, 1)},
+        "energy": float(over(energy) / over(distance)),
+        "lost": float(over(lost) / over(distance)),
+        "distance": float(over(distance)),
+        **{f"lost_{number}": float(value) for number, value in enumerate(by_third, 1)},
         "slope": float(np.sqrt(np.mean(np.log(by_third) ** 2))) if by_third else np.nan,
         "spectrum": float(np.sqrt(np.mean(apart**2))),
     }
 
 
-def _lost_by_third(twins: pd.DataFrame, records: pd.DataFrame, smoothing: float) -> list[float]:
-    """Return what drivers lose per distance over the recorded, by thirds of their leaders."""
+def _thirds(records: pd.DataFrame) -> list[NDArray[np.intp]]:
+    """Return the rows of recorded drivers by thirds of their leaders, the calmest first."""
     if LEADER_LOST not in records or len(records) < 3:
         return []
     calm_first = (records[LEADER_LOST] / records[LEADER_WAY]).to_numpy().argsort()
-    lost, way = (f"{x}_{smoothing}s_{unit}" for x, unit in (("lost", "j"), ("distance", "m")))
-    sums = (
-        [table.iloc[part].sum(numeric_only=True) for table in (twins, records)]
-        for part in np.array_split(calm_first, 3)
-    )
-    return [float(a[lost] / a[way] / (b[lost] / b[way])) for a, b in sums]
+    return np.array_split(calm_first, 3)
 
 
 @dataclass(frozen=True)

@@ -257,8 +257,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
         # TorchRL's own version insists on finding the out_keys literally in the specs, which
-        # keys under "next" never are.
-        output_spec = output_spec.clone()
+        # keys under "next" never are. TransformedEnv passes a copy; one per piece would be slow.
         for part, transform in (
             ("full_observation_spec", self.transform_observation_spec),
             ("full_reward_spec", self.transform_reward_spec),
@@ -266,6 +265,11 @@ class Piece(Part, TensorDictModuleBase, Transform):
         ):
             output_spec[part] = transform(output_spec[part])
         return output_spec
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        part = "full_state_spec"
+        input_spec[part] = self.transform_state_spec(input_spec[part])
+        return input_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         return add_specs(self, observation_spec)

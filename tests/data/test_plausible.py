@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import check_refused
+from helpers import check_episodes, check_refused
 from ngsim_text import csv_text, native_text, pair
 from table_text import pairs
 
@@ -20,7 +20,6 @@ from lcc_rl.data.sources import EpisodesSource, NgsimSource
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.errors import Concern, DataError
 from lcc_rl.io.files import write_parquet
-from tests.helpers import check_episodes
 
 # Column, value in row 95 (episode 3), what is said of it.
 FLAWS = [

@@ -9,7 +9,7 @@ from io import StringIO
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import check_refused
+from helpers import check_episodes, check_refused
 from table_text import GAP, LENGTH, long_table, openacc_text, pairs, speed, written
 
 from lcc_rl.data import text
@@ -23,7 +23,6 @@ from lcc_rl.data.table_source import TableSource
 from lcc_rl.data.trajectories import FOOT
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.io.files import write_parquet
-from tests.helpers import check_episodes
 
 BASE = {"vehicle": "id", "time": "t", "speed": "v"}
 BY_GAP = {**BASE, "leader": "ahead", "gap": "gap"}
