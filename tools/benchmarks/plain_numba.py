@@ -286,12 +286,11 @@ class NumbaLoop:
             ),
         )
         prior = (plain.estimator.prior_estimate, plain.estimator.prior_covariance)
-        self.tables = Tables(
-            *(x.numpy() for x in (leader.speeds.flatten(), leader.offsets, leader.starts)),
-            *(x.numpy().ravel() for x in (human.desired_speeds, human.time_gaps)),
-            torch.cat([x.flatten() for x in prior]).numpy(),
-            *(x.numpy() for x in (mean.thresholds, mean.sums, plain.scales)),
-        )
+        arrays = [leader.speeds.flatten(), leader.offsets, leader.starts]
+        arrays += [human.desired_speeds.flatten(), human.time_gaps.flatten()]
+        arrays += [torch.cat([x.flatten() for x in prior])]
+        arrays += [mean.thresholds, mean.sums, plain.scales]
+        self.tables = Tables(*(array.numpy() for array in arrays))
         now = plain.start(first)
         self.clock = torch.cat([now[key] for key in ("seed", "step", "place")], -1).numpy()
         cars = [torch.stack([now["leader"], torch.zeros_like(now["leader"])], -1)]
