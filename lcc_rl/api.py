@@ -150,14 +150,14 @@ def compare(
     if isinstance(strategies, (str, PathLike)) or not isinstance(strategies, Iterable):
         strategies = [strategies]
     named = isinstance(strategies, Mapping)
-    items = strategies.items() if named else [(type(who).__name__, who) for who in strategies]
-    given = [(name, who, as_given(who, name)) for name, who in items]
+    items = strategies.items() if named else [(type(one).__name__, one) for one in strategies]
+    given = [(name, one, as_given(one, name)) for name, one in items]
     policies = {name: policy for name, _, policy in given if policy is not None}
-    others = [(name, who) for name, who, policy in given if policy is None]
+    others = [(name, one) for name, one, policy in given if policy is None]
     if named:
-        cfg.compare = {name: setting_of(who, f"compare.{name}") for name, who in others}
+        cfg.compare = {name: setting_of(one, f"compare.{name}") for name, one in others}
     else:
-        cfg.compare = [setting_of(who) for _, who in others]
+        cfg.compare = [setting_of(one) for _, one in others]
     rows = evaluation.run(cfg, target, own=False, quiet=True, policies=policies)
     if folder is not None:
         evaluation.draw(rows, cfg, target)

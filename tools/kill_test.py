@@ -121,19 +121,19 @@ class Job:
         lines = (self.root / "log").read_text(errors="replace", encoding="utf-8").splitlines()
         return "\n".join(lines[-100:])
 
-    def disturb(self, delay: float, kind: int, everyone: bool) -> bool:
+    def disturb(self, delay: float, kind: int, group: bool) -> bool:
         """Start the command and send it a signal; return whether that ended it.
 
         Args:
             delay: seconds until the signal.
             kind: the signal.
-            everyone: send it to the command's own processes, too.
+            group: send it to the command's own processes, too.
         """
         child = self.start(self.killed)
         deadline = time.monotonic() + delay
         while time.monotonic() < deadline and os.waitid(os.P_PID, child, WAITED) is None:
             time.sleep(0.002)
-        (os.killpg if everyone else os.kill)(child, kind)  # nothing happens if it has ended
+        (os.killpg if group else os.kill)(child, kind)  # nothing happens if it has ended
         patience = time.monotonic() + PATIENCE
         while os.waitid(os.P_PID, child, WAITED) is None or at_work(child):
             if time.monotonic() > patience:
@@ -150,8 +150,8 @@ class Job:
     def kill(self, chance: random.Random) -> bool:
         """Kill the command once and check its files; return whether the kill met it at work."""
         before, kind = finished(self.killed), chance.choice(SIGNALS)
-        everyone = kind == signal.SIGINT or chance.random() < 0.5  # as a terminal does
-        ended = self.disturb(chance.uniform(0.0, self.length), kind, everyone)
+        group = kind == signal.SIGINT or chance.random() < 0.5  # as a terminal does
+        ended = self.disturb(chance.uniform(0.0, self.length), kind, group)
         now, wrong = finished(self.killed), unreadable(self.killed)
         assert before.items() <= now.items(), f"missing or changed: {before} became {now}"
         assert not wrong, "\n".join(wrong)

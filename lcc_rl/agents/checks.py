@@ -56,13 +56,13 @@ def check_learner(
         raise Diverged(f"the policy's weight {found} became no number", advice)
 
 
-def check_batch(batch: TensorDictBase, begun: int = 0, who: str = "") -> None:
+def check_batch(batch: TensorDictBase, begun: int = 0, label: str = "") -> None:
     """Check that transitions are numbers, before anything is learned from them.
 
     Args:
         batch: ``[environments, steps]``.
         begun: steps played before the batch.
-        who: what the message calls the policy.
+        label: what the message calls the policy.
 
     Raises:
         Diverged: naming the first entry that is not a number, its step and its episode.
@@ -72,4 +72,4 @@ def check_batch(batch: TensorDictBase, begun: int = 0, who: str = "") -> None:
     keys = [ACTION, *(key for key in known if key[0] == NEXT and root_key(key) != ACTION)]
     entries = {root_key(key): known[key].transpose(0, 1) for key in keys if key in known}
     running = torch.ones((*batch.shape[1::-1], 1), dtype=torch.bool, device=batch.device)
-    require_finite(entries, running, begun + 1, who)
+    require_finite(entries, running, begun + 1, label)

@@ -4,7 +4,7 @@ lcc-rl table outputs/evaluate/<run>
 lcc-rl table outputs/evaluate/<run> --all               # every measure
 lcc-rl table outputs/evaluate/<run> --against idm       # savings against it
 lcc-rl table outputs/evaluate/<run> --format latex      # for booktabs
-lcc-rl table outputs/evaluate/<run> --columns who,saved_pct
+lcc-rl table outputs/evaluate/<run> --columns driver,saved_pct
 lcc-rl table outputs/evaluate/<run> --format csv --decimal comma
 lcc-rl table outputs/train/<sweep> --figure sweep.pdf   # a row a setting
 lcc-rl table outputs/alcc/tables/<table>.parquet --format latex

@@ -103,7 +103,7 @@ def _run(
 
 def _named(result: Calibration, vehicles: Mapping[int, str]) -> Calibration:
     """Add the names that the data have for followers and leaders."""
-    names = {who: result.drivers[f"{who}_id"].map(vehicles) for who in ("follower", "leader")}
+    names = {role: result.drivers[f"{role}_id"].map(vehicles) for role in ("follower", "leader")}
     return replace(result, drivers=result.drivers.assign(**names))
 
 

@@ -123,7 +123,7 @@ def check_installed(cfg: StudyConfig, compared: Sequence[Any] = ()) -> None:
         compared: further controllers, see :func:`lcc_rl.evaluation.named.controller_of`.
     """
     own = [name for name in cfg.evaluation.baselines if applies(cfg, name)]
-    others = [controller_of(who) for who in (*own, *compared) if who != DIRECT]
+    others = [controller_of(spec) for spec in (*own, *compared) if spec != DIRECT]
     for node in nodes_in([cfg.scenario.controllers, *others]):
         getattr(node.kind, "check_installed", lambda: None)()
 

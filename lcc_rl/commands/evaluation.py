@@ -200,14 +200,14 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], list[tuple[str, str]]
             unknown or has no vehicle to drive.
     """
     named = cfg.compare
-    for who in named.values() if isinstance(named, Mapping) else named:
+    for spec in named.values() if isinstance(named, Mapping) else named:
         require(
-            isinstance(who, (str, Node)),
-            f"compare names {who!r}: expected a name, a path or a node; of several runs the folder "
-            "that holds them",
+            isinstance(spec, (str, Node)),
+            f"compare names {spec!r}: expected a name, a path or a node; for several runs, the "
+            "folder that holds them",
         )
     if not isinstance(named, Mapping):
-        labels = [who if is_policy(who) else label_of(who) for who in named]
+        labels = [spec if is_policy(spec) else label_of(spec) for spec in named]
         for label, count in Counter(labels).items():
             require(
                 count == 1,
@@ -218,15 +218,15 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], list[tuple[str, str]]
     task = _task_name(cfg)
     policies = [
         (label if named is cfg.compare else "", of_task(run, task))
-        for label, who in named.items()
-        if is_policy(who)
-        for run in _runs_of(Path(who))
+        for label, spec in named.items()
+        if is_policy(spec)
+        for run in _runs_of(Path(spec))
     ]
-    rivals = {label: who for label, who in named.items() if not is_policy(who)}
-    for label, who in rivals.items():
-        _check_label(label, who, str(who).removesuffix(FILTERED))
-        if who != DIRECT:
-            controller_of(who)
+    rivals = {label: spec for label, spec in named.items() if not is_policy(spec)}
+    for label, spec in rivals.items():
+        _check_label(label, spec, str(spec).removesuffix(FILTERED))
+        if spec != DIRECT:
+            controller_of(spec)
     if _nobody_drives(cfg):
         if left := [*named, *filter(None, [cfg.policy])]:
             log.warning("no vehicle is automated; left out: %s", ", ".join(left))
@@ -236,12 +236,12 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], list[tuple[str, str]]
     return rivals, policies
 
 
-def _check_label(label: str, who: Any, own: str) -> None:
+def _check_label(label: str, spec: Any, own: str) -> None:
     """Refuse reserved names of rows; ``own`` is allowed for the strategy of that name."""
     plain = label.removesuffix(FILTERED)
     require(
         in_words(plain) in (plain, in_words(own)),
-        f"compare names {label_of(who)} {label}, which stands for {in_words(label)!r}: choose "
+        f"compare names {label_of(spec)} {label}, which stands for {in_words(label)!r}: choose "
         "another",
     )
 

@@ -88,7 +88,7 @@ class Scored(NamedTuple):
     """A scored controller: its name in tables, what was given, and the policy if it is one."""
 
     label: str
-    who: str
+    spec: str
     policy: TrainedPolicy | None
 
     def strategy(self, cfg: EvaluateConfig) -> Strategy:
@@ -99,15 +99,15 @@ class Scored(NamedTuple):
         """
         population, scenario = build_drivers(cfg), cfg.scenario
         if self.policy is not None:
-            found = replace(trained(cfg, self.who, self.policy, population), name=self.label)
+            found = replace(trained(cfg, self.spec, self.policy, population), name=self.label)
         else:
             require(applies(cfg, self.label), "it has no vehicle to drive in this string")
             require(
                 scenario.filters.get(AUTOMATED) is not None or not self.label.endswith(FILTERED),
-                f"the task has no safety filter: score {self.who.removesuffix(FILTERED)}, which "
+                f"the task has no safety filter: score {self.spec.removesuffix(FILTERED)}, which "
                 "drives without one; with +filter=cbf the leaderboard refuses the row",
             )
-            found = baseline(cfg, self.label, self.who)
+            found = baseline(cfg, self.label, self.spec)
         road = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["trial"])
         build_env(any_leader(found.cfg), road, population, 1, nominal=True)
         return found
@@ -118,25 +118,25 @@ class Scored(NamedTuple):
         Those are a policy or a program; or a yaml file, and the module of an own class or function.
         """
         if self.policy is not None:
-            return [policy_file(self.who)]
-        return list(compared_files(self.who))
+            return [policy_file(self.spec)]
+        return list(compared_files(self.spec))
 
 
-def scored(who: str, trust: Sequence[str] = ()) -> Scored:
+def scored(spec: str, trust: Sequence[str] = ()) -> Scored:
     """Read a policy, or find a controller.
 
     Raises:
         LccError: if there is none, or it drives no vehicle.
     """
-    require(who not in (DIRECT, RECORDED), f"{who} is no controller that could be scored")
-    if is_policy(who):
-        return Scored(who, who, load_policy(who, trust=trust))
-    controller_of(who)
-    return Scored(label_of(who), who, None)
+    require(spec not in (DIRECT, RECORDED), f"{spec} is no controller that could be scored")
+    if is_policy(spec):
+        return Scored(spec, spec, load_policy(spec, trust=trust))
+    controller_of(spec)
+    return Scored(label_of(spec), spec, None)
 
 
 def roads(
-    who: Scored, task: str, given: Mapping[str, Sequence[str]], further: Sequence[str]
+    entrant: Scored, task: str, given: Mapping[str, Sequence[str]], further: Sequence[str]
 ) -> dict[str, EvaluateConfig]:
     """Return the configurations of a task by the source of its leaders.
 
@@ -147,7 +147,7 @@ def roads(
     """
     words = (f"task={task}", *further)
     own: EvaluateConfig = load("evaluate", words)
-    who.strategy(own)
+    entrant.strategy(own)
     if own.scenario.road == RING:
         return {"ring": own}
     if own.leader is not None and "held_out" in own.leader.settings:
@@ -161,14 +161,14 @@ def roads(
     }
 
 
-def play_source(who: Scored, source: str, cfg: EvaluateConfig, folder: Path) -> dict[str, Any]:
+def play_source(entrant: Scored, source: str, cfg: EvaluateConfig, folder: Path) -> dict[str, Any]:
     """Play a task behind the leaders of a source; return its row.
 
     Raises:
         LccError: if it does not fit the task, or the source has no leaders for it.
     """
     prepare_torch(cfg)
-    task, strategy = task_of(cfg), who.strategy(cfg)
+    task, strategy = task_of(cfg), entrant.strategy(cfg)
     assert task is not None
     check_installed(cfg)
     inputs = load_inputs(cfg)
@@ -195,9 +195,9 @@ def hash_of(windows: Profiles) -> str:
     return digest.hexdigest()
 
 
-def about(who: Scored) -> dict[str, Any]:
+def about(entrant: Scored) -> dict[str, Any]:
     """Return the hash of the scored policy's files, and versions."""
-    contents = [file.read_bytes() for file in who.files()]
+    contents = [file.read_bytes() for file in entrant.files()]
     found: dict[str, str | None] = {}
     for name in ("lcc_rl", *SCORED_WITH):
         try:
@@ -211,8 +211,8 @@ def about(who: Scored) -> dict[str, Any]:
 
 def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
     """Play all tasks that fit and write the scores; return them."""
-    who = scored(options.who, tuple(options.trust))
-    name = who.label if options.name is None else _own_name(options.name)
+    entrant = scored(options.policy, tuple(options.trust))
+    name = entrant.label if options.name is None else _own_name(options.name)
     file = re.sub(r"\W+", "_", name)
     default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{file}"
     mine = {*choices("task"), ERROR}.issuperset  # of a killed one, which is played again
@@ -220,7 +220,7 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
     with claim(folder):
         own_folder(folder, "--out", mine)  # another one may just have ended
         try:
-            return _run(who, name, folder, options, further)
+            return _run(entrant, name, folder, options, further)
         except Exception as error:
             if any(path.name != LOCK for path in folder.iterdir()):  # if refused, it leaves nothing
                 record(folder, error)
@@ -228,7 +228,7 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
 
 
 def _run(
-    who: Scored, name: str, folder: Path, options: Namespace, further: Sequence[str]
+    entrant: Scored, name: str, folder: Path, options: Namespace, further: Sequence[str]
 ) -> dict[str, Any]:
     own = dict(map(_source, options.source))
     given, wanted = {**LEADER_SOURCES, **own}, {*options.on, *own} if options.on else None
@@ -237,16 +237,16 @@ def _run(
     for task in options.task or choices("task"):
         sources: dict[str, EvaluateConfig] = {}
         with leaving_out(task, left_out):
-            sources = roads(who, task, given, further)
+            sources = roads(entrant, task, given, further)
         chosen = [one for one in sources if one in (wanted or [one])]
         if sources and not chosen:
             left_out.append(f"{task}: no such source, only {', '.join(sources)}")
         for source in chosen:
             with leaving_out(f"{task}, {source}", left_out):
-                found.append(play_source(who, source, sources[source], folder / task / source))
+                found.append(play_source(entrant, source, sources[source], folder / task / source))
     why = "; ".join(left_out) or f"no such source, only {', '.join(given)}"
     require(bool(found), f"nothing could be played: {why}")
-    document = {"name": name, **about(who), "results": found, "left_out": left_out}
+    document = {"name": name, **about(entrant), "results": found, "left_out": left_out}
     with atomic_path(folder / FILE) as temporary:
         temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", "utf-8")
     forget(folder)
@@ -298,7 +298,7 @@ def _source(given: Sequence[str]) -> tuple[str, tuple[str, ...]]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Score and print the table."""
     parser = Arguments(prog="lcc-rl score", description=__doc__)
-    parser.add_argument("who", metavar="policy", help="ONNX file, run, policy file or controller")
+    parser.add_argument("policy", help="ONNX file, run, policy file or controller")
     parser.add_argument("--name", help="name in tables; by default that of the file")
     parser.add_argument("--task", action="append", help="only this task; repeat for several")
     parser.add_argument("--on", action="append", default=[], help="only this source")

@@ -80,8 +80,8 @@ def _cars(table: TableFile, driver: str | None, report: ReadReport) -> pd.DataFr
         report.notes.append(f"{table.path}: {unknown:,} samples with a blank gap follow no vehicle")
     if driver is not None:
         none = np.full(rows, "")
-        who = np.concatenate([read.get(f"Driver{n}", none) for n in numbers])
-        cars["gap"], note = _driven_by(driver, cars.gap, who)
+        drivers = np.concatenate([read.get(f"Driver{n}", none) for n in numbers])
+        cars["gap"], note = _driven_by(driver, cars.gap, drivers)
         report.notes.append(f"{table.path}: {note}")
     cars["leader"] = (cars.vehicle - 1).where(cars.gap.notna(), 0)
     return cars[seen]
@@ -104,9 +104,9 @@ def _columns(table: TableFile) -> tuple[list[int], list[int], list[Column]]:
     return numbers, followers, [x for x in columns if x.key == "Time" or x.key in table.header]
 
 
-def _driven_by(driver: str, gap: pd.Series, who: NDArray) -> tuple[pd.Series, str]:
+def _driven_by(driver: str, gap: pd.Series, drivers: NDArray) -> tuple[pd.Series, str]:
     """Return the gaps of the samples that a kind of driver drives, and a line on both kinds."""
-    other = gap.notna() & (np.char.lower(who.astype(str)) != driver)
+    other = gap.notna() & (np.char.lower(drivers.astype(str)) != driver)
     own = gap.mask(other)
     words = f"{int(own.notna().sum()):,} samples of followers driven by {driver}"
     return own, f"{words}, {int(other.sum()):,} of others"

@@ -223,7 +223,7 @@ def _check_way(rows: pd.DataFrame, place: Places, report: ReadReport) -> None:
         (f"the vehicle from {where}, on drives", "its", each.iloc[worst]),
         ("the vehicles drive", "their", each.sum()),
     ]
-    for who, whose, (way, driven) in (
+    for subject, owner, (way, driven) in (
         found if (far & (off < np.log(AGREE[1]))).any() else found[::-1]
     ):
         if max(way, driven) >= LEAST_WAY and not AGREE[0] * driven <= way <= AGREE[1] * driven:
@@ -240,7 +240,7 @@ def _check_way(rows: pd.DataFrame, place: Places, report: ReadReport) -> None:
             elif way < 0:
                 hint = f"positions must grow in the direction of travel; {hint}"
             raise DataError(
-                f"{report.source}: by {whose} positions {who} {way:.4g} m, by {whose} speeds "
+                f"{report.source}: by {owner} positions {subject} {way:.4g} m, by {owner} speeds "
                 f"{driven:.4g} m; {hint}"
             )
 

@@ -319,8 +319,8 @@ class _Fit:
 def count_records(drivers: pd.DataFrame) -> str:
     """Return how many records a calibration in one mode fitted, and of how many drivers."""
     people = len(drivers[["recording", "follower_id"]].drop_duplicates())
-    whose = f"{people} driver{'s' * (people > 1)}"
-    return whose if people == len(drivers) else f"{len(drivers)} records of {whose}"
+    counted = f"{people} driver{'s' * (people > 1)}"
+    return counted if people == len(drivers) else f"{len(drivers)} records of {counted}"
 
 
 def _findings(

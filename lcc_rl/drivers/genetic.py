@@ -190,8 +190,8 @@ def _survivors(
     """Let the elite of the parents compete with the children; sorted, fittest first."""
     count = genes.shape[1]
     elites = max(1, round(settings.elites * count))
-    everyone = torch.cat([genes[:, :elites], children], 1)  # the parents are sorted
-    return _fittest(everyone, torch.cat([fitness[:, :elites], born], 1), count)
+    united = torch.cat([genes[:, :elites], children], 1)  # the parents are sorted
+    return _fittest(united, torch.cat([fitness[:, :elites], born], 1), count)
 
 
 def _fittest(genes: Tensor, fitness: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -164,8 +164,8 @@ def drive_twins(
     series = (observed.leader_speed, observed.follower_speed[0], observed.gaps[0])
     leader, *start = (x.double().cpu() for x in series)
     generator = torch.Generator().manual_seed(0)
-    who, shape = _people(observed, drivers), (len(reactions), repeats, observed.count)
-    motion = _follow(who, leader, start, reactions, shape, generator, observed.time_step)
+    people, shape = _people(observed, drivers), (len(reactions), repeats, observed.count)
+    motion = _follow(people, leader, start, reactions, shape, generator, observed.time_step)
     truth = observed.follower_speed.double().cpu().numpy()[:, None]
     alive = _inside(len(truth), observed.samples)
     norm = (truth**2).sum(0)
@@ -193,9 +193,9 @@ def growth(observed: Observed, drivers: pd.DataFrame, reactions: Sequence[Reacti
     for car in range(CARS):
         order = torch.from_numpy(chance.permutation(observed.count))
         shared = {name: getattr(law, name)[order] for name in law.shared()}
-        who = (law.with_(**shared), (own[0][order], own[1][order]))
-        gap = who[0].equilibrium_gap(leader[0], *who[1])
-        motion = _follow(who, leader, (leader[0], gap), reactions, shape, generator, step)
+        people = (law.with_(**shared), (own[0][order], own[1][order]))
+        gap = people[0].equilibrium_gap(leader[0], *people[1])
+        motion = _follow(people, leader, (leader[0], gap), reactions, shape, generator, step)
         collided |= [bool(((gaps <= 0.0) & inside).any()) for _, gaps in motion]
         if car in (0, CARS - 1):
             each = [_energies(x, observed.samples, step, AVERAGES[0]) for x, _ in motion]
@@ -206,7 +206,7 @@ def growth(observed: Observed, drivers: pd.DataFrame, reactions: Sequence[Reacti
 
 
 def _follow(
-    who: People,
+    people: People,
     leader: Tensor,
     start: Sequence[Tensor],
     reactions: Sequence[Reaction],
@@ -218,7 +218,7 @@ def _follow(
 
     The leader's speed is ``[time, …]``, broadcast to ``shape``: reactions, draws, drivers.
     """
-    law, own = who
+    law, own = people
     level, gap_level = (
         torch.tensor(x).double().view(-1, 1, 1)
         for x in ([one.noise for one in reactions], [one.gap_noise for one in reactions])
@@ -436,8 +436,8 @@ def compare_twins(
         REACTING: cross_chosen(tries, records),
     }
     errors = {
-        who: one_step_error(observed, drivers, delay)
-        for who, delay in ((TWINS, 0.0), (REACTING, reaction.delay))
+        kind: one_step_error(observed, drivers, delay)
+        for kind, delay in ((TWINS, 0.0), (REACTING, reaction.delay))
     }
     line = (
         f"reaction delay {reaction.delay:g} s and acceleration noise {reaction.noise:g} m/s²"
@@ -445,7 +445,7 @@ def compare_twins(
         f"chosen ({100 * np.expm1(tries[reaction].growth):+.0f} % of energy from the first to the "
         f"{CARS}th in a row); below, each driver has what was chosen on others"
     )
-    lines = [Concern(line), *(_line(who, found, one) for who, one in errors.items())]
+    lines = [Concern(line), *(_line(kind, found, one) for kind, one in errors.items())]
     return reaction, _together(found, observed), lines
 
 
@@ -457,18 +457,18 @@ def accelerate(records: pd.DataFrame) -> bool:
 
 def _together(found: Mapping[str, pd.DataFrame], observed: Observed) -> pd.DataFrame:
     episode = observed.identity["episode"]
-    parts = [part.assign(episode=episode, driver=who) for who, part in found.items()]
+    parts = [part.assign(episode=episode, driver=kind) for kind, part in found.items()]
     return pd.concat(parts, ignore_index=True)
 
 
-def _line(who: str, found: Mapping[str, pd.DataFrame], one_step: float) -> str:
-    each = [ratios(found[who], found[RECORDED_DRIVERS], smoothing=width) for width in AVERAGES]
+def _line(kind: str, found: Mapping[str, pd.DataFrame], one_step: float) -> str:
+    each = [ratios(found[kind], found[RECORDED_DRIVERS], smoothing=width) for width in AVERAGES]
     energies = ", ".join(f"{one['energy']:.3f}" for one in each)
     losses = ", ".join(f"{one['lost']:.2f}" for one in each)
     parts = ", ".join(f"{value:.2f}" for name, value in each[0].items() if "lost_" in name)
-    own, theirs = (found[x].mean(numeric_only=True) for x in (who, RECORDED_DRIVERS))
+    own, theirs = (found[x].mean(numeric_only=True) for x in (kind, RECORDED_DRIVERS))
     return (
-        f"drivers {who}: RMSPE {100 * own.rmspe:.1f} %; {energies} of the recorded energy per km, "
+        f"drivers {kind}: RMSPE {100 * own.rmspe:.1f} %; {energies} of the recorded energy per km, "
         f"{losses} of what accelerating loses (speeds smoothed over {AVERAGES[0]}, "
         f"{AVERAGES[1]} s), {parts} of it behind the calmest, middle and roughest leaders; "
         f"spectrum off by a factor {np.exp(each[0]['spectrum']):.2f}, one-step error "

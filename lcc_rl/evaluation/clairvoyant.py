@@ -101,7 +101,7 @@ def clairvoyant(
         every = shifts.repeat_interleave(hold, 0)[:steps]
         _, record = source.play(source.start(given), network, steps, every)
         data = source.assemble(record)
-        check_batch(data, who=strategy.title)
+        check_batch(data, label=strategy.title)
         price, missed = goal(data)
         found.take(torch.stack(measured(data)).sum(0), every)
         total = price + min(1.0, 0.1 + 1.8 * share) * missed
@@ -194,9 +194,9 @@ class Goal:
         scenario = cfg.scenario
         self.task, self.string = cfg.task is not None, scenario.vehicles
         self.length, self.time_step = scenario.vehicle_length, scenario.time_step
-        whose = self.string if own else None
+        own_string = self.string if own else None
         self.fleet = build_energy(cfg)
-        self.counted = (self.time_step, whose, self.fleet, exact and self.task)
+        self.counted = (self.time_step, own_string, self.fleet, exact and self.task)
         self.first: tuple[Tensor, Tensor] | None = None
 
     def __call__(self, data: TensorDictBase) -> tuple[Tensor, Tensor]:

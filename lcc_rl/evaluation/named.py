@@ -61,40 +61,40 @@ def is_shipped(name: str) -> bool:
     return name.removesuffix(FILTERED) in {DIRECT, PEOPLE, *OF_CACC, *BASELINES, *_files()}
 
 
-def setting_of(who: Any, where: str = "compare") -> str | Node:
+def setting_of(spec: Any, where: str = "compare") -> str | Node:
     """Return what a configuration calls a policy or a controller that a program names.
 
     Args:
-        who: a name; a path, such as a run's; a node; or a controller as object, class or function.
+        spec: a name; a path, such as a run's; a node; or a controller as object, class or function.
         where: its place in the configuration, for messages.
 
     Raises:
         ConfigError: if a class or function is not at the top of a module.
     """
-    if isinstance(who, Node):
-        return who
-    if isinstance(who, Controller):
-        who = {TARGET: path_of(type(who)), **values(who)}
-    if isinstance(who, Mapping):
-        return Node.of(who, where)
-    if isinstance(who, PathLike):
-        return fspath(who)
-    return path_of(who) if callable(who) else str(who)
+    if isinstance(spec, Node):
+        return spec
+    if isinstance(spec, Controller):
+        spec = {TARGET: path_of(type(spec)), **values(spec)}
+    if isinstance(spec, Mapping):
+        return Node.of(spec, where)
+    if isinstance(spec, PathLike):
+        return fspath(spec)
+    return path_of(spec) if callable(spec) else str(spec)
 
 
-def is_policy(who: Any) -> TypeGuard[str]:
+def is_policy(spec: Any) -> TypeGuard[str]:
     """Whether a name is that of a trained policy's file or folder."""
-    if not isinstance(who, str) or who.endswith((*YAML, ONNX, MODULE)):
+    if not isinstance(spec, str) or spec.endswith((*YAML, ONNX, MODULE)):
         return False
-    path = Path(who)
+    path = Path(spec)
     return path.exists() or path.parts[:1] == (PRETRAINED,) or path.suffix == ".pt"
 
 
-def controller_of(who: Any, behind: bool = False) -> Node:
+def controller_of(spec: Any, behind: bool = False) -> Node:
     """Return the node of a controller.
 
     Args:
-        who: a baseline; a file of ``controller`` or ``variant`` in conf/ or ``--config-dir``; the
+        spec: a baseline; a file of ``controller`` or ``variant`` in conf/ or ``--config-dir``; the
             dotted path of a class or of a function of named entries; a yaml file that holds a
             node; an ONNX program (:mod:`lcc_rl.interfaces.onnx_policy`); or a node.
         behind: whether it drives behind a filter that keeps a longest time gap, for which tuned
@@ -103,46 +103,46 @@ def controller_of(who: Any, behind: bool = False) -> Node:
     Raises:
         ConfigError: if there is no such controller, or it cannot be built.
     """
-    if isinstance(who, str):
-        plain = who.removesuffix(FILTERED)
-        own = _named(who) if behind or plain not in TUNED else None
+    if isinstance(spec, str):
+        plain = spec.removesuffix(FILTERED)
+        own = _named(spec) if behind or plain not in TUNED else None
         if node := own or _named(plain):
             return node
-        who = plain
-    node = who if isinstance(who, Node) else Node.of(_described(who), f"compare={who}")
+        spec = plain
+    node = spec if isinstance(spec, Node) else Node.of(_described(spec), f"compare={spec}")
     node.made(Controller)
     return node
 
 
-def label_of(who: Any) -> str:
+def label_of(spec: Any) -> str:
     """Return what tables call a controller: its name, or that of its file, class or function.
 
     A file whose name is one of the package's keeps its ending: ``idm_acc.yaml``.
     """
-    if isinstance(who, Node):
-        who = str(who.settings.get("law") or who.settings[TARGET])
-    known, plain = {*rules(), *choices("variant")}, who.removesuffix(FILTERED)
+    if isinstance(spec, Node):
+        spec = str(spec.settings.get("law") or spec.settings[TARGET])
+    known, plain = {*rules(), *choices("variant")}, spec.removesuffix(FILTERED)
     file = Path(plain)
     if file.suffix in (*YAML, ONNX):
-        return (file.name if file.stem in known else file.stem) + who[len(plain) :]
-    return who if who in known else str(who).rpartition(".")[2]
+        return (file.name if file.stem in known else file.stem) + spec[len(plain) :]
+    return spec if spec in known else str(spec).rpartition(".")[2]
 
 
-def _named(who: str) -> Node | None:
+def _named(spec: str) -> Node | None:
     """Return the controller that has a name; None if none has it."""
-    if who in (shipped := _shipped()):
-        return shipped[who]
-    if who in choices("controller"):
-        words = ["variant=idm", f"controller@{AUTO}={who}"]
-    elif who in choices("variant"):
-        words = [f"variant={who}"]
+    if spec in (shipped := _shipped()):
+        return shipped[spec]
+    if spec in choices("controller"):
+        words = ["variant=idm", f"controller@{AUTO}={spec}"]
+    elif spec in choices("variant"):
+        words = [f"variant={spec}"]
     else:
         return None
     cfg = load("evaluate", words)
     if cfg.agent is not None:
         raise ConfigError(
-            f"variant {who} is learned: compare its run folder or policy.pt, which "
-            f"lcc-rl train variant={who} makes"
+            f"variant {spec} is learned: compare its run folder or policy.pt, which "
+            f"lcc-rl train variant={spec} makes"
         )
     found: Node = cfg.scenario.controllers[AUTOMATED]
     return found
@@ -168,20 +168,20 @@ def _shipped() -> dict[str, Node]:
     return found | {f"cacc {x}": found["cacc"].changed(**cfg.gains[x]) for x in GAINS}
 
 
-def _described(who: Any) -> Any:
+def _described(spec: Any) -> Any:
     """Return the mapping that describes a controller which has no name."""
-    if isinstance(who, Mapping):
-        return who
-    if who.endswith(ONNX):
-        return {TARGET: ONNX_POLICY, "path": who}
-    if who.endswith(YAML):
-        return parse_yaml(read_text(Path(who)), who)
-    if who.endswith(MODULE):
-        inside = Path(who).stem
-        raise ConfigError(f"{who} is a module: name a class or function in it, {inside}.<Class>")
-    if DOTTED.fullmatch(who) is None:
-        error = unknown_name("strategy", who, [*rules(), *OTHER_WORDS])
-        raise ConfigError(f"{error} {own_file('controller', who)}")
-    if inspect.isclass(find_target(who, f"compare={who}")):
-        return {TARGET: who}
-    return {TARGET: f"{Law.__module__}.{Law.__name__}", "law": who}
+    if isinstance(spec, Mapping):
+        return spec
+    if spec.endswith(ONNX):
+        return {TARGET: ONNX_POLICY, "path": spec}
+    if spec.endswith(YAML):
+        return parse_yaml(read_text(Path(spec)), spec)
+    if spec.endswith(MODULE):
+        inside = Path(spec).stem
+        raise ConfigError(f"{spec} is a module: name a class or function in it, {inside}.<Class>")
+    if DOTTED.fullmatch(spec) is None:
+        error = unknown_name("strategy", spec, [*rules(), *OTHER_WORDS])
+        raise ConfigError(f"{error} {own_file('controller', spec)}")
+    if inspect.isclass(find_target(spec, f"compare={spec}")):
+        return {TARGET: spec}
+    return {TARGET: f"{Law.__module__}.{Law.__name__}", "law": spec}

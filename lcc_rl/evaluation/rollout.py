@@ -33,10 +33,10 @@ def play(
     policy: Policy | None,
     given: TensorDictBase,
     keys: Sequence[Key],
-    who: str = "",
+    label: str = "",
 ) -> tuple[Record, Tensor]:
     """Play one batch of episodes to the horizon, see :class:`Player`."""
-    return Player(env, policy, keys, who).play(given)
+    return Player(env, policy, keys, label).play(given)
 
 
 class Player:
@@ -46,7 +46,7 @@ class Player:
         env: the environment, without the single-agent view.
         policy: writes the action; None where none is needed.
         keys: entries to keep; those that the environment lacks are left out.
-        who: name of the strategy, for messages.
+        label: name of the strategy, for messages.
         compiled: compile the step, policy included; where there is no compiler, one line of the
             log says so and the plain step is used.
 
@@ -59,10 +59,10 @@ class Player:
         env: TransformedEnv,
         policy: Policy | None,
         keys: Sequence[Key],
-        who: str = "",
+        label: str = "",
         compiled: bool = False,
     ) -> None:
-        self.env, self.policy, self.who, self.horizon = env, policy, who, env.base_env.horizon
+        self.env, self.policy, self.label, self.horizon = env, policy, label, env.base_env.horizon
         self.pieces = pieces_of(env)
         _check_driven(policy, self.pieces)
         known = written(self.pieces)
@@ -117,7 +117,7 @@ class Player:
                     record[key][0] = before[key]
                 record[key][step + first] = value
         after = {key: record[key][-self.horizon :] for key in self.checked}
-        if require_finite(after, torch.stack(alive), who=self.who, named=named):
+        if require_finite(after, torch.stack(alive), label=self.label, named=named):
             for value in after.values():
                 value.nan_to_num_(0.0, 0.0, 0.0)
         return {key: record[key] for key in self.kept}, torch.stack(alive)

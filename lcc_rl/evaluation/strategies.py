@@ -91,7 +91,7 @@ def driven_by(cfg: StudyConfig, controller: Node) -> StudyConfig:
 def baselines(cfg: StudyConfig, further: Mapping[str, Any] | None = None) -> list[Strategy]:
     """Build the baselines that an evaluation names, and further controllers by their names."""
     named = dict.fromkeys(cfg.evaluation.baselines) | dict(further or {})
-    return [baseline(cfg, name, who) for name, who in named.items() if applies(cfg, name)]
+    return [baseline(cfg, name, spec) for name, spec in named.items() if applies(cfg, name)]
 
 
 def applies(cfg: StudyConfig, name: str) -> bool:
@@ -104,13 +104,13 @@ def applies(cfg: StudyConfig, name: str) -> bool:
     return AUTOMATED in roles and (not name.endswith("oracle") or roles == {AUTOMATED})
 
 
-def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
+def baseline(cfg: StudyConfig, name: str, spec: Any = None) -> Strategy:
     """Build a controller in the scenario under study, with the settings of the variant under study.
 
     Args:
         cfg: the configuration under study.
         name: its name in tables.
-        who: what :func:`lcc_rl.evaluation.named.controller_of` takes; by default the name. It
+        spec: what :func:`lcc_rl.evaluation.named.controller_of` takes; by default the name. It
             drives behind the safety filter if this or the name ends in ``_filtered``.
 
     Raises:
@@ -126,11 +126,11 @@ def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
         cfg.scenario.start[AUTOMATED] = start
         return Strategy(name, cfg)
     kept = cfg.scenario.filters.get(AUTOMATED)
-    named = any(str(word).endswith(FILTERED) for word in (name, who))
+    named = any(str(word).endswith(FILTERED) for word in (name, spec))
     words = f"{name} drives behind the safety filter, and there is none (+filter=cbf adds one)"
     require(kept is not None or not named, words)
     held = kept is not None and kept.settings.get("time_gap", True) is not None
-    controller = controller_of(who or name, held)
+    controller = controller_of(spec or name, held)
     if named:
         return Strategy(name, driven_by(cfg, controller))
     if cfg.variant == name and _kind(cfg) is controller.kind:

@@ -123,18 +123,18 @@ def twins_figure(twins: pd.DataFrame) -> Figure:
     figure = new_figure(PAGE_WIDTH, 0.3 + 2.2 * len(modes))
     for mode, row in zip(modes, np.atleast_2d(figure.subplots(len(modes), 3)), strict=True):
         part = twins[twins["mode"] == mode]
-        found = {who: part[part["driver"] == who] for who in dict.fromkeys(part["driver"])}
+        found = {kind: part[part["driver"] == kind] for kind in dict.fromkeys(part["driver"])}
         spectra, share, gaps = row
-        for who, one in found.items():
-            look: dict[str, Any] = {"color": DRIVER_COLOURS[who], "label": who, "linewidth": 1.3}
+        for kind, one in found.items():
+            look: dict[str, Any] = {"color": DRIVER_COLOURS[kind], "label": kind, "linewidth": 1.3}
             density = densities(one).mean()
             spectra.semilogy(density.index, density, **look)
             ordered = np.sort(one["gap_m"])
             gaps.plot(ordered, np.linspace(0.0, 1.0, len(ordered)), **look)
-            if who != RECORDED_DRIVERS:
+            if kind != RECORDED_DRIVERS:
                 near = ratios(one, found[RECORDED_DRIVERS])
                 places = [100.0 * (near[name] - 1.0) for name in RATIOS]
-                share.plot(places, range(len(RATIOS)), "o", color=DRIVER_COLOURS[who], label=who)
+                share.plot(places, range(len(RATIOS)), "o", color=DRIVER_COLOURS[kind], label=kind)
         share.axvline(0.0, color=DRIVER_COLOURS[RECORDED_DRIVERS], linewidth=1.0)
         share.set_yticks(range(len(RATIOS)), list(RATIOS.values()))
         share.set_ylim(len(RATIOS) - 0.5, -0.5)

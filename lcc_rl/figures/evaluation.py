@@ -164,8 +164,8 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, report:
     left, right = figure.subplots(1, 2, width_ratios=(4, 5))
     _over_time(left, _one_episode(steps, strategy), "speed")
     style(left, "time [s]", "speed [m/s]")
-    whose = shorten(in_words(strategy), 40, placeholder="…")
-    left.set_title(f"one episode: {whose}", loc="left", pad=16)
+    owner = shorten(in_words(strategy), 40, placeholder="…")
+    left.set_title(f"one episode: {owner}", loc="left", pad=16)
     legend_above(left)
     against = str(report.against)
     what, _, unit = report.label.removesuffix("]").partition(" [")
@@ -194,8 +194,8 @@ def measures_of(report: Report, seeds: Sequence[Report] = ()) -> Figure:
         seeds: the report of each training seed alone.
     """
     table = report.short.assign(of=report.short.get("of", ""))
-    names = table[["of", "who"]].to_numpy()
-    labels = [fill(f"{of}: {who}".removeprefix(": "), 28) for of, who in names]
+    names = table[["of", "driver"]].to_numpy()
+    labels = [fill(f"{of}: {driver}".removeprefix(": "), 28) for of, driver in names]
     places = {tuple(key): place for place, key in enumerate(table[["of", "strategy"]].to_numpy())}
     shown = [one for one in report.shown if is_numeric_dtype(table[one.key])]
     shown = [one for one in shown if table[one.key].any()] or shown
@@ -247,14 +247,14 @@ def paired_improvement(means: Means, strategy: str, baseline: str) -> Figure:
 
 
 @paper
-def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> Figure:
+def _by_driver(means: Means, column: str, names: dict[str, str], owner: str) -> Figure:
     """Draw the energies of all drivers under a baseline and a strategy, and what each saves.
 
     Args:
         means: of an evaluation.
         column: the energy.
         names: labels of the baseline and of the strategy, in this order.
-        whose: energy, for the label of the axis.
+        owner: energy, for the label of the axis.
     """
     baseline, strategy = names
     # Rounded to joules: bins have a width also where drivers are alike.
@@ -265,7 +265,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> 
     for (name, label), alpha in zip(names.items(), (0.45, 0.6), strict=True):
         mean = f"{label}, mean of drivers {energy[name].mean():.1f}"
         left.hist(energy[name], bins, color=colour(name), alpha=alpha, label=mean)
-    style(left, f"path energy of {whose}\n[kJ per {means.per}]", "drivers")
+    style(left, f"path energy of {owner}\n[kJ per {means.per}]", "drivers")
     left.xaxis.set_major_locator(MaxNLocator(5))
     left.yaxis.set_major_locator(MaxNLocator(integer=True))
     legend_above(left, 1)

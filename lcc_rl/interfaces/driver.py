@@ -87,31 +87,31 @@ class Driver:
     ) -> None:
         usable = isinstance(time_step, (int, float)) and 0.0 < time_step < math.inf
         require(usable, f"time_step must be a positive number of seconds, got {time_step!r}")
-        who = setting_of(name)
-        self.name = who if isinstance(who, str) else label_of(who)
+        spec = setting_of(name)
+        self.name = spec if isinstance(spec, str) else label_of(spec)
         self.time_step, self.seed = time_step, seed
-        if is_policy(who):
+        if is_policy(spec):
             require(drivers is None, f"drivers are of rules; {self.name} is a policy")
-            self.program = program(who, trust, safety=safety)
+            self.program = program(spec, trust, safety=safety)
             trained = self.program.controller.time_step
             if abs(trained - time_step) > 1e-9:
                 raise ConfigError(
-                    f"{who} was trained with steps of {trained!r} s, the simulation has "
+                    f"{spec} was trained with steps of {trained!r} s, the simulation has "
                     f"{time_step!r} s (in SUMO, --step-length {trained:g} sets it)"
                 )
         else:
             own = bootstrap(drivers) if isinstance(drivers, (str, Path)) else drivers
-            self.program = self._rule(who, safety, measuring(time_step, True, own))
+            self.program = self._rule(spec, safety, measuring(time_step, True, own))
         self.names = self.program.names
         self.behind = {x for x in self.names if x.startswith("behind.")} - {BEHIND_PRESENT}
         self._check()
         self.reset()
 
-    def _rule(self, who: Any, safety: CBFFilter | None, world: World) -> DrivingProgram:
-        if safety is None and isinstance(who, str) and who.endswith(FILTERED):
+    def _rule(self, spec: Any, safety: CBFFilter | None, world: World) -> DrivingProgram:
+        if safety is None and isinstance(spec, str) and spec.endswith(FILTERED):
             filters = load("evaluate", ["variant=idm", "+filter=cbf"]).scenario.filters
             safety = filters[AUTOMATED].made(CBFFilter)
-        node = controller_of(who, safety is not None and safety.time_gap is not None)
+        node = controller_of(spec, safety is not None and safety.time_gap is not None)
         return driving([node.made(Controller)], safety, world)
 
     def _check(self) -> None:
@@ -226,8 +226,8 @@ class Driver:
         for name in () if np.all(present) else self.behind:
             entry = name.partition(".")[2]
             zero = BEHIND_PRESENT in self.names or entry == "acceleration"
-            nobody = 0.0 if zero else measured[f"self.{entry}"]
-            found[name] = nobody if absent else np.where(present, found[name], nobody)
+            default = 0.0 if zero else measured[f"self.{entry}"]
+            found[name] = default if absent else np.where(present, found[name], default)
         return found
 
     @cached_property

@@ -187,12 +187,12 @@ class DrivingProgram(nn.Module):
 def described_input(name: str) -> Input:
     """Return name, unit and meaning of a measurement such as ``"ahead.speed"``."""
     view, entry = name.split(".")[:2]
-    whose = {"self": "own", "ahead": "of the vehicle ahead", "behind": "of the vehicle behind"}
+    owners = {"self": "own", "ahead": "of the vehicle ahead", "behind": "of the vehicle behind"}
     known = declared(Piece)
     for key in ((VEHICLES, entry), (view, entry), (ROLE, entry)):
         if key in known:
-            return Input(name, known[key].unit, f"{known[key].meaning} ({whose.get(view, view)})")
-    return Input(name, "–", f"{entry} ({whose.get(view, view)})")
+            return Input(name, known[key].unit, f"{known[key].meaning} ({owners.get(view, view)})")
+    return Input(name, "–", f"{entry} ({owners.get(view, view)})")
 
 
 def measuring(time_step: float, behind: bool = True, population: Population | None = None) -> World:

@@ -71,7 +71,7 @@ def _number(value: Any) -> float | None:
     return float(f"{value:.7g}") if np.isfinite(value) else None
 
 
-def score_table(who: str, rows: Sequence[BoardRow]) -> Table:
+def score_table(name: str, rows: Sequence[BoardRow]) -> Table:
     """Return rows as a table for the terminal, within 80 characters."""
     lines: list[dict[str, str]] = []
     for row in rows:
@@ -85,7 +85,7 @@ def score_table(who: str, rows: Sequence[BoardRow]) -> Table:
         "windows where there are fewer than five drives, too narrow if one drive has several; "
         "score.json has every limit and value."
     )
-    return render.as_rich(pd.DataFrame(lines), BOARD_COLUMNS, in_words(who), caption)
+    return render.as_rich(pd.DataFrame(lines), BOARD_COLUMNS, in_words(name), caption)
 
 
 def unit_of(row: BoardRow) -> str:
@@ -119,13 +119,13 @@ def leaderboard(documents: Mapping[str, Mapping[str, Any]]) -> str:
         ConfigError: if two rows of one task and source are not comparable, or have one name.
     """
     check_alike(documents)
-    every = [{**row, "who": one["name"]} for one in documents.values() for row in one["results"]]
+    every = [{**row, "by": one["name"]} for one in documents.values() for row in one["results"]]
     parts = []
     for task in dict.fromkeys(row["task"] for row in every):
         rows = [row for row in every if row["task"] == task]
         sources = list(dict.fromkeys(row["source"] for row in rows))
         lines = [
-            [f"{row['source']}, {_sample(row)}", f"`{row['who']}`", *_markdown(row)]
+            [f"{row['source']}, {_sample(row)}", f"`{row['by']}`", *_markdown(row)]
             for row in sorted(rows, key=lambda x: sources.index(x["source"]))
         ]
         lines = [HEAD, ["---"] * len(HEAD), *lines]

@@ -31,7 +31,7 @@ SEVERAL = {
     "ddpg": "DDPG",
     "hcfs": "HCFS",
 }
-WHO = SEVERAL | {
+LABELS = SEVERAL | {
     "idm": "one driver (IDM)",
     HUMAN: "simulated drivers",
     "recorded": "the recorded drivers",
@@ -59,12 +59,12 @@ def in_words(name: str) -> str:
         >>> in_words("alcc"), in_words("alcc ddpg"), in_words("my_idm_1.1")
         ('network, for all', 'network, for all (ddpg)', 'my_idm_1.1')
     """
-    if name.endswith(FILTERED) and name not in WHO:
+    if name.endswith(FILTERED) and name not in LABELS:
         return f"{in_words(name.removesuffix(FILTERED))}, filtered"
     first, _, rest = name.partition(" ")
-    if name not in WHO and first in SEVERAL:
+    if name not in LABELS and first in SEVERAL:
         return f"{SEVERAL[first]} ({rest.replace('_', ' ')})"
-    return WHO.get(name, name)
+    return LABELS.get(name, name)
 
 
 def worded(table: pd.DataFrame) -> pd.DataFrame:

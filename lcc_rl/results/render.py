@@ -212,7 +212,7 @@ def for_print(report: Report, names: Sequence[str] = ()) -> pd.DataFrame:
         ConfigError: for a column that is not there, naming the nearest.
     """
     table = chosen(report.short, names or [column.key for column in report.shown])
-    return table.rename(columns={"who": "driven by", "score": report.label})
+    return table.rename(columns={"driver": "driven by", "score": report.label})
 
 
 def chosen(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:

@@ -269,9 +269,9 @@ def _of_energy(table: pd.DataFrame, energy: Fleet | None, filtered: bool) -> dic
     cars = table[table[PATH].notna()] if table[PATH].notna().any() else table
     cars = cars.sort_values(PATH_PER_KM, ascending=False, kind="stable").reset_index(drop=True)
     against = (cars["against"].iloc[0] or None) if len(cars) > 1 else None
-    who, flow = flow_against(cars)
-    way, whose = (WAY, "distance against theirs") if flow.isna().all() else (FLOW_SHARE, who)
-    note = "" if against is None else f"{saved_against(cars, against)}; {whose}; "
+    source, flow = flow_against(cars)
+    way, basis = (WAY, "distance against theirs") if flow.isna().all() else (FLOW_SHARE, source)
+    note = "" if against is None else f"{saved_against(cars, against)}; {basis}; "
     short = [one for one in MEASURES if one.short]
     columns = {"energy_kj_per_km": cars[PATH_PER_KM], FLOW_SHARE.key: flow}
     columns |= {one.shown.key: (one.scale * cars[one.key]).round(2) for one in short}
@@ -313,8 +313,8 @@ def shortened(
     table: pd.DataFrame, shown: Sequence[Shown]
 ) -> tuple[pd.DataFrame, tuple[Shown, ...]]:
     """Return columns of a table with their intervals and strategies in words, and the columns."""
-    table = table.assign(who=[in_words(str(name)) for name in table["strategy"]])
-    shown = (Shown("who", "driven by"), *shown)
+    table = table.assign(driver=[in_words(str(name)) for name in table["strategy"]])
+    shown = (Shown("driver", "driven by"), *shown)
     names = [f"{one.key}{end}" for one in shown for end in ("", "_low", "_high")]
     return table[["strategy", *(x for x in names if x in table)]], shown
 

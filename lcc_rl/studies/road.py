@@ -166,7 +166,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     )
     shown = [Shown(x.shown.key, x.label.replace(" [", "\n[")) for x in MEASURES if x.key in DRAWN]
     of = [f"{x:g} %" for x in table["automated_pct"]]
-    named = table.assign(of=of, who=[in_words(str(name)) for name in table["strategy"]])
+    named = table.assign(of=of, driver=[in_words(str(name)) for name in table["strategy"]])
     one = Report("", table, named, tuple(shown), (), "", "")
     found.figure("road", "The same values and intervals; shares of time in %", measures_of(one))
     for name, file in (("Data", folder / TRAJECTORIES), ("Drivers", folder / DRIVERS_FILE)):

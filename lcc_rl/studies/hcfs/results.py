@@ -84,12 +84,12 @@ def _windows(found: StudyResults, episodes: pd.DataFrame) -> None:
 
 
 def _case(found: StudyResults, episodes: pd.DataFrame, steps: pd.DataFrame, case: str) -> None:
-    stem, (table, speeds, jerk, who) = case.replace(" ", "_"), CASES[case]
+    stem, (table, speeds, jerk, use) = case.replace(" ", "_"), CASES[case]
     found.table(stem, f"{case} ({table} of the paper)", case_table(episodes, case))
     pictures = {
         ("velocities", f"speeds (Fig. {speeds})"): platoon.velocities(steps, case),
         ("jerk", f"jerk and its bound (Fig. {jerk})"): platoon.jerks(steps, case, 30.0),
-        ("switching_hcfs", f"controller in use, hcfs (Fig. {who})"): platoon.switching(steps, case),
+        ("switching_hcfs", f"controller in use, hcfs (Fig. {use})"): platoon.switching(steps, case),
         ("switching_hcfs_oracle", "controller in use, hcfs oracle"): platoon.switching(
             steps, case, "hcfs oracle"
         ),
