@@ -136,7 +136,7 @@ def build_logger(cfg: TrainConfig) -> Any:
 def check_variant(cfg: StudyConfig) -> None:
     """Refuse a variant that the scenario does not fit.
 
-    A learner does not go under the name of a variant that learns nothing, or the reverse, and
+    A learner does not go under the name of a variant that has no agent, or the reverse, and
     connected vehicles need messages.
     """
     try:
@@ -150,7 +150,7 @@ def check_variant(cfg: StudyConfig) -> None:
             "no messages: use task=platoon-us06, task=platoon-highway or scenario=platoon"
         )
     if learns(cfg) and not learns(own):  # it has no automated vehicle, and the task has
-        raise ConfigError(f"variant={cfg.variant} learns nothing: use compare=[{cfg.variant}]")
+        raise ConfigError(f"variant={cfg.variant} has no agent: use compare=[{cfg.variant}]")
     if learns(own) and not learns(cfg) and _is_driven_as(cfg, own):
         raise ConfigError(
             f"variant={cfg.variant} is a learned controller, but there is no agent; for a human "

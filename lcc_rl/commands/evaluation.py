@@ -138,7 +138,7 @@ def _run(
     prepare_torch(cfg)
     check_measured(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg) and not _nobody_drives(cfg):
-        raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
+        raise ConfigError(f"variant {cfg.variant} has no agent: remove policy={cfg.policy}")
     own = own and not only_named(cfg)
     if own:
         check_variant(cfg)
@@ -288,7 +288,7 @@ def strategies_of(
         strategies += studied(cfg, policy, inputs.population)
     for name, policy_given in (further or {}).items():
         _check_label(name, "a policy", "")
-        require(learns(cfg), f"{name} is a policy, and variant {cfg.variant} learns nothing")
+        require(learns(cfg), f"{name} is a policy, and variant {cfg.variant} has no agent")
         env = build_env(cfg, inputs.evaluation, inputs.population, 1, 0, cfg.device, nominal=True)
         policy_given.tried(env.reset())
         strategies.append(Strategy(name, cfg, policy_given))

@@ -103,7 +103,7 @@ def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
         save_config(cfg, folder)
     if not learns(cfg):
         strategy = rule(cfg)
-        log.info("%s learns nothing: evaluating it", strategy.name)
+        log.info("%s has no agent: evaluating it", strategy.name)
     elif cfg.policy is not None:
         strategy = _given(cfg, inputs, folder)
     else:

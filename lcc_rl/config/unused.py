@@ -19,7 +19,7 @@ def check_used(cfg: BaseConfig, overrides: Sequence[str], sweep: bool = False) -
         cfg: the configuration.
         overrides: what was typed.
         sweep: the runs of a sweep share what was typed, so what one of them learns by may be
-            given to another that learns nothing.
+            given to another that has no agent.
 
     Raises:
         ConfigError: naming the option and the reason.
@@ -68,7 +68,7 @@ def _of_agent(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
     if cfg.agent is not None:
         return
     driver = cfg.scenario.controllers.get(AUTOMATED)
-    reason = f"variant {cfg.variant} learns nothing"
+    reason = f"variant {cfg.variant} has no agent"
     if not cfg.scenario.vehicles.count(AUTOMATED):
         reason = "no vehicle of the string is automated"
     elif driver is not None and not takes_action(driver):

@@ -17,7 +17,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, FrameSkipTransform, Transform
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.finite import any_lost, require_finite
+from lcc_rl.functional.finite import any_nonfinite, require_finite
 from lcc_rl.pieces.base import (
     ACTION,
     OBSERVATION,
@@ -200,7 +200,7 @@ class Pieces(Compose):
             Diverged: naming the first entry that is not, its step and its episode.
         """
         telling = [td.get(ACTION, None), *(next_td.get(key, None) for key in FINITE_CHECKED)]
-        if not any_lost(value for value in telling if value is not None):
+        if not any_nonfinite(value for value in telling if value is not None):
             return
         pieces = [piece for piece in self.transforms if isinstance(piece, Piece)]
         named: dict[Key, Tensor | None] = {ACTION: telling[0]}

@@ -174,7 +174,7 @@ def without_automated(cfg: StudyConfig) -> StudyConfig:
 
 
 def rule(cfg: StudyConfig) -> Strategy:
-    """Return the strategy of a configuration that learns nothing.
+    """Return the strategy of a configuration that has no agent.
 
     Its name is that of the variant, or of the controller's class where that is not the variant's.
     """

@@ -10,15 +10,15 @@ from torch import Tensor
 from lcc_rl.errors import Diverged
 
 
-def any_lost(values: Iterable[Tensor]) -> bool:
+def any_nonfinite(values: Iterable[Tensor]) -> bool:
     """Whether a value may be NaN or infinite, by the sum of each tensor."""
     sums = [value.sum() for value in values if value.is_floating_point()]
     return bool(sums) and not bool(torch.stack(sums).sum().isfinite())
 
 
-def lost_weight(weights: Mapping[str, Tensor]) -> str | None:
+def nonfinite_weight(weights: Mapping[str, Tensor]) -> str | None:
     """Return the name of the first weight with a NaN or an infinity; None if there is none."""
-    if not any_lost(weights.values()):
+    if not any_nonfinite(weights.values()):
         return None
     return next((name for name, x in weights.items() if not bool(x.isfinite().all())), None)
 
@@ -45,13 +45,13 @@ def require_finite(
     Raises:
         Diverged: naming the first such entry, its step and its episode.
     """
-    if not any_lost(entries.values()):
+    if not any_nonfinite(entries.values()):
         return False
     found = []
     for place, (key, value) in enumerate(entries.items()):
-        lost = ~value.isfinite().flatten(2).all(-1) & running.squeeze(-1)
-        if lost.any():
-            step, episode = lost.nonzero()[0].tolist()
+        bad = ~value.isfinite().flatten(2).all(-1) & running.squeeze(-1)
+        if bad.any():
+            step, episode = bad.nonzero()[0].tolist()
             found.append((step, place, episode, key))
     if not found:
         return True

@@ -195,7 +195,7 @@ FITS = [
     ({"scenario.time_step": 0.5}, "idm", r"p\.pt.*scenario\.time_step=0\.5, got 0\.1"),
     ({"scenario.controllers.automated.max_acceleration": 1.0}, "alcc", r"max_acceleration=1\.0"),
     ({}, "reference", "trained as variant alcc"),
-    ({}, "none", "learns nothing"),
+    ({}, "none", "has no agent"),
 ]
 
 

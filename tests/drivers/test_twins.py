@@ -199,5 +199,5 @@ def test_drivers_that_hold_their_speeds_tell_nothing() -> None:
     with pytest.raises(DataError, match=r"hold their speeds: too little .* use calibration=local"):
         Calibrator(modes=["local"], reaction=True)(episodes)
     report = "\n".join(Calibrator(modes=["local"])(episodes).report)
-    assert "hold their speeds: too little to tell" in report
+    assert "hold their speeds: too little to compare" in report
     assert "inf" not in report

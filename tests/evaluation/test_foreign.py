@@ -108,5 +108,5 @@ def test_what_is_no_policy_of_these_keys_is_refused_in_a_line() -> None:
         ({"alcc": network}, "a policy alcc, which stands for 'network, for all': choose another"),
     ]
     check_refused(lambda who: lcc_rl.compare(who, overrides=SMALL), cases, ConfigError)
-    with pytest.raises(ConfigError, match="x is a policy, and variant idm learns nothing"):
+    with pytest.raises(ConfigError, match="x is a policy, and variant idm has no agent"):
         lcc_rl.compare({"x": network}, "idm", [*NO_AGENT])
