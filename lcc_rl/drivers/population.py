@@ -146,8 +146,8 @@ def bootstrap(
     Args:
         path: table of calibrated drivers; None: the shipped I-80 drivers.
         mode: see :func:`load_drivers`.
-        least_speed: lower bound to which desired speeds are raised, for leaders faster than those of
-            the calibration [m/s]; None: no bound. Time gaps are unchanged.
+        least_speed: lower bound of desired speeds, for leaders faster than those of the calibration
+            [m/s]; None: no bound. Time gaps are unchanged.
         reaction_delay: delay of all drivers [s]; None: that of the table, 0 if it has none.
         acceleration_noise: standard deviation [m/s²], likewise; see
             :class:`lcc_rl.functional.driver_models.Reaction`.

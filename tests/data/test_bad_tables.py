@@ -121,9 +121,9 @@ BAD: list[tuple[str, str | bytes, str]] = [
     (
         "episodes",
         TWICE,
-        "row 601, column 'time_s' repeats a moment of its episode with other values, as do 50 %",
+        "row 601, column 'time_s' repeats a time of its episode with other values, as do 50 %",
     ),
-    ("table", csv(TABLE.assign(t=0.0)), "data row 2, vehicle 1, column 't' repeats a moment of"),
+    ("table", csv(TABLE.assign(t=0.0)), "data row 2, vehicle 1, column 't' repeats a time of"),
     ("leaders", RECORD + "0,1\n1,2\n2,1\n", r"covers 0–2 s, not the stretch 0–9 s"),
     # Values that are implausible, and units.
     ("ngsim", csv_text(pair(v_Length=4.5, Preceding=0)[:20]), "is 4.5 feet; .*data.units=metres"),
