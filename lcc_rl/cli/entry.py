@@ -201,10 +201,10 @@ def recording_errors(function: Callable[[DictConfig], Any]) -> Callable[[DictCon
                 if "resume" in cfg and (folder / CONFIG).exists():
                     name = HydraConfig.get().job.config_name
                     from lcc_rl.results.runs import stored_config
-                    from lcc_rl.results.trust import said_again
+                    from lcc_rl.results.trust import trust_option
 
                     command = f"lcc-rl {'run' if name == 'pipeline' else name} resume={folder}"
-                    command += said_again(stored_config(folder))
+                    command += trust_option(stored_config(folder))
                     raise Interrupted(f"stopped; go on with: {command}") from error
                 raise
             given = isinstance(input_error(error) or error, (LccError, OSError))

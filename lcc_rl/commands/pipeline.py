@@ -54,7 +54,7 @@ from lcc_rl.results.runs import (
     resumed_config,
     save_config,
 )
-from lcc_rl.results.trust import own_modules, said_again
+from lcc_rl.results.trust import own_modules, trust_option
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import tell
 from lcc_rl.runs.precision import prepare_torch
@@ -157,7 +157,7 @@ def _run(
     try:
         train_all(trainings, folder, cfg.jobs)
     except Interrupted:
-        words = f"stopped; complete it with: lcc-rl run resume={folder}{said_again(final)}"
+        words = f"stopped; complete it with: lcc-rl run resume={folder}{trust_option(final)}"
         raise Interrupted(words) from None
     final.compare = [
         str(folder / name) for name in trainings if (folder / name / "policy.pt").exists()

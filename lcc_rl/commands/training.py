@@ -26,7 +26,7 @@ from lcc_rl.results.platoons import case_table
 from lcc_rl.results.policies import load_policy, save_policy
 from lcc_rl.results.report import summary, windows_for
 from lcc_rl.results.runs import EPISODES, check_folder, resumed_config, save_config
-from lcc_rl.results.trust import said_again
+from lcc_rl.results.trust import trust_option
 from lcc_rl.runs.loggers import RowLogger, Silent
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import working
@@ -148,7 +148,7 @@ def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume:
         try:
             trainer.run()
         except Interrupted as error:
-            raise Interrupted(f"{error}{said_again(cfg)}") from error
+            raise Interrupted(f"{error}{trust_option(cfg)}") from error
     weights = agent.policy.state_dict()
     if all(torch.equal(weights[name], value) for name, value in first.items()):
         log.warning(

@@ -199,11 +199,11 @@ class Pieces(Compose):
         Raises:
             Diverged: naming the first entry that is not, its step and its episode.
         """
-        telling = [td.get(ACTION, None), *(next_td.get(key, None) for key in FINITE_CHECKED)]
-        if not any_nonfinite(value for value in telling if value is not None):
+        checked = [td.get(ACTION, None), *(next_td.get(key, None) for key in FINITE_CHECKED)]
+        if not any_nonfinite(value for value in checked if value is not None):
             return
         pieces = [piece for piece in self.transforms if isinstance(piece, Piece)]
-        named: dict[Key, Tensor | None] = {ACTION: telling[0]}
+        named: dict[Key, Tensor | None] = {ACTION: checked[0]}
         named |= {key: next_td.get(key, None) for piece in pieces for key in piece.targets}
         done = td.get(DONE, None)
         running = ones_like(next_td.get(DONE)) if done is None else ~done

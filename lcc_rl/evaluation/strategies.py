@@ -34,7 +34,7 @@ from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces import Observation, Piece, RecordedStart
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.results.runs import flatten, told_apart
+from lcc_rl.results.runs import distinguished, flatten
 from lcc_rl.settings import TARGET, path_of
 
 log = logging.getLogger("lcc_rl")
@@ -358,7 +358,7 @@ def _labels(strategies: Sequence[Strategy], marks: Sequence[tuple[str, int]]) ->
     differences: dict[tuple[str, str], str] = {}
     for name in {name for name, _ in groups}:
         texts = list(dict.fromkeys(text for other, (text, _) in places if other == name))
-        words = told_apart([json.loads(text) for text in texts])
+        words = distinguished([json.loads(text) for text in texts])
         differences |= {(name, text): word for text, word in zip(texts, words, strict=True)}
     found = []
     for one, (name, (text, which)) in zip(strategies, groups, strict=True):

@@ -37,7 +37,7 @@ from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.bootstrap import Estimate, share_saved
-from lcc_rl.results.motion import telling
+from lcc_rl.results.motion import most_varied
 from lcc_rl.results.names import in_words, several
 from lcc_rl.results.render import column_cells, signed
 from lcc_rl.results.report import AGAINST, RULE, Report
@@ -224,7 +224,7 @@ def _over_time(axis: Axes, rows: pd.DataFrame, entry: str) -> None:
 
 def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
     """Return the telling episode of a strategy, its columns named for one car and one human."""
-    rows = telling(steps)
+    rows = most_varied(steps)
     rows = rows[rows["strategy"] == strategy]
     if "training_seed" in rows and rows["training_seed"].notna().any():
         rows = rows[rows["training_seed"] == rows["training_seed"].min()]

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from lcc_rl.errors import ResultsError
 from lcc_rl.figures.drawing import COLUMN_WIDTH, PAGE_WIDTH, lines_of, new_figure, paper, unbox
 from lcc_rl.functional.pattern import HUMAN
-from lcc_rl.results.motion import SampleMotion, motion_of, sample_episodes, telling
+from lcc_rl.results.motion import SampleMotion, most_varied, motion_of, sample_episodes
 
 FEWEST = 3  # vehicles; of fewer, speeds over time show all
 POINT_STEPS = 5  # steps between the points of a line
@@ -44,7 +44,7 @@ def space_time(
     Returns:
         The figure; None for strings with fewer than :data:`FEWEST` vehicles.
     """
-    found, episode = {}, telling(steps)
+    found, episode = {}, most_varied(steps)
     for name in names:
         try:
             rows = next(iter(sample_episodes(episode, name).values()))

@@ -168,7 +168,7 @@ def schema_of(path: str | Path, needed: Iterable[str] = ()) -> pa.Schema:
         raise _no_frame(path, error) from error
     for name in needed:
         if name not in found.names:
-            raise ResultsError(f"{path}: not what a run writes: it has no column {name}")
+            raise ResultsError(f"{path}: not written by a run: it has no column {name}")
     return _texts_encoded(found.remove_metadata())
 
 

@@ -95,7 +95,7 @@ def test_a_stored_configuration_writes_nowhere_but_into_its_folder(run, tmp_path
     assert (cfg.data.made().keep, cfg.logger.made().where) == (None, None)
     assert cfg.logger.made().kind == "tensorboard"
     assert "data.keep=" in caplog.text
-    assert "names a place to write and is left out" in caplog.text
+    assert "names a path to write to and is left out" in caplog.text
     change(run, {"logger": None})
     run_command("lcc_rl.cli.train", f"resume={run}", cwd=tmp_path, check=True)
     assert list(tmp_path.iterdir()) == [run]

@@ -112,7 +112,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("table", COMMAS.replace(";11,", ";1l,", 1), "column 'v' holds '1l,"),
     ("table", csv(TABLE.assign(v="")), "data row 1, column 'v' is blank"),
     ("table", table(id=""), "data row 501, column 'id' is blank"),
-    ("table", table(id="x" * 1001), "data row 501, column 'id' holds a text of 1,001 signs"),
+    ("table", table(id="x" * 1001), "data row 501, column 'id' holds a text of 1,001 characters"),
     ("record", RECORD + "0,1\n1,fast\n", "data row 2, column 'speed_mps' holds 'fast'"),
     # Rows that contradict each other, and times.
     ("table", csv(LATE), r"data row 1191, vehicle 3 is 1e\+11 s after the first"),

@@ -54,7 +54,7 @@ def test_the_name_of_a_column_may_say_its_unit(tmp_path) -> None:
         frame[name] /= UNITS[quantity][unit]
         path = written(tmp_path, frame, "named.csv", quotechar='"')
         words = re.escape(f"the name of column {name!r} contains {unit}, but it is read in")
-        with pytest.raises(DataError, match=rf"{words} .*; set data\.units\.{key}={unit}, or give"):
+        with pytest.raises(DataError, match=rf"{words} .*; set data\.units\.{key}={unit}, or"):
             TableSource(path=path, columns=columns).load()
         loaded = TableSource(path=path, columns=columns, units={key: unit}).load()
         assert len(loaded.episodes) == 800, name
