@@ -446,9 +446,8 @@ def remarks(windows: pd.DataFrame) -> list[str]:
 def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
     """Return a warning for every driver with a desired speed that leaders mostly exceed.
 
-    Such a driver falls behind with any strategy, so energies reflect distances. There is no
-    warning for strategies behind a safety filter, or for networks, which have the share of the drivers
-    behind them.
+    Such a driver falls behind with any strategy, so energies reflect distances. There is no warning
+    for strategies behind a safety filter, or for networks, whose share is that of drivers behind.
 
     Args:
         windows: result of :func:`windows_for`.
