@@ -286,7 +286,7 @@ TAMPERED: dict[str, tuple[Callable[[dict], object], str]] = {
     "less": (lambda state: state.pop("memory"), "memory is required"),
     "bytes": (cast(torch.int8), "weight is torch.int8"),
     "complex": (cast(torch.complex64), "weight is torch.complex64"),
-    "optimizer": (spoil_optimizer, r"0\.exp_avg holds values that are no numbers"),
+    "optimizer": (spoil_optimizer, r"0\.exp_avg holds values that are not finite"),
 }
 
 

@@ -115,7 +115,7 @@ def test_the_runs_of_a_sweep_are_read_as_one_evaluation(tmp_path) -> None:
     assert rows["training_seed"].tolist() == [pd.NA, 0, 1, 0, 1]
     assert sweep_of(tmp_path / "seeds", *grid[:2])["strategy"].tolist() == ["idm", "alcc", "alcc"]
     refusals = [
-        ([{"seed": 0}, {"seed": 0, "table": "all"}], "one training twice: alcc, seed 0"),
+        ([{"seed": 0}, {"seed": 0, "table": "all"}], "a training twice: alcc, seed 0"),
         ([{"seed": 0}, {"seed": 1, "leader": 8.0}], r"have different leaders .*results\.load"),
     ]
     for place, (runs, words) in enumerate(refusals):

@@ -109,7 +109,7 @@ def test_a_changed_file_is_said_on_resume_and_seen_by_a_sweep(place, entry, anew
 
 
 def test_what_a_run_reads_is_no_setting() -> None:
-    with pytest.raises(Exception, match="inputs: a run notes itself which files it reads"):
+    with pytest.raises(Exception, match="inputs: runs record the files that they read"):
         load("train", ["inputs={}"])
 
 
