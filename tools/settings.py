@@ -50,7 +50,7 @@ def settings(kind: type[Settings]) -> Iterator[tuple[str, str, str, str]]:
     for node in body.body:
         if isinstance(node, ast.AnnAssign) and "ClassVar" not in ast.unparse(node.annotation):
             value = "required" if node.value is None else default(kind, node)
-            yield ast.unparse(node.target), ast.unparse(node.annotation), value, comment_of(lines, node)
+            yield ast.unparse(node.target), ast.unparse(node.annotation), value, noted(lines, node)
 
 
 def default(kind: type[Settings], node: ast.AnnAssign) -> str:
@@ -61,7 +61,7 @@ def default(kind: type[Settings], node: ast.AnnAssign) -> str:
     return re.sub(r"^field\(default_factory=(?:lambda: )?(.*)\)$", r"\1", source)
 
 
-def comment_of(lines: list[str], node: ast.AnnAssign) -> str:
+def noted(lines: list[str], node: ast.AnnAssign) -> str:
     """Return the comment of a setting, at its end or in the lines above it."""
     behind = lines[(node.end_lineno or node.lineno) - 1].partition("  # ")[2].strip()
     above: list[str] = []
