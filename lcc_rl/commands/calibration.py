@@ -54,7 +54,7 @@ def run(
     cfg: CalibrateConfig,
     folder: str | Path,
     console: Console | None = None,
-    tell: Callable[[Sequence[str]], None] | None = None,
+    emit: Callable[[Sequence[str]], None] | None = None,
 ) -> pd.DataFrame:
     """Calibrate the drivers of ``cfg.data`` with the settings ``cfg.calibration``.
 
@@ -65,7 +65,7 @@ def run(
         cfg: configuration of the entry point ``calibrate``.
         folder: folder of the results.
         console: console of progress and summary; by default the terminal.
-        tell: receives the lines of the report; by default they go to the console.
+        emit: receives the lines of the report; by default they go to the console.
 
     Returns:
         The calibrated drivers, as written.
@@ -76,28 +76,28 @@ def run(
     with claim(Path(folder)):
         check_folder(cfg, Path(folder))
         console = console or Console(highlight=False)
-        return _run(cfg, Path(folder), console, tell or partial(_say, console))
+        return _run(cfg, Path(folder), console, emit or partial(_print, console))
 
 
 def _run(
-    cfg: CalibrateConfig, folder: Path, console: Console, tell: Callable[[Sequence[str]], None]
+    cfg: CalibrateConfig, folder: Path, console: Console, emit: Callable[[Sequence[str]], None]
 ) -> pd.DataFrame:
     device = prepare_torch(cfg)
     # Settings are checked before the data are read, which may take a long time.
     calibrator = cfg.calibration.made(CALLED)
     dataset = load_episodes(cfg.data)
-    tell(dataset.report)
+    emit(dataset.report)
     start = perf_counter()
-    with Phases("calibration", console, tell) as progress:
+    with Phases("calibration", console, emit) as progress:
         result = calibrator(dataset.episodes, seed=cfg.seed, device=device, progress=progress)
     if dataset.vehicles:
         result = _named(result, dataset.vehicles)
     seconds = perf_counter() - start
     save_config(cfg, folder)
-    tell(result.report)
+    emit(result.report)
     _write(result, dataset.report, cfg, folder)
     console.print(_summary(result.drivers))
-    tell([f"calibrated in {seconds:.1f} s; results in {folder}"])
+    emit([f"calibrated in {seconds:.1f} s; results in {folder}"])
     return result.drivers
 
 
@@ -124,7 +124,7 @@ def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: P
     write_parquet(result.drivers, folder / "drivers.parquet", metadata)
 
 
-def _say(console: Console, lines: Sequence[str]) -> None:
+def _print(console: Console, lines: Sequence[str]) -> None:
     for line in lines:
         console.print(line, markup=False, soft_wrap=True)
 

@@ -72,8 +72,8 @@ def plan(options: Namespace, cfg: EvaluateConfig, inputs: Inputs, folder: Path) 
     made, done = [], count(1)
     with ProgressReporter("clairvoyant", work, folder=folder) as progress:
         for first, block in parts:
-            tell = partial(_tell, progress, done)
-            rows = pd.concat(block_rows(cfg, learned, block, options, tell))
+            update = partial(_update, progress, done)
+            rows = pd.concat(block_rows(cfg, learned, block, options, update))
             rows["profile_id"] += first
             made.append(rows)
     episodes = pd.concat(made, ignore_index=True)
@@ -81,7 +81,7 @@ def plan(options: Namespace, cfg: EvaluateConfig, inputs: Inputs, folder: Path) 
     return episodes
 
 
-def _tell(
+def _update(
     progress: ProgressReporter, done: Iterator[int], _: int, values: dict[str, float]
 ) -> None:
     progress.update(next(done), values)
@@ -113,7 +113,7 @@ def block_rows(
     learned: list[Strategy],
     block: Inputs,
     options: Namespace,
-    tell: Callable[[int, dict[str, float]], None],
+    update: Callable[[int, dict[str, float]], None],
 ) -> Iterator[pd.DataFrame]:
     """Yield the rows of all strategies for a block of windows."""
     size = cfg.evaluation
@@ -137,7 +137,7 @@ def block_rows(
                 not options.no_compile,
                 own,
                 hold,
-                tell,
+                update,
             )
             for strategy in learned
         ]

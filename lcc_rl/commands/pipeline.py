@@ -56,7 +56,7 @@ from lcc_rl.results.runs import (
 )
 from lcc_rl.results.trust import own_modules, trust_option
 from lcc_rl.runs.interrupts import INTERRUPTED
-from lcc_rl.runs.output import tell
+from lcc_rl.runs.output import show_headline
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch_jobs
 from lcc_rl.runs.states import claim
@@ -147,13 +147,13 @@ def _run(
     folder: Path,
     command: str,
 ) -> Rows:
-    tell(f"lcc_rl {__version__}: data, drivers, policies, results into {folder}")
+    show_headline(f"lcc_rl {__version__}: data, drivers, policies, results into {folder}")
     read_once(cfg, folder)
     drivers = calibrate_once(cfg, folder)
     for part in (*trainings.values(), final):
         part.data = _episodes(cfg, folder)
         part.drivers = Node.of({TARGET: path_of(bootstrap), "path": str(drivers)}, "drivers")
-    tell(f"training {', '.join(trainings)}, {cfg.jobs} at a time; details in */train.log")
+    show_headline(f"training {', '.join(trainings)}, {cfg.jobs} at a time; details in */train.log")
     try:
         train_all(trainings, folder, cfg.jobs)
     except Interrupted:
@@ -162,7 +162,7 @@ def _run(
     final.compare = [
         str(folder / name) for name in trainings if (folder / name / "policy.pt").exists()
     ]
-    tell("evaluating them and the baselines on held-out windows")
+    show_headline("evaluating them and the baselines on held-out windows")
     paged = final.evaluation.rows == "episodes"
     rows = evaluation.run(final, folder / FINAL, own=False, quiet=paged)
     if final.compare:
@@ -177,8 +177,8 @@ def _run(
         write_figures(folder / FINAL, reports=[one])
         page = write_page(folder, [command], one, size)
         print_table(terminal(one, f"Leader, car, human behind it: {size}"))
-        tell(f"rows, figures and policies: {folder}")
-        tell(f"page: {page}")
+        show_headline(f"rows, figures and policies: {folder}")
+        show_headline(f"page: {page}")
     return rows
 
 
@@ -207,7 +207,7 @@ def read_once(cfg: PipelineConfig, folder: Path, learns: bool = True) -> None:
     loaded = cfg.data.made(LOADS).load()
     _pass_on(loaded.report)
     counts = [line for line in loaded.report if line.startswith(("kept ", "read "))]
-    tell(f"data: {(counts or loaded.report)[-1]}")
+    show_headline(f"data: {(counts or loaded.report)[-1]}")
     if learns:
         load_inputs(cfg, loaded.episodes).to_learn_from()
     episodes = loaded.episodes[list(SCHEMA)].astype({**SCHEMA, "recording": str})
@@ -221,11 +221,11 @@ def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
     own = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})
     check_folder(own, drivers.parent)
     if not drivers.exists():
-        found = calibration.run(own, drivers.parent, Console(quiet=True), tell=_pass_on)
+        found = calibration.run(own, drivers.parent, Console(quiet=True), emit=_pass_on)
         modes = {str(mode): rows for mode, rows in found.groupby("mode", sort=False)}
         errors = (f"{mode} {100.0 * x['rmspe'].mean():.2f} %" for mode, x in modes.items())
         records = count_records(next(iter(modes.values())))
-        tell(f"calibrated {records}: mean RMSPE {', '.join(errors)}")
+        show_headline(f"calibrated {records}: mean RMSPE {', '.join(errors)}")
     return drivers
 
 

@@ -58,7 +58,7 @@ from lcc_rl.results.render import print_table
 from lcc_rl.results.report import summary, windows_for
 from lcc_rl.results.runs import EPISODES, save_config
 from lcc_rl.runs.arguments import Arguments
-from lcc_rl.runs.output import HEADLINE, tell
+from lcc_rl.runs.output import HEADLINE, show_headline
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import ERROR, LOCK, claim, forget, record
 
@@ -250,7 +250,7 @@ def _run(
     with atomic_path(folder / FILE) as temporary:
         temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", "utf-8")
     forget(folder)
-    tell(f"scores in {folder / FILE}")
+    show_headline(f"scores in {folder / FILE}")
     played = {row["source"] for row in found}
     for source in own:
         require(source in played, f"--source {source} could not be played: {'; '.join(left_out)}")

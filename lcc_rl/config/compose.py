@@ -60,9 +60,9 @@ HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
 def find_conf() -> None:
     """Make :data:`CONF` importable if a clone hides the installed package."""
-    beside = Path(__file__).parents[2] / "conf" / "__init__.py"
-    if find_spec(CONF) is None and beside.is_file():
-        spec: Any = spec_from_file_location(CONF, beside)
+    cloned = Path(__file__).parents[2] / "conf" / "__init__.py"
+    if find_spec(CONF) is None and cloned.is_file():
+        spec: Any = spec_from_file_location(CONF, cloned)
         sys.modules[CONF] = module = module_from_spec(spec)
         spec.loader.exec_module(module)
 

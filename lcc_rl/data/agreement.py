@@ -163,7 +163,7 @@ def check_pairs(
     clear = moves[:-1] & (pairs["seconds"] >= LEAST_S) & (pairs["fit"] >= LEAST_FIT)
     right = clear & pairs["leader"].between(*span) & pairs["follower"].between(*span)
 
-    def said(cases: list[tuple[int, str, str]]) -> Iterator[str]:
+    def middle(cases: list[tuple[int, str, str]]) -> Iterator[str]:
         """Yield a line on the middle one of several cases."""
         for row, signal, words in cases[len(cases) // 2 :][:1]:
             count = f"; {len(cases):,} of {len(pairs):,} pairs" if len(pairs) > 1 else ""
@@ -180,7 +180,7 @@ def check_pairs(
         lag = f"{abs(pair['late']):.1f} s{most} {'late' if pair['late'] > 0 else 'early'}"
         late.append((pair["row"], pair["signal"], f"{pair['signal']} {lag}; are clocks apart?"))
         too_late += late[-1:] * (abs(pair["late"]) > max_lag)
-    for line in (*said(wrong), *said(too_late)):
+    for line in (*middle(wrong), *middle(too_late)):
         raise DataError(line)
     odd = pairs[clear & ~pairs["slope"].between(*span)].to_dict("records")
     words = "the gap changes by {:.2f} m where both speeds give 1 m, and no unit fits"
@@ -190,7 +190,7 @@ def check_pairs(
         raise DataError(
             f"{words.format(every['slope'])}: are times in another unit, or speeds to be smoothed?"
         )
-    lines = [Concern(line) for line in (*said(late), *said(strange))]
+    lines = [Concern(line) for line in (*middle(late), *middle(strange))]
     return [*lines, medians(episodes, pairs[clear], len(pairs), units)], bool(right.any())
 
 
@@ -238,10 +238,10 @@ def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Unit
     slope, late = clear["slope"].median(), clear["late"].median()
     known = f"slope of gaps over speeds {slope:.2f}, lag {late:.1f} s of {len(clear):,} pair(s)"
     few = f"slope and lag unknown for {pairs - len(clear):,}"
-    said = [known] * (len(clear) > 0) + [few] * (len(clear) < pairs)
+    parts = [known] * (len(clear) > 0) + [few] * (len(clear) < pairs)
     line = (
         f"medians: speed {speed.median():.3g} m/s, gap {gap.median():.3g} m, time gap "
-        f"{behind:.2g} s above 1 m/s; {', '.join(said)}"
+        f"{behind:.2g} s above 1 m/s; {', '.join(parts)}"
     )
     stand = gap[episodes[["follower_speed_mps", "leader_speed_mps"]].max(axis=1) < STANDING]
     if len(stand) < LEAST_STANDING or stand.median() < FAR_STANDING or "ft" in units.values():

@@ -134,8 +134,8 @@ def _first_of_moments(
     again = samples.duplicated(["episode", "time_s"]).to_numpy()
     if not again.any():
         return samples
-    said = samples.columns.drop(["file", "row"], errors="ignore")
-    others = again & ~samples.duplicated(said).to_numpy()
+    given = samples.columns.drop(["file", "row"], errors="ignore")
+    others = again & ~samples.duplicated(given).to_numpy()
     rows = np.flatnonzero(others if others.any() else again)
     where = place(samples)(int(rows[samples["row"].to_numpy()[rows].argmin()]), "time_s")
     if others.sum() > MOST_TWICE * len(samples):

@@ -120,5 +120,5 @@ def _marked(table: TableFile, followers: Iterable[int], read: Mapping[str, NDArr
     ]
     counts = ", ".join(f"{marks.count(mark)} {mark}" for mark in sorted({*marks}))
     header = table.preamble.get("ACC")
-    said = f" (header: ACC,{header})" if header else ""
-    return f"followers by driver: {counts}{said}; data.driver=human keeps those marked Human"
+    extra = f" (header: ACC,{header})" if header else ""
+    return f"followers by driver: {counts}{extra}; data.driver=human keeps those marked Human"

@@ -128,11 +128,11 @@ class Plausible(Settings):
                 continue
             row = int(np.argmax(new))
             limit = f"{setting}.{name}={getattr(self, name):g}"
-            said = f"{place(row, column)} {words.format(values[row])}, {limit}"
+            example = f"{place(row, column)} {words.format(values[row])}, {limit}"
             more = remedy if name == "max_acceleration" else ""
-            line = f"left out {int(new.sum()):,} implausible sample(s), the first: {said}"
+            line = f"left out {int(new.sum()):,} implausible sample(s), the first: {example}"
             lines.append(f"{line}{more and '; to keep it'}{more}")
-            advice = advice or f"{said}; correct the file or units{more}, or raise the threshold"
+            advice = advice or f"{example}; correct the file or units{more}, or raise the threshold"
             wrong |= new
         return wrong, lines, advice
 

@@ -80,11 +80,11 @@ class Source(Settings):
     ) -> LoadedEpisodes:
         """Return the averaged plausible episodes; see :meth:`Plausible.select`."""
         thresholds = self.plausible or Plausible()
-        kept, said = thresholds.select(episodes, source, place, remedy=remedy, units=units)
+        kept, notes = thresholds.select(episodes, source, place, remedy=remedy, units=units)
         if self.average_s:
             kept, line = averaged(kept, self.average_s, source)
-            said.append(line)
-        return LoadedEpisodes(kept, [*lines, *said])
+            notes.append(line)
+        return LoadedEpisodes(kept, [*lines, *notes])
 
 
 class TrajectorySource(Source):

@@ -246,11 +246,11 @@ class TableFile:
         """Return the size of a column's unit in SI; refuse another unit in its name."""
         unit, name = units.get(column.key, SI.get(column.quantity, "")), self.names[column.key]
         scale = (unit and unit_size(column.quantity, unit)) or 1.0
-        said = named_unit(name, column.quantity)
-        if option and said and UNITS[column.quantity][said] != scale:
-            where = f"{option.removesuffix('columns')}units.{column.key}={said}"
+        named = named_unit(name, column.quantity)
+        if option and named and UNITS[column.quantity][named] != scale:
+            where = f"{option.removesuffix('columns')}units.{column.key}={named}"
             raise DataError(
-                f"{self.path}: the name of column {name!r} contains {said}, but it is read in "
+                f"{self.path}: the name of column {name!r} contains {named}, but it is read in "
                 f"{unit}; set {where}, or rename the column"
             )
         return scale

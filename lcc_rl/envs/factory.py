@@ -220,7 +220,7 @@ def _watchers(drivers: Sequence[Controller | CBFFilter], world: World) -> list[P
         for piece in drivers
         if isinstance(piece, Action) and piece.role in filters
     ]
-    return [*(piece.watch() for piece in filters.values() if piece.answers), *changed]
+    return [*(piece.watch() for piece in filters.values() if piece.guaranteed), *changed]
 
 
 def _leader(scenario: ScenarioConfig, node: Any, world: World) -> list[Piece]:

@@ -43,9 +43,9 @@ class GippsConstants(DriverConstants):
         free = 2.5 * self.acceleration * (1.0 - share) * (0.025 + share).sqrt()
         brake, ahead = self.deceleration * tau, speed - approach_rate
         room = self.deceleration * (2.0 * (gap - self.min_gap) - speed * tau)
-        believed = self.deceleration / self.leader_deceleration * ahead * ahead
+        expected = self.deceleration / self.leader_deceleration * ahead * ahead
         # Clamped: the gradient of sqrt is infinite at 0.
-        root = (brake * brake + room + believed).clamp(min=1e-12).sqrt()
+        root = (brake * brake + room + expected).clamp(min=1e-12).sqrt()
         return torch.minimum(free, (root - brake - speed) / tau)
 
     def steady_gap(self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor) -> Tensor:

@@ -119,7 +119,7 @@ class CBFFilter(RoleTransform):
         self.time_step = world.time_step
         actuation = world.actuators.get(self.role, Actuation())
         sensors = world.sensors.get(self.role, Sensors())
-        self.answers = self.robust or self.role not in {*world.actuators, *world.sensors}
+        self.guaranteed = self.robust or self.role not in {*world.actuators, *world.sensors}
         if not self.robust:
             actuation, sensors = Actuation(), Sensors()
         self.response = actuation.response_in(world, self.role, self.max_acceleration)

@@ -107,8 +107,8 @@ def _over_drives(
         kept = np.array([drive != name for drive in drives])
         means = ({key: x[..., kept, :].mean((-2, -1)) for key, x in one.items()} for one in sides)
         left.append(float(statistic(*means)))
-    beside = STUDENT[len(names) - 2] * float(np.std(left)) * (len(names) - 1) ** 0.5
-    return value - beside, value + beside
+    half_width = STUDENT[len(names) - 2] * float(np.std(left)) * (len(names) - 1) ** 0.5
+    return value - half_width, value + half_width
 
 
 def _sizes(side: Side) -> tuple[int, ...]:

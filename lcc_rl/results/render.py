@@ -133,13 +133,13 @@ def terminal(report: Report, title: str = "", full: bool = False) -> RenderableT
         title: title of the table.
         full: all measures with a column per strategy.
     """
-    said = [report.verdict] if report.verdict else []
+    notes = [report.verdict] if report.verdict else []
     if full:
         drawn: RenderableType = _side_by_side(report, title)
-        said += [fill(line, WIDTH) for line in report.remarks]
+        notes += [fill(line, WIDTH) for line in report.remarks]
     else:
         drawn = as_rich(report.short, report.shown, title, report.note)
-    return Group(drawn, Text("\n".join(said))) if said else drawn
+    return Group(drawn, Text("\n".join(notes))) if notes else drawn
 
 
 def as_rich(table: pd.DataFrame, shown: Sequence[Shown], title: str, caption: str) -> Table:

@@ -220,7 +220,7 @@ def report(
     if task:
         task = replace(task, against=against) if against else task.among(windows["strategy"])
         task = task.resolved(windows)
-    table, said = summary(windows, task, energy, against), remarks(windows)
+    table, notes = summary(windows, task, energy, against), remarks(windows)
     percent = {f"saved_pct{end}": 100.0 * table[f"saving{end}"] for end in ("", "_low", "_high")}
     percent["distance_pct"] = -100.0 * table["distance_lost"] + 0.0  # no negative zero
     every = table.assign(**percent)
@@ -229,7 +229,7 @@ def report(
     rows = _rows(task, table["against"].iloc[0])
     words = "" if task else verdict(windows, table, few)
     words = "\n".join(filter(None, [words, few_drives(table)]))
-    made |= {"full_caption": FULL, "verdict": words, "remarks": said}
+    made |= {"full_caption": FULL, "verdict": words, "remarks": notes}
     return Report(of, table, short, shown, rows, **made)
 
 

@@ -31,7 +31,7 @@ class ShortFormatter(logging.Formatter):
         return f"{record.levelname} {text}" if record.levelno >= logging.WARNING else text
 
 
-def tell(text: str) -> None:
+def show_headline(text: str) -> None:
     """Log a headline, which :func:`headlines` shows on the terminal."""
     log.log(HEADLINE, text)
 

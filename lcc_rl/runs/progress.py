@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from lcc_rl.config import is_sweep
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.runs.output import tell
+from lcc_rl.runs.output import show_headline
 from lcc_rl.runs.states import PROGRESS, check_present, read_progress
 
 log = logging.getLogger("lcc_rl")
@@ -49,7 +49,7 @@ class Phases:
     Args:
         title: name of the job.
         console: console of the bar.
-        tell: function that receives the lines.
+        emit: function that receives the lines.
         every: seconds between lines without a terminal.
     """
 
@@ -57,10 +57,10 @@ class Phases:
         self,
         title: str,
         console: Console,
-        tell: Callable[[Sequence[str]], None],
+        emit: Callable[[Sequence[str]], None],
         every: float = 10.0,
     ) -> None:
-        self.title, self.tell, self.every = title, tell, every
+        self.title, self.emit, self.every = title, emit, every
         self.live = console.is_terminal
         self.bar = bar(console, self.live, transient=True)
         self.task = self.bar.add_task(title, total=None, note="")
@@ -85,7 +85,7 @@ class Phases:
         self.bar.update(self.task, completed=done, total=total, note=note)
         if not self.live and now - self.last_line >= self.every:
             self.last_line = now
-            self.tell([f"{self.title}: {note}"])
+            self.emit([f"{self.title}: {note}"])
 
 
 class ProgressReporter:
@@ -200,7 +200,7 @@ def watch_jobs(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0
             running = bool(wait(futures, 1.0, FIRST_EXCEPTION).not_done)
             due = not console.is_terminal and time.monotonic() - last >= every
             last = time.monotonic() if due else last
-            told = []
+            parts = []
             for name, (folder, future) in jobs.items():
                 state = read_progress(folder)
                 if state is None:
@@ -211,8 +211,8 @@ def watch_jobs(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0
                 note = f"{count}  {reward}"
                 shown.update(tasks[name], completed=int(done), total=total, note=note)
                 if not future.done():
-                    told.append(f"{name} {count}, {reward}")
-            if due and told:
-                tell("; ".join(told))
+                    parts.append(f"{name} {count}, {reward}")
+            if due and parts:
+                show_headline("; ".join(parts))
             if any(future.done() and future.exception() for future in futures):
                 return
