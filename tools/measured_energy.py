@@ -39,7 +39,7 @@ LABELS = {"summer": "summer", "winter": "winter, with the heating"}
 def agreement(rows: pd.DataFrame, model: str) -> tuple[float, float]:
     """Return level and correlation of runs: modelled over measured in total, and r of both per km.
 
-    The r of totals would depend on the lengths of the runs. With less than three runs it is NaN.
+    The r of totals would depend on the lengths of the runs. With fewer than three runs it is NaN.
     """
     level = float(rows[model].sum() / rows["measured"].sum())
     per_km = rows[[model, "measured"]].div(rows["distance_m"], axis=0)

@@ -288,8 +288,8 @@ def _source(given: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     for word in words:
         require(
             "=" in word and top_key(word) in OF_A_SOURCE,
-            f"--source {name}: expected settings of {', '.join(OF_A_SOURCE)}, got {word}; others "
-            "stand before it",
+            f"--source {name}: expected settings of {', '.join(OF_A_SOURCE)}, got {word}; put "
+            "others before --source",
         )
     people = () if any(top_key(word) == "drivers" for word in words) else ("drivers=highway",)
     return name, (*people, *words)

@@ -23,7 +23,7 @@ from lcc_rl.data.profiles import (
     from_records,
     joined,
     leader_profiles,
-    nothing,
+    no_profiles,
     resample,
 )
 from lcc_rl.data.sources import find_files
@@ -295,7 +295,7 @@ class DriveLeaders(Settings):
             self = copy(self)  # self is not changed
             self.together = None
         divide = self._by_time if single else self._by_name
-        training, held_out = nothing(time_step), profiles
+        training, held_out = no_profiles(time_step), profiles
         if self.evaluation_share < 1:
             training, held_out = divide(profiles)
             if self.tuning:

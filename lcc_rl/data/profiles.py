@@ -184,7 +184,7 @@ def from_records(
     )
 
 
-def nothing(time_step: float) -> Profiles:
+def no_profiles(time_step: float) -> Profiles:
     """Return empty profiles, for training if all are for evaluation."""
     none = torch.zeros(0, dtype=torch.int64)
     return Profiles(torch.zeros(0), none, none, (), (), time_step)
@@ -312,7 +312,7 @@ class Split(Settings):
             DataError: if there are not at least two recordings (or vehicles) to divide.
         """
         if self.evaluation_share == 1:
-            return nothing(profiles.time_step), profiles
+            return no_profiles(profiles.time_step), profiles
         if self.tuning:
             profiles, _ = self._divide(profiles)
         return self._divide(profiles)

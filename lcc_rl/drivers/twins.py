@@ -42,8 +42,8 @@ AT_ONCE = 20_000  # parallel trajectories; more would only need memory
 DRIVER_FOLDS = 5  # each fold is evaluated with the reaction chosen on the other folds
 DELAYS = tuple(round(0.1 * number, 1) for number in range(10))  # candidates [s]
 NOISES = tuple(round(0.05 * number, 2) for number in range(13))  # likewise [m/s²]
-GAP_NOISES = tuple(round(0.1 * number, 1) for number in range(1, 7))  # likewise, beside none
-# Relative; see choose_reaction.
+# Candidates of the relative noise of gaps, in addition to none; see choose_reaction.
+GAP_NOISES = tuple(round(0.1 * number, 1) for number in range(1, 7))
 TOLERANCES = {"lost": 0.05, "spectrum": 0.2, "growth": 0.05, "slope": 0.1}
 LEADER_LOST, LEADER_WAY = "leader_lost_1.1s_j", "leader_distance_1.1s_m"
 CARS = 5  # cars in the string over which energy must not grow

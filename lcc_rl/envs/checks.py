@@ -123,8 +123,8 @@ def _check_forgets(piece: Piece, before: Mapping[str, list[Any]]) -> None:
         ):
             raise ConfigError(
                 f"{type(piece).__name__} remembers in its attribute {name!r}, which all episodes "
-                "share; what lasts from step to step must be an entry, which a controller names in "
-                "remembers, see docs/extend.md"
+                "share; a state must be an entry, which a controller names in remembers, see "
+                "docs/extend.md"
             )
 
 

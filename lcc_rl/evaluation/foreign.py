@@ -57,7 +57,7 @@ class GivenPolicy(TensorDictModuleBase):
         require(
             set(reads) <= set(seen) and seen[0] in reads and self.action in writes,
             f"{name} reads {reads} and writes {writes}: expected 'observation' and 'action', maybe "
-            "of the group 'automated', 'is_init', and what it writes to ('next', key)",
+            "of the group 'automated', 'is_init', and entries that it writes to ('next', key)",
         )
         self.kept: dict[Any, Tensor] = {}
 

@@ -42,7 +42,7 @@ def least_room(speed: Tensor, gap: Tensor, speed_ahead: Tensor, braking: Braking
 
     Args:
         speed: v, any shape [m/s].
-        gap: gap, less what counts as contact [m].
+        gap: gap minus the margin of contact [m].
         speed_ahead: speed of the vehicle ahead [m/s].
         braking: how hard both brake, and τ.
 
@@ -83,7 +83,7 @@ def least_room_held(
     The vehicle ahead brakes fully from now on.
 
     Args:
-        motion: the state, its gap less what counts as contact; its acceleration is not used.
+        motion: the state, with the gap minus the margin; its acceleration is not used.
         acceleration: held [m/s²].
         time: for which it is held [s].
         braking: how hard both brake, and τ.
@@ -118,7 +118,7 @@ def least_room_late(motion: PairState, response: Response, braking: Braking) -> 
     See :attr:`lcc_rl.functional.actuation.Response.hold`.
 
     Args:
-        motion: the state, its gap less what counts as contact.
+        motion: the state, with the gap minus the margin.
         response: how commands become accelerations.
         braking: how hard both brake, and τ.
     """
@@ -133,7 +133,7 @@ def least_room_to_come(
     The vehicle ahead brakes fully from now on.
 
     Args:
-        now: the state, its gap less what counts as contact.
+        now: the state, with the gap minus the margin.
         pending: commands that do not act yet, oldest first, ``[…, late]`` [m/s²].
         response: how commands become accelerations.
         braking: how hard both brake, and τ.
@@ -151,7 +151,7 @@ def safe_command(motion: PairState, response: Response, braking: Braking) -> Ten
     and has the gradient of the implicit function.
 
     Args:
-        motion: the state when the command begins to act, its gap less what counts as contact.
+        motion: the state when the command begins to act, with the gap minus the margin.
         response: how commands become accelerations.
         braking: how hard both brake, and τ.
 
@@ -197,7 +197,7 @@ def safe_acceleration(
 
     Args:
         speed: v, any shape [m/s].
-        gap: gap, less what counts as contact [m].
+        gap: gap minus the margin of contact [m].
         speed_ahead: speed of the vehicle ahead [m/s].
         braking: how hard both brake, and τ.
         time_step: T [s].

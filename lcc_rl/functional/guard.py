@@ -39,5 +39,5 @@ def changed(title: str, name: str) -> ConfigError:
     """Return the error for a class that changes its inputs."""
     return ConfigError(
         f"{title} changes {name} in place, and so the state of the vehicles; use "
-        "gap.clamp(…) instead of gap.clamp_(…) and the like, or change a clone"
+        "gap.clamp(…) instead of gap.clamp_(…), or change a clone"
     )

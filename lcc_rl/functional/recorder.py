@@ -186,7 +186,7 @@ class Recorder(TorchDispatchMode):
         if variables is not None:
             same = value.dtype == dtype
             return variables if same else self._stated(f"{kind}({{0}})", [variables])
-        if isinstance(value, int):  # a stream's counter may exceed what torch takes and wraps
+        if isinstance(value, int):  # a stream's counter may exceed int64 and wraps
             value = (value + 2**63) % 2**64 - 2**63
         value = torch.as_tensor(value, dtype=dtype)
         literals = [self.variable(f"{kind}({x!r})", ()) for x in value.flatten().tolist()]
@@ -247,7 +247,7 @@ class Recorder(TorchDispatchMode):
         if variables is None:
             return self._read(result, value, places)
         if any(self.of(place) is not None for place in places):
-            raise Untranslatable("an index that depends on the inputs, into what does, too")
+            raise Untranslatable("indices and values that both depend on the inputs")
         return variables[tuple(slice(None) if x is None else x for x in places)]
 
     def _read(self, result: Tensor, table: Tensor, places: Sequence[Tensor | None]) -> Tensor:
@@ -267,7 +267,7 @@ class Recorder(TorchDispatchMode):
         self, result: Tensor, table: Tensor, value: Tensor, right: bool = False, **more: Any
     ) -> Tensor:
         if more or table.ndim != 1 or self.of(table) is not None:
-            raise Untranslatable("a search in what is not one constant list")
+            raise Untranslatable("a search in anything but one constant list")
         side = "right" if right else "left"
         formula = f"i64(np.searchsorted({self._table(table)}, {{0}}, '{side}'))"
         return self._stated(formula, [self.numbers(value, table.dtype)])

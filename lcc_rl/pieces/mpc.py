@@ -122,8 +122,8 @@ class Solver:
         Args:
             rows: speed, gap, acceleration, speed and acceleration ahead, ``[rows, 5]``.
         """
-        alike, place = np.unique(rows, axis=0, return_inverse=True)
-        first, unsolved = self._each(alike)
+        distinct, place = np.unique(rows, axis=0, return_inverse=True)
+        first, unsolved = self._each(distinct)
         return first[place.ravel()], unsolved[place.ravel()]
 
     def _each(self, rows: Array) -> tuple[Array, Array]:
