@@ -68,6 +68,7 @@ def networks() -> tuple[nn.Sequential, dict[str, nn.Module]]:
     }
 
 
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize("string", ["automated human", "automated human automated human"])
 def test_a_policy_of_any_keys_drives_as_its_network_does(tmp_path, string) -> None:
     network, modules = networks()
