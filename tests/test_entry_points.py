@@ -70,6 +70,7 @@ def test_baselines_share_the_scenario_under_study(trained, tmp_path) -> None:
 @pytest.mark.usefixtures("blank_figures")
 def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> None:
     jobs_in_threads(monkeypatch)
+    monkeypatch.setattr("lcc_rl.drivers.twins.DELAYS", (0.0, 0.2))
     words = [*TINY, QUICK, "variants=[alcc]", "hydra.run.dir=job"]
     done = run_command("lcc_rl.cli.pipeline", *words, cwd=tmp_path, check=True)
     job = tmp_path / "job"

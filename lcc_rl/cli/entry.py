@@ -15,6 +15,7 @@ from typing import Any
 from unittest.mock import patch
 
 import hydra
+from hydra._internal.hydra import Hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -107,9 +108,11 @@ def start_command(command: Callable[[], Any]) -> None:
 def run_sorted(command: Callable[[], Any]) -> None:
     """Run a Hydra command with flags at any place among the settings."""
     words = ["--help" if word == FULL_HELP else word for word in sys.argv[1:]]
+    mode = any("hydra.mode=" in word for word in words)  # else Hydra composes twice to look for it
     with (
         patch.object(sys, "argv", [sys.argv[0], *flags_first(words)]),
         patch.object(sys.modules["hydra.main"], "get_args_parser", hydra_parser),
+        patch.object(Hydra, "get_mode", Hydra.get_mode if mode else lambda *_, **__: None),
     ):
         sweep(command)
 

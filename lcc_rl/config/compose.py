@@ -164,7 +164,8 @@ def _is_choice(item: str) -> bool:
 def choices(group: str) -> list[str]:
     """Return the names of a group's files, including those of ``--config-dir``."""
     if GlobalHydra.instance().is_initialized():
-        return list(GlobalHydra.instance().config_loader().get_group_options(group))
+        loader: Any = GlobalHydra.instance().config_loader()
+        return list(loader.repository.get_group_options(group))  # its own copies all, for 4 ms
     return sorted(path.stem for path in Path(str(files(CONF))).joinpath(group).glob("*.yaml"))
 
 

@@ -146,15 +146,15 @@ def _attempt(piece: Piece, action: object) -> None:
 
 def _compare(piece: Piece, found: Mapping[Key, Tensor], when: str) -> None:
     """Compare the written entries of a piece with its specs."""
-    specs = piece.specs(torch.Size([BATCH]), None)
+    layouts = piece.layouts(torch.Size([BATCH]))
     for key, value in found.items():
-        spec = specs.get(key)
-        if spec is None or key in (DONE, TERMINATED):
+        if key not in layouts or key in (DONE, TERMINATED):
             continue
-        if value.shape != spec.shape or value.dtype != spec.dtype:
+        shape, dtype = layouts[key]
+        if value.shape != shape or value.dtype != dtype:
             raise ConfigError(
                 f"{piece.title} writes {'.'.join(key)} as {list(value.shape[1:])} "
-                f"{value.dtype} {when}; expected {list(spec.shape[1:])} {spec.dtype}, one row per "
+                f"{value.dtype} {when}; expected {list(shape[1:])} {dtype}, one row per "
                 "vehicle"
             )
 

@@ -167,9 +167,9 @@ def _check_roles(roles: Iterable[str], where: str, scenario: ScenarioConfig) -> 
 
 def _size(pieces: Sequence[Piece], batch_size: Sequence[int] | int) -> int:
     """Return the least memory that a step of a batch of episodes needs [bytes]."""
-    one = torch.Size([1])
-    specs = [spec for piece in pieces for spec in piece.specs(one, None, piece.targets).values()]
-    moment = sum(spec.shape.numel() * spec.dtype.itemsize for spec in specs)
+    size = torch.Size([1])
+    layouts = [one for piece in pieces for one in piece.layouts(size, piece.targets).values()]
+    moment = sum(shape.numel() * dtype.itemsize for shape, dtype in layouts)
     return MOMENTS * moment * math.prod(batch_shape(batch_size))
 
 

@@ -198,18 +198,21 @@ class Piece(Part, TensorDictModuleBase, Transform):
         return (*self.rows, *((width,) if isinstance(width, int) else width))
 
     def specs(
-        self,
-        batch: torch.Size,
-        device: torch.device | None,
-        keys: Sequence[Key] | None = None,
+        self, batch: torch.Size, device: torch.device | None, keys: Sequence[Key] | None = None
     ) -> dict[Key, Any]:
         """Return the specs of declared entries, by default of all."""
+        layouts = self.layouts(batch, keys).items()
+        return {key: Unbounded(shape, dtype=x, device=device) for key, (shape, x) in layouts}
+
+    def layouts(
+        self, batch: torch.Size, keys: Sequence[Key] | None = None
+    ) -> dict[Key, tuple[torch.Size, torch.dtype]]:
+        """Return shape and type of declared entries, by default of all."""
         found = {}
         for key in self.entries if keys is None else keys:
-            entry, shape = self.entries[key], (*batch, *self.shape_of(key))
-            whole = entry.whole or entry.option
+            whole = self.entries[key].whole or self.entries[key].option
             dtype = torch.int64 if whole else torch.get_default_dtype()
-            found[key] = Unbounded(shape=shape, dtype=dtype, device=device)
+            found[key] = torch.Size((*batch, *self.shape_of(key))), dtype
         return found
 
     def derive(self, before: State, reached: State, detached: bool = False) -> None:
@@ -312,8 +315,8 @@ class StepTransform(Piece):
             given: TensorDict passed to ``env.reset``, which may contain reset options.
             start: first state of the episodes, with the entries of the pieces before this one.
         """
-        for key, spec in self.specs(start.batch_size, start.device, self.targets).items():
-            start.set(key, spec.zero())
+        for key, (shape, dtype) in self.layouts(start.batch_size, self.targets).items():
+            start.set(key, torch.zeros(shape, dtype=dtype, device=start.device))
 
     def derive(self, before: State, reached: State, detached: bool = False) -> None:
         super().derive(before, reached, detached)
@@ -366,7 +369,7 @@ class RewardPiece(Feature):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        batch, device = tensordict_reset.batch_size, tensordict_reset.device
-        for key, spec in self.specs(batch, device).items():
-            tensordict_reset.set(key, batch_innermost(spec.zero()))
+        for key, (shape, dtype) in self.layouts(tensordict_reset.batch_size).items():
+            zeros = torch.zeros(shape, dtype=dtype, device=tensordict_reset.device)
+            tensordict_reset.set(key, batch_innermost(zeros))
         return tensordict_reset

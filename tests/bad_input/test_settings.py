@@ -137,6 +137,6 @@ def test_an_evaluation_that_does_not_fit_is_refused_once_the_data_are_read(
 ) -> None:
     many = ("evaluation.drivers=null", "evaluation.repeats=8")
     cfg = tiny("evaluate", "variant=idm", *many, agent=False)
-    monkeypatch.setattr(memory, "available", lambda device: 12 * 2**20)
-    with pytest.raises(ConfigError, match="an evaluation of 3984 episodes of 40 steps side by"):
+    monkeypatch.setattr(memory, "available", lambda device: 6 * 2**20)
+    with pytest.raises(ConfigError, match="an evaluation of 3984 episodes of 20 steps side by"):
         evaluation.run(cfg, tmp_path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from commands import NO_AGENT
-from helpers import check_refused
+from helpers import check_refused, slow_but
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs.transforms import CatFrames
@@ -17,6 +17,7 @@ from lcc_rl.errors import ConfigError
 ROOT, GROUP = (["observation"], ["action"]), (["automated", "observation"], ["automated", "action"])
 SMALL = [*NO_AGENT, "evaluation.baselines=[]"]
 WIDTH = 7
+STRINGS = ["automated human", "automated human automated human"]
 
 
 class Lagged(nn.Module):
@@ -68,7 +69,8 @@ def networks() -> tuple[nn.Sequential, dict[str, nn.Module]]:
     }
 
 
-@pytest.mark.parametrize("string", ["automated human", "automated human automated human"])
+@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.parametrize("string", slow_but(STRINGS[1:], STRINGS))
 def test_a_policy_of_any_keys_drives_as_its_network_does(tmp_path, string) -> None:
     network, modules = networks()
     modules["drawn"].train()

@@ -23,7 +23,7 @@ from lcc_rl.pieces.rewards import TERMS
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import Positive
 
-WHOLE, AUTO = "scenario.horizon=300", "scenario.filters.automated"
+WHOLE, AUTO = "scenario.horizon=150", "scenario.filters.automated"
 
 
 def driven(action: float | None, *overrides: str, places: tuple[int, ...] = (0,)):
