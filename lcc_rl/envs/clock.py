@@ -172,7 +172,7 @@ class Traffic(TransformedEnv):
         Settings of pieces are compared at every step only with a ``mode``, a ``backend`` or
         ``options``.
         """
-        own = {} if {"mode", "backend", "options"} & set(given) else compile_settings()
+        own = {} if {"mode", "backend", "options"} & set(given) else compile_settings(self.device)
         super().compile(warmup=warmup, **{**own, **given})
         return self
 

@@ -81,8 +81,8 @@ class StringCollector(BaseCollector):
         self.first = Step(pieces_of(env), env.base_env.horizon)  # a reset may read more
         self.carried = self._needed()
         self.state = {key: value for key, value in state.items() if key in self.carried}
-        self.advance = Compiled(self._advance, "the environment", compiled)
-        self.renew = Compiled(self._renewed, "its resets", compiled)
+        self.advance = Compiled(self._advance, "the environment", compiled, env.device)
+        self.renew = Compiled(self._renewed, "its resets", compiled, env.device)
         # Number of episodes of a compiled reset, about twice as many as end in a step.
         self.rows = min(episodes, max(32, episodes // 64)) if compiled else 0
 

@@ -82,7 +82,7 @@ class Player:
         self.checked = list(dict.fromkeys([*driven, *wishes, *self.kept]))
         self.compiled = compiled
         self.record: Record = {}
-        self.advance = Compiled(self._advance, "the evaluation", compiled)
+        self.advance = Compiled(self._advance, "the evaluation", compiled, env.device)
 
     @torch.no_grad()
     def play(
