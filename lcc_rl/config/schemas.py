@@ -147,16 +147,10 @@ class BaseConfig(Settings):
     threads: Parallel
     matmul_precision: Literal["highest", "high", "medium"] = "highest"
     data: Described  # null in shipped policies, as drivers and split
-    figure_formats: list[Format]
+    figure_formats: list[Format]  # beside png, which pages show
     trust: list[str] = dataclasses.field(default_factory=list)
     # Hashes of input files, see lcc_rl.config.inputs, recorded by a run.
     inputs: dict[str, dict[str, str]] = dataclasses.field(default_factory=dict)
-
-    def validate(self) -> None:
-        if "png" not in self.figure_formats:
-            raise ConfigError(
-                f"figure_formats must name png, which pages show, got {self.figure_formats}"
-            )
 
 
 class CalibrateConfig(BaseConfig):
