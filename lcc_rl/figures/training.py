@@ -50,7 +50,7 @@ def training_figure(training: pd.DataFrame) -> Figure:
     figure = new_figure(PAGE_WIDTH if limits else COLUMN_WIDTH, 2.7)
     first, *others = figure.subplots(1, 1 + len(limits), squeeze=False)[0]
     draw_curves(first, training, "loss_actor")
-    style(first, "training episodes", "objective (lower is better)")
+    style(first, "training episodes", "objective, less is better")
     legend_above(first, 1)
     for axis, name in zip(others, limits, strict=True):
         draw_curves(axis, training.assign(percent=100.0 * training[name]), "percent")

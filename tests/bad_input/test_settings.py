@@ -68,7 +68,7 @@ WRONG = {
 # Options without effect on the variant, and why.
 IGNORED = {
     "variant=cacc split.by=vehicle": "leader=trajectories",
-    f"controller@{AUTO}=handover agent=td3": "handover drives the .* takes no action",
+    f"controller@{AUTO}=handover agent=td3": "handover drives the .* uses no action",
     "scenario.circumference=200": "belongs to scenario.road=ring",
     "variant=idm training.episodes=20": "variant idm has no agent",
     "variant=alcc scenario.string=human*3 training.episodes=20": "no vehicle .* is automated",
