@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import sys
@@ -82,10 +83,14 @@ def entry_point(
             if HELP.intersection(sys.argv):
                 print(help_text(config_name, sys.argv[1:]))
                 return
-            if SWEEP.intersection(sys.argv):
-                with ending_quietly():
-                    import_module(work)
-            start_command(command)
+            gc.disable()  # settings load modules, too; see ending_quietly
+            try:
+                if SWEEP.intersection(sys.argv):
+                    with ending_quietly():
+                        import_module(work)
+                start_command(command)
+            finally:
+                gc.enable()
 
         return main
 
