@@ -239,7 +239,7 @@ def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
     cfg = deepcopy(cfg)
     cfg.agent = own.agent
     seen = own.observation.made(Piece)
-    if isinstance(seen, Observation) and seen.tells_presence(own.scenario.vehicles):
+    if isinstance(seen, Observation) and seen.shows_presence(own.scenario.vehicles):
         cfg.observation = cfg.observation.changed(presence=True)
     if cfg.scenario.filters.get(AUTOMATED) is None and own.scenario.filters.get(AUTOMATED):
         log.info("the policy of variant %s keeps the filter of its training", own.variant)

@@ -49,10 +49,10 @@ class CBFFilter(RoleTransform):
     the first limit if the vehicle ahead brakes by ``braking_ahead`` until it stands
     (:mod:`lcc_rl.functional.braking`). A vehicle that starts in such a state has no TTC below τ at
     any sample as long as the vehicle ahead brakes no harder. The :class:`CBFGuarantee` of
-    :meth:`watch` writes which steps that covers. If a measurement or the command is NaN, the
-    filter brakes fully.
+    :meth:`watch` marks the covered steps. If a measurement or the command is NaN, the filter
+    brakes fully.
 
-    Gaps are trusted more than speeds. Where the rate of the measured gap differs from the measured
+    Gaps have priority over speeds. If the rate of the measured gap differs from the measured
     relative speed (:class:`lcc_rl.functional.sensing.Agreement`), the limits of short gaps use the
     lower speed ahead, those of long gaps the higher one. While the gap is below ``margin`` and does
     not grow, the vehicle does not accelerate.
@@ -60,7 +60,7 @@ class CBFFilter(RoleTransform):
     With ``shortest_time_gap``, ``gap − shortest_time_gap·v`` is kept positive, too, as long as the
     vehicle ahead keeps its acceleration and braking suffices.
 
-    With ``longest_gap``, ``longest_gap − gap − h·(v_ahead − v)`` is kept positive, likewise, with
+    With ``longest_gap``, ``longest_gap − gap − h·(v_ahead − v)`` is kept positive, too, with
     ``h = √(2·longest_gap / max_acceleration)``; the last two terms are the gap after h at the
     present speeds. Half of the acceleration suffices to keep this limit; the other half is left for
     a vehicle ahead that accelerates. Limits of short gaps have priority.
@@ -87,13 +87,13 @@ class CBFFilter(RoleTransform):
     # Use the actuators and sensors of the scenario; false: assume that both are exact.
     robust: bool = True
     time_to_collision: Positive = 4.0  # shortest allowed [s]
-    rate: Positive = 3.0  # how fast that limit may be approached [1/s]
+    rate: Positive = 3.0  # largest relative rate of approach to that limit [1/s]
     margin: Positive = 0.2  # gap that counts as contact [m]
     braking_ahead: Positive = 2.6  # hardest braking assumed of the vehicle ahead [m/s²]
     time_gap: Positive | None = 2.45  # longest allowed; None: no limit [s]
     shortest_time_gap: Positive | None = None  # shortest allowed; None: no limit [s]
     longest_gap: Positive | None = None  # longest allowed; None: no limit [m]
-    # How fast the limits of the time gap and the longest gap may be approached [1/s].
+    # Largest relative rate of approach to the limits of the time gap and the longest gap [1/s].
     time_gap_rate: Positive = 0.2
     # Speed below which the longest time gap falls in proportion to the speed; 0: never [m/s].
     full_speed: NonNegative = 0.0
@@ -266,15 +266,15 @@ class Corrected(RoleTransform):
 
 
 class CBFGuarantee(RoleTransform):
-    """Writes which steps a filter's guarantee covers, ``(role, "promised")``, ``[*batch, n, 1]``.
+    """Marks the steps that a filter's guarantee covers, ``(role, "promised")``, ``[*batch, n, 1]``.
 
     It is 1 where the vehicle was safe when the step began and the vehicle ahead braked no harder
     than ``braking_ahead``, in the step and since the oldest measurement in use. Time-to-collision
     at the end of the step is then above the filter's limit. Elsewhere, and before the filter acts
     (``from_s``), it is 0.
 
-    ``(role, "safe")``, likewise, is 1 where the vehicle was safe when the step began, by its true
-    state and the declared actuators. A covered step that ends unsafe shows that actuators or
+    ``(role, "safe")`` of the same shape is 1 where the vehicle was safe when the step began, by its
+    true state and the declared actuators. A covered step that ends unsafe shows that actuators or
     sensors differ from the declared ones.
     """
 

@@ -56,7 +56,7 @@ class Observation(Feature):
     def _flat(self) -> dict[tuple[str, str], float]:
         return {(view, name): x for view, own in self.scales.items() for name, x in own.items()}
 
-    def tells_presence(self, string: VehicleString) -> bool:
+    def shows_presence(self, string: VehicleString) -> bool:
         """Whether entries show which vehicles behind exist."""
         everywhere = Views(string, AUTOMATED, [], self.visible).sees_all_behind()
         return BEHIND in self.scales and (self.presence or not everywhere)
@@ -72,7 +72,7 @@ class Observation(Feature):
         bases = _bases(self.relative_to or {}, flat, counts)
         values = [x for x, n in zip(flat.values(), counts, strict=True) for _ in range(n)]
         seen = list(flat)
-        if self.tells_presence(string):
+        if self.shows_presence(string):
             seen.append((BEHIND, PRESENT))
             values += [1.0] * visible
             bases.append([])
