@@ -109,7 +109,8 @@ def composed(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
     hydra, meant = GlobalHydra.instance(), as_meant(overrides)
     try:
         where = str(hydra.config_loader().get_search_path()) if hydra.is_initialized() else ""
-        cfg = deepcopy(_composed(entry, tuple(filter(_is_choice, meant)), where))
+        made = _composed.__wrapped__ if "command-line" in where else _composed  # own files change
+        cfg = deepcopy(made(entry, tuple(filter(_is_choice, meant)), where))
         read = OverridesParser.create().parse_overrides([x for x in meant if not _is_choice(x)])
         ConfigLoaderImpl.validate_sweep_overrides_legal(read, RunMode.RUN, from_shell=False)
         ConfigLoaderImpl._apply_overrides_to_config(read, cfg)
