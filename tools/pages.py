@@ -86,6 +86,7 @@ SOURCES = {
     "platoons": "OpenACC, motorways (`data=platoons`)",
 }
 RIVALS = (RECORDED, "idm_acc_filtered")
+LEARNERS = {"ppo": "PPO", "td3": "TD3", "sac": "SAC", "analytic": "gradient (`analytic`)"}
 
 
 def fill(page: Path, tables: Mapping[str, str]) -> None:
@@ -161,7 +162,8 @@ def averaged(rows: pd.DataFrame) -> str:
 
 def learners(reference: Path, docs: Path) -> None:
     """Write what each learner reaches: a row per task and learner, with the range of its seeds."""
-    rows = worded(read_parquet(reference / "learners.parquet"))
+    rows = worded(read_parquet(reference / "learners.parquet")).replace({"strategy": LEARNERS})
+    rows = rows.rename(columns={"minutes_until_there": "minutes_to_95_%"})
     scores = {"score": "mean", "score_low": "min", "score_high": "max"}
     how = {name: ("score", kind) for name, kind in scores.items()}
     how |= {name: (name, "mean") for name in rows.columns[4:]}

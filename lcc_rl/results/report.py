@@ -53,12 +53,12 @@ MUCH = 0.01  # share of time beyond the reach of an energy model that tables and
 MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
 ALL = "all measures: table=all or --all."
 CAPTION = (
-    "Energy per vehicle and km, without what motion stores; {}shares of the time: "
+    "Energy per vehicle and km, net of kinetic energy; {}shares of the time: "
     f"TTC < 4 s; time gap > 2.5 s above 1 m/s; {ALL}"
 )
 BEHIND_FILTER = "networks, and those called filtered, drive behind the safety filter; "
 FULL = (
-    "energies: mean per episode; path energy: without what the motion stores; saved: of path "
+    "energies: mean per episode; path energy: net of kinetic energy; saved: of path "
     "energy per km, of a task of its score; intervals: over held-out windows (drives, if five or "
     "more) and training seeds"
 )
@@ -336,7 +336,8 @@ def saved_against(found: pd.DataFrame, against: str, always: bool = False) -> st
         up_to = "up to " if found.loc[found["seeds"] > 0, "seeds"].nunique() > 1 else ""
         over += f" and {up_to}{seeds} training seeds"
     if drives < min(LEAST_DRIVES, windows):
-        over += f" (too narrow: too few drives, {drives}, whose windows are alike)"
+        of = "one drive" if drives == 1 else f"only {drives} drives"
+        over += f" (too narrow: all windows are of {of})"
     return f"{words}, with the 95 % interval over {over}"
 
 
@@ -393,7 +394,7 @@ def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> 
             words.append(_sentence(windows, rows, name, other))
         elif of_few:
             both = (f"{rows[x][PATH_PER_KM]:,.1f} kJ ({in_words(x)})" for x in (name, other))
-            few = f"{counted_windows(count)} allow no finding."
+            few = f"{counted_windows(count)} are too few for a conclusion."
             words.append(f"Per vehicle and km: {', '.join(both)}; {few}")
     least = min(rows, key=lambda name: rows[name][PATH_PER_KM])
     # It may be a rule of the user's own.

@@ -185,7 +185,7 @@ def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     assert second.startswith("With far, energy")
     assert sample_of(frame) == f"12 held-out windows × {frame['driver_id'].nunique()} drivers"
     few = said(frame[frame["profile_id"] < 4]).verdict
-    assert few.endswith("; 4 windows allow no finding.")
+    assert few.endswith("; 4 windows are too few for a conclusion.")
     assert "%" not in few
 
 
@@ -211,7 +211,7 @@ def test_the_table_of_an_evaluation_ends_with_the_verdict(tmp_path, capsys) -> N
     run = Run(tmp_path, frame, cfg)
     assert " less than with IDM, tuned on these data" in " ".join(run.printed().split())
     few = Run(tmp_path, frame[frame["profile_id"] < 4], cfg)
-    assert "allow no finding" not in few.printed()
+    assert "too few for a conclusion" not in few.printed()
 
 
 def test_one_strategy_is_compared_with_nobody_and_one_window_has_no_interval() -> None:
