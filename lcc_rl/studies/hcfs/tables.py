@@ -149,8 +149,8 @@ def windows(episodes: pd.DataFrame, strategies: Sequence[str], of: str = "hcfs")
     rows = [
         {
             "strategy": in_words(name),
-            "Σ abs e_v_mps": table.at[name, "speed_error_sum_mps"],
-            "Σ abs jerk_mps3": table.at[name, "jerk_sum_mps3"],
+            "sum of speed errors_mps": table.at[name, "speed_error_sum_mps"],
+            "sum of jerks_mps3": table.at[name, "jerk_sum_mps3"],
             **crossed_rewards(reward_per_seed(episodes, name, WINDOW_CASES)).columns("Σ reward"),
         }
         for name in strategies
