@@ -61,7 +61,13 @@ def figure_of(table: pd.DataFrame) -> Figure:
     right.set(xlabel="measured, BMW i3 on the road [Wh/km]", ylabel="modelled energy [Wh/km]")
     for axis in (left, right):
         ends = [*axis.get_xlim(), *axis.get_ylim()]
-        axis.plot([min(ends), max(ends)], [min(ends), max(ends)], color=INK, lw=0.8, label="equal")
+        axis.plot(
+            [min(ends), max(ends)],
+            [min(ends), max(ends)],
+            color=INK,
+            lw=0.8,
+            label="modelled = measured",
+        )
         legend_above(axis, 1)
     return figure
 
