@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -164,16 +165,11 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
         f"it, over {several(drives, 'recording')}{few}",
         table,
     )
-    of_time = {"share_time_gap_short": "time gap < 1 s\n[% of the time]"}
-    shown = [
-        Shown(x.shown.key, of_time.get(x.key) or x.label.replace(" [", "\n["))
-        for x in MEASURES
-        if x.key in DRAWN
-    ]
+    shown = [Shown(x.shown.key, fill(x.label, 18)) for x in MEASURES if x.key in DRAWN]
     of = [f"{x:g} %" for x in table["automated_pct"]]
     named = table.assign(of=of, who=[in_words(str(name)) for name in table["strategy"]])
     one = Report("", table, named, tuple(shown), (), "", "")
-    found.figure("road", "The same values and intervals", measures_of(one))
+    found.figure("road", "The same values and intervals; shares of time in %", measures_of(one))
     for name, file in (("Data", folder / TRAJECTORIES), ("Drivers", folder / DRIVERS_FILE)):
         if file.is_file():
             lines = [f"* {line}" for line in parquet_metadata(file)["report"].splitlines()]
