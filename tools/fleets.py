@@ -61,8 +61,8 @@ def fronts(rows: pd.DataFrame) -> str:
         "automated",
         "saved",
         "flow [1/h]",
-        "against the rule at this flow",
-        "the rule at best",
+        "saved against the rule at equal flow",
+        "largest saving of the rule",
     ]
     lines = [head, ["---"] * len(head)]
     for setting, share, part in by_setting(rows):
