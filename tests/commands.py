@@ -36,7 +36,7 @@ UNTRAINED = ("direct", "idm", "human", "idm_acc", "acc")
 
 # Data that take a fraction of a second to generate; enough for every entry point.
 DATA = ("data.platoons=2", "data.recordings=2", "data.duration_s=[32,40]")
-HORIZON = "scenario.horizon=40"
+HORIZON = "scenario.horizon=20"
 QUICK = "calibration.local_genetic.generations=2"
 AGENT = ("agent.batch_size=64", "agent.hidden=[16,16]")
 NO_AGENT = ("experiment=smoke", *DATA, HORIZON)

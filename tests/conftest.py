@@ -18,6 +18,7 @@ from streams import driven_once
 
 from lcc_rl.commands import training
 
+gc.disable()  # until all modules are loaded, see pytest_collection_finish
 # Several test processes share a machine's cores; more threads each would only slow them down.
 torch.set_num_threads(1)
 
@@ -35,7 +36,8 @@ def pytest_collection_finish() -> None:
     """Spare the collector of garbage what lives to the end: modules and thousands of tests."""
     gc.collect()
     gc.freeze()
-    gc.set_threshold(20_000, 20, 50)
+    gc.set_threshold(50_000, 20, 50)
+    gc.enable()
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:

@@ -15,7 +15,7 @@ from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import identity, load
 from lcc_rl.config.nodes import as_plain, settings_at, with_defaults, without_defaults
-from lcc_rl.config.schemas import as_text, parse_config
+from lcc_rl.config.schemas import TrainConfig, as_text, parse_config
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import Observation, SafetyReward
@@ -43,21 +43,33 @@ def options(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
 
 
-def test_every_variant_and_controller_drives(subtests) -> None:
+def check_drives(cfg: TrainConfig) -> None:
+    policy = shared_policy(build_agent(cfg, POPULATION).policy) if learns(cfg) else None
+    env = build_env(cfg, followed_profiles(), POPULATION, 2)
+    rows = env.rollout(3, policy, break_when_any_done=False)["next"]
+    assert rows["vehicles", "acceleration"].isfinite().all()
+
+
+def test_every_variant_and_task_drives(subtests) -> None:
     for words in [
         *([f"variant={name}"] for name in options("variant")),
         *([f"task={name}", "+faults=all"] for name in options("task")),
-        *(
-            [f"variant={SCENARIO_OF.get(name, 'alcc')}", f"controller@{AUTO}={name}"]
-            for name in options("controller")
-        ),
     ]:
         with subtests.test(words=words):
-            cfg = load("train", [*words, "scenario.horizon=20"])
-            policy = shared_policy(build_agent(cfg, POPULATION).policy) if learns(cfg) else None
-            env = build_env(cfg, followed_profiles(), POPULATION, 2)
-            rows = env.rollout(3, policy, break_when_any_done=False)["next"]
-            assert rows["vehicles", "acceleration"].isfinite().all()
+            check_drives(load("train", [*words, "scenario.horizon=20"]))
+
+
+def test_every_controller_drives(subtests) -> None:
+    for variant in ("alcc", "cacc", "hcfs"):
+        own = [x for x in options("controller") if SCENARIO_OF.get(x, "alcc") == variant]
+        places = [f"+controller@scenario.controllers.the_{name}={name}" for name in own]
+        words = [f"variant={variant}", "scenario.horizon=20"]
+        controllers = load("train", [*words, *places]).scenario.controllers
+        for name in own:
+            with subtests.test(name=name):
+                cfg = load("train", words)
+                cfg.scenario.controllers["automated"] = controllers[f"the_{name}"]
+                check_drives(cfg)
 
 
 def test_the_tests_know_every_variant() -> None:

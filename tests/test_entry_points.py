@@ -70,6 +70,7 @@ def test_baselines_share_the_scenario_under_study(trained, tmp_path) -> None:
 @pytest.mark.usefixtures("blank_figures")
 def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> None:
     jobs_in_threads(monkeypatch)
+    monkeypatch.setattr("lcc_rl.drivers.twins.DELAYS", (0.0, 0.2))
     words = [*TINY, QUICK, "variants=[alcc]", "hydra.run.dir=job"]
     done = run_command("lcc_rl.cli.pipeline", *words, cwd=tmp_path, check=True)
     job = tmp_path / "job"
@@ -138,7 +139,7 @@ def test_learn_and_compare_give_the_rows_and_tables_of_the_commands(
     assert "was trained with other" not in caplog.text
     assert len(run.training) == 3
     shrunk = [word for word in TINY if not word.startswith("agent.")]
-    shrunk += ["figure_formats=[png,svg]"]
+    shrunk += ["figure_formats=[svg]"]
     found = lcc_rl.compare([run, "idm_acc"], "alcc", shrunk, tmp_path / "found")
     assert {"alcc", "idm_acc", "idm"} <= set(found.table["strategy"])
     drawn = {path.name for path in (found.folder / "figures").iterdir()}
@@ -172,6 +173,7 @@ def test_a_training_that_changed_nothing_says_so(trained, tmp_path, caplog) -> N
     assert "changed nothing" in caplog.text
     folders = [api._folder("evaluate", "alcc", None) for _ in range(2)]
     assert folders[0] != folders[1]  # within one second
+    assert api._words("alcc", "seed=3") == ["variant=alcc", "seed=3"]  # not letters
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ def trained(tmp_path_factory) -> Path:
 def test_hcfs_trains_its_parent_first(trained, tmp_path) -> None:
     rows = read_parquet(trained / "training.parquet")
     assert {"reward_velocity", "reward_jerk", "loss_value"} <= set(rows)
-    assert rows["transitions"].iloc[-1] == 24 * 40 * 6  # episodes × steps × followers
+    assert rows["transitions"].iloc[-1] == 24 * 20 * 6  # episodes × steps × followers
     # The same settings train the same parent, whatever drives afterwards.
     training.run(tiny("train", "ddpg"), tmp_path / "ddpg", quiet=True)
     one, two = (load_policy(folder)[0] for folder in (trained, tmp_path / "ddpg"))

@@ -1,8 +1,8 @@
 """Write tables and figures of the documentation from outputs/reference: python tools/pages.py
 
-Tables stand in docs/*.md between ``<!-- table: name -->`` and ``<!-- end -->``, figures in
-docs/figures. The commands that the pages name draw the other figures. What is kept in
-outputs/reference was made by the tools of the tag history/2026-11, see its README.
+Tables are in docs/*.md between ``<!-- table: name -->`` and ``<!-- end -->``, figures in
+docs/figures. Commands on the pages draw the other figures. The tools of the tag history/2026-11
+made the results in outputs/reference, see its README.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ from lcc_rl.studies.reproduce import STUDY_RESULTS
 REFERENCE, DOCS = Path("outputs/reference"), Path("docs")
 MARKED = re.compile(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", re.DOTALL)
 TASKS_SHOWN = ("i24-follow5", "i80-follow")
-LIMIT = "limit_"  # begins the columns of kept scores that hold the task's limits
-# Figures of the studies whose rows are kept, on their pages.
+LIMIT = "limit_"  # prefix of the columns of limits in stored scores
+# Figures of the studies with stored rows.
 SHOWN_OF = {
     "alcc": ("learning_curve", "improvement"),
     "hcfs": ("case_1_velocities", "case_1_switching_hcfs"),
@@ -70,7 +70,7 @@ SHOWN = {
     "pi_saturation": "one car: PI with saturation",
     "alcc": "one car: network",
 }
-KINDS_SHOWN = {  # variant and policy, how it is named, and its colour
+KINDS_SHOWN = {  # label and colour by variant and policy
     ("alcc", "idm"): ("IDM, tuned by search", colour("idm_acc")),
     ("alcc", "idm_gradient"): ("IDM, tuned by gradient", colour("rule")),
     ("own_energy", "network"): (in_words("own_energy"), colour("own_energy")),
@@ -78,7 +78,7 @@ KINDS_SHOWN = {  # variant and policy, how it is named, and its colour
     ("alcc", "memory"): ("network with memory", OWN_COLOURS[0]),
     ("alcc", "preview"): ("network with preview", OWN_COLOURS[1]),
 }
-# Sources of what is kept for averaged energies, for readers.
+# Labels of the sources of averaged energies.
 SOURCES = {
     "i80": "I-80",
     "ring": "ring",
@@ -93,7 +93,7 @@ def fill(page: Path, tables: Mapping[str, str]) -> None:
     """Write tables into a Markdown file, between their marks.
 
     Raises:
-        ConfigError: if there is no table of a marked name.
+        ConfigError: if a marked table is missing.
         ResultsError: if the file cannot be written.
     """
 
@@ -108,7 +108,7 @@ def fill(page: Path, tables: Mapping[str, str]) -> None:
 
 
 def study(name: str, reference: Path, docs: Path) -> None:
-    """Write the tables of a study's page, and the figures that it shows."""
+    """Write the tables and figures of a study's page."""
     with TemporaryDirectory() as place:
         kept = shutil.copytree(reference / name, Path(place) / name)
         found = STUDY_RESULTS[name](kept).tables
@@ -138,7 +138,7 @@ def tasks(reference: Path, docs: Path) -> None:
 
 
 def averaged(rows: pd.DataFrame) -> str:
-    """Return a Markdown table: what the network saves by source, longest time gap and rival.
+    """Return a Markdown table of savings by source, longest time gap and baseline.
 
     Args:
         rows: ``source``, ``time_gap`` of the filter [s], ``average_s`` of the leaders [s],
@@ -161,7 +161,7 @@ def averaged(rows: pd.DataFrame) -> str:
 
 
 def learners(reference: Path, docs: Path) -> None:
-    """Write what each learner reaches: a row per task and learner, with the range of its seeds."""
+    """Write the scores of learners: a row per task and learner, with the range of seeds."""
     rows = worded(read_parquet(reference / "learners.parquet")).replace({"strategy": LEARNERS})
     rows = rows.rename(columns={"minutes_until_there": "minutes_to_95_%"})
     scores = {"score": "mean", "score_low": "min", "score_high": "max"}
@@ -173,7 +173,7 @@ def learners(reference: Path, docs: Path) -> None:
 
 
 def task_table(name: str, table: pd.DataFrame) -> str:
-    """Return the Markdown table of a task below its name; the kept scores hold every measure."""
+    """Return the Markdown table of a task below its name."""
     first = {str(key): value for key, value in table.iloc[0].items()}
     kept = {x.removeprefix(LIMIT): float(first[x]) for x in first if x.startswith(LIMIT)}
     given = {"score": first["score_name"], "unit": first["unit"], "against": first["against"]}
@@ -207,7 +207,7 @@ def bounded(measure: Measure, bound: float) -> str:
 
 
 def broken(task: Task, row: Mapping[Hashable, Any]) -> str:
-    """Return the limits that are not kept with their values, or the collisions."""
+    """Return the violated limits with their values, or the collisions."""
     found = [
         f"{one.limited} {measured(one, row[one.key])}"
         for one, bound in task.bounds.items()
@@ -226,7 +226,7 @@ def measured(measure: Measure, value: float) -> str:
 
 
 def figure_of_record() -> Figure:
-    """Draw the speed record that platoons train on, and their test cases."""
+    """Draw the speed record of platoons' training, and the test cases."""
     cfg = load("evaluate", ["variant=cacc"])
     step, used = cfg.scenario.time_step, cfg.leader.settings["training"]["udds"]
     leaders = cfg.leader.made().load(step, cfg.scenario.horizon, len(cfg.scenario.vehicles))
@@ -258,7 +258,7 @@ def figure_of_limits(windows: pd.DataFrame) -> Figure:
 
 
 def figure_of_ring(reference: Path) -> Figure:
-    """Draw every vehicle's way on the ring."""
+    """Draw the trajectories on the ring."""
     cfg = as_plain(load("evaluate", ["task=ring-22"]))
     steps = read_parquet(reference / "tasks" / "ring_steps.parquet").replace({"strategy": SHOWN})
     figure = space_time(steps, list(SHOWN.values()), cfg, every=2)
@@ -267,7 +267,7 @@ def figure_of_ring(reference: Path) -> Figure:
 
 
 def figures(reference: Path, folder: Path) -> list[Path]:
-    """Draw the figures of what is kept; return the files written."""
+    """Draw the figures of stored results; return the written files."""
 
     def kept(name: str) -> pd.DataFrame:
         return read_parquet(reference / f"{name}.parquet")

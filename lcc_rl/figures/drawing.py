@@ -22,10 +22,10 @@ from lcc_rl.io.atomic import atomic_path
 from lcc_rl.results.names import in_words
 
 INK, SOFT = "#222222", "#8a8a8a"
-COLUMN_WIDTH, PAGE_WIDTH = 3.5, 7.2  # widths of one column of a journal, and of two [in]
-LABEL = 28  # signs of a name in one line of a figure
+COLUMN_WIDTH, PAGE_WIDTH = 3.5, 7.2  # widths of one and two columns of a journal [in]
+LABEL = 28  # most characters of a name in one line
 INTERVAL: dict[str, Any] = {"lw": 1.5, "alpha": 0.6}  # look of the line along an interval
-# Decorates what draws. The look of every figure is set here and nowhere else.
+# Decorator of drawing functions: the look of all figures.
 paper = mpl.rc_context(
     {
         "font.size": 8.0,
@@ -51,11 +51,11 @@ paper = mpl.rc_context(
         "lines.linewidth": 1.2,
         "lines.markersize": 4.0,
         "svg.fonttype": "none",
-        "svg.hashsalt": "lcc_rl",  # the same picture gives the same file
+        "svg.hashsalt": "lcc_rl",  # equal pictures give equal files
         "pdf.fonttype": 42,
     }
 )
-# Distinct without colour vision and in grey. A filtered rule has its colour, dashed.
+# Distinguishable without colour vision and in grey. A filtered rule has its colour, dashed.
 COLOURS = {
     "alcc": "#0072b2",
     "reference": "#d55e00",
@@ -69,12 +69,12 @@ COLOURS = {
     "human": "#b0a080",
     "direct": INK,
 }
-OWN_COLOURS = ("#cc79a7", "#882255", "#117733")  # of the user's own; no colour of a baseline
+OWN_COLOURS = ("#cc79a7", "#882255", "#117733")  # of the user's controllers
 SERIES = ("#56b4e9", "#009e73", "#e69f00", "#cc79a7")  # of ordered values, such as shares
 
 
 def colour(strategy: str) -> str:
-    """Return the colour that a strategy has in every figure."""
+    """Return the colour of a strategy in all figures."""
     strategy = strategy.removesuffix(FILTERED)
     return COLOURS.get(strategy) or OWN_COLOURS[sum(strategy.encode()) % len(OWN_COLOURS)]
 
@@ -87,12 +87,12 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def footnote(figure: Figure, text: str) -> None:
-    """Write how to read a figure below it."""
+    """Write a note below a figure."""
     figure.supxlabel(text, fontsize=7, color=INK)
 
 
 def legend_above(axis: Axes, columns: int = 3) -> Legend:
-    """Put the legend above the frame, where it covers no data."""
+    """Put the legend above the frame."""
     return axis.legend(
         ncols=columns,
         loc="lower left",
@@ -102,12 +102,12 @@ def legend_above(axis: Axes, columns: int = 3) -> Legend:
 
 
 def lines_of(name: str) -> str:
-    """Return a strategy's name in words, in two lines at most."""
+    """Return a strategy's name in words, in at most two lines."""
     return fill(in_words(name), LABEL, max_lines=2, placeholder="…")
 
 
 def rows_of(axis: Axes, names: Sequence[str]) -> None:
-    """Label the rows of a chart, the first at the top; without a name no label is drawn."""
+    """Label the rows of a chart, the first at the top; empty names have no label."""
     axis.set_yticks(range(len(names)), [lines_of(name) for name in names])
     axis.set_ylim(len(names) - 0.4, -0.6)
 
@@ -130,7 +130,7 @@ def dots(
         column: name of the column.
         hue: colour of dots and lines.
         upright: draw vertical lines.
-        look: of the dots, for ``Axes.plot``.
+        look: options of the dots, for ``Axes.plot``.
     """
     low, high = (table[f"{column}_{end}"].to_numpy(float) for end in ("low", "high"))
     draw = axis.vlines if upright else axis.hlines
@@ -140,7 +140,7 @@ def dots(
 
 
 def in_file(name: str) -> str:
-    """Return a name as part of a file's: without spaces, or what would lead elsewhere."""
+    """Return a name for use in a file name: without spaces and separators of paths."""
     return re.sub(r"[^\w.+-]", "_", name)
 
 
@@ -151,8 +151,8 @@ def save(figure: Figure, path: str | Path, dpi: int = 200, formats: Iterable[str
     Args:
         figure: the figure.
         path: the file.
-        dpi: pixels per inch of what is drawn as pixels.
-        formats: further formats, each a file beside it (``figure_formats``).
+        dpi: pixels per inch of raster graphics.
+        formats: further formats, each in its own file (``figure_formats``).
 
     Returns:
         The path.
@@ -161,7 +161,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 200, formats: Iterable[str
         ResultsError: if a file cannot be written.
     """
     path = Path(path)
-    logging.getLogger("fontTools").setLevel(logging.WARNING)  # it tells of every letter of a PDF
+    logging.getLogger("fontTools").setLevel(logging.WARNING)  # it logs every glyph of a PDF
     for suffix in dict.fromkeys([path.suffix or ".png", *(f".{kind}" for kind in formats)]):
         with atomic_path(path if suffix == path.suffix else path.with_suffix(suffix)) as temporary:
             figure.savefig(temporary, dpi=dpi, format=suffix[1:])

@@ -13,8 +13,8 @@ from lcc_rl.pieces.views import EPISODE
 class Collision(Feature):
     """Ends an episode (``"terminated"`` and ``"done"``) when any gap of the string is zero or less.
 
-    Without this piece a collision ends nothing; gaps may turn negative and are counted in the
-    evaluation.
+    Without this piece episodes continue after a collision. Gaps may become negative; the evaluation
+    counts them.
     """
 
     role = EPISODE

@@ -8,7 +8,7 @@ from typing import Any
 from zlib import crc32
 
 import pytest
-from helpers import check_refused, check_resuming, small_env, small_loop, weights
+from helpers import check_refused, check_resuming, slow_but, small_env, small_loop, weights
 from page_blocks import ROOT
 from tensordict import TensorDict
 from torch import nn
@@ -111,7 +111,9 @@ def test_what_a_learner_of_ones_own_lacks_is_one_line(tmp_path, my_learner) -> N
     check_refused(run, WRONG, ConfigError)
 
 
-@pytest.mark.parametrize("agent", ["ddpg", "td3", "sac", "ppo", "analytic"])
+@pytest.mark.parametrize(
+    "agent", slow_but(["sac", "ppo", "analytic"], ["ddpg", "td3", "sac", "ppo", "analytic"])
+)
 def test_activation_schedule_and_clipping_are_settings_of_every_learner(tmp_path, agent) -> None:
     words = (f"agent={agent}", *SMALL, "agent.final_lr_fraction=0.2", "agent.clip_norm=1e-12")
     words += ("agent.activation=tanh", "agent.schedule=linear")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import check_refused
+from helpers import check_episodes, check_refused
 from ngsim_text import cells, csv_text, pair
 
 from lcc_rl.data.car_following import Criteria, ExtractionReport, extract
@@ -15,7 +15,6 @@ from lcc_rl.data.episodes import SCHEMA
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.errors import ConfigError, DataError
-from tests.helpers import check_episodes
 
 FOOT = 0.3048
 SHORT = Criteria(min_duration_s=1.0)

@@ -9,7 +9,7 @@ from io import StringIO
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import check_refused
+from helpers import check_episodes, check_refused
 from table_text import GAP, LENGTH, long_table, openacc_text, pairs, speed, written
 
 from lcc_rl.data import text
@@ -23,7 +23,6 @@ from lcc_rl.data.table_source import TableSource
 from lcc_rl.data.trajectories import FOOT
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.io.files import write_parquet
-from tests.helpers import check_episodes
 
 BASE = {"vehicle": "id", "time": "t", "speed": "v"}
 BY_GAP = {**BASE, "leader": "ahead", "gap": "gap"}
@@ -201,7 +200,7 @@ def test_a_leader_that_is_not_there_and_duplicates_are_counted(tmp_path) -> None
     frame.loc[frame["id"] == 2, "ahead"] = 77
     frame.loc[20, "v"] = np.nan
     loaded = TableSource(path=written(tmp_path, frame), columns=BY_GAP).load()
-    words = "dropped 2 rows: rows of a moment that their vehicle has already, 0 of them with"
+    words = "dropped 2 rows: rows that repeat a time of their vehicle, 0 of them with"
     assert any(line.startswith(words) for line in loaded.report)
     assert "dropped 1 rows: blank time, speed or position" in loaded.report
     assert loaded.episodes["follower_id"].unique().tolist() == [3]

@@ -55,6 +55,7 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
         assert text in out.getvalue()
 
 
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize("model", slow_but(["gipps"], list(LAWS)))
 def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
     cfg.calibration = cfg.calibration.changed(model=model, objective="both", holdout=0.3)
@@ -96,6 +97,7 @@ def command(source):
     return partial(run_command, "lcc_rl.cli.calibrate", cwd=source)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_command_writes_into_the_run_folder(source, command):
     quick = [f"calibration.local_genetic.{name}" for name in ("generations=2", "population=8")]
     (source / "data").mkdir()
@@ -108,6 +110,7 @@ def test_command_writes_into_the_run_folder(source, command):
     assert "v0 on a bound" in done.stdout
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_drivers_keep_the_names_of_the_data(cfg, tmp_path):
     names = {0: "", 1: "Audi", 2: "BMW", 3: "Ford"}
     table = long_table().replace({"id": names, "ahead": names})
@@ -128,6 +131,7 @@ def test_spreads_are_those_of_a_sample():
     assert calibration._spread(pd.Series([2.0, 2.0])) == "2.00 (all)"
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_the_report_counts_records_and_drivers(cfg, source, tmp_path):
     path = source / "episodes.parquet"
     table = pd.read_parquet(path).reset_index(drop=True)
@@ -135,8 +139,8 @@ def test_the_report_counts_records_and_drivers(cfg, source, tmp_path):
     table.to_parquet(path)
     out, lines = io.StringIO(), []
     cfg.calibration = cfg.calibration.changed(modes=["local"])
-    tell = lines.extend
-    drivers = calibration.run(cfg, tmp_path / "run", Console(file=out, width=100), tell)
+    emit = lines.extend
+    drivers = calibration.run(cfg, tmp_path / "run", Console(file=out, width=100), emit)
     assert len(drivers) == 4
     assert any(line.startswith("local: RMSPE of 4 records of 3 drivers: ") for line in lines)
     assert "4 records of 3 drivers" in out.getvalue()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from commands import NO_AGENT
-from helpers import check_refused
+from helpers import check_refused, slow_but
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs.transforms import CatFrames
@@ -17,6 +17,7 @@ from lcc_rl.errors import ConfigError
 ROOT, GROUP = (["observation"], ["action"]), (["automated", "observation"], ["automated", "action"])
 SMALL = [*NO_AGENT, "evaluation.baselines=[]"]
 WIDTH = 7
+STRINGS = ["automated human", "automated human automated human"]
 
 
 class Lagged(nn.Module):
@@ -68,7 +69,8 @@ def networks() -> tuple[nn.Sequential, dict[str, nn.Module]]:
     }
 
 
-@pytest.mark.parametrize("string", ["automated human", "automated human automated human"])
+@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.parametrize("string", slow_but(STRINGS[1:], STRINGS))
 def test_a_policy_of_any_keys_drives_as_its_network_does(tmp_path, string) -> None:
     network, modules = networks()
     modules["drawn"].train()
@@ -101,12 +103,12 @@ def test_a_recurrent_policy_of_torchrl_drives() -> None:
 def test_what_is_no_policy_of_these_keys_is_refused_in_a_line() -> None:
     network = networks()[0]
     cases = [
-        ({"x": nn.Linear(5, 1)}, "x is given observations of 7 numbers, and fails: mat1 and mat2"),
-        ({"x": nn.Linear(WIDTH, 2)}, r"x is given .* shape '\[1, 1, 1\]' is invalid"),
+        ({"x": nn.Linear(5, 1)}, "x fails for observations of 7 numbers: mat1 and mat2"),
+        ({"x": nn.Linear(WIDTH, 2)}, r"x fails .* shape '\[1, 1, 1\]' is invalid"),
         ({"x": TensorDictModule(network, ["obs"], ["action"])}, r"x reads \['obs'\] and writes"),
         ({"x": TensorDictModule(network, ["observation"], ["act"])}, r"writes \['act'\]: expected"),
         ({"alcc": network}, "a policy alcc, which stands for 'network': choose another"),
     ]
     check_refused(lambda who: lcc_rl.compare(who, overrides=SMALL), cases, ConfigError)
-    with pytest.raises(ConfigError, match="x is a policy, and variant idm learns nothing"):
+    with pytest.raises(ConfigError, match="x is a policy, and variant idm has no agent"):
         lcc_rl.compare({"x": network}, "idm", [*NO_AGENT])

@@ -61,7 +61,7 @@ def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, ca
     np.testing.assert_allclose(every["score"], run.headline["score"])
     limits = task_of(cfg).limits
     assert {*limits, *(f"limit_{x}" for x in limits), "total_path_energy_kj"} <= set(every)
-    table_again([str(tmp_path), "--format", "latex", "--columns", "who,saved_pct"])
+    table_again([str(tmp_path), "--format", "latex", "--columns", "driver,saved_pct"])
     heads = capsys.readouterr().out.splitlines()[2]
     assert heads.split(" & ") == ["driven by", r"saved [\%] \\"]
     with pytest.raises(ConfigError, match="Did you mean 'saved_pct'"):
@@ -103,12 +103,16 @@ def test_mistakes_are_named_before_the_data_are_read(tmp_path, monkeypatch) -> N
     )
 
 
-def test_any_population_fits_any_task() -> None:
+DRIVERS = sorted(path.stem for path in Path("conf/drivers").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("each", slow_but([1], [1, len(DRIVERS)]))
+def test_any_population_fits_any_task(each) -> None:
     path = "drivers.path=lcc_rl/assets/i80_drivers.parquet"
-    for task in TASKS:
+    for place, task in enumerate(TASKS):
         own = load("evaluate", [f"task={task}"])
         assert other_drivers(own) == "", task
-        for name in sorted(path.stem for path in Path("conf/drivers").glob("*.yaml")):
+        for name in (DRIVERS[(place + turn) % len(DRIVERS)] for turn in range(each)):
             words = [f"task={task}", f"drivers={name}"]
             cfg = load("evaluate", [*words, path] if name == "calibrated" else words)
             alone = load("evaluate", [f"drivers={name}", *[path] * (name == "calibrated")])

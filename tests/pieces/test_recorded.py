@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from helpers import POPULATION, compose, composed, followed_profiles, wavy_profiles
+from helpers import POPULATION, check_episodes, compose, composed, followed_profiles, wavy_profiles
 
 from lcc_rl.commands.evaluation import strategies_of
 from lcc_rl.config import load
@@ -19,7 +19,6 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import applies, baseline, baselines
 from lcc_rl.results.measures import FASTER
-from tests.helpers import check_episodes
 
 
 def drive(*overrides: str):

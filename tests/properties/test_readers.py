@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from helpers import check_episodes
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from table_text import long_table, openacc_text, pairs
@@ -25,7 +26,6 @@ from lcc_rl.data.speed_records import read_drives
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.errors import DataError, LccError
 from lcc_rl.io.files import read_parquet, write_parquet
-from tests.helpers import check_episodes
 
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "60"))
 FUZZ = settings(

@@ -69,6 +69,7 @@ def of_one_file(folder: Path, *overrides: str) -> Study:
     return one(folder / "study", "smoke", overrides=words)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_study_of_one_file_divides_it_by_vehicle(tmp_path, monkeypatch) -> None:
     for name in ("train_all", "complete"):
         monkeypatch.setattr(study, name, lambda *arguments: None)
