@@ -2,7 +2,7 @@
 
   lcc-rl reproduce alcc                           # embedded stream, 8 seeds
   lcc-rl reproduce alcc data=ngsim data.path=...  # trajectories; any override
-  lcc-rl reproduce alcc --recipe quickstart --parts main  # an hour instead of days
+  lcc-rl reproduce alcc --recipe quickstart --parts main  # an hour, not days
   lcc-rl reproduce alcc --parts main agent=analytic       # another agent
   lcc-rl reproduce alcc --recipe smoke --seeds 1  # everything once, in seconds
   lcc-rl reproduce hcfs                           # platoon: DDPG, CACC, hybrids
