@@ -173,7 +173,7 @@ def choices(group: str) -> list[str]:
 @cache
 def _groups() -> frozenset[str]:
     folder = Path(str(files(CONF)))
-    return frozenset(path.name for path in folder.iterdir() if path.is_dir())
+    return frozenset(path.parts[len(folder.parts)] for path in folder.glob("*/**/*.yaml"))
 
 
 @cache
