@@ -2,7 +2,7 @@
 
 ``lcc_rl.make_env`` builds a TorchRL environment of a string of vehicles, ``lcc_rl.learn`` trains a
 policy, ``lcc_rl.compare`` evaluates several, ``lcc_rl.export`` writes one for other software and
-``lcc_rl.results`` reads what runs leave behind. The command is ``lcc-rl``.
+``lcc_rl.results`` reads the results of runs. The command is ``lcc-rl``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 from lcc_rl.version import __version__
 
 __all__ = ["__version__", "compare", "export", "learn", "make_env", "results"]
-# Modules of the names that load torch.
+# Modules of names that load torch.
 LAZY = {
     "make_env": "lcc_rl.envs.factory",
     "learn": "lcc_rl.api",
@@ -23,7 +23,7 @@ LAZY = {
 
 
 def __getattr__(name: str) -> Any:
-    # Lazy: asking for the version must not load torch.
+    # Lazy, so that reading the version does not load torch.
     if name in LAZY:
         return getattr(import_module(LAZY[name]), name)
     if name == "results":

@@ -3,7 +3,7 @@
 from lcc_rl.runs.interrupts import end_quietly
 
 if __name__ == "__main__":
-    end_quietly()  # here: a program that imports the package keeps its own handlers
+    end_quietly()  # here, because programs that import the package have their own handlers
 
     from lcc_rl.cli.console import main
 

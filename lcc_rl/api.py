@@ -1,4 +1,4 @@
-"""Training and evaluation as functions that return objects, for notebooks and programs."""
+"""Training and evaluation as functions, for notebooks and programs."""
 
 from __future__ import annotations
 
@@ -28,13 +28,12 @@ class Run:
     """The results of a training or an evaluation.
 
     Args:
-        folder: its files: configuration, parquet tables, and the policy of a training.
-        rows: one row per episode, or vehicle of an episode, as in episodes.parquet; of many a
-            dataset that is not read yet.
+        folder: folder of the configuration, the parquet tables, and the policy of a training.
+        rows: one row per episode, or vehicle of an episode, as in episodes.parquet; many rows as a
+            dataset, which is read on demand.
         cfg: its configuration.
 
-    ``print(run)`` shows the tables that commands print; where a path is expected, a run is that of
-    its folder.
+    ``print(run)`` shows the tables that commands print. A run stands for the path of its folder.
     """
 
     folder: Path
@@ -48,7 +47,7 @@ class Run:
         return self.printed()
 
     def printed(self, full: bool = False, against: str | None = None) -> str:
-        """Return the tables that commands print, with ``full`` of every measure."""
+        """Return the tables that commands print; ``full``: with all measures."""
         console = Console(width=render.WIDTH)
         with console.capture() as text:
             for one in self.reports(against):
@@ -56,18 +55,18 @@ class Run:
         return text.get().rstrip()
 
     def reports(self, against: str | None = None) -> list[Report]:
-        """Return the report of each source of leaders, or case of a platoon.
+        """Return the report of each source of leaders or case of a platoon.
 
         Args:
-            against: the strategy that savings are against; by default as in tables.
+            against: the baseline of savings; by default that of tables.
         """
         return list(evaluation.reports(self.rows, self.cfg, against))
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """Every measure: a row per strategy with energies, savings with intervals and safety.
+        """All measures: a row per strategy with energies, savings with intervals and safety.
 
-        Of a task its scores and limits come first. Several sources or cases as below.
+        For a task, scores and limits come first. Several sources or cases are named in ``of``.
         """
         return together(self.reports()).table
 
@@ -75,13 +74,13 @@ class Run:
     def headline(self) -> pd.DataFrame:
         """The table that commands print: energy or a task's score, distance and safety.
 
-        Of several sources of leaders, or cases of a platoon, the rows of each, named in ``of``.
+        Several sources of leaders, or cases of a platoon, are named in ``of``.
         """
         return together(self.reports()).short
 
     @cached_property
     def training(self) -> pd.DataFrame:
-        """A row per iteration; a ResultsError where nothing was learned."""
+        """A row per iteration; a ResultsError without a training."""
         return read_parquet(self.folder / training.RECORD)
 
     @cached_property
@@ -98,21 +97,21 @@ def learn(
     Args:
         variant: ``"alcc"``, ``"reference"`` … (``conf/variant``).
         overrides: further settings, ``["experiment=limits", "seed=3"]``.
-        folder: where the files go; a training that it holds is resumed. By default a new one
-            below ``outputs/train``.
+        folder: folder of the results; a training in it is resumed. By default a new one below
+            ``outputs/train``.
 
     Returns:
-        The run, whose ``rows`` are of the held-out windows.
+        The run, with the rows of the held-out windows.
 
     Raises:
-        LccError: one clear error for whatever is wrong with settings, data or files.
+        LccError: for any error in settings, data or files, in one line.
 
     Examples:
         >>> run = learn("alcc", ["experiment=smoke"], "outputs/mine")  # doctest: +SKIP
         >>> run.table[["strategy", "total_path_energy_kj"]]  # doctest: +SKIP
     """
     target = _folder("train", variant, folder)
-    cfg = load("train", [f"variant={variant}", *overrides])
+    cfg = load("train", _words(variant, overrides))
     return Run(target, training.run(cfg, target, quiet=True, resume=True), cfg)
 
 
@@ -122,46 +121,51 @@ def compare(
     overrides: Sequence[str] = (),
     folder: str | Path | None = None,
 ) -> Run:
-    """Evaluate policies and controllers on the same held-out windows, beside the baselines.
+    """Evaluate policies, controllers and baselines on the same held-out windows.
 
     Args:
-        strategies: one or several: runs, run folders, policy files, ``"pretrained/alcc"``;
-            controllers as names, objects, classes, plain functions of named entries
-            (:class:`lcc_rl.pieces.Law`) or yaml files; policies of other libraries, see
-            :mod:`lcc_rl.evaluation.foreign`, which read the variant's observation; or these by the
-            names of their rows. A name that ends in ``_filtered`` means behind the safety filter.
-        variant: whose scenario and data they meet.
+        strategies: one or several strategies, or a mapping of them by name: runs, run folders,
+            policy files, ``"pretrained/alcc"``; controllers as names, objects, classes, plain
+            functions of named entries (:class:`lcc_rl.pieces.Law`) or yaml files; policies of
+            other libraries, see :mod:`lcc_rl.evaluation.foreign`, with the variant's observation.
+            Append ``_filtered`` to a name to put the controller behind the safety filter.
+        variant: variant of the scenario and the data.
         overrides: further settings, ``["evaluation.drivers=12"]``.
-        folder: where the files go, figures among them; by default a new one below
+        folder: folder of the results and figures; by default a new one below
             ``outputs/evaluate``, without figures, which take seconds.
 
     Returns:
         The run, with the rows of all strategies.
 
     Raises:
-        LccError: one clear error for whatever is wrong with settings, data or files.
+        LccError: for any error in settings, data or files, in one line.
 
     Examples:
         >>> found = compare([run, "pretrained/alcc_limits", "idm_acc"])  # doctest: +SKIP
         >>> found = compare({"slow": PID(gain=0.1), "fast": PID(gain=0.4)})  # doctest: +SKIP
     """
     target = _folder("evaluate", variant, folder)
-    cfg = load("evaluate", [f"variant={variant}", *overrides])
+    cfg = load("evaluate", _words(variant, overrides))
     if isinstance(strategies, (str, PathLike)) or not isinstance(strategies, Iterable):
         strategies = [strategies]
     named = isinstance(strategies, Mapping)
-    items = strategies.items() if named else [(type(who).__name__, who) for who in strategies]
-    given = [(name, who, as_given(who, name)) for name, who in items]
+    items = strategies.items() if named else [(type(one).__name__, one) for one in strategies]
+    given = [(name, one, as_given(one, name)) for name, one in items]
     policies = {name: policy for name, _, policy in given if policy is not None}
-    others = [(name, who) for name, who, policy in given if policy is None]
+    others = [(name, one) for name, one, policy in given if policy is None]
     if named:
-        cfg.compare = {name: setting_of(who, f"compare.{name}") for name, who in others}
+        cfg.compare = {name: setting_of(one, f"compare.{name}") for name, one in others}
     else:
-        cfg.compare = [setting_of(who) for _, who in others]
+        cfg.compare = [setting_of(one) for _, one in others]
     rows = evaluation.run(cfg, target, own=False, quiet=True, policies=policies)
     if folder is not None:
         evaluation.draw(rows, cfg, target)
     return Run(target, rows, cfg)
+
+
+def _words(variant: str, overrides: Sequence[str]) -> list[str]:
+    """Return the words of a command; a text is one setting."""
+    return [f"variant={variant}", *([overrides] if isinstance(overrides, str) else overrides)]
 
 
 def _folder(kind: str, variant: str, folder: str | Path | None) -> Path:

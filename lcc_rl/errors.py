@@ -1,4 +1,4 @@
-"""Exceptions for wrong input, with messages for the user."""
+"""Exceptions for wrong input with messages for users."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ class LccError(Exception):
     """Base class of errors caused by input: a file, a row, a key or an option."""
 
     def __str__(self) -> str:
-        """Return the message; what a file brings into it cannot steer a terminal."""
+        """Return the message without control characters."""
         text = super().__str__()
         return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
 
 
 class DataError(LccError, ValueError):
-    """A trajectory, profile or driver file is not what was expected."""
+    """A file of trajectories, profiles or drivers is not valid."""
 
 
 class ConfigError(LccError, ValueError):
@@ -30,7 +30,7 @@ class ResultsError(LccError, RuntimeError):
 
 
 class Concern(str):
-    """A line of a report on something that changes results; it is shown first."""
+    """A line of a report on a condition that changes results; it is shown first."""
 
 
 class Interrupted(LccError):
@@ -41,8 +41,8 @@ class Diverged(LccError):
     """An action, a state, a reward, an energy or a loss is not a finite number.
 
     Args:
-        what: which one, where and when.
-        advice: what to do about it.
+        what: the value, with place and time.
+        advice: the remedy.
     """
 
     def __init__(self, what: str, advice: str = "") -> None:
@@ -50,10 +50,10 @@ class Diverged(LccError):
         self.what, self.advice = what, advice
 
 
-# Far beyond every quantity of traffic and learning; its square is a number in single precision.
+# Exceeds all quantities of traffic and learning; its square is finite in single precision.
 LARGEST = 1e9
-# Far beyond what fits into memory, which is said with what is needed; and seeds.
-LARGEST_SIZE, LAST_SEED = 10**15, 2**32 - 1  # torch takes no more bits of a seed
+# Exceeds any memory, which has its own error; and the largest seed.
+LARGEST_SIZE, LAST_SEED = 10**15, 2**32 - 1  # torch uses no more bits of a seed
 
 
 def require(condition: bool, message: str) -> None:
@@ -63,19 +63,19 @@ def require(condition: bool, message: str) -> None:
 
 
 def require_positive(what: str, value: Any) -> None:
-    """Raise a ConfigError unless the value is a positive number within what traffic knows."""
+    """Raise a ConfigError unless the value is a positive number of plausible size."""
     number = isinstance(value, Real) and not isinstance(value, bool)
     if not (number and 0.0 < value <= LARGEST):
         raise ConfigError(f"{what} must be a positive, finite number, got {value!r}")
 
 
 def how_to_install(extra: str) -> str:
-    """Say how an extra of this package is installed, in a clone or from a wheel."""
+    """Return the commands that install an extra of this package, from a clone or a wheel."""
     return f"pip install -e '.[{extra}]', or '<wheel>[{extra}]' where there is no clone"
 
 
 def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:
-    """Build the error for an unknown name, listing the valid ones and the nearest."""
+    """Return the error for an unknown name with the valid names and the nearest one."""
     options = sorted(valid)
     near = get_close_matches(name, options, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
@@ -83,19 +83,19 @@ def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Whether an allocation failed, as NumPy, pyarrow and torch say it."""
+    """Whether an allocation failed in NumPy, pyarrow or torch."""
     text = str(error)
     return isinstance(error, MemoryError) or "t allocate memory" in text or "out of memory" in text
 
 
 def of_hydra(error: BaseException) -> bool:
-    """Whether an error is one of Hydra's or OmegaConf's; neither need be loaded."""
+    """Whether an error is one of Hydra or OmegaConf, which need not be loaded."""
     kinds = type(error).__mro__
     return any(kind.__module__.startswith(("hydra.", "omegaconf.")) for kind in kinds)
 
 
 def input_error(error: BaseException) -> LccError | None:
-    """Return the error of this package that another one wraps."""
+    """Return the error of this package that another error wraps."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, LccError):
         # OmegaConf sets its resolvers' errors as context, not as cause.
@@ -104,5 +104,5 @@ def input_error(error: BaseException) -> LccError | None:
 
 
 def one_line(text: str) -> str:
-    """Return a text in one line without control characters, which a terminal would obey."""
+    """Return a text in one line without control characters."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())

@@ -1,4 +1,4 @@
-"""Settings of a class as annotated fields, each written once and checked where it comes in.
+"""Settings of a class as annotated, checked fields.
 
 A class that derives from :class:`Settings` is a pydantic dataclass: an annotated name in its body
 is a setting with type, range and default; names without annotation are plain class attributes::
@@ -8,8 +8,8 @@ is a setting with type, range and default; names without annotation are plain cl
         reads = ("self.jerk",)
         def reward(self, jerk): return -(jerk.abs() - self.limit).clamp(min=0.0)
 
-Unknown names, values of another type, numbers outside their range or not finite are refused with
-one :class:`ConfigError` that names the setting.
+Unknown names, values of another type, and numbers outside their range or not finite raise a
+:class:`ConfigError` that names the setting.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ from lcc_rl.errors import LARGEST, LARGEST_SIZE, LAST_SEED, ConfigError, LccErro
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
 NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST)]
-Speed = Annotated[float, Field(ge=0.0, le=100.0)]  # of a vehicle [m/s]
+Speed = Annotated[float, Field(ge=0.0, le=100.0)]  # speed of a vehicle [m/s]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 Count = Annotated[int, Field(ge=1, le=LARGEST_SIZE)]
 Whole = Annotated[int, Field(ge=0)]
 Seed = Annotated[int, Field(ge=0, le=LAST_SEED)]
 Million = Annotated[int, Field(ge=1, le=1_000_000)]
-MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # threads or processes of a command
+MOST_PARALLEL = max(64, 4 * (os.cpu_count() or 1))  # most threads or processes of a command
 Parallel = Annotated[int, Field(ge=1, le=MOST_PARALLEL)]
 
 
@@ -64,9 +64,9 @@ def _increasing(ends: tuple[float, float]) -> tuple[float, float]:
     return ends
 
 
-Increasing = AfterValidator(_increasing)  # of the two ends of a range
+Increasing = AfterValidator(_increasing)  # checks the two ends of a range
 
-# Least and largest factor that a training episode draws by its seed; an evaluation takes 1.
+# Range of a factor that training episodes draw by their seed; 1 in an evaluation.
 Factors = Annotated[tuple[Positive, Positive], Increasing]
 
 TARGET = "_target_"  # the key that names the class of a node
@@ -78,7 +78,7 @@ R = TypeVar("R")
 
 @dataclass_transform(kw_only_default=True, eq_default=False)
 class Settings:
-    """Base of classes whose annotated fields are settings; see the module."""
+    """Base of classes with annotated fields as settings; see the module."""
 
     def __init_subclass__(cls, **more: Any) -> None:
         super().__init_subclass__(**more)
@@ -94,36 +94,36 @@ class Settings:
                 self.validate()
             except LccError:
                 raise
-            except ValueError as error:  # pydantic's ValidationError is one
+            except ValueError as error:  # includes pydantic's ValidationError
                 raise refused(error, cls, cls.__name__) from error
 
         cls.__init__ = checked  # type: ignore[method-assign]
 
     def validate(self) -> None:
-        """Check relations between the settings, and derive from them what needs nothing else.
+        """Check relations between the settings, and derive values from them.
 
         Raises:
-            ValueError: saying what is wrong; its message gets the place of the settings.
+            ValueError: describing the error; the place of the settings is added to its message.
         """
 
 
 def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
-    """Construct a class from settings that came in.
+    """Construct a class from external settings.
 
     Args:
         kind: the class.
-        given: its settings by name; a list may stand for a tuple, a mapping for an object that has
-            settings itself or is a dataclass.
+        given: its settings by name; a list may stand for a tuple, a mapping for an object with
+            settings or a dataclass.
         where: their place in the configuration, for messages.
 
     Raises:
-        ConfigError: naming the first setting that is unknown or wrong.
+        ConfigError: naming the first unknown or wrong setting.
     """
     own = {key: value for key, value in given.items() if value != "???"}
     try:
         return kind(**_converted(kind, own, where))
     except RefusedSetting as error:
-        if error.__cause__ is None:  # its place is named already
+        if error.__cause__ is None:  # it contains its place already
             raise
         raise refused(error.__cause__, kind, where) from None
 
@@ -135,7 +135,7 @@ def _converted(kind: type[Settings], given: Mapping[str, Any], where: str) -> di
 
 
 def _as_declared(annotation: Any, value: Any, where: str) -> Any:
-    """Return lists as tuples, and mappings as objects, as deep as the annotation says so."""
+    """Return lists as tuples and mappings as objects according to the annotation."""
     kind, inner = get_origin(annotation) or annotation, get_args(annotation)
     if kind is Annotated:
         return _as_declared(inner[0], value, where)
@@ -162,11 +162,11 @@ def _as_declared(annotation: Any, value: Any, where: str) -> Any:
 
 
 class RefusedSetting(ConfigError):
-    """A setting that its class refuses; caused by the ValueError that says why."""
+    """A setting that its class refuses; its cause is the ValueError with the reason."""
 
 
 def refused(error: Any, kind: Any, where: str) -> ConfigError:
-    """Return the one-line error for a ValueError, or the first setting that pydantic refused."""
+    """Return the one-line error for a ValueError or pydantic's first error."""
     return RefusedSetting(_reason(error, kind, where))
 
 
@@ -189,7 +189,7 @@ def _reason(error: Any, kind: Any, where: str) -> str:
 
 
 def checked(function: Callable[..., R]) -> Callable[..., R]:
-    """Decorate a function so that its annotated arguments are checked like settings."""
+    """Decorate a function so that its annotated arguments are checked as settings."""
     call = validate_call(config=STRICT)(function)
     names = inspect.signature(function)
 
@@ -228,7 +228,7 @@ def as_plain(value: Any, places: bool = True) -> Any:
 
     Args:
         value: a configuration, a part of one or a node.
-        places: with the places that it names to write to; else they are null.
+        places: include paths to write to; else they are null.
     """
     if hasattr(value, "stored"):  # a node
         value = value.stored(places)
@@ -243,32 +243,32 @@ def path_of(kind: Any) -> str:
     """Return the ``_target_`` that names a class or function.
 
     Raises:
-        ConfigError: if a module does not hold it by its name.
+        ConfigError: if its module does not contain it by its name.
     """
     module, name = (getattr(kind, key, None) for key in ("__module__", "__qualname__"))
     if not module or not name or getattr(import_module(module), name, None) is not kind:
         raise ConfigError(
-            f"{name or kind!r} cannot be named in a configuration: define it at the top of a "
-            "module, of a script or of a notebook"
+            f"{name or kind!r} cannot be named in a configuration: define it at the top level of "
+            "a module, a script or a notebook"
         )
     return f"{module}.{name}"
 
 
 def find_target(target: str, where: str) -> Any:
-    """Return the class or function that a ``_target_`` names.
+    """Return the class or function of a ``_target_``.
 
     Raises:
-        ConfigError: if there is none, naming its place in the configuration.
+        ConfigError: naming its place in the configuration, if there is none.
     """
     module, _, name = target.rpartition(".")
     try:
         found = getattr(import_module(module), name)
-    except Exception as error:  # a module of the user's own may raise anything
+    except Exception as error:  # a user's module may raise any error
         hint = ""
         if not isinstance(error, (ImportError, AttributeError, ValueError)):
             raise ConfigError(f"{where}: {module} cannot be imported: {error}") from error
         if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("lcc_rl"):
-            hint = "; if it is a file of your own, export PYTHONPATH=<its folder>"
+            hint = "; for your own file, export PYTHONPATH=<its folder>"
         raise ConfigError(f"{where}.{TARGET}: cannot find {target!r}: {error}{hint}") from error
     if not callable(found):
         raise ConfigError(f"{where}.{TARGET}: {target!r} is no class or function")

@@ -139,7 +139,7 @@ def test_learn_and_compare_give_the_rows_and_tables_of_the_commands(
     assert "was trained with other" not in caplog.text
     assert len(run.training) == 3
     shrunk = [word for word in TINY if not word.startswith("agent.")]
-    shrunk += ["figure_formats=[png,svg]"]
+    shrunk += ["figure_formats=[svg]"]
     found = lcc_rl.compare([run, "idm_acc"], "alcc", shrunk, tmp_path / "found")
     assert {"alcc", "idm_acc", "idm"} <= set(found.table["strategy"])
     drawn = {path.name for path in (found.folder / "figures").iterdir()}
@@ -173,6 +173,7 @@ def test_a_training_that_changed_nothing_says_so(trained, tmp_path, caplog) -> N
     assert "changed nothing" in caplog.text
     folders = [api._folder("evaluate", "alcc", None) for _ in range(2)]
     assert folders[0] != folders[1]  # within one second
+    assert api._words("alcc", "seed=3") == ["variant=alcc", "seed=3"]  # not letters
 
 
 @pytest.mark.slow

@@ -235,7 +235,7 @@ def composes(entry: str, settings: Sequence[str], sweep: bool) -> bool:
     try:
         load(entry, settings)
     except ConfigError as error:
-        return sweep and "learns nothing" in str(error)
+        return sweep and "has no agent" in str(error)
     return True
 
 

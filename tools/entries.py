@@ -27,7 +27,7 @@ from lcc_rl.pieces.base import ROLE, TERM, Key, as_key, declared
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "entries.md"
 SPECS = ("observation", "action", "reward", "done")
-WIDEST = 3  # the width of wider entries depends on settings
+WIDEST = 3  # widths of wider entries depend on settings
 CLOCK = declared(Clock)
 ENTRIES = declared(Piece, Clock, SingleAgent)
 SIZES = "scenario.string=automated*3 human*5"
@@ -38,7 +38,7 @@ HEAD = """# Entries and equations
 Keys of the environments' TensorDicts, at the root after a reset and under `"next"` after a step.
 `role` stands for a role of the string, such as `"human"`; `name` for a term of the reward.
 Shapes: `*B` batch of episodes, `N` vehicles of the string from front to back, `A` automated
-vehicles, `n` vehicles of the role, `k` a width that depends on settings; float32 unless said
+vehicles, `n` vehicles of the role, `k` a width that depends on settings; float32 unless noted
 otherwise. The classes are in `lcc_rl.pieces` and `lcc_rl.envs`. A *reset option* may be given to
 `env.reset(TensorDict({key: value}, env.batch_size))`. Any other key is refused, unless a complete
 state of an episode is given; the reset options in it then apply.
@@ -46,7 +46,7 @@ state of an episode is given; the reset options in it then apply.
 
 
 def configurations() -> Iterator[StudyConfig]:
-    """Yield configurations that together write every entry, with sizes that differ."""
+    """Yield configurations that together write every entry, with different sizes."""
     for path in sorted((ROOT / "conf" / "variant").glob("*.yaml")):
         string = "scenario.string=human*5" if path.stem == "direct" else SIZES
         cfg = load("train", [f"variant={path.stem}", string])
@@ -84,10 +84,10 @@ def environments() -> Iterator[tuple[TransformedEnv, VehicleString]]:
 
 
 def entry_key(key: Key, roles: Collection[str]) -> Key:
-    """Return the key by which a class declares an entry.
+    """Return the declared key of an entry.
 
     Raises:
-        ConfigError: if none declares it.
+        ConfigError: if no class declares it.
     """
     by_role = tuple(ROLE if part in roles else part for part in key)
     for known in (key, by_role, (*key[:-1], TERM)):
@@ -126,7 +126,7 @@ def writers(env: TransformedEnv, key: Key) -> list[str]:
 def collect(found_in: Iterable[tuple[TransformedEnv, VehicleString]]) -> dict[Key, list[str]]:
     """Return shape, mark and then the writers of every entry, in the order of the dictionary.
 
-    The mark says which may be given to ``env.reset``.
+    The mark names the options of ``env.reset``.
 
     Raises:
         ConfigError: if an entry is not in the dictionary, or has two shapes.
@@ -138,7 +138,7 @@ def collect(found_in: Iterable[tuple[TransformedEnv, VehicleString]]) -> dict[Ke
         specs = {as_key(key): spec for part in parts for key, spec in part.items(True, True)}
         for key, spec in specs.items():
             if ("observation",) in specs and group_key(key) == key:
-                continue  # of the single-agent view only what it shows at the root
+                continue  # only the root of the single-agent view
             kind = "" if spec.dtype == torch.float32 else f" {str(spec.dtype).split('.')[1]}"
             shape = symbols(key, spec.shape, string) + kind
             row = rows.setdefault(entry_key(key, string.names), [shape, ""])

@@ -1,4 +1,4 @@
-"""Every equation of the two papers: formula, symbols with units, and what implements it."""
+"""All equations of the two papers: formula, symbols with units, and implementation."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ PAPERS = """A1–A20: Wang et al., *Adaptive Leading Cruise Control in Mixed Tra
 Human Behavioral Diversity* (ALCC). H1–H21: Yan et al., *Hybrid Car-Following Strategy Based on
 Deep Deterministic Policy Gradient and Cooperative Adaptive Cruise Control* (HCFS). Vehicles count
 from the front, 0 is the leader. T is the time step, in A4 and A15 the desired time gap. Import
-paths begin with `lcc_rl.`. – means no unit, or no deviation."""
+paths start with `lcc_rl.`. – means no unit, or no deviation."""
 REFERENCE = re.compile(r"\b([AH])(\d+)[a-d]?(?:–\1?(\d+)[a-d]?)?")
 
 
 class Equation(NamedTuple):
-    """One equation, or several that belong together.
+    """One equation or several related ones.
 
     number: as ``A3`` or ``H4–H6``; formula: in plain text; symbols: with units; functions: import
-    paths below ``lcc_rl``; deviation: how the code differs from what is printed.
+    paths below ``lcc_rl``; deviation: difference of the code from the printed form.
     """
 
     number: str
@@ -31,7 +31,7 @@ class Equation(NamedTuple):
 
 
 def numbers_in(text: str) -> set[str]:
-    """Return the equations that a text names, ranges written out.
+    """Return the numbers of equations in a text, with ranges written out.
 
     Examples:
         >>> sorted(numbers_in("CACC (HCFS H1–H2), see A18d"))

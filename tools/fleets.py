@@ -1,4 +1,4 @@
-"""What fleets save over the share of automated vehicles, for docs/fleets.md."""
+"""Savings of fleets over the share of automated vehicles, for docs/fleets.md."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from lcc_rl.results.render import markdown_row
 SHARE, LEARNED = "penetration", "learned"
 SHOWN = {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"}
 HUMAN, RULE = "human", "idm_acc"
-SETTINGS = {  # of what is kept for fronts, for readers
+SETTINGS = {  # labels of the stored fronts
     "drives": "I-24, whole drives",
     "drives_taught": "I-24, whole drives, trained so",
     "drives_wavy": "I-24, wavy half of the drives",
@@ -39,7 +39,7 @@ SETTINGS = {  # of what is kept for fronts, for readers
     "true_taught": "true drivers, I-24, 100 s, trained so",
 }
 DRIVES, PANELS = "drives", ("front", "free", "long", "true")
-TAUGHT = ", trained "  # what makes a setting one whose fleets learned in it
+TAUGHT = ", trained "  # part of the label of a setting with fleets trained in it
 SHOWN_AS = {
     LEARNED: ("learned", "#0072b2"),
     "idm_acc": ("tuned IDM", "#009e73"),
@@ -83,7 +83,7 @@ def by_setting(rows: pd.DataFrame) -> Iterator[tuple[str, float, pd.DataFrame]]:
 
 
 def curve(part: pd.DataFrame, name: str) -> tuple[pd.Series, pd.Series]:
-    """Return what a kind of fleet saves against humans [%] and its flow [1/h], by time gap."""
+    """Return the saving of a fleet against human drivers [%] and its flow [1/h], by time gap."""
     means = part.groupby(["variant", "limit"])[list(FLEET)].mean()
     own, people = means.xs(name), means.xs(HUMAN).iloc[0]
     saving = 100.0 * (1.0 - own[NET] / own[DISTANCE] * people[DISTANCE] / people[NET])
@@ -103,7 +103,7 @@ def percent(found: Estimate) -> str:
 
 @paper
 def drawn_fronts(rows: pd.DataFrame) -> Figure:
-    """Draw, for each setting, the learned fleets beside the rule's fronts, a colour per share."""
+    """Draw, for each setting, the learned fleets and the rule's fronts, a colour per share."""
     figure = new_figure(PAGE_WIDTH, 5.4)
     titles = [SETTINGS[name] for name in PANELS]
     rows = rows[~rows["setting"].str.startswith(DRIVES)]
@@ -122,7 +122,7 @@ def drawn_fronts(rows: pd.DataFrame) -> Figure:
     for setting, axis in axes.items():
         axis.axhline(0.0, color=INK, lw=0.6)
         axis.axvline(0.0, color=INK, lw=0.6)
-        axis.set(xlim=(-15.0, 15.0), ylim=(-2.0, None), title=setting)  # the fronts go on
+        axis.set(xlim=(-15.0, 15.0), ylim=(-2.0, None), title=setting)  # fronts are longer
         style(axis, "flow against humans only [%]", "fuel saved per km [%]")
     handles = axes[SETTINGS["front"]].get_legend_handles_labels()
     figure.legend(*handles, loc="outside upper left", ncols=4, frameon=False)
@@ -136,7 +136,7 @@ def drawn_fronts(rows: pd.DataFrame) -> Figure:
 
 @paper
 def drawn_ring(table: pd.DataFrame) -> Figure:
-    """Draw what the ring shows over the share; hollow where a limit is missed."""
+    """Draw the results of the ring over the share, with hollow dots beyond a limit."""
     figure = new_figure(PAGE_WIDTH, 3.2)
     axes = figure.subplots(1, len(SHOWN))
     humans = table[table["strategy"] == HUMAN]
@@ -154,7 +154,7 @@ def drawn_ring(table: pd.DataFrame) -> Figure:
             if name == LEARNED and column == "saving":
                 ends = (scale * rows[f"saving_{end}"] for end in ("low", "high"))
                 axis.vlines(x, *ends, color=colour, lw=1.5, alpha=0.5, zorder=above)
-        # Of a saving zero; what is left are draws of the noise, alike at every share.
+        # The saving is zero; means over the shares average the noise.
         axis.axhline(scale * humans[column].fillna(0.0).mean(), color=INK, ls="--", lw=0.8)
         axis.set_xscale("log")
         shares = sorted(100.0 * table[SHARE].unique())

@@ -2,9 +2,10 @@
 
     python tools/kill_test.py --kills 200
 
-A kill counts if it ended a process at work. After each, every file must be readable and no finished
-run may be missing or written again; the final rows must equal those of commands never killed.
-Prints the counts; the exit code is 1 if a check fails or the time is over before the last kill.
+A kill counts if it ended an active process. After each kill, every file must be readable and no
+finished run may be missing or written again; the final rows must equal those of commands that were
+not killed. Prints the counts; the exit code is 1 if a check fails or the time ends before the last
+kill.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ from lcc_rl.runs.states import LOCK, RESULT_TABLES, read_progress
 
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 WAITED = os.WEXITED | os.WNOHANG | os.WNOWAIT
-PATIENCE = 120.0  # for a process to react to a signal, or to leave its folder [s]
-UNTIMED = "timing.parquet"  # seconds, which differ
+PATIENCE = 120.0  # timeout of a process after a signal [s]
+UNTIMED = "timing.parquet"  # its seconds differ
 READERS: dict[str, Callable[[Path], object]] = {
     ".parquet": read_parquet,
     ".pt": read_torch,
@@ -55,14 +56,14 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 @dataclass
 class Job:
-    """A command and what is known of its runs.
+    """A command and the state of its runs.
 
     Args:
         main: the entry point.
         words: its settings.
         where: the setting of the folder.
-        share: share of the kills that meet this command.
-        root: folder of everything that it writes.
+        share: share of the kills of this command.
+        root: folder of its files.
     """
 
     main: Callable[[], None]
@@ -70,22 +71,22 @@ class Job:
     where: str
     share: float
     root: Path
-    length: float = 0.0  # seconds of the command never killed
+    length: float = 0.0  # seconds of the command that is not killed
     completed: int = 0
     seen: Counter[str] = field(default_factory=Counter)
 
     @property
     def whole(self) -> Path:
-        """Folder of the command never killed."""
+        """Folder of the command that is not killed."""
         return self.root / "whole"
 
     @property
     def killed(self) -> Path:
-        """Folder of the command that is killed; another one once that came to its end."""
+        """Folder of the command that is killed; a new one after its end."""
         return self.root / f"killed{self.completed}"
 
     def start(self, folder: Path) -> int:
-        """Start the command, or resume it, in a process of its own; return its id."""
+        """Start or resume the command in a separate process; return its id."""
         child = os.fork()  # importing torch again would take longer than the command
         if child:
             return child
@@ -94,7 +95,7 @@ class Job:
         os.dup2(output, 1)
         os.dup2(output, 2)
         faulthandler.register(signal.SIGUSR1)
-        # A shell that starts this in the background makes it, and all below it, deaf to SIGINT.
+        # Processes in the background of a shell ignore SIGINT by default.
         signal.signal(signal.SIGINT, signal.default_int_handler)
         words = [*self.words, f"{self.where}={folder}"]
         if (folder / COMMAND_FILE).exists():
@@ -112,7 +113,7 @@ class Job:
             os._exit(code)
 
     def complete(self, folder: Path) -> None:
-        """Let the command do what is left of its work."""
+        """Complete the command's work."""
         code = os.waitstatus_to_exitcode(os.waitpid(self.start(folder), 0)[1])
         assert code == 0, self.tail()
 
@@ -121,23 +122,23 @@ class Job:
         lines = (self.root / "log").read_text(errors="replace", encoding="utf-8").splitlines()
         return "\n".join(lines[-100:])
 
-    def disturb(self, delay: float, kind: int, everyone: bool) -> bool:
-        """Start the command and send it a signal; return whether that ended it.
+    def disturb(self, delay: float, kind: int, group: bool) -> bool:
+        """Start the command and send it a signal; return whether the signal ended it.
 
         Args:
             delay: seconds until the signal.
             kind: the signal.
-            everyone: send it to the command's own processes, too.
+            group: send it to the command's child processes, too.
         """
         child = self.start(self.killed)
         deadline = time.monotonic() + delay
         while time.monotonic() < deadline and os.waitid(os.P_PID, child, WAITED) is None:
             time.sleep(0.002)
-        (os.killpg if everyone else os.kill)(child, kind)  # nothing happens if it has ended
+        (os.killpg if group else os.kill)(child, kind)  # no effect if it has ended
         patience = time.monotonic() + PATIENCE
         while os.waitid(os.P_PID, child, WAITED) is None or at_work(child):
             if time.monotonic() > patience:
-                os.killpg(child, signal.SIGUSR1)  # prints where it hangs
+                os.killpg(child, signal.SIGUSR1)  # prints the stack
                 time.sleep(1.0)
                 os.killpg(child, signal.SIGKILL)
                 os.waitpid(child, 0)
@@ -148,10 +149,10 @@ class Job:
         return code != 0
 
     def kill(self, chance: random.Random) -> bool:
-        """Kill the command once and check its files; return whether the kill met it at work."""
+        """Kill the command once and check its files; return whether it was active."""
         before, kind = finished(self.killed), chance.choice(SIGNALS)
-        everyone = kind == signal.SIGINT or chance.random() < 0.5  # as a terminal does
-        ended = self.disturb(chance.uniform(0.0, self.length), kind, everyone)
+        group = kind == signal.SIGINT or chance.random() < 0.5  # as a terminal does
+        ended = self.disturb(chance.uniform(0.0, self.length), kind, group)
         now, wrong = finished(self.killed), unreadable(self.killed)
         assert before.items() <= now.items(), f"missing or changed: {before} became {now}"
         assert not wrong, "\n".join(wrong)
@@ -162,14 +163,14 @@ class Job:
         return ended
 
     def end(self) -> None:
-        """Check what a completed command left, and begin another one."""
+        """Check the files of a completed command, and start another one."""
         compare(self.whole, self.killed)
         self.completed += 1
         self.seen["completed"] += 1
 
 
 def at_work(group: int) -> bool:
-    """Return whether a process of a group lives; a zombie does not."""
+    """Return whether a process of a group runs; a zombie does not."""
     for path in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
             state, _, own = path.read_text(encoding="utf-8").rpartition(")")[2].split()[:3]
@@ -179,7 +180,7 @@ def at_work(group: int) -> bool:
 
 
 def unreadable(root: Path) -> list[str]:
-    """Return the files of a folder that cannot be read, with the reason."""
+    """Return the unreadable files of a folder, with the error."""
     wrong = []
     for path in root.rglob("*"):
         if path.name.startswith(".") or ".hydra" in path.parts or path.suffix not in READERS:
@@ -188,7 +189,7 @@ def unreadable(root: Path) -> list[str]:
             if path.name == "progress.json" and read_progress(path.parent) is None:
                 raise ResultsError("damaged")
             READERS[path.suffix](path)
-        except (ResultsError, OSError, SyntaxError) as error:  # the last two: of a figure
+        except (ResultsError, OSError, SyntaxError) as error:  # the last two are errors of figures
             wrong.append(f"{path}: {error}")
     return wrong
 
@@ -200,7 +201,7 @@ def finished(root: Path) -> dict[str, str]:
 
 
 def compare(whole: Path, killed: Path) -> None:
-    """Check that two folders hold the same files and their tables the same rows."""
+    """Check that two folders have the same files, and their tables the same rows."""
     names, others = (
         {str(x.relative_to(root)) for x in root.rglob("*") if x.is_file() and x.suffix != ".log"}
         for root in (whole, killed)
@@ -214,7 +215,7 @@ def compare(whole: Path, killed: Path) -> None:
 
 
 def jobs(folder: Path) -> dict[str, Job]:
-    """Return the commands that are killed, each run once to its end."""
+    """Return the commands to kill, each run to its end once."""
     source = load("train", ["data.platoons=4", "data.recordings=2"]).data.made()
     write_parquet(source.load().episodes, folder / "pairs.parquet")
     small = ["experiment=smoke", "scenario.horizon=40", "data=episodes"]
@@ -264,8 +265,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             listed = ", ".join(f"{n} {what} in {name}" for what, name, n in sorted(counts))
             print(f"{done} kills: {listed}; {time.monotonic() - begun:.0f} s", flush=True)
     if done < options.kills:
-        sys.exit(f"too few: {done} of {options.kills} kills met a command at work")
-    print("nothing lost, all readable, rows identical")
+        sys.exit(f"too few: {done} of {options.kills} kills ended an active command")
+    print("all files are present and readable, rows are identical")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Compare energy models with measurements: python tools/measured_energy.py
 
-Prints levels and correlations of the kept runs: fuel on an engine bench and on a chassis
-dynamometer [g], energy of an electric car's battery [kWh], each measured and modelled. This tool
-of commit a07c1fcb made them from the tables of samples.
+Prints levels and correlations of the stored runs: fuel on an engine bench and on a chassis
+dynamometer [g], energy of an electric car's battery [kWh], each measured and modelled. The version
+of commit a07c1fcb wrote the runs from the tables of samples.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ LABELS = {"summer": "summer", "winter": "winter, with the heating"}
 def agreement(rows: pd.DataFrame, model: str) -> tuple[float, float]:
     """Return level and correlation of runs: modelled over measured in total, and r of both per km.
 
-    In totals r would tell how long the runs are. Below three runs it says nothing and is NaN.
+    The r of totals would depend on the lengths of the runs. With fewer than three runs it is NaN.
     """
     level = float(rows[model].sum() / rows["measured"].sum())
     per_km = rows[[model, "measured"]].div(rows["distance_m"], axis=0)
@@ -102,7 +102,7 @@ def lines(table: pd.DataFrame) -> list[str]:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Measure where files are given, print the agreement, and draw."""
+    """Print the agreement, and draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kept", type=Path, default=KEPT, help="table of runs")
     options = parser.parse_args(words)

@@ -1,8 +1,8 @@
 """Write tables and figures of the documentation from outputs/reference: python tools/pages.py
 
-Tables stand in docs/*.md between ``<!-- table: name -->`` and ``<!-- end -->``, figures in
-docs/figures. The commands that the pages name draw the other figures. What is kept in
-outputs/reference was made by the tools of the tag history/2026-11, see its README.
+Tables are in docs/*.md between ``<!-- table: name -->`` and ``<!-- end -->``, figures in
+docs/figures. Commands on the pages draw the other figures. The tools of the tag history/2026-11
+made the results in outputs/reference, see its README.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ from lcc_rl.studies.reproduce import STUDY_RESULTS
 REFERENCE, DOCS = Path("outputs/reference"), Path("docs")
 MARKED = re.compile(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", re.DOTALL)
 TASKS_SHOWN = ("i24-follow5", "i80-follow")
-LIMIT = "limit_"  # begins the columns of kept scores that hold the task's limits
-# Figures of the studies whose rows are kept, on their pages.
+LIMIT = "limit_"  # prefix of the columns of limits in stored scores
+# Figures of the studies with stored rows.
 SHOWN_OF = {
     "alcc": ("learning_curve", "improvement"),
     "hcfs": ("case_1_velocities", "case_1_switching_hcfs"),
@@ -62,7 +62,7 @@ SHOWN = {
     "pi_saturation": "one car: PI with saturation",
     "alcc": "one car: learned",
 }
-KINDS_SHOWN = {  # variant and policy, how it is named, its colour and whether its dots are filled
+KINDS_SHOWN = {  # label, colour and filled dots by variant and policy
     ("alcc", "idm"): ("IDM, tuned by search", "#d55e00", True),
     ("alcc", "idm_gradient"): ("IDM, tuned by gradient", "#cc79a7", True),
     ("own_energy", "network"): ("network, its own energy", "#0072b2", False),
@@ -70,7 +70,7 @@ KINDS_SHOWN = {  # variant and policy, how it is named, its colour and whether i
     ("alcc", "memory"): ("network with memory", "#56b4e9", True),
     ("alcc", "preview"): ("network with preview", "#009e73", True),
 }
-# Sources of what is kept for averaged energies, for readers.
+# Labels of the sources of averaged energies.
 SOURCES = {
     "i80": "I-80",
     "ring": "ring",
@@ -84,7 +84,7 @@ def fill(page: Path, tables: Mapping[str, str]) -> None:
     """Write tables into a Markdown file, between their marks.
 
     Raises:
-        ConfigError: if there is no table of a marked name.
+        ConfigError: if a marked table is missing.
         ResultsError: if the file cannot be written.
     """
 
@@ -99,7 +99,7 @@ def fill(page: Path, tables: Mapping[str, str]) -> None:
 
 
 def study(name: str, reference: Path, docs: Path) -> None:
-    """Write the tables of a study's page, and the figures that it shows."""
+    """Write the tables and figures of a study's page."""
     with TemporaryDirectory() as place:
         kept = shutil.copytree(reference / name, Path(place) / name)
         found = STUDY_RESULTS[name](kept).tables
@@ -129,7 +129,7 @@ def tasks(reference: Path, docs: Path) -> None:
 
 
 def averaged(rows: pd.DataFrame) -> str:
-    """Return a Markdown table: what the network saves by source, longest time gap and rival.
+    """Return a Markdown table of savings by source, longest time gap and baseline.
 
     Args:
         rows: ``source``, ``time_gap`` of the filter [s], ``average_s`` of the leaders [s],
@@ -152,7 +152,7 @@ def averaged(rows: pd.DataFrame) -> str:
 
 
 def learners(reference: Path, docs: Path) -> None:
-    """Write what each learner reaches: a row per task and learner, with the range of its seeds."""
+    """Write the scores of learners: a row per task and learner, with the range of seeds."""
     rows = worded(read_parquet(reference / "learners.parquet"))
     scores = {"score": "mean", "score_low": "min", "score_high": "max"}
     how = {name: ("score", kind) for name, kind in scores.items()}
@@ -163,7 +163,7 @@ def learners(reference: Path, docs: Path) -> None:
 
 
 def task_table(name: str, table: pd.DataFrame) -> str:
-    """Return the Markdown table of a task below its name; the kept scores hold every measure."""
+    """Return the Markdown table of a task below its name."""
     first = {str(key): value for key, value in table.iloc[0].items()}
     kept = {x.removeprefix(LIMIT): float(first[x]) for x in first if x.startswith(LIMIT)}
     given = {"score": first["score_name"], "unit": first["unit"], "against": first["against"]}
@@ -197,7 +197,7 @@ def bounded(measure: Measure, bound: float) -> str:
 
 
 def broken(task: Task, row: Mapping[Hashable, Any]) -> str:
-    """Return the limits that are not kept with their values, or the collisions."""
+    """Return the violated limits with their values, or the collisions."""
     found = [
         f"{one.limited} {measured(one, row[one.key])}"
         for one, bound in task.bounds.items()
@@ -216,7 +216,7 @@ def measured(measure: Measure, value: float) -> str:
 
 
 def figure_of_record() -> Figure:
-    """Draw the speed record that platoons train on, and their test cases."""
+    """Draw the speed record of platoons' training, and the test cases."""
     cfg = load("evaluate", ["variant=cacc"])
     step, used = cfg.scenario.time_step, cfg.leader.settings["training"]["udds"]
     leaders = cfg.leader.made().load(step, cfg.scenario.horizon, len(cfg.scenario.vehicles))
@@ -248,7 +248,7 @@ def figure_of_limits(windows: pd.DataFrame) -> Figure:
 
 
 def figure_of_ring(reference: Path) -> Figure:
-    """Draw every vehicle's way on the ring."""
+    """Draw the trajectories on the ring."""
     cfg = as_plain(load("evaluate", ["task=ring-22"]))
     steps = read_parquet(reference / "tasks" / "ring_steps.parquet").replace({"strategy": SHOWN})
     figure = space_time(steps, list(SHOWN.values()), cfg, every=1)
@@ -257,7 +257,7 @@ def figure_of_ring(reference: Path) -> Figure:
 
 
 def figures(reference: Path, folder: Path) -> list[Path]:
-    """Draw the figures of what is kept; return the files written."""
+    """Draw the figures of stored results; return the written files."""
 
     def kept(name: str) -> pd.DataFrame:
         return read_parquet(reference / f"{name}.parquet")
@@ -271,7 +271,7 @@ def figures(reference: Path, folder: Path) -> list[Path]:
         "ring": lambda: figure_of_ring(reference),
         "twins": lambda: twins_figure(kept("twins")),
     }
-    # The ring has thousands of lines: larger is over a megabyte.
+    # The ring has thousands of lines: a larger figure exceeds a megabyte.
     dots = {"ring": 150}
     return [save(draw(), folder / f"{x}.png", dots.get(x, 200)) for x, draw in drawn.items()]
 

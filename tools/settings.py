@@ -23,15 +23,15 @@ HEAD = """# Settings
 
 <!-- Written by `python tools/settings.py`; do not edit. -->
 
-A node of the configuration names its class by `_target_`; its other keys are the settings below.
+The key `_target_` of a node names its class; the other keys are the settings below.
 `lcc-rl train agent.gamma=0.95 reward.terms.safety.margin=0.5` sets two of them. A run's
-`config.yaml` holds the values of all settings. The files of `conf/` hold what differs from the
+`config.yaml` holds the values of all settings. The files of `conf/` hold values that differ from
 defaults.
 """
 
 
 def classes() -> Iterator[type[Settings]]:
-    """Yield the classes that have settings, room by room, each once."""
+    """Yield the classes with settings in order of packages, each once."""
     for room in ROOMS:
         top = import_module(f"lcc_rl.{room}")
         parts = pkgutil.walk_packages(getattr(top, "__path__", ()), f"{top.__name__}.")
@@ -43,26 +43,26 @@ def classes() -> Iterator[type[Settings]]:
 
 
 def settings(kind: type[Settings]) -> Iterator[tuple[str, str, str, str]]:
-    """Yield name, type, default and meaning of each setting that a class itself declares."""
+    """Yield name, type, default and meaning of each setting declared by a class."""
     lines, _ = inspect.getsourcelines(kind)
     (body,) = ast.parse("".join(lines)).body
     assert isinstance(body, ast.ClassDef)
     for node in body.body:
         if isinstance(node, ast.AnnAssign) and "ClassVar" not in ast.unparse(node.annotation):
             value = "required" if node.value is None else default(kind, node)
-            yield ast.unparse(node.target), ast.unparse(node.annotation), value, said(lines, node)
+            yield ast.unparse(node.target), ast.unparse(node.annotation), value, noted(lines, node)
 
 
 def default(kind: type[Settings], node: ast.AnnAssign) -> str:
-    """Return a default without the words of dataclasses; of a name its value."""
+    """Return a default without ``field(...)``, and the value of a name."""
     if isinstance(node.value, ast.Name | ast.Attribute):
         return repr(defaults(kind)[ast.unparse(node.target)])
     source = ast.unparse(node.value) if node.value else ""
     return re.sub(r"^field\(default_factory=(?:lambda: )?(.*)\)$", r"\1", source)
 
 
-def said(lines: list[str], node: ast.AnnAssign) -> str:
-    """Return the comment of a setting: at its end, or in the lines above it."""
+def noted(lines: list[str], node: ast.AnnAssign) -> str:
+    """Return the comment of a setting, at its end or in the lines above it."""
     behind = lines[(node.end_lineno or node.lineno) - 1].partition("  # ")[2].strip()
     above: list[str] = []
     place = node.lineno - 2
@@ -74,7 +74,7 @@ def said(lines: list[str], node: ast.AnnAssign) -> str:
 
 
 def page() -> str:
-    """Return the page: a section per class that declares settings."""
+    """Return the page, with a section per class that declares settings."""
     parts = [HEAD]
     for kind in classes():
         rows = list(settings(kind))

@@ -1,9 +1,9 @@
-"""Print or check how large the project is: python tools/size.py [--check]; make size, make lint.
+"""Print or check the size of the project: python tools/size.py [--check]; make size, make lint.
 
-Only files that git tracks count. Code is what is left of the lines without docstrings, comments and
-blank lines. Guards are the lines of `raise`, of calls of check_… and require_…, and of functions
-so named. Cases are the tests that pytest collects, marked slow or not. A floor of a package stands
-above those of all packages that it imports; a circle is a group of modules that import each other.
+Only files tracked by git count. Code is lines without docstrings, comments and blank lines. Guards
+are the lines of `raise`, of calls of check_… and require_…, and of functions with these names.
+Cases are the tests that pytest collects, slow ones included. The floor of a package is above those
+of all packages that it imports; a circle is a group of modules that import each other.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ GUARD = re.compile(r"(check|require)_")
 SPACE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
-# Above these make lint fails; what is built next may take the difference to what there is.
+# make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 40_100, "code": 26_150},
+    "lcc_rl + tools": {"lines": 40_300, "code": 26_350},
     "tests": {"lines": 21_500},
     "conf": {"yaml": 147},
 }
-CASES = 1_100  # that a run of all quick tests collects, see tests/tools/test_size.py
+CASES = 1_100  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {"names in several modules": 60, "floors": 10, "circles": 0}
 
 
 def tracked() -> list[str]:
-    """Return the files that git tracks, relative to the root."""
+    """Return the files tracked by git, relative to the root."""
     done = subprocess.run(("git", "ls-files"), cwd=ROOT, capture_output=True, text=True, check=True)
     return [name for name in done.stdout.splitlines() if (ROOT / name).is_file()]
 
@@ -69,7 +69,7 @@ def measured(text: str) -> dict[str, int]:
 
 
 def cases() -> dict[str, int]:
-    """Return how many cases pytest collects in each test module."""
+    """Return the number of cases that pytest collects in each test module."""
     words = (sys.executable, "-m", "pytest", "--collect-only", "-qq", "tests")
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     found = re.findall(r"^(tests/\S+\.py): (\d+)$", done.stdout, re.MULTILINE)
@@ -127,7 +127,7 @@ def module_of(name: str) -> str:
 
 
 def shared_names(trees: dict[str, ast.Module]) -> list[str]:
-    """Return the top-level names that several modules define, private ones and ``log`` left out."""
+    """Return the top-level names that several modules define, except private ones and ``log``."""
     places: dict[str, set[str]] = {}
     for module, tree in trees.items():
         for node in tree.body:
@@ -145,7 +145,7 @@ def shared_names(trees: dict[str, ast.Module]) -> list[str]:
 
 
 def imports(trees: dict[str, ast.Module]) -> dict[str, set[str]]:
-    """Return the modules of the package that each imports, within functions, too."""
+    """Return the modules of the package that each imports, also within functions."""
     found: dict[str, set[str]] = {}
     for module, tree in trees.items():
         names = set()
@@ -170,7 +170,7 @@ def circles(arrows: dict[str, set[str]]) -> list[set[str]]:
 
 
 def floors(arrows: dict[str, set[str]]) -> dict[str, int]:
-    """Return the floor of each package, 1 for those that import none; a circle shares its floor."""
+    """Return the floor of each package, 1 without imports; packages of a circle have one floor."""
     rooms: dict[str, set[str]] = {}
     for module, ends in arrows.items():
         room = ".".join(module.split(".")[:2])
@@ -189,7 +189,7 @@ def floors(arrows: dict[str, set[str]]) -> dict[str, int]:
 
 
 def structure(names: Iterable[str]) -> dict[str, int]:
-    """Return how often names repeat, how high the package is, and its circles."""
+    """Return the numbers of shared names, floors and circles."""
     files = [x for x in names if x.startswith("lcc_rl/") and x.endswith(".py")]
     trees = {module_of(x): ast.parse((ROOT / x).read_text(encoding="utf-8")) for x in files}
     arrows = imports(trees)

@@ -1,4 +1,4 @@
-"""Agents: one learning algorithm a file, each with the loop that trains it."""
+"""Agents: learning algorithms and their training loops, one file each."""
 
 from lcc_rl.agents.actor import GaussianExploration, make_actor, seeded_mlp
 from lcc_rl.agents.agent import Agent, Scene, anneal, derived_seed

@@ -1,4 +1,4 @@
-"""The learned policy: a deterministic network, and the noise that explores around it."""
+"""The policy network and its exploration noise."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def seeded_mlp(
     seed: int,
     activation: Activation = "relu",
 ) -> MLP:
-    """Build a network whose initial weights depend on ``seed`` alone.
+    """Build a network with initial weights that depend on ``seed`` only.
 
     Args:
-        inputs: entries read.
-        outputs: entries written.
-        hidden: sizes of the layers between; none for a linear map.
+        inputs: number of inputs.
+        outputs: number of outputs.
+        hidden: sizes of the hidden layers; none for a linear map.
         seed: seed of the weights.
-        activation: between the layers.
+        activation: activation between the layers.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -53,9 +53,9 @@ def make_actor(
     seed: int,
     activation: Activation = "relu",
 ) -> TensorDictModule:
-    """Build the policy network, which ends in a tanh, so that actions lie in [−1, 1].
+    """Build the policy network; a final tanh keeps actions in [−1, 1].
 
-    Reads ``"observation"`` ``[*batch, observation_size]``, writes ``"action"``
+    It reads ``"observation"`` ``[*batch, observation_size]`` and writes ``"action"``
     ``[*batch, action_size]``.
     """
     layers = seeded_mlp(observation_size, action_size, hidden, seed, activation)
@@ -64,10 +64,10 @@ def make_actor(
 
 
 def shared_policy(policy: TensorDictModule) -> TensorDictModule:
-    """Return a policy that drives every automated vehicle of a string by the same network.
+    """Return a policy that applies one network to every automated vehicle of a string.
 
-    Reads ``("automated", "observation")`` ``[*batch, A, n]`` and writes ``("automated",
-    "action")`` ``[*batch, A, 1]``; the weights are those of the policy given.
+    It reads ``("automated", "observation")`` ``[*batch, A, n]`` and writes ``("automated",
+    "action")`` ``[*batch, A, 1]``; it shares the weights of the given policy.
 
     Args:
         policy: a network that reads ``"observation"`` and writes ``"action"``.
@@ -76,7 +76,7 @@ def shared_policy(policy: TensorDictModule) -> TensorDictModule:
 
 
 class GaussianExploration(TensorDictModuleBase):
-    """Adds N(0, sigma²) to actions and holds them within [−1, 1].
+    """Adds N(0, sigma²) to actions and clamps them to [−1, 1].
 
     The noise is a function of the episode's seed and step, so exploration needs no random state.
 
@@ -107,7 +107,7 @@ def action_noise(like: Tensor, tensordict: TensorDictBase, stream: int) -> Tenso
     Args:
         like: the action, ``[*batch, …, n]``.
         tensordict: holds seed and step, ``[*batch, 1]``.
-        stream: the stream of the first entry; the others take those that follow.
+        stream: the stream of the first entry; further entries use the next ones.
     """
     seed, step = (tensordict.get(key) for key in (SEED, STEP))
     event = like.shape[seed.ndim - 1 :]

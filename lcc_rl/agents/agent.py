@@ -1,4 +1,4 @@
-"""What every agent is: settings that start a learner in a scene."""
+"""Base of agents: settings of a learning algorithm and its state."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from lcc_rl.pieces.world import World
 from lcc_rl.settings import Settings, values
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
-Schedule = Literal["cosine", "linear"]  # how learning rates fall
+Schedule = Literal["cosine", "linear"]  # shape of the learning rates
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The scene in which an agent learns.
+    """Context in which an agent learns.
 
     Args:
         observation_size: entries of the observation of one automated vehicle.
-        seed: seed of the initial weights and of what is drawn in an update.
-        device: where the networks live.
-        world: what the pieces of the environment share.
-        observation: what the policy sees, for policies that are rules.
-        max_acceleration: acceleration of action 1 [m/s²], for rules; None where the controller of
+        seed: seed of the initial weights and of the random numbers of updates.
+        device: device of the networks.
+        world: see :class:`lcc_rl.pieces.world.World`.
+        observation: the observation, for policies that are rules.
+        max_acceleration: acceleration of action 1 [m/s²], for rules; None if the controller of
             automated vehicles has no such setting.
     """
 
@@ -44,14 +44,14 @@ class Scene:
 
 
 class Agent(Settings, ABC):
-    """Settings of a learning algorithm; ``setup`` makes its ``policy``.
+    """Settings of a learning algorithm; ``setup`` builds its ``policy``.
 
     ``policy`` reads ``"observation"`` and writes ``"action"``; ``loop`` trains it.
     """
 
     loop: ClassVar[Any]  # a class, see lcc_rl.agents.loop.TrainingLoop
 
-    if TYPE_CHECKING:  # what setup makes
+    if TYPE_CHECKING:  # set by setup
 
         def __getattr__(self, name: str) -> Any: ...
 
@@ -64,15 +64,15 @@ class Agent(Settings, ABC):
 
     @abstractmethod
     def setup(self, scene: Scene) -> None:
-        """Make ``policy`` and what else a training needs."""
+        """Build ``policy`` and everything else that a training needs."""
 
     def take(self, profiles: Profiles) -> None:
-        """Take what depends on the records to learn behind: nothing, unless overridden."""
+        """Read the training records, if overridden; by default nothing depends on them."""
 
     def anneal(self, share: float) -> float:
         """Set the learning rates after this share of the training; return the policy's.
 
-        Unless overridden they stay as they are.
+        By default they are constant.
         """
         rates = (x.param_groups[0]["lr"] for x in self._parts().values() if hasattr(x, "step"))
         return float(next(rates, 0.0))
@@ -80,13 +80,13 @@ class Agent(Settings, ABC):
     def state_dict(self) -> dict[str, Any]:
         """Return everything that :meth:`load_state_dict` needs to resume bit for bit.
 
-        Unless overridden that is the state of every attribute that has one, such as networks and
-        optimizers; random numbers come from :func:`derived_seed` and need no state.
+        By default this is the state of every attribute that has one, such as networks and
+        optimizers. Random numbers are derived by :func:`derived_seed` and need no state.
         """
         return {name: part.state_dict() for name, part in self._parts().items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
+        """Restore the result of :meth:`state_dict`."""
         for name, part in self._parts().items():
             part.load_state_dict(state[name])
 
@@ -95,7 +95,7 @@ class Agent(Settings, ABC):
 
 
 def derived_seed(*parts: object) -> int:
-    """Return a seed that depends on all parts; distinct purposes get independent streams."""
+    """Return a seed that depends on all parts; different parts give independent streams."""
     digest = hashlib.sha256("/".join(map(str, parts)).encode()).digest()
     return int.from_bytes(digest[:4], "big") >> 1
 
@@ -106,13 +106,13 @@ def anneal(
     final_lr_fraction: float,
     schedule: Schedule = "cosine",
 ) -> float:
-    """Let learning rates fall from what they are made with to a share of it.
+    """Set learning rates that fall from their initial value to a fraction of it.
 
     Args:
-        optimizers: whose rates to set.
-        share: how much of the training is over.
-        final_lr_fraction: of the rate at the start, at the end; 1 for a constant rate.
-        schedule: along half a cosine, or a line.
+        optimizers: the optimizers.
+        share: share of the training that is over.
+        final_lr_fraction: final rate as a fraction of the initial one; 1: constant.
+        schedule: half a cosine, or a line.
 
     Returns:
         The first rate.

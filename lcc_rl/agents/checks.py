@@ -1,4 +1,4 @@
-"""Checks during a training: what is learned from and what was learned are finite numbers."""
+"""Checks during a training that transitions, losses and weights are finite."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from lcc_rl.errors import Diverged, require
-from lcc_rl.functional.finite import lost_weight, require_finite
+from lcc_rl.functional.finite import nonfinite_weight, require_finite
 from lcc_rl.pieces.base import ACTION, NEXT, as_key, root_key
 
 
 def check_state(policy: TensorDictModule, state: Mapping[str, Any]) -> None:
-    """Check that the state of an agent, by which a training resumes, holds the policy's weights."""
+    """Check that the state of an agent contains the policy's weights."""
     held = list(_tensors(state))
     for name, weight in policy.state_dict().items():
         same = any(x.shape == weight.shape and torch.equal(x, weight) for x in held)
@@ -36,40 +36,40 @@ def _tensors(state: Any) -> Iterator[Tensor]:
 def check_learner(
     policy: TensorDictModule, values: Mapping[str, float | Tensor], advice: str
 ) -> None:
-    """Check that the results of an update and the policy's weights are numbers.
+    """Check that the results of an update and the policy's weights are finite.
 
     Args:
-        policy: what was learned.
+        policy: the policy.
         values: losses and other results by name.
-        advice: what to do where they are not.
+        advice: the remedy in the message.
 
     Raises:
-        Diverged: naming the first that is not.
+        Diverged: naming the first value that is not.
     """
     for name, value in values.items():
         words = "learn returns numbers by name, anneal the policy's learning rate"
         require(isinstance(value, (SupportsFloat, Tensor)), f"{name} is {value!r}; {words}")
         if not math.isfinite(value):
             raise Diverged(f"{name} became {float(value)}", advice)
-    found = lost_weight(policy.state_dict())
+    found = nonfinite_weight(policy.state_dict())
     if found is not None:
-        raise Diverged(f"the policy's weight {found} became no number", advice)
+        raise Diverged(f"the policy's weight {found} is not finite", advice)
 
 
-def check_batch(batch: TensorDictBase, begun: int = 0, who: str = "") -> None:
-    """Check that transitions are numbers, before anything is learned from them.
+def check_batch(batch: TensorDictBase, begun: int = 0, label: str = "") -> None:
+    """Check that transitions are finite, before an update uses them.
 
     Args:
         batch: ``[environments, steps]``.
         begun: steps played before the batch.
-        who: what the message calls the policy.
+        label: name of the policy in the message.
 
     Raises:
-        Diverged: naming the first entry that is not a number, its step and its episode.
+        Diverged: naming the first entry that is not finite, its step and its episode.
     """
     known = {as_key(key): value.detach() for key, value in batch.items(True, True)}
-    # The state before a step is the one that the previous step reached.
+    # The state before a step is the result of the previous step.
     keys = [ACTION, *(key for key in known if key[0] == NEXT and root_key(key) != ACTION)]
     entries = {root_key(key): known[key].transpose(0, 1) for key in keys if key in known}
     running = torch.ones((*batch.shape[1::-1], 1), dtype=torch.bool, device=batch.device)
-    require_finite(entries, running, begun + 1, who)
+    require_finite(entries, running, begun + 1, label)

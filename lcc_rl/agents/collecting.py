@@ -1,4 +1,4 @@
-"""The loop of agents that learn from what a collector plays, after every segment of it."""
+"""The loop of agents that learn from a collector's segments."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lcc_rl.envs import StringCollector
 from lcc_rl.errors import require
 from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD
 
-# What is learned from, as the environment names it and as the losses do.
+# Entries of transitions: their keys in the environment and in the losses.
 LEARNED_FROM = {
     OBSERVATION: ("observation",),
     ACTION: ("action",),
@@ -29,16 +29,15 @@ LEARNED_FROM = {
     ("next", "terminated"): ("next", "terminated"),
 }
 
-# Steps of an environment from which on compiling it, which takes 5 to 10 s, pays for itself.
+# Steps of a training from which compiling the environment, 5 to 10 s, pays off.
 COMPILED_TRAINING_STEPS = 40_000
 
 
 class CollectingLoop(TrainingLoop[AgentT]):
     """Plays batches of episodes by the agent's policy and its exploration, ``agent.noise``.
 
-    The noise is a module that changes ``("automated", "action")``; None for none.
-
-    A subclass says what is learned from a segment; arguments as of :class:`TrainingLoop`.
+    The noise is a module that changes ``("automated", "action")``, or None. A subclass defines
+    :meth:`learn`; arguments as for :class:`TrainingLoop`.
     """
 
     def _prepare(self) -> None:
@@ -54,8 +53,8 @@ class CollectingLoop(TrainingLoop[AgentT]):
         """Learn from a segment; return the means of the losses, ``loss_value`` among them.
 
         Args:
-            batch: transitions, ``[environments, steps]``, by the keys of :data:`LEARNED_FROM`.
-            before: transitions of the segments before it, those of all vehicles.
+            batch: transitions, ``[environments, steps]``, with the keys of :data:`LEARNED_FROM`.
+            before: number of transitions of earlier segments, over all vehicles.
         """
 
     def explore(self, share: float) -> float:
@@ -79,16 +78,16 @@ class CollectingLoop(TrainingLoop[AgentT]):
         )
 
     def _compiled(self) -> bool:
-        """Whether to compile the environment: if left open, where the whole training pays for it.
+        """Whether to compile the environment; by default if the whole training pays for it.
 
-        The whole, not what remains, so that a resumed training computes what it would have.
+        The whole training counts, so that a resumed one computes the same.
         """
         if self.settings.compiled is not None:
             return self.settings.compiled
         return self.iterations * self.horizon >= COMPILED_TRAINING_STEPS
 
     def _iterate(self, collector: BaseCollector) -> dict[str, float]:
-        """Play one batch of episodes, learning after every segment of them."""
+        """Play one batch of episodes and learn after every segment."""
         share, steps = self.iteration / self.iterations, self.settings.segment
         sigma, rate = self.explore(share), self.agent.anneal(share)
         self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
@@ -117,10 +116,10 @@ class CollectingLoop(TrainingLoop[AgentT]):
 
 
 def transitions(batch: TensorDictBase) -> TensorDictBase:
-    """Return what is learned from a batch ``[environments, steps]``, one transition a row.
+    """Return the transitions of a batch ``[environments, steps]``, one per row.
 
-    Every automated vehicle's is a transition of its own, ``[environments × steps × A]``; all of
-    them end when the episode does.
+    Every automated vehicle has its own transitions, ``[environments × steps × A]``; all of them end
+    with the episode.
     """
     shape = batch.get(("next", *REWARD)).shape[:-1]
     rows = TensorDict(batch_size=[shape.numel()], device=batch.device)

@@ -1,4 +1,4 @@
-"""A controller as a policy: what a rule would command, as actions."""
+"""A controller as a policy."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from lcc_rl.pieces.world import MAX_ACCELERATION
 class ControllerPolicy(TensorDictModuleBase):
     """A controller as a policy: writes its command as the action.
 
-    Writes ``("automated", "action")``, ``[*batch, A, 1]``: the command over the acceleration of
-    action 1, held within [−1, 1].
+    The action, ``("automated", "action")``, ``[*batch, A, 1]``, is the command divided by the
+    acceleration of action 1, clamped to [−1, 1].
 
     Args:
-        controller: a controller of the automated vehicles that remembers nothing.
+        controller: a controller of the automated vehicles without memory.
         max_acceleration: acceleration of action 1 in the environment [m/s²].
 
     Raises:
-        ConfigError: if the controller keeps entries of its own from step to step.
+        ConfigError: if the controller has a memory.
     """
 
     def __init__(self, controller: Controller, max_acceleration: float = MAX_ACCELERATION) -> None:
         require_positive("policy.max_acceleration", max_acceleration)
         if len(controller.targets) > 1 or any(key[0] == NEXT for key in controller.in_keys):
             raise ConfigError(
-                f"{type(controller).__name__} remembers entries of its own, which only an "
-                "environment carries; let it drive by scenario.controllers.automated instead"
+                f"{type(controller).__name__} remembers entries, which only an environment keeps; "
+                "use it as scenario.controllers.automated"
             )
         self.in_keys = [root_key(key) for key in controller.in_keys]
         self.out_keys = [ACTION]

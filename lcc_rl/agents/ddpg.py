@@ -1,4 +1,4 @@
-"""Deep deterministic policy gradient, on TorchRL's loss (ALCC Table III)."""
+"""Deep deterministic policy gradient with TorchRL's loss (ALCC Table III)."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from lcc_rl.settings import Count
 class DDPG(OffPolicy):
     """Actor, critic, their target networks and one optimizer of both (A7–A9, HCFS H7–H10)."""
 
-    # Updates between two steps of each target network; with tau 1 a step is a copy.
+    # Updates between two steps of each target network; with tau = 1 a step is a copy.
     target_every: dict[Literal["actor", "critic"], Count] = field(
         default_factory=lambda: {"actor": 1, "critic": 1}
     )
-    mask_terminal: bool = True  # no value is expected after a collision; False: one is
+    mask_terminal: bool = True  # value 0 after a collision; False: the critic's value
 
     def setup(self, scene: Scene) -> None:
         super().setup(scene)
@@ -47,15 +47,14 @@ class DDPG(OffPolicy):
     def _by_loss(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Write the gradient by TorchRL's loss; return the losses."""
         losses = self.loss(batch)
-        # Only these two: the other entries of TorchRL's result are not losses, and one of them
-        # still carries a gradient.
+        # Only these two are losses; another entry of TorchRL's result has a gradient, too.
         actor, value = losses["loss_actor"], losses["loss_value"]
         self._differentiate(actor + value + self._penalty(batch))
         return actor.detach(), value.detach()
 
     @torch.no_grad()
     def _by_hand(self, batch: TensorDictBase, networks: ActorCritic) -> tuple[Tensor, Tensor]:
-        """Write the gradient out (A8–A9, H7–H8); the actor follows the critic before its step."""
+        """Compute the gradient explicitly (A8–A9, H7–H8); the actor uses the old critic."""
         space = networks.space(len(batch))
         seen, after = batch.get("observation"), batch.get("next")
         reached = after.get("observation")
@@ -67,7 +66,7 @@ class DDPG(OffPolicy):
         action = raw.tanh()
         space.data.place(seen, batch.get("action"))
         space.own.place(seen, action)
-        networks.judge(space.both)
+        networks.evaluate(space.both)
         loss_actor = -space.own.values[0].mean()
         loss_value = networks.critic_step(space.data, wanted)
         networks.actor_step(seen, space, raw, action)

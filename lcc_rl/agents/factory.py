@@ -1,4 +1,4 @@
-"""From a configuration to an agent and the loop that trains it."""
+"""Builds agents and training loops from configurations."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lcc_rl.pieces.controllers import Population
 
 
 def learns(cfg: StudyConfig) -> bool:
-    """Whether anything is learned: the configuration has an agent."""
+    """Whether the configuration has an agent."""
     return cfg.agent is not None
 
 
@@ -30,10 +30,10 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
     """Build the agent of a configuration.
 
     Raises:
-        ConfigError: naming the option at fault; if there is none.
+        ConfigError: if there is no agent, or naming the option at fault.
     """
     if not learns(cfg):
-        raise ConfigError(f"variant {cfg.variant} learns nothing: it has no agent")
+        raise ConfigError(f"variant {cfg.variant} has no agent")
     world = world_of(cfg, population=population)
     observation = cfg.observation.made(Observation).bind(world)
     driver = cfg.scenario.controllers.get(AUTOMATED)
@@ -70,10 +70,10 @@ def make_trainer(
 
 
 def check_lengths(cfg: StudyConfig) -> None:
-    """Check that the length of a training and those of its parts go together.
+    """Check that the lengths of a training and of its parts are consistent.
 
     Raises:
-        ConfigError: naming the two that do not.
+        ConfigError: naming two that are not.
     """
     settings, horizon = cfg.training, cfg.scenario.horizon
     require(

@@ -1,8 +1,8 @@
-"""Updates with their gradient written out: the numbers of TorchRL's losses, in less time.
+"""Updates with explicit gradients: the results of TorchRL's losses in less time.
 
-For networks this small, most of an update by automatic differentiation is bookkeeping. Here the
-backward pass writes straight into the gradients, and what is computed on the way is written into
-tensors that are made once for a size of the batch. DDPG, TD3 and SAC share these parts.
+For small networks, most of an update by automatic differentiation is overhead. Here the backward
+pass writes into the gradients, and intermediate results into tensors that are allocated once per
+batch size. DDPG, TD3 and SAC share these parts.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-Layers = list[tuple[Tensor, Tensor, Tensor]]  # weights, the same transposed, biases
+Layers = list[tuple[Tensor, Tensor, Tensor]]  # weights, transposed weights, biases
 
 
 def layers(tensors: Sequence[Tensor]) -> Layers:
@@ -25,11 +25,11 @@ def layers(tensors: Sequence[Tensor]) -> Layers:
 
 
 class Network:
-    """A ReLU network whose backward pass writes into the gradients of its weights.
+    """A ReLU network with a backward pass that writes into the gradients of its weights.
 
     Args:
         tensors: weights and biases in order, with their gradients if the network learns.
-        number: which one, if the tensors hold those of several networks, ``[networks, …]``.
+        number: index of the network, if the tensors hold several, ``[networks, …]``.
     """
 
     def __init__(self, tensors: Sequence[Tensor], number: int | None = None) -> None:
@@ -39,7 +39,7 @@ class Network:
         self.rooms: dict[int, tuple[list[Tensor], list[Tensor]]] = {}
 
     def room(self, rows: int) -> tuple[list[Tensor], list[Tensor]]:
-        """Return tensors for what every layer returns and for the derivatives by it."""
+        """Return tensors for the output of every layer and for the derivatives by it."""
         if rows not in self.rooms:
             weights = [weight for weight, _, _ in self.layers]
             outputs, slopes = ([w.new_empty(rows, len(w)) for w in weights] for _ in range(2))
@@ -60,9 +60,9 @@ class Network:
         """Propagate the slope of a loss from the output to the first layer's.
 
         Args:
-            x: what the network was applied to, ``[batch, inputs]``.
+            x: input of the network, ``[batch, inputs]``.
             slope: derivative by the output, ``[batch, outputs]``.
-            outputs: where :meth:`forward` wrote; None: the network's own tensors.
+            outputs: the outputs that :meth:`forward` wrote; None: the network's own tensors.
             learn: write the derivatives by weights and biases.
 
         Returns:
@@ -76,48 +76,48 @@ class Network:
                 torch.mm(slope.t(), x, out=self.slopes[place][0])
                 torch.sum(slope, 0, out=self.slopes[place][2])
             if place:
-                # ReLU passes the slope where its output, the next layer's input, is positive.
+                # ReLU passes the slope where its output is positive.
                 below = torch.mm(slope, self.layers[place][0], out=spare[place - 1])
                 slope = torch.ops.aten.threshold_backward.grad_input(below, x, 0, grad_input=below)
         return slope
 
 
 class CriticBatch(NamedTuple):
-    """Observations and actions side by side, and what each layer of each critic returns."""
+    """Concatenated observations and actions, and the outputs of each layer of each critic."""
 
     input: Tensor
     outputs: list[list[Tensor]]
 
     def place(self, observation: Tensor, action: Tensor) -> CriticBatch:
-        """Write what is to be judged."""
+        """Write observation and action."""
         torch.cat([observation, action], -1, out=self.input)
         return self
 
     @property
     def values(self) -> list[Tensor]:
-        """Each critic's, ``[batch, 1]``."""
+        """The values of each critic, ``[batch, 1]``."""
         return [output[-1] for output in self.outputs]
 
 
 class Workspace(NamedTuple):
-    """Actions that the critics evaluate: those of the data and, below them, those of the actor."""
+    """Actions for the critics: those of the data, followed by those of the actor."""
 
     both: CriticBatch
     data: CriticBatch
     own: CriticBatch
-    slope: Tensor  # of the mean value of the actor's actions, negated
+    slope: Tensor  # slope of the negative mean value of the actor's actions
 
 
 class ActorCritic:
-    """An actor and its Q networks, with the steps that make up an update (A8–A9, H7–H8).
+    """An actor and its Q networks, with the parts of an update (A8–A9, H7–H8).
 
     Args:
         networks: weights and biases of ``"actor"``, a ReLU network before a tanh, and ``"value"``,
-            the Q networks, which read observation and action side by side.
-        targets: the same of the target networks; without an actor, the actor is its own target.
+            the Q networks, which read observation and action.
+        targets: likewise for the target networks; without an actor, the actor is its own target.
         critics: number of Q networks.
         gamma: discount.
-        saturation: weight of the penalty on the actor's square output before the tanh.
+        saturation: weight of the penalty on the actor's squared output before the tanh.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class ActorCritic:
         self.spaces: dict[int, Workspace] = {}
 
     def space(self, rows: int) -> Workspace:
-        """Return the tensors for a size of the batch."""
+        """Return the tensors for a batch size."""
         if rows not in self.spaces:
             first = self.critics[0].layers[0][0]
             outputs = [critic.room(2 * rows)[0] for critic in self.critics]
@@ -157,18 +157,18 @@ class ActorCritic:
         return reduce(torch.minimum, [critic.forward(into.input, out) for critic, out in pairs])
 
     def wanted(self, after: TensorDictBase, future: Tensor) -> Tensor:
-        """Return what the critics are to answer, ``[batch, 1]``."""
-        # A time limit is no end of the world: only a collision stops the sum of rewards.
+        """Return the TD target, ``[batch, 1]``."""
+        # Only a collision ends the sum of rewards; a truncated episode would continue.
         future = future.masked_fill(after.get("terminated"), 0.0)
         return future.mul_(self.gamma).add_(after.get("reward"))
 
-    def judge(self, what: CriticBatch, count: int | None = None) -> list[Tensor]:
-        """Return the values by the first critics, all unless a count is given."""
+    def evaluate(self, what: CriticBatch, count: int | None = None) -> list[Tensor]:
+        """Return the values by the first ``count`` critics, by default by all."""
         pairs = zip(self.critics[:count], what.outputs, strict=False)
         return [critic.forward(what.input, out) for critic, out in pairs]
 
     def critic_step(self, data: CriticBatch, wanted: Tensor) -> Tensor:
-        """Write the gradient of the critics' loss, their mean square errors; return the loss."""
+        """Write the gradient of the critics' mean squared errors; return the loss."""
         errors = [value.sub_(wanted) for value in data.values]
         loss = reduce(torch.add, [error.square().mean() for error in errors])
         for critic, error, outputs in zip(self.critics, errors, data.outputs, strict=True):
@@ -189,10 +189,10 @@ class ActorCritic:
         """Write the gradient of the deterministic actor's loss: value by one critic, and penalty.
 
         Args:
-            observation: what the actor read, ``[batch, …]``.
-            space: whose ``own`` actions are judged by the first critic.
+            observation: input of the actor, ``[batch, …]``.
+            space: its ``own`` actions have been evaluated by the first critic.
             raw: the actor's output before the tanh, ``[batch, actions]``.
-            action: its tanh; is overwritten.
+            action: tanh of ``raw``; it is overwritten.
         """
         slope = self.through_critics(space.own, [space.slope], action.shape[-1])
         slope.mul_(action.square_().neg_().add_(1.0))

@@ -1,4 +1,4 @@
-"""The loop of the analytic agent: play a batch of episodes with its gradient, and learn from it."""
+"""The loop of the analytic agent, which plays episodes with their gradient."""
 
 from __future__ import annotations
 
@@ -22,15 +22,14 @@ from lcc_rl.pieces.rewards import RewardTerm
 
 log = logging.getLogger("lcc_rl")
 
-# Iterations from which on compiling the simulator pays for itself.
+# Iterations from which compiling the simulator pays off.
 COMPILED_ITERATIONS = 100
 
 
 class GradientLoop(TrainingLoop[Any]):
-    """Trains by the simulator's gradient; arguments as of :class:`TrainingLoop`.
+    """Trains by the simulator's gradient; arguments as for :class:`TrainingLoop`.
 
-    A segment of the settings is the stretch through which gradients flow; the whole episode where
-    it is as long as the horizon.
+    Gradients flow through one segment, which may be the whole episode.
     """
 
     advice = "Lower agent.learning_rate, agent.value_lr or agent.clip_norm"
@@ -54,18 +53,19 @@ class GradientLoop(TrainingLoop[Any]):
         if compiled is None:
             compiled = self.settings.compiled
         if compiled is None:
-            # Of the whole: resuming changes nothing.
+            # Of the whole training, so that resuming changes nothing.
             compiled = self.iterations >= COMPILED_ITERATIONS
         known = set(map(as_key, self.env.full_observation_spec.keys(True, True)))
         return DifferentiableRollout(
             self.env,
+            self.agent.policy.module,
             wanted=self.objective.wanted(known),
             observed=[REWARD, *(term.targets[0] for term in self.terms)],
             compiled=compiled,
         )
 
     def _limits_row(self, shares: Mapping[str, float]) -> dict[str, float]:
-        """Return the columns of the limits: how often each was missed, and at which price."""
+        """Return the columns of the limits: share missed and price."""
         price, largest = self.objective.limits.price, self.objective.limits.largest
         return {
             **{f"limit_{name}": largest[name] for name in shares},
@@ -74,7 +74,7 @@ class GradientLoop(TrainingLoop[Any]):
         }
 
     def _iterate(self, source: DifferentiableRollout) -> dict[str, float]:
-        """Play one batch of episodes, with a gradient step after every segment of them."""
+        """Play one batch of episodes with a gradient step after every segment."""
         rate = self.agent.anneal(self.iteration / self.iterations)
         self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
         state = source.skip(source.start(), self.agent.burn_in)
@@ -83,7 +83,7 @@ class GradientLoop(TrainingLoop[Any]):
         missed: list[dict[str, float]] = []
         for _ in range(self.horizon // self.settings.segment):
             begun = time.perf_counter()
-            state, record = source.play(state, self.agent.policy.module, self.settings.segment)
+            state, record = source.play(state, self.settings.segment)
             data = source.assemble(record)
             check_batch(data)
             collected = time.perf_counter()
@@ -102,7 +102,7 @@ class GradientLoop(TrainingLoop[Any]):
         return self._record(played, losses, spent, count, {"learning_rate": rate}, limits)
 
     def _learn(self, data: TensorDictBase, running: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Take a gradient step on a segment; return which episodes go on after each step."""
+        """Take a gradient step on a segment; return which episodes continue, and the results."""
         crashed = data["next", "terminated"].cumsum(1) > 0
         after = running * ~crashed
         before = torch.cat([running, after[:, :-1]], 1)

@@ -1,10 +1,9 @@
-"""Limits of a training: prices rise until the limits hold, and no further.
+"""Limits of a training: their prices rise until the limits hold.
 
-A limit is a share of the time that must not be exceeded. Its smooth surrogate, which has a
-gradient, is priced by a multiplier; the multiplier follows the share that is really missed (a proxy
-Lagrangian: Cotter, Jiang and Sridharan, "Two-player games for efficient non-convex constrained
-optimization", ALT 2019). If something else keeps the limit, such as a safety filter, its price
-falls towards zero.
+A limit is a largest share of the time. A multiplier prices its smooth surrogate, which has a
+gradient; the multiplier follows the true share (a proxy Lagrangian: Cotter, Jiang and Sridharan,
+"Two-player games for efficient non-convex constrained optimization", ALT 2019). If a safety filter
+keeps the limit, its price falls towards zero.
 """
 
 from __future__ import annotations
@@ -22,20 +21,20 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError
 
 log = logging.getLogger("lcc_rl")
-LEAST = 1e-3  # a limit of zero is approached as if it were this share
+LEAST = 1e-3  # smaller limits count as this share
 
 
 class Limits:
     """The multipliers of all limits, such as those of the ALCC paper's problem (A5).
 
     Args:
-        largest: largest share of the time of each limit, by name; ``recorded`` for the share of
-            the drivers recorded behind the leaders, see :meth:`take`.
-        rate: how much the logarithm of a multiplier changes at most per update.
-        known: the names that there are.
+        largest: largest share of the time of each limit, by name; ``recorded``: the share of the
+            recorded drivers, see :meth:`take`.
+        rate: largest change of the logarithm of a multiplier per update.
+        known: the surrogates by name.
 
     Raises:
-        ConfigError: if a name is unknown, or of a term without weight.
+        ConfigError: if a name is unknown, or its surrogate has no limit or no weight.
     """
 
     def __init__(
@@ -50,8 +49,8 @@ class Limits:
                 raise ConfigError(f"agent.limits.{name}: {kind} has no limit to keep")
             if not known[name].weight:
                 raise ConfigError(
-                    f"agent.limits.{name}: agent.surrogates.{name}.weight is 0, which no price "
-                    f"can change; raise it, or use agent.limits.{name}=null"
+                    f"agent.limits.{name}: agent.surrogates.{name}.weight is 0, so its price has "
+                    f"no effect; raise it, or use agent.limits.{name}=null"
                 )
         self.recorded = {name: known[name] for name, share in given.items() if share == RECORDED}
         self.largest = {name: 0.0 if x == RECORDED else float(x) for name, x in given.items()}
@@ -59,10 +58,10 @@ class Limits:
         self.logarithms = dict.fromkeys(self.largest, 0.0)
 
     def take(self, profiles: Profiles) -> None:
-        """Set the limits that are ``recorded`` to the share that recorded drivers miss.
+        """Set the limits that are ``recorded`` to the share of the recorded drivers.
 
         Args:
-            profiles: speeds of the training leaders, and of the drivers recorded behind them.
+            profiles: speeds of the training leaders and motion of the recorded drivers.
 
         Raises:
             ConfigError: if no driver was recorded.
@@ -81,11 +80,11 @@ class Limits:
             log.info("agent.limits.%s: %.4f of the time, as the recorded drivers", name, share)
 
     def price(self, name: str) -> float:
-        """Return the multiplier of a limit; 1 for what is none."""
+        """Return the multiplier of a limit; 1 for other terms."""
         return math.exp(self.logarithms.get(name, 0.0))
 
     def update(self, shares: Mapping[str, float]) -> None:
-        """Raise the multipliers of limits that are missed, lower those of others.
+        """Raise the multipliers of missed limits and lower the others.
 
         Args:
             shares: share of the time in which each limit was missed.
@@ -101,6 +100,6 @@ class Limits:
         return {"logarithms": torch.tensor(values, dtype=torch.float64)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what :meth:`state_dict` returned."""
+        """Restore the result of :meth:`state_dict`."""
         names = sorted(self.logarithms)
         self.logarithms = dict(zip(names, state["logarithms"].tolist(), strict=True))

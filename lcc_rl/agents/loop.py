@@ -1,8 +1,8 @@
-"""What every training loop does besides learning: record, checkpoint, stop and resume.
+"""Base of training loops: record, checkpoints, stopping and resuming.
 
-Iteration i of a training is a function of the state before it and of (seed, i) alone: every
-generator is seeded anew from these at its start. A checkpoint therefore holds tensors and a
-counter, and a resumed training equals one that never stopped, bit for bit.
+Iteration i of a training is a function of the state before it and of (seed, i): every generator is
+seeded from these at its start. A checkpoint therefore contains tensors and a counter, and a resumed
+training equals an uninterrupted one bit for bit.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from lcc_rl.runs.checkpoints import Checkpoint
 from lcc_rl.runs.interrupts import stop_signal
 from lcc_rl.runs.progress import ProgressReporter
 
-# What the record of an iteration is made from.
+# Entries from which the record of an iteration is computed.
 REPORTED = tuple(("next", *key) for key in (REWARD, TERMS, ("done",), ("terminated",)))
 
 
@@ -43,15 +43,15 @@ class TrainingLoop(ABC, Generic[AgentT]):
     """Runs iterations to the end and keeps their record; a subclass defines the iteration.
 
     Args:
-        agent: what learns.
-        env: the training environment, ``[environments]`` episodes side by side.
-        settings: length and bookkeeping.
-        seed: seed of everything random.
-        folder: where training.parquet, timing.parquet, checkpoint.pt and progress.json go.
-        identity: hash of the configuration; a checkpoint of another one is refused.
+        agent: the agent.
+        env: the training environment, ``[environments]`` parallel episodes.
+        settings: settings ``training``.
+        seed: seed of all random numbers.
+        folder: folder of training.parquet, timing.parquet, checkpoint.pt and progress.json.
+        identity: hash of the configuration; a checkpoint with another hash is refused.
     """
 
-    advice: ClassVar[str] = "Lower its learning rate"  # what to do when the training diverges
+    advice: ClassVar[str] = "Lower its learning rate"  # remedy if the training diverges
     watched: ClassVar[str] = "loss_value"  # the entry of the record shown as the loss
 
     def __init__(
@@ -70,21 +70,21 @@ class TrainingLoop(ABC, Generic[AgentT]):
         self.iterations = settings.episodes // settings.environments
         self.iteration, self.updates = 0, 0
         self.rows: list[dict[str, float]] = []
-        # Score, iteration and weights of the best policy, where a subclass keeps one.
+        # Score, iteration and weights of the best policy, if a subclass keeps one.
         self.best: dict[str, Any] | None = None
         self.times: list[dict[str, float]] = []
-        # Told every row (lcc_rl.runs.loggers), and every iteration whose policy is to be kept.
+        # Called with every row (lcc_rl.runs.loggers), and with iterations whose policy is kept.
         self.on_row: Callable[[dict[str, float]], None] = lambda row: None
         self.on_keep: Callable[[int], None] = lambda iteration: None
         check_state(agent.policy, agent.state_dict())
         self._prepare()
 
     def _prepare(self) -> None:
-        """Make what a subclass needs besides; called once the rest is known."""
+        """Build further parts of a subclass; called at the end of the constructor."""
 
     @abstractmethod
     def _source(self) -> Any:
-        """Return what :meth:`_iterate` plays episodes with; made once per run."""
+        """Return the argument of :meth:`_iterate`; built once per run."""
 
     @abstractmethod
     def _iterate(self, source: Any) -> dict[str, float]:
@@ -94,8 +94,8 @@ class TrainingLoop(ABC, Generic[AgentT]):
         """Train to the end and return the record, one row per iteration.
 
         Raises:
-            Interrupted: on SIGINT or SIGTERM, after the iteration at hand is saved.
-            Diverged: if a loss, a weight, or anything learned from is not a finite number.
+            Interrupted: on SIGINT or SIGTERM, after the present iteration is saved.
+            Diverged: if a loss, a weight or an entry of transitions is not finite.
         """
         title = f"train {self.folder.name}"
         progress = ProgressReporter(
@@ -123,7 +123,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
         return pd.DataFrame(self.rows)
 
     def _numbers(self, source: Any) -> dict[str, float]:
-        """Do an iteration; an error names it, and where the last good state is."""
+        """Run an iteration; an error names it and the file of the last valid state."""
         good = self.folder / "checkpoint.pt"
         where = f"in iteration {self.iteration + 1} of {self.iterations}"
         try:
@@ -147,9 +147,9 @@ class TrainingLoop(ABC, Generic[AgentT]):
 
         Args:
             played: the entries :data:`REPORTED` of each segment, ``[environments, steps]``.
-            losses: of each segment; their means are recorded.
-            spent: time in which episodes were played, and in which was learned [s].
-            transitions: of the iteration.
+            losses: losses of each segment; their means are recorded.
+            spent: time of playing episodes and time of learning [s].
+            transitions: number of transitions of the iteration.
             begin, end: further columns, before and after those of episodes and losses.
 
         Raises:
@@ -175,11 +175,11 @@ class TrainingLoop(ABC, Generic[AgentT]):
     # -- state ---------------------------------------------------------------------------------
 
     def _memory(self) -> dict[str, Any]:
-        """Return what a checkpoint holds besides the agent and the record."""
+        """Return further parts of a checkpoint besides the agent and the record."""
         return {}
 
     def _remember(self, memory: dict[str, Any]) -> None:
-        """Restore what :meth:`_memory` returned."""
+        """Restore the result of :meth:`_memory`."""
         assert not memory, "a loop that keeps a memory restores it"
 
     def save(self) -> None:
@@ -202,7 +202,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
         write_parquet(times, self.folder / "timing.parquet", metadata)
 
     def load(self) -> None:
-        """Go on from checkpoint.pt.
+        """Resume from checkpoint.pt.
 
         Raises:
             ResultsError: if it is missing, damaged or belongs to another configuration.
@@ -220,7 +220,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
             check_like(found.agent, self.agent.state_dict(), "agent")
             self.agent.load_state_dict(found.agent)
             self._remember(found.memory)
-        except Exception as error:  # what a part that does not fit raises is of many kinds
+        except Exception as error:  # parts that do not fit raise many kinds of errors
             raise ResultsError(f"{path}: does not fit this training: {error!r}") from error
         self.iteration, self.updates = found.iteration, found.updates
         self.rows, self.times = _rows(found.rows), _rows(found.times)
@@ -229,11 +229,11 @@ class TrainingLoop(ABC, Generic[AgentT]):
 def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
     """Summarise the first episode of every slot of a batch ``[environments, steps]``.
 
-    A collision ends an episode early; what the collector appends after it belongs to another
-    episode and is left out. All automated vehicles are added up.
+    A collision ends an episode early; the steps after it belong to another episode and are left
+    out. Rewards are summed over automated vehicles.
 
     Returns:
-        Mean sums per episode of the reward and of every term, and the number of collisions.
+        Mean sum per episode of the reward and of every term, and the number of collisions.
     """
     done = batch["next", "done"].squeeze(-1).int()
     alive = (done.cumsum(1) - done == 0).unsqueeze(-1)

@@ -1,4 +1,4 @@
-"""What a training through the simulator maximises: the reward's terms, their surrogates, limits."""
+"""The objective of a training through the simulator: terms, surrogates and limits."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lcc_rl.agents.limits import Limits
 from lcc_rl.errors import ConfigError, Diverged
-from lcc_rl.functional.finite import any_lost
+from lcc_rl.functional.finite import any_nonfinite
 from lcc_rl.pieces.base import Key, next_key
 from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.pieces.world import World
@@ -23,8 +23,8 @@ class Objective:
     Args:
         settings: its ``surrogates``, ``regularizers``, ``limits`` and ``limit_rate``, see
             :class:`lcc_rl.agents.analytic.Analytic`.
-        device: where the terms compute.
-        world: what the terms share.
+        device: device of the terms.
+        world: see :class:`lcc_rl.pieces.world.World`.
 
     Raises:
         ConfigError: if a node or a limit is wrong.
@@ -43,7 +43,7 @@ class Objective:
         self.terms: list[tuple[RewardTerm, float]] = []
 
     def replace(self, terms: Sequence[RewardTerm]) -> None:
-        """Set what is maximised in place of the reward's terms, with factors."""
+        """Replace the reward's terms by their surrogates, and add the regularizers."""
         own = self.surrogates
         chosen = [
             (own[term.name], term.weight) if term.name in own else (term, 1.0) for term in terms
@@ -54,10 +54,10 @@ class Objective:
         """Return the entries of the next state that the terms read.
 
         Args:
-            known: the entries that there are.
+            known: keys of all entries.
 
         Raises:
-            ConfigError: naming a term that reads another one.
+            ConfigError: naming a term that reads an unknown entry.
         """
         read = [(term, key) for term, _ in self.terms for _, key in term.needs]
         for term, key in read:
@@ -76,21 +76,21 @@ class Objective:
             data: the rollout, ``[batch, steps]``.
 
         Raises:
-            Diverged: naming the first of them.
+            Diverged: naming the first term that is not finite.
         """
         parts = [
             factor * self.limits.price(term.name) * term.computed(_entries(term, data)).squeeze(-1)
             for term, factor in self.terms
         ]
-        if any_lost(parts):
+        if any_nonfinite(parts):
             for (term, _), part in zip(self.terms, parts, strict=True):
-                if any_lost([part]):
+                if any_nonfinite([part]):
                     kind = type(term).__name__
                     raise Diverged(f"the objective's term {term.name} ({kind}) is nan")
         return torch.stack(parts).sum(0)
 
     def limited(self) -> dict[str, Any]:
-        """Return the terms that have a limit to keep, by name."""
+        """Return the terms with a limit, by name."""
         return {term.name: term for term, _ in self.terms if term.name in self.limits.largest}
 
     def missed(self, data: TensorDictBase, running: Tensor) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""What agents that learn from a replay buffer share: settings, networks and optimizers."""
+"""Base of agents that learn from a replay buffer: settings, networks and optimizers."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from lcc_rl.settings import Count, NonNegative, Positive, Settings, Share, Whole
 
 
 class Exploration(Settings):
-    """Schedule of the exploration noise: falls linearly, or by a factor at every update."""
+    """Schedule of the exploration noise: linear, or a factor per update."""
 
     initial: NonNegative = 0.4  # standard deviation at the first episode; actions lie in [-1, 1]
-    final: NonNegative = 0.05  # after the decay
-    decay_share: Fraction | None = 0.5  # share of the training over which it falls linearly
-    decay_per_update: Fraction | None = None  # instead: factor of every update, down to final
+    final: NonNegative = 0.05  # standard deviation after the decay
+    decay_share: Fraction | None = 0.5  # share of the training with the linear decay
+    decay_per_update: Fraction | None = None  # alternatively the factor per update
 
     def validate(self) -> None:
         if (self.decay_share is None) == (self.decay_per_update is None):
@@ -42,7 +42,7 @@ class Exploration(Settings):
             )
 
     def sigma(self, share: float, updates: int = 0) -> float:
-        """Return the standard deviation after this share of the training and these updates."""
+        """Return the standard deviation after a share of the training and a number of updates."""
         if self.decay_per_update is not None:
             return max(self.final, self.initial * self.decay_per_update**updates)
         assert self.decay_share is not None
@@ -52,7 +52,7 @@ class Exploration(Settings):
 class OffPolicy(Agent):
     """A policy, its Q networks, their loss and optimizers; a subclass defines the update.
 
-    Target networks follow by a share of the difference (HCFS H9–H10).
+    Each step moves target networks by a share of the difference (HCFS H9–H10).
     """
 
     gamma: Share = 0.9  # discount
@@ -62,37 +62,37 @@ class OffPolicy(Agent):
     critic_lr: Positive = 1e-3  # learning rate of the Q networks
     batch_size: Count = 1024  # transitions per update
     buffer_size: Count = 20_000  # transitions that the replay buffer holds
-    tau: Fraction = 0.005  # share by which the targets follow at an update; the paper is silent
+    tau: Fraction = 0.005  # share of a step of the targets; not given in the paper
     # Weight of a penalty on the square of the actor's output before its tanh; 0 is the literal
-    # algorithm. Without it some seeds brake fully for ever: where every action leads to the same
-    # end, nothing else draws the actor back from the tanh's flat part.
+    # algorithm. Without it the policies of some seeds brake fully in all states: where all actions
+    # have equal values, no other term moves the actor away from the flat part of the tanh.
     saturation: NonNegative = 0.001
-    # Share of the learning rates that is left at the end of the schedule. 1 is the literal
-    # algorithm, whose policy keeps swinging until it stops.
+    # Final learning rates as a fraction of the initial ones. 1 is the literal algorithm, whose
+    # policy fluctuates until the end.
     final_lr_fraction: Fraction = 0.05
-    schedule: Schedule = "cosine"  # how the learning rates fall
-    clip_norm: Positive | None = None  # gradients longer than this are shortened to it
-    # Updates per collected transition; the paper is silent. Many more would never end.
+    schedule: Schedule = "cosine"  # shape of the learning rates
+    clip_norm: Positive | None = None  # largest norm of a gradient; None: not clipped
+    # Updates per collected transition; not given in the paper.
     updates_per_transition: Annotated[float, Field(gt=0.0, le=1000.0)] = 0.125
     learning_starts: Whole = 0  # transitions in the buffer before the first update
-    # Episodes whose mean reward rates the policy; the best one becomes the run's. None: the last.
+    # Number of episodes whose mean reward selects the run's policy; None: the last policy.
     best_window: Count | None = None
     exploration: Exploration = field(default_factory=Exploration)
-    # Compute the gradient as written out, which gives the numbers of TorchRL's loss up to rounding
-    # in less time; False, and networks without ReLU, differentiate the loss itself.
+    # Compute the gradient explicitly, which equals that of TorchRL's loss up to rounding and takes
+    # less time. False, or networks without ReLU: differentiate the loss automatically.
     fused: bool = True
 
     LATER = ("activation", "schedule", "clip_norm")
     loop = ReplayLoop
     critics: ClassVar[int] = 1
-    joint: ClassVar[bool] = True  # whether one optimizer steps all that is learned at once
+    joint: ClassVar[bool] = True  # whether one optimizer steps all networks at once
 
     def validate(self) -> None:
         for name in ("batch_size", "learning_starts"):
             if getattr(self, name) > self.buffer_size:
                 raise ConfigError(
                     f"agent.{name} ({getattr(self, name)}) must be at most agent.buffer_size "
-                    f"({self.buffer_size}), or nothing is ever learned"
+                    f"({self.buffer_size}), or there are no updates"
                 )
 
     def setup(self, scene: Scene) -> None:
@@ -130,13 +130,13 @@ class OffPolicy(Agent):
         """Set discount, optimizers and targets of a loss with an actor and Q networks.
 
         Args:
-            loss: TorchRL's.
-            delayed: which of ``"actor"`` and ``"value"`` have a target network.
-            alpha: a temperature that is learned, and its learning rate.
+            loss: TorchRL's loss.
+            delayed: names of networks with a target network, of ``"actor"`` and ``"value"``.
+            alpha: a learned temperature and its learning rate.
         """
         self.loss = loss
         self.loss.make_value_estimator(gamma=self.gamma)
-        # TorchRL asks for an updater of the targets; _follow does its work.
+        # TorchRL requires an updater of the targets; _follow replaces it.
         HardUpdate(loss)
         keys = {"actor": "actor_network_params"}
         keys["value"] = "value_network_params" if self.critics == 1 else "qvalue_network_params"
@@ -156,7 +156,7 @@ class OffPolicy(Agent):
         rates: dict[str, float],
         targets: dict[str, list[Tensor]],
     ) -> None:
-        """Let all that is learned live in one vector, as do its gradients and the targets."""
+        """Store all learned tensors in one vector, likewise their gradients and targets."""
         everything = [tensor for network in networks.values() for tensor in network]
         vector = as_vector(everything)
         self.slopes = torch.zeros_like(vector)
@@ -176,20 +176,20 @@ class OffPolicy(Agent):
 
     @contextmanager
     def _own_randomness(self) -> Iterator[None]:
-        """Make what TorchRL draws a function of the seed and the number of updates so far."""
+        """Seed TorchRL's draws by the seed and the number of updates."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derived_seed(self.seed, self.count, "update"))
             yield
 
     def _noise(self, like: Tensor, count: int) -> list[Tensor]:
-        """Draw what TorchRL's loss draws in this update: N(0, 1), so many times."""
+        """Draw ``count`` times N(0, 1) as TorchRL's loss does in this update."""
         generator = self.generator.manual_seed(derived_seed(self.seed, self.count, "update"))
         return [
             torch.randn(like.shape, generator=generator, device=like.device) for _ in range(count)
         ]
 
     def _losses(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Write the gradient, by hand where it is written out; return the losses."""
+        """Write the gradient, explicit or automatic; return the losses."""
         by_loss = self.written is None
         losses = self._by_loss(batch) if by_loss else self._by_hand(batch, self.written)
         return dict(zip(("loss_actor", "loss_value"), losses, strict=True))
@@ -205,7 +205,7 @@ class OffPolicy(Agent):
         loss.backward()
 
     def _step(self, name: str) -> None:
-        """Take a step of the named optimizer along the gradients at hand."""
+        """Take a step of the named optimizer along the present gradients."""
         optimizer = self.optimizers[name]
         if self.clip_norm is not None:
             weights = [weight for group in optimizer.param_groups for weight in group["params"]]
@@ -214,7 +214,7 @@ class OffPolicy(Agent):
 
     @torch.no_grad()
     def _follow(self, *names: str) -> None:
-        """Move the named target networks towards their own, as TorchRL's ``SoftUpdate`` does."""
+        """Move the named target networks towards the networks, as TorchRL's ``SoftUpdate``."""
         for name in names:
             target, vector = self.targets[name]
             target.lerp_(vector, self.tau)
@@ -228,7 +228,7 @@ class OffPolicy(Agent):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
+        """Restore the result of :meth:`state_dict`."""
         self.count = state["count"]
         self.loss.load_state_dict(state["loss"])
         for name, part in self.optimizers.items():

@@ -1,4 +1,4 @@
-"""Proximal policy optimization, on TorchRL's loss and advantage (Schulman et al., 2017)."""
+"""Proximal policy optimization with TorchRL's loss and advantage (Schulman et al., 2017)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lcc_rl.agents.sac import SampledAction
 from lcc_rl.pieces.base import REWARD
 from lcc_rl.settings import Count, NonNegative, Positive, Share
 
-LOG_PROB = "action_log_prob"  # where TorchRL's loss expects it
+LOG_PROB = "action_log_prob"  # the key in TorchRL's loss
 
 
 class Gaussian(nn.Module):
@@ -38,13 +38,13 @@ class Gaussian(nn.Module):
 
 
 class OnPolicyLoop(CollectingLoop[Any]):
-    """Learns from each segment once; arguments as of :class:`lcc_rl.agents.loop.TrainingLoop`."""
+    """Learns from each segment once; arguments as for :class:`lcc_rl.agents.loop.TrainingLoop`."""
 
     advice = "Lower agent.learning_rate or agent.clip"
 
     def learn(self, batch: TensorDictBase, before: int) -> dict[str, float]:
         vehicles = batch.get(("next", *REWARD)).shape[2]
-        # Time last, a row per vehicle: advantages are of trajectories.
+        # One row per vehicle, time last: advantages are computed along trajectories.
         rows = transitions(batch).reshape(*batch.shape, vehicles).permute(0, 2, 1)
         losses = self.agent.update(rows.reshape(-1, batch.shape[1]).contiguous())
         self.updates += 1
@@ -52,21 +52,21 @@ class OnPolicyLoop(CollectingLoop[Any]):
 
 
 class PPO(Agent):
-    """A Gaussian policy and a value, learned by clipped ratios; the kept policy is the mean."""
+    """A Gaussian policy and a value network with clipped ratios; the stored policy is the mean."""
 
     gamma: Share = 0.99  # discount
     td_lambda: Annotated[float, Field(ge=0.0, le=1.0)] = 0.95  # weight of longer returns, per step
     hidden: Sequence[Count] = (64, 64)  # layers of policy and value
     activation: Activation = "relu"  # between the layers of networks
-    learning_rate: Positive = 1e-3  # of both at the start
-    final_lr_fraction: Fraction = 0.1  # of it that is left at the end
-    schedule: Schedule = "cosine"  # how the learning rates fall
-    clip: Fraction = 0.2  # largest change of the ratio of probabilities that earns anything
+    learning_rate: Positive = 1e-3  # of both networks at the start
+    final_lr_fraction: Fraction = 0.1  # final learning rate as a fraction of the initial one
+    schedule: Schedule = "cosine"  # shape of the learning rates
+    clip: Fraction = 0.2  # ratios of probabilities are clipped to 1 ± clip
     epochs: Count = 10  # passes over the transitions of a segment
     batch_size: Count = 1024  # transitions of a gradient step
-    entropy: NonNegative = 0.0  # price of a narrow distribution
+    entropy: NonNegative = 0.0  # coefficient of the entropy bonus
     sigma: Positive = 0.5  # standard deviation before the tanh at the start
-    clip_norm: Positive = 0.5  # gradients longer than this are shortened to it
+    clip_norm: Positive = 0.5  # largest norm of a gradient
 
     LATER = ("activation", "schedule")
     loop = OnPolicyLoop
@@ -105,13 +105,13 @@ class PPO(Agent):
         """Learn from trajectories.
 
         Args:
-            data: transitions, ``[trajectories, steps]``, as of
+            data: transitions, ``[trajectories, steps]``, with the keys of
                 :data:`lcc_rl.agents.collecting.LEARNED_FROM`.
 
         Returns:
             The means of ``loss_actor`` and ``loss_value``, and the standard deviation ``sigma``.
         """
-        with torch.random.fork_rng(devices=[]):  # of the shuffle, and of TorchRL's entropy
+        with torch.random.fork_rng(devices=[]):  # for the shuffle and TorchRL's entropy
             torch.manual_seed(derived_seed(self.seed, self.count, "update"))
             self.count += 1
             with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The loop of off-policy agents: play a batch of episodes, learning from a replay buffer."""
+"""The loop of off-policy agents, which learn from a replay buffer."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from lcc_rl.io.tensors import check_like
 
 
 class ReplayLoop(CollectingLoop[Any]):
-    """Trains an off-policy agent and keeps its record.
+    """Trains an off-policy agent.
 
-    Arguments as of :class:`lcc_rl.agents.loop.TrainingLoop`.
+    Arguments as for :class:`lcc_rl.agents.loop.TrainingLoop`.
     """
 
     advice = "Lower agent.critic_lr or agent.actor_lr"
@@ -44,7 +44,7 @@ class ReplayLoop(CollectingLoop[Any]):
         return row
 
     def _keep_best(self) -> None:
-        """Keep the policy if no window of episodes since learning began had a higher reward."""
+        """Keep the policy if its window of episodes has the highest reward so far."""
         window = (self.agent.best_window or 0) // self.settings.environments
         recent = self.rows[-window:]
         if not window or len(recent) < window or not recent[0]["updates"]:
@@ -56,7 +56,7 @@ class ReplayLoop(CollectingLoop[Any]):
             self.best = {"score": score, "iteration": self.iteration, "weights": weights}
 
     def learn(self, batch: TensorDictBase, before: int) -> dict[str, float]:
-        """Take the updates that are due after the transitions of a segment."""
+        """Make the updates that are due after a segment."""
         new, settings = transitions(batch), self.agent
         self.buffer.extend(new)
         ratio = settings.updates_per_transition
@@ -78,17 +78,17 @@ class ReplayLoop(CollectingLoop[Any]):
         if self.best is not None:
             check_like(self.best["weights"], self.agent.policy.state_dict(), "best")
         self.buffer.load_state_dict(memory["buffer"])
-        self.buffer.set_rng(self.sampler)  # loading gives the buffer a generator of its own
+        self.buffer.set_rng(self.sampler)  # loading replaces the buffer's generator
 
 
 def draws(buffer: ReplayBuffer, generator: torch.Generator) -> Iterator[TensorDictBase]:
     """Draw batches of a replay buffer as its ``sample()`` does, all into the same tensors.
 
-    A batch holds until the next one is drawn; the buffer is not to grow meanwhile.
+    A batch is valid until the next one is drawn; the buffer must not grow meanwhile.
 
     Args:
-        buffer: draws with replacement, each transition as likely as any other.
-        generator: the buffer's own; the numbers are those that ``sample()`` would draw.
+        buffer: a buffer that draws uniformly with replacement.
+        generator: the buffer's generator; the draws equal those of ``sample()``.
 
     Yields:
         Transitions, ``[batch_size]``.

@@ -1,7 +1,7 @@
-"""Policies that are rules with learned constants, alone or below a network that corrects them.
+"""Policies that are rules with learned constants, optionally with a network as correction.
 
-Like a network they map the observation to the action, so that every agent that learns through the
-simulator, or by search, can train them, and what is stored is a policy like any other.
+They map the observation to the action, as a network does, so agents that learn through the
+simulator can train and store them as any policy.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from lcc_rl.pieces.observation import Observation
 
 
 class Rule(nn.Module):
-    """A cruise control whose constants are learned: their logarithms, so that they stay positive.
+    """A cruise control with learned logarithms of its constants, which remain positive.
 
     Args:
-        kind: the controller that has the law; its defaults are the constants at the start.
-        observation: where the vehicle's own speed, gap and relative speed are found.
-        constants: other constants at the start, by name.
+        kind: the controller with the law; its defaults are the initial constants.
+        observation: the observation, with the vehicle's own speed, gap and relative speed.
+        constants: other initial constants, by name.
         max_acceleration: acceleration of action 1 [m/s²].
 
     Raises:
@@ -58,7 +58,7 @@ class Rule(nn.Module):
         return dict(zip(self.names, self.logarithms.exp().tolist(), strict=True))
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the action in [−1, 1], ``[*batch, 1]``, of the observation ``[*batch, n]``."""
+        """Return the action in [−1, 1], ``[*batch, 1]``, for the observation ``[*batch, n]``."""
         speed, gap, relative_speed = (
             observation[..., column : column + 1] / scale
             for column, scale in zip(self.columns, self.scales, strict=True)
@@ -68,11 +68,11 @@ class Rule(nn.Module):
 
 
 class Residual(nn.Module):
-    """A rule whose constants are kept, plus a network that begins at zero.
+    """A rule with fixed constants plus a network that is zero at the start.
 
     Args:
         rule: the rule.
-        network: from an observation to a number.
+        network: maps an observation to a number.
     """
 
     def __init__(self, rule: Rule, network: nn.Module) -> None:
@@ -106,22 +106,22 @@ def make_policy(
     """Build the policy of an agent.
 
     Args:
-        kind: ``"network"``; a rule with learned constants, ``"idm"`` or ``"acc"``; or one below a
+        kind: ``"network"``; a rule with learned constants, ``"idm"`` or ``"acc"``; or a rule with a
             network, ``"residual_idm"`` or ``"residual_acc"``.
-        observation: what the policy sees.
-        hidden: sizes of the layers of a network.
+        observation: the observation of the policy.
+        hidden: sizes of the hidden layers of a network.
         seed: seed of its initial weights.
-        constants: constants of a rule at the start.
+        constants: initial constants of a rule.
         max_acceleration: acceleration of action 1 [m/s²]; None if it is unknown.
-        activation: between the layers of a network.
+        activation: activation between the layers of a network.
 
     Returns:
         A module that reads ``"observation"`` ``[*batch, n]`` and writes ``"action"``
         ``[*batch, 1]``.
 
     Raises:
-        ConfigError: if the kind is unknown, constants are given where there is no rule, or a rule
-            does not know what its actions do.
+        ConfigError: if the kind is unknown, constants are given without a rule, or the acceleration
+            of action 1 is unknown for a rule.
     """
     size = observation.event_shape[-1]
     if kind == NETWORK_ALONE:
@@ -134,7 +134,7 @@ def make_policy(
         raise unknown_name("agent.policy", kind, known)
     if max_acceleration is None:
         raise ConfigError(
-            f"agent.policy={kind} needs to know the acceleration of action 1: the controller of "
+            f"agent.policy={kind} needs the acceleration of action 1, but the controller of "
             "automated vehicles has no setting max_acceleration [m/s²]"
         )
     module: nn.Module = Rule(RULE_KINDS[name], observation, constants, max_acceleration)

@@ -1,4 +1,4 @@
-"""Soft actor-critic with a learned temperature, on TorchRL's loss (Haarnoja et al., 2018)."""
+"""Soft actor-critic with a learned temperature and TorchRL's loss (Haarnoja et al., 2018)."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from lcc_rl.functional.random import stream_id
 from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP
 from lcc_rl.settings import Number, Positive
 
-ONE = 1.0 - 1e-6  # the largest action whose inverse tanh exists in single precision
+ONE = 1.0 - 1e-6  # largest action with a finite inverse tanh in single precision
 
 
 class Head(nn.Module):
     """Mean and standard deviation of the action before the tanh.
 
     Args:
-        mean: network whose tanh is the deterministic policy.
-        spread: network of the logarithm of the standard deviation, held within [−5, 1].
+        mean: network before the tanh of the deterministic policy.
+        spread: network of the logarithm of the standard deviation, clamped to [−5, 1].
     """
 
     def __init__(self, mean: nn.Module, spread: nn.Module) -> None:
@@ -44,7 +44,7 @@ class Head(nn.Module):
 
 
 class SampledAction(TensorDictModuleBase):
-    """Replaces the deterministic action by a draw of the policy's distribution.
+    """Replaces the deterministic action by a draw from the policy's distribution.
 
     The draw is a function of the episode's seed and step, so it needs no random state.
 
@@ -79,17 +79,17 @@ class Sample(NamedTuple):
 
 
 class SAC(OffPolicy):
-    """Learns a distribution of actions and its temperature; its mean is the policy that is kept.
+    """Learns a distribution of actions and its temperature; its mean is the stored policy.
 
-    Its exploration is a factor of the policy's own standard deviation.
+    Exploration is a factor on the policy's standard deviation.
     """
 
     exploration: Exploration = field(
         default_factory=lambda: Exploration(initial=1.0, final=1.0, decay_share=1.0)
     )
     alpha_init: Positive = 0.1  # temperature at the start
-    alpha_lr: Positive = 1e-3  # its learning rate
-    target_entropy: Number | None = None  # entropy to keep per action; None: -1, of one action
+    alpha_lr: Positive = 1e-3  # learning rate of the temperature
+    target_entropy: Number | None = None  # target of the entropy; None: −1 per action
 
     critics = 2
 
@@ -134,7 +134,7 @@ class SAC(OffPolicy):
 
     @torch.no_grad()
     def _by_hand(self, batch: TensorDictBase, networks: ActorCritic) -> tuple[Tensor, Tensor]:
-        """Write the gradient out; policy and temperature follow the Q networks before the step."""
+        """Compute the gradient explicitly; policy and temperature use the old Q networks."""
         rows = len(batch)
         space, seen, after = networks.space(rows), batch.get("observation"), batch.get("next")
         reached, alpha = after.get("observation"), self.log_alpha.exp()
@@ -145,11 +145,11 @@ class SAC(OffPolicy):
         now = self._sample(seen, noise[1], networks)
         space.data.place(seen, batch.get("action"))
         space.own.place(seen, now.action)
-        networks.judge(space.both)
+        networks.evaluate(space.both)
         first, second = space.own.values
         loss_actor = (now.log_prob * alpha).sub_(torch.minimum(first, second)).mean()
         loss_value = networks.critic_step(space.data, wanted)
-        # Each action's value is that of the critic that gives less.
+        # The value of an action is the smaller one of both critics.
         chosen = space.slope * (first <= second)
         slope = networks.through_critics(space.own, [chosen, space.slope - chosen], 1)
         self._learn_policy(seen, now, slope, alpha, networks)
@@ -172,7 +172,7 @@ class SAC(OffPolicy):
     def _learn_policy(
         self, seen: Tensor, now: Sample, slope: Tensor, alpha: Tensor, networks: ActorCritic
     ) -> None:
-        """Write the gradient of the policy, from the derivative by its actions."""
+        """Write the gradient of the policy from the derivative by its actions."""
         rows = len(seen)
         slope.mul_(now.action.square().neg_().add_(1.0))
         slope.addcmul_(now.action, alpha, value=2.0 / rows)

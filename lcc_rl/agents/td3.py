@@ -1,4 +1,4 @@
-"""Twin delayed deep deterministic policy gradient, on TorchRL's loss (Fujimoto et al., 2018)."""
+"""Twin delayed deep deterministic policy gradient, TorchRL's loss (Fujimoto et al., 2018)."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from lcc_rl.settings import Count, NonNegative
 
 
 class TD3(OffPolicy):
-    """DDPG with two Q networks, smoothed target actions and a policy that is updated less often."""
+    """DDPG with two Q networks, smoothed target actions and delayed updates of the policy."""
 
     policy_noise: NonNegative = 0.1  # standard deviation of the noise on target actions
-    noise_clip: NonNegative = 0.25  # its largest size
-    policy_delay: Count = 2  # updates of the Q networks for each of policy and targets
+    noise_clip: NonNegative = 0.25  # largest absolute value of this noise
+    policy_delay: Count = 2  # updates of the Q networks per update of policy and targets
 
     critics = 2
     joint = False
@@ -72,7 +72,7 @@ class TD3(OffPolicy):
         noise.mul_(self.policy_noise).clamp_(-self.noise_clip, self.noise_clip)
         action.add_(noise).clamp_(-1.0, 1.0)
         wanted = networks.wanted(after, networks.future(reached, action, data))
-        networks.judge(data.place(batch.get("observation"), batch.get("action")))
+        networks.evaluate(data.place(batch.get("observation"), batch.get("action")))
         return networks.critic_step(data, wanted)
 
     @torch.no_grad()
@@ -81,7 +81,7 @@ class TD3(OffPolicy):
         space, seen = networks.space(len(batch)), batch.get("observation")
         raw = networks.actor.forward(seen)
         action = raw.tanh()
-        (value,) = networks.judge(space.own.place(seen, action), 1)
+        (value,) = networks.evaluate(space.own.place(seen, action), 1)
         networks.actor_step(seen, space, raw, action)
         return -value.mean()
 

@@ -1,4 +1,4 @@
-"""Networks that lie in one vector: Adam and target steps are one operation each."""
+"""Networks in one vector, for which Adam and target steps are one operation each."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from torch import Tensor, nn
 
 
 def views(vector: Tensor, tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Return a vector's parts in the shapes of tensors, one after the other."""
+    """Return consecutive parts of a vector in the shapes of tensors."""
     parts = vector.split([tensor.numel() for tensor in tensors])
     return [part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True)]
 
 
 def as_vector(tensors: Sequence[Tensor]) -> Tensor:
-    """Move tensors into one vector, of which they become views, and return it."""
+    """Move tensors into one vector and make them views of it; return the vector."""
     vector = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
     for tensor, view in zip(tensors, views(vector, tensors), strict=True):
         tensor.data = view
@@ -26,13 +26,13 @@ def as_vector(tensors: Sequence[Tensor]) -> Tensor:
 def vector_adam(
     vector: Tensor, slopes: Tensor, sizes: Sequence[int], rates: Sequence[float]
 ) -> torch.optim.Adam:
-    """Return Adam of a vector of weights whose parts learn at rates of their own.
+    """Return Adam for a vector of weights with a learning rate per part.
 
     Args:
         vector: the weights.
-        slopes: where their derivatives are written.
-        sizes: of the parts.
-        rates: the learning rate of each part; one step serves all where they are equal.
+        slopes: tensor of their derivatives.
+        sizes: sizes of the parts.
+        rates: learning rate of each part; equal rates need one step only.
     """
     if len(set(rates)) == 1:
         sizes, rates = [len(vector)], rates[:1]
@@ -46,8 +46,8 @@ def vector_adam(
 
 @torch.no_grad()
 def take_step(optimizer: torch.optim.Adam) -> None:
-    """Take the step of ``optimizer.step()`` without what torch does around each call."""
-    if not optimizer.state:  # made by the first step
+    """Take the step of ``optimizer.step()`` without torch's overhead per call."""
+    if not optimizer.state:  # created by the first step
         optimizer.step()
         return
     for group in optimizer.param_groups:
@@ -77,10 +77,10 @@ def take_step(optimizer: torch.optim.Adam) -> None:
 
 @contextmanager
 def denormals_flushed() -> Iterator[None]:
-    """Count numbers below the normal range of floats as zero, on processors that can.
+    """Flush denormal numbers to zero, if the processor supports it.
 
     The momentum of a weight without a gradient, such as one behind a ReLU that is always zero,
-    falls to such numbers and stays there; with them, arithmetic is many times slower.
+    becomes denormal; arithmetic with such numbers is many times slower.
     """
     before = not bool(torch.tensor(1e-39) * 1.0)
     torch.set_flush_denormal(True)

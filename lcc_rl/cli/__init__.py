@@ -1,1 +1,1 @@
-"""The commands: what is typed, and the exit codes and messages of what goes wrong."""
+"""Command lines with messages and exit codes."""

@@ -1,4 +1,4 @@
-"""Entry point: calibrate drivers from trajectories, ``lcc-rl calibrate``."""
+"""``lcc-rl calibrate``: calibrate drivers from trajectories."""
 
 from __future__ import annotations
 

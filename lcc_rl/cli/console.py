@@ -1,4 +1,4 @@
-"""The console command ``lcc-rl``: all commands of the package under one name."""
+"""The console command ``lcc-rl`` with all commands of the package."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from lcc_rl.errors import unknown_name
 from lcc_rl.runs.interrupts import ending_quietly
 from lcc_rl.version import __version__
 
-# Name, module and what it does. Each module has a main: of the first four, which Hydra reads,
-# without arguments.
+# Name, module and description. Each module has a main; those of the first four, which use Hydra,
+# have no arguments.
 HYDRA_COMMANDS = {
     "run": ("lcc_rl.cli.pipeline", "the main job: data, drivers, policies, results, one page"),
     "train": ("lcc_rl.cli.train", "train a variant and evaluate it; -m for a sweep"),
@@ -20,12 +20,12 @@ HYDRA_COMMANDS = {
     "calibrate": ("lcc_rl.cli.calibrate", "fit driver models to trajectories"),
 }
 TOOLS = {
-    "status": ("lcc_rl.cli.status", "what runs are running, waiting, finished, failed"),
+    "status": ("lcc_rl.cli.status", "runs that are running, waiting, finished, failed"),
     "table": ("lcc_rl.cli.table", "the table of an evaluation: text, Markdown, LaTeX, CSV"),
-    "score": ("lcc_rl.commands.score", "any policy on every task and source that it fits"),
-    "animate": ("lcc_rl.commands.animate", "episodes as a moving picture: page, SVG, GIF, MP4"),
+    "score": ("lcc_rl.commands.score", "a policy on every task and source that it fits"),
+    "animate": ("lcc_rl.commands.animate", "animations of episodes: page, SVG, GIF, MP4"),
     "reproduce": ("lcc_rl.studies.reproduce", "a paper's study: tables and figures"),
-    "clairvoyant": ("lcc_rl.commands.clairvoyant", "what could be saved at most"),
+    "clairvoyant": ("lcc_rl.commands.clairvoyant", "upper bound of the saving"),
     "export": ("lcc_rl.interfaces.export", "a trained policy as ONNX, PyTorch program or page"),
 }
 COMMANDS = {**HYDRA_COMMANDS, **TOOLS}
@@ -33,10 +33,10 @@ COMMANDS = {**HYDRA_COMMANDS, **TOOLS}
 
 @main_guard
 def main(words: Sequence[str] | None = None) -> None:
-    """Run ``lcc-rl <command> …``; exits as the command does.
+    """Run ``lcc-rl <command> …`` and exit with its code.
 
     Args:
-        words: what is typed after ``lcc-rl``; by default this process's arguments.
+        words: the words after ``lcc-rl``; by default this process's arguments.
     """
     words = list(sys.argv[1:] if words is None else words)
     if not words or words[0] in ("-h", "--help"):
@@ -66,7 +66,7 @@ def _help() -> str:
 
 
 def _run(name: str, words: list[str]) -> None:
-    """Run one command, with the words that follow it as this process's arguments."""
+    """Run a command with the following words as this process's arguments."""
     sys.argv = [f"lcc-rl {name}", *words]
     with ending_quietly():
         module = import_module(COMMANDS[name][0])

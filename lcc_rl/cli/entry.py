@@ -1,4 +1,4 @@
-"""Hydra entry points: errors in one line, exit codes."""
+"""Hydra entry points with one-line errors and exit codes."""
 
 from __future__ import annotations
 
@@ -47,20 +47,20 @@ def entry_point(
 ) -> Callable[[Callable[[Any], Any]], Callable[[], None]]:
     """Decorate a function of a configuration as a Hydra command.
 
-    An input error (option, file, row) is one line on stderr, exit code 2 and ``error.txt`` in the
-    run's folder; Ctrl-C is exit code 130; other errors show a traceback. In a sweep a failed run
-    does not stop the others. ``HYDRA_FULL_ERROR=1`` shows tracebacks of input errors, too.
+    An input error (option, file, row) gives one line on stderr, exit code 2 and ``error.txt`` in
+    the run's folder. Ctrl-C gives exit code 130; other errors show a traceback. In a sweep a failed
+    run does not stop the others. ``HYDRA_FULL_ERROR=1`` shows tracebacks of input errors, too.
 
     Args:
         config_name: the entry point's configuration in ``lcc_rl.conf``, without suffix.
-        work: the module that does the work and loads torch. It is imported once the options are
-            accepted, of a sweep before Hydra reads them: ``--help`` and a refused option need
+        work: the module of the work, which loads torch. It is imported after the options are
+            accepted (in a sweep before Hydra reads them), so ``--help`` and refused options need
             no torch. The function imports from it inside its body.
     """
 
     def decorate(function: Callable[[Any], Any]) -> Callable[[], None]:
         def checked(config: DictConfig) -> Any:
-            logging.raiseExceptions = False  # a log that cannot be written ends no run
+            logging.raiseExceptions = False  # a failing log must not end a run
             check_own_files()
             typed = list(HydraConfig.get().overrides.task)
             with ending_quietly():  # settings load modules, too
@@ -107,7 +107,7 @@ def start_command(command: Callable[[], Any]) -> None:
 
 
 def run_sorted(command: Callable[[], Any]) -> None:
-    """Run a Hydra command whose flags may stand anywhere among the settings."""
+    """Run a Hydra command with flags at any place among the settings."""
     words = ["--help" if word == FULL_HELP else word for word in sys.argv[1:]]
     mode = any("hydra.mode=" in word for word in words)  # else Hydra composes twice to look for it
     with (
@@ -119,18 +119,18 @@ def run_sorted(command: Callable[[], Any]) -> None:
 
 
 def hydra_parser() -> ArgumentParser:
-    """Return Hydra's parser, also where Python (3.14) checks that a help is a text, as one is not.
+    """Return Hydra's parser, also with Python 3.14, which checks that each help is a text.
 
-    Hydra 1.3 writes the help of ``--shell-completion`` only where it is shown.
+    Hydra 1.3 creates the help of ``--shell-completion`` only when it is shown.
     """
     with patch.object(ArgumentParser, "_check_help", lambda *_: None, create=True):
         return get_args_parser()
 
 
 def flags_first(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line, its flags, as ``-m``, first, variants in lower case."""
+    """Return the words of a command line with flags, such as ``-m``, first."""
     parser = hydra_parser()
-    parser.allow_abbrev = False  # --experiment is none of Hydra's flags
+    parser.allow_abbrev = False  # --experiment is not a flag of Hydra
     known, unknown = parser.parse_known_intermixed_args(list(words))
     if unknown:
         raise ConfigError(
@@ -144,7 +144,7 @@ def flags_first(words: Sequence[str]) -> list[str]:
 
 
 def sweep(command: Callable[[], Any]) -> None:
-    """Run a Hydra command; report how the runs of a sweep ended."""
+    """Run a Hydra command; report the result of a sweep."""
     try:
         command()
     except (KeyboardInterrupt, Exception) as error:
@@ -159,7 +159,7 @@ def sweep(command: Callable[[], Any]) -> None:
 
 
 def explaining(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Turn what Hydra refuses into an error with the nearest option that exists."""
+    """Convert errors of Hydra to errors with the nearest option."""
 
     def explained_function(*arguments: Any) -> Any:
         try:
@@ -174,17 +174,17 @@ def explaining(function: Callable[..., Any]) -> Callable[..., Any]:
         except OSError as error:
             if error.filename is not None or SweepCallback.target is None:
                 raise
-            # Of a file that Hydra writes itself.
+            # Raised for a file that Hydra writes.
             raise ResultsError(f"{SweepCallback.target}: {error}") from error
 
     return explained_function
 
 
 def recording_errors(function: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
-    """Leave nothing of a command that was refused, and ``error.txt`` of one that failed at work.
+    """Remove the folder of a refused command, and write ``error.txt`` for a failed one.
 
-    One that was interrupted at work names the command that goes on. A command that names another
-    run by mistake leaves it as it was.
+    The message of an interrupted command contains the command that resumes it. Folders of other
+    runs are not changed.
     """
 
     def recording(cfg: DictConfig) -> Any:
@@ -199,11 +199,11 @@ def recording_errors(function: Callable[[DictConfig], Any]) -> Callable[[DictCon
                 if "resume" in cfg and (folder / CONFIG).exists():
                     name = HydraConfig.get().job.config_name
                     from lcc_rl.results.runs import stored_config
-                    from lcc_rl.results.trust import said_again
+                    from lcc_rl.results.trust import trust_option
 
                     command = f"lcc-rl {'run' if name == 'pipeline' else name} resume={folder}"
-                    command += said_again(stored_config(folder))
-                    raise Interrupted(f"stopped; go on with: {command}") from error
+                    command += trust_option(stored_config(folder))
+                    raise Interrupted(f"stopped; resume with: {command}") from error
                 raise
             given = isinstance(input_error(error) or error, (LccError, OSError))
             if given and not (folder / CONFIG).exists() and SweepCallback.made:
@@ -218,16 +218,16 @@ def recording_errors(function: Callable[[DictConfig], Any]) -> Callable[[DictCon
 
 
 def run_folder() -> Path:
-    """Return the folder that Hydra made for the present run or job."""
+    """Return the folder that Hydra created for the present run or job."""
     return Path(HydraConfig.get().runtime.output_dir)
 
 
 def resumed_folder(cfg: StudyConfig, own: Sequence[str]) -> Path:
-    """Return the folder of the run that ``resume`` names; without it that of the present run.
+    """Return the folder of the run ``resume``, or of the present run.
 
     Args:
         cfg: the configuration, with the key ``resume``.
-        own: settings that may be given beside the folder.
+        own: settings that may be given besides the folder.
     """
     if cfg.resume is None:
         return run_folder()

@@ -1,4 +1,4 @@
-"""Entry point: evaluate a policy beside the baselines, ``lcc-rl evaluate``."""
+"""``lcc-rl evaluate``: evaluate a policy and baselines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every command does: its streams, its signals, its exit codes, one line for an error."""
+"""Streams, signals, exit codes and one-line errors of all commands."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from lcc_rl.runs.output import unbroken_output
 
 
 def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a function a command: the one place for streams, signals and exit codes.
+    """Decorate a function as a command with streams, signals and exit codes.
 
-    Wrong input (this package's errors, Hydra's, OSError) and too little memory are one line on
-    stderr and exit code 2, an interrupt is exit code 130; any other error shows its traceback,
-    exit code 1. Commands may be nested.
+    Wrong input (this package's errors, Hydra's, OSError) and too little memory give one line on
+    stderr and exit code 2, an interrupt exit code 130, any other error its traceback and exit
+    code 1. Commands may be nested.
     """
 
     @wraps(function)

@@ -1,4 +1,4 @@
-"""The written help of the commands that take settings; its options are read from conf/."""
+"""Help of the commands with settings; options are read from conf/."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from lcc_rl.config import as_meant, choices
 from lcc_rl.config.compose import CONF
 
 HELP, FULL_HELP = {"-h", "--help"}, "--help-all"
-ENTRY_COMMANDS = {"pipeline": "run"}  # of commands that are not called as their configuration
+ENTRY_COMMANDS = {"pipeline": "run"}  # commands with another name than their configuration
 EXAMPLES = {
     "pipeline": (
         ("lcc-rl run", "on data in the package: minutes"),
         ("lcc-rl run data=ngsim data.path=tracks.csv", "on your trajectories"),
-        ("lcc-rl run experiment=smoke", "seconds: does everything run?"),
+        ("lcc-rl run experiment=smoke", "a check in seconds"),
     ),
     "train": (
         ("lcc-rl train variant=alcc experiment=limits", "a minute"),
@@ -31,7 +31,7 @@ EXAMPLES = {
     ),
     "evaluate": (
         ("lcc-rl evaluate policy=outputs/train/<run>", "baselines"),
-        ("lcc-rl evaluate 'compare=[my_pieces.PID,mpc,pretrained/alcc]'", "rivals"),
+        ("lcc-rl evaluate 'compare=[my_pieces.PID,mpc,pretrained/alcc]'", "other controllers"),
         ("lcc-rl evaluate task=ring-22 'compare=[pretrained,pid.yaml]'", "a task"),
     ),
     "calibrate": (
@@ -64,7 +64,7 @@ def text(entry: str, overrides: Sequence[str] = ()) -> str:
 
     Args:
         entry: ``"train"``, ``"evaluate"``, ``"calibrate"`` or ``"pipeline"``.
-        overrides: what was typed; the defaults show the effect of the settings among it.
+        overrides: overrides of the command line, which change the displayed defaults.
     """
     name = ENTRY_COMMANDS.get(entry, entry)
     typed = [word for word in overrides if word[:1] != "-" and "=" in word]
@@ -80,15 +80,15 @@ def text(entry: str, overrides: Sequence[str] = ()) -> str:
         [
             *lines,
             "",
-            f"What conf/ sets: lcc-rl {name} --cfg job. Defaults of all classes: python",
+            f"Settings of conf/: lcc-rl {name} --cfg job. Defaults of all classes: python",
             "tools/settings.py writes docs/settings.md. All groups: --help-all. Pages: docs/.",
-            "-m makes a sweep of all combinations: a=1,2 b=3,4.",
+            "-m runs a sweep of all combinations: a=1,2 b=3,4.",
         ]
     )
 
 
 def _option(entry: str, key: str, cfg: Any) -> Iterator[str]:
-    """Yield the lines of an option: its name, its default, and its choices or its meaning."""
+    """Yield the lines of an option: name, default, and choices or meaning."""
     chosen = cfg.hydra.runtime.choices
     if names := choices(key):
         value, what = chosen.get(key) or "–", ", ".join(names)
@@ -103,7 +103,7 @@ def _option(entry: str, key: str, cfg: Any) -> Iterator[str]:
 
 
 def meaning(entry: str, key: str) -> str:
-    """Return the comment of a setting in the first file of conf/ that has one."""
+    """Return the comment of a setting in the first file of conf/ with one."""
     folder, (root, _, last) = Path(str(files(CONF))), key.rpartition(".")
     places = [folder / f"{name}.yaml" for name in (entry, "study", "base")]
     if root:

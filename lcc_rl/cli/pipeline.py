@@ -1,4 +1,4 @@
-"""Entry point: the main job, data to results in one command, ``lcc-rl run``."""
+"""``lcc-rl run``: the main job, from data to results."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from lcc_rl.runs.output import headlines
 
 @entry_point("pipeline", "lcc_rl.commands.pipeline")
 def main(cfg: PipelineConfig) -> None:
-    """Run everything into the run's folder, or complete the one given by ``resume``."""
+    """Run the job into its folder, or complete that of ``resume``."""
     from lcc_rl.commands.pipeline import run  # loads torch
 
     folder = resumed_folder(cfg, ("resume", "trust"))
     typed, chosen = HydraConfig.get().overrides.task, HydraConfig.get().runtime.choices
     own = [] if any(top_key(item) == "experiment" for item in typed) else ["experiment"]
-    with headlines():  # the parts are composed of what was typed, and of the default
+    with headlines():  # the parts are composed from the overrides
         run(cfg, folder, [*(f"{key}={chosen[key]}" for key in own), *typed])
 
 

@@ -1,4 +1,4 @@
-"""Show the state of the runs in a folder, by default of all below outputs."""
+"""Show the state of the runs in a folder, by default outputs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lcc_rl.runs.sweeps import read_plan
 
 
 def show_states(root: Path, console: Console) -> None:
-    """Print the state of the runs: a table on a terminal, otherwise one line per run."""
+    """Print the state of the runs: a table on a terminal, else one line per run."""
     states, planned = survey(root), read_plan(root).runs
     if console.is_terminal:
         console.print(states_table(root, states, planned))
@@ -44,9 +44,9 @@ def watch_folder(root: Path, console: Console) -> None:
 
 
 def look(folder: str, console: Console, watching: bool) -> None:
-    """Show a folder once, or keep showing it."""
+    """Show a folder once or continuously."""
     if not folder:
-        raise ConfigError("the name of the folder is empty; say, e.g., outputs")
+        raise ConfigError("the name of the folder is empty; use, e.g., outputs")
     if watching and console.is_terminal:
         watch_folder(Path(folder), console)
     else:
@@ -54,12 +54,12 @@ def look(folder: str, console: Console, watching: bool) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Show the folder given on the command line."""
+    """Show the folder of the command line."""
     parser = Arguments(prog="lcc-rl status", description=__doc__)
     parser.add_argument("folder", nargs="?", default="outputs")
     parser.add_argument("--watch", action="store_true", help="update the table until all runs end")
     parser.add_argument(
-        "--clean", action="store_true", help="first remove failed runs that hold no results"
+        "--clean", action="store_true", help="first remove failed runs without results"
     )
     options = parser.parse_args(arguments)
     if options.clean:

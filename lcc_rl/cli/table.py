@@ -1,12 +1,12 @@
-"""Print the table of an evaluation again, or as rows for a paper or a program.
+"""Print the table of an evaluation in several formats.
 
 lcc-rl table outputs/evaluate/<run>
 lcc-rl table outputs/evaluate/<run> --all               # every measure
-lcc-rl table outputs/evaluate/<run> --against idm       # savings against it
+lcc-rl table outputs/evaluate/<run> --against idm       # another baseline
 lcc-rl table outputs/evaluate/<run> --format latex      # for booktabs
-lcc-rl table outputs/evaluate/<run> --columns who,saved_pct
+lcc-rl table outputs/evaluate/<run> --columns driver,saved_pct
 lcc-rl table outputs/evaluate/<run> --format csv --decimal comma
-lcc-rl table outputs/train/<sweep> --figure sweep.pdf   # a row a setting
+lcc-rl table outputs/train/<sweep> --figure sweep.pdf   # a row per setting
 lcc-rl table outputs/alcc/tables/<table>.parquet --format latex
 """
 
@@ -40,19 +40,19 @@ TABLE_FORMATS: dict[str, Callable[[pd.DataFrame], str]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the table of a run, or any table that is kept as a parquet file."""
+    """Print the table of a run or of a parquet file."""
     parser = Arguments(prog="lcc-rl table", description=__doc__)
     what = "folder of an evaluation, a training, a job or a sweep; or a parquet file"
     parser.add_argument("run", type=Path, help=what)
-    form = "text is that of the run; of --columns and parquet files it is markdown"
+    form = "text by default, as the run prints it; markdown for --columns and parquet files"
     parser.add_argument("--format", choices=TABLE_FORMATS, default="text", help=form)
-    parser.add_argument("--all", action="store_true", help="every measure, as table=all shows")
-    parser.add_argument("--columns", help="which, by the names of --format csv, with commas")
-    parser.add_argument("--against", help="strategy that savings are against")
+    parser.add_argument("--all", action="store_true", help="all measures, as table=all")
+    parser.add_argument("--columns", help="names of columns of --format csv, separated by commas")
+    parser.add_argument("--against", help="baseline of savings")
     ending = typed(Annotated[str, Field(pattern=r"\.(png|pdf|svg)$")])
-    parser.add_argument("--figure", type=ending, help="draw the table, too: a .png, .pdf or .svg")
+    parser.add_argument("--figure", type=ending, help="also draw the table: a .png, .pdf or .svg")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
-    marks = "of --format csv; comma, as spreadsheets of many countries read, divides columns by ;"
+    marks = "decimal mark of --format csv; with comma, columns are separated by ;"
     parser.add_argument("--decimal", choices=("point", "comma"), default="point", help=marks)
     options = parser.parse_args(arguments)
     if options.decimal == "comma" and options.format != "csv":
@@ -84,8 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def draw(run: Run, against: str | None, path: str) -> None:
-    """Draw the table of a run, each training seed as a grey dot."""
-    # Here: tables alone need no matplotlib.
+    """Draw the table of a run with grey dots for training seeds."""
+    # Here, because tables need no matplotlib.
     from lcc_rl.figures.drawing import save
     from lcc_rl.figures.evaluation import measures_of
 
@@ -100,7 +100,7 @@ def draw(run: Run, against: str | None, path: str) -> None:
 
 
 def read_run(folder: Path, trust: Sequence[str]) -> Run:
-    """Return a run as its folder holds it; of a job its last part, of a sweep all runs as one."""
+    """Return the run of a folder: the last part of a job, all runs of a sweep as one."""
     folder = folder / FINAL if (folder / PARTS).is_dir() else folder
     if not (folder / CONFIG).is_file() and (runs := run_folders(folder)):
         return Run(folder, load_sweep(folder), load_config(runs[0], trust))

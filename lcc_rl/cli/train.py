@@ -1,4 +1,4 @@
-"""Entry point: train a variant and evaluate it on held-out windows, ``lcc-rl train``."""
+"""``lcc-rl train``: train a variant and evaluate it on held-out windows."""
 
 from __future__ import annotations
 

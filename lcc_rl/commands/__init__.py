@@ -1,1 +1,1 @@
-"""The work of each command, without the command line."""
+"""The commands, without their command lines."""

@@ -36,21 +36,21 @@ def run(
     start: float = 0.0,
     duration: float | None = None,
 ) -> Path:
-    """Write an animation of one sample episode.
+    """Write an animation of a sample episode.
 
     Args:
-        folder: of an evaluation, a training or a main job.
-        strategies: each a name of the table or of its rows, or
-            ``"<name>: <words for the reader>"``; none for the last one of the table. An ``.svg``,
-            or of an open road a ``.gif``, shows several beside each other.
-        episode: which of their sample episodes, from 0.
+        folder: folder of an evaluation, a training or a main job.
+        strategies: names in the table or its rows, or ``"<name>: <title>"``; by default the last
+            one of the table. An ``.svg``, or on an open road a ``.gif``, shows several side by
+            side.
+        episode: index of the sample episode.
         out: the file, see :func:`lcc_rl.figures.animation.animate`; by default a page in the
             run's folder ``figures``.
-        start: when the animation begins [s].
-        duration: how long it is [s]; None for to the end.
+        start: start of the animation [s].
+        duration: its duration [s]; None: to the end.
 
     Returns:
-        The file's path.
+        The path of the file.
 
     Raises:
         ConfigError: if there is no such run, strategy, episode, ending or time.
@@ -74,7 +74,7 @@ def run(
             label, rows = _episode(steps, strategy, episode)
             scenario = stored_config(folder)["scenario"]
             motion = _cut(motion_of(rows, scenario), start, duration)
-            # Side by side, there is room for little more than a name.
+            # Side by side, only a short title fits.
             name = in_words(strategy) + (f": {label}" if len(named) == 1 else "")
             motions[words or name] = motion
     default = folder / "figures" / f"animation_{in_file(named[0][0])}_{episode}.html"
@@ -90,20 +90,20 @@ def _episode(steps: pd.DataFrame, strategy: str, episode: int) -> tuple[str, pd.
 
 
 def _cut(motion: SampleMotion, start: float, duration: float | None) -> SampleMotion:
-    """Return the part of an episode that is shown."""
+    """Return the animated part of an episode."""
     end = float("inf") if duration is None else start + duration
     inside = ((motion.time >= start) & (motion.time <= end)).nonzero()[0]
     if len(inside) < 2:
         first, last = motion.time[0], motion.time[-1]
         raise ConfigError(
-            f"--start {start:g} and --duration leave no two moments: the episode has those from "
-            f"{first:g} to {last:g} s"
+            f"--start {start:g} and --duration leave fewer than two samples: the episode lasts "
+            f"from {first:g} to {last:g} s"
         )
     return motion.at(slice(inside[0], inside[-1] + 1))
 
 
 def with_steps(folder: Path) -> Path:
-    """Return the folder that holds a run's sample episodes; of a main job its evaluation."""
+    """Return the folder of a run's sample episodes; for a main job, of its evaluation."""
     for place in (folder, folder / "evaluation"):
         if (place / STEPS).is_file():
             return place
@@ -113,21 +113,21 @@ def with_steps(folder: Path) -> Path:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Animate what is named on the command line; print the file's name."""
+    """Write the animation of a command line; print its path."""
     parser = Arguments(description=__doc__)
     parser.add_argument("run", type=Path, help="folder of an evaluation, training or main job")
-    words_of = "name, or 'name: words for the reader'; by default the last of the evaluation"
+    words_of = "name, or 'name: title'; by default the last of the evaluation"
     parser.add_argument("--strategy", action="append", default=[], help=words_of)
     number = typed(NonNegative)
     parser.add_argument(
         "--episode",
         type=typed(Whole),
         default=0,
-        help="which sample episode, from 0",
+        help="index of the sample episode",
     )
     parser.add_argument("--out", type=Path, help=f"file to write, {', '.join(ANIMATION_FORMATS)}")
-    parser.add_argument("--start", type=number, default=0.0, help="first moment [s]")
-    parser.add_argument("--duration", type=number, help="by default to the end [s]")
+    parser.add_argument("--start", type=number, default=0.0, help="start [s]")
+    parser.add_argument("--duration", type=number, help="duration, by default to the end [s]")
     given = parser.parse_args(words)
     file = run(given.run, given.strategy, given.episode, given.out, given.start, given.duration)
     print(file)

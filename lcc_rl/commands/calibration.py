@@ -1,4 +1,4 @@
-"""Calibration of drivers from trajectories: rows, figures and a summary in a folder."""
+"""Calibration of drivers from trajectories."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ ERROR_HEADINGS = (
     ("gap_nrmse", "gap NRMSE [%]"),
 )
 
-# Gaps over the record's mean speed, in the table below T.
+# Gaps divided by the record's mean speed, below T in the table.
 BESIDE_T = ((EQUILIBRIUM, "  at equilibrium [s]"), (MEAN_GAP, "  recorded [s]"))
 
 
@@ -54,56 +54,56 @@ def run(
     cfg: CalibrateConfig,
     folder: str | Path,
     console: Console | None = None,
-    tell: Callable[[Sequence[str]], None] | None = None,
+    emit: Callable[[Sequence[str]], None] | None = None,
 ) -> pd.DataFrame:
-    """Calibrate the drivers of ``cfg.data`` as ``cfg.calibration`` says.
+    """Calibrate the drivers of ``cfg.data`` with the settings ``cfg.calibration``.
 
     Writes ``config.yaml``, ``twins.parquet``, ``drivers.parquet``, ``calibration.png``,
     ``joint_distribution.png`` and ``twins.png``.
 
     Args:
         cfg: configuration of the entry point ``calibrate``.
-        folder: where the files go.
-        console: where progress and summary go; by default the terminal.
-        tell: where the report's lines go; by default the console.
+        folder: folder of the results.
+        console: console of progress and summary; by default the terminal.
+        emit: receives the lines of the report; by default they go to the console.
 
     Returns:
         The calibrated drivers, as written.
 
     Raises:
-        LccError: one clear error for whatever is wrong with settings, data or files.
+        LccError: for any error in settings, data or files, in one line.
     """
     with claim(Path(folder)):
         check_folder(cfg, Path(folder))
         console = console or Console(highlight=False)
-        return _run(cfg, Path(folder), console, tell or partial(_say, console))
+        return _run(cfg, Path(folder), console, emit or partial(_print, console))
 
 
 def _run(
-    cfg: CalibrateConfig, folder: Path, console: Console, tell: Callable[[Sequence[str]], None]
+    cfg: CalibrateConfig, folder: Path, console: Console, emit: Callable[[Sequence[str]], None]
 ) -> pd.DataFrame:
     device = prepare_torch(cfg)
-    # Settings are checked before the data are read, which may take long.
+    # Settings are checked before the data are read, which may take a long time.
     calibrator = cfg.calibration.made(CALLED)
     dataset = load_episodes(cfg.data)
-    tell(dataset.report)
+    emit(dataset.report)
     start = perf_counter()
-    with Phases("calibration", console, tell) as progress:
+    with Phases("calibration", console, emit) as progress:
         result = calibrator(dataset.episodes, seed=cfg.seed, device=device, progress=progress)
     if dataset.vehicles:
         result = _named(result, dataset.vehicles)
     seconds = perf_counter() - start
     save_config(cfg, folder)
-    tell(result.report)
+    emit(result.report)
     _write(result, dataset.report, cfg, folder)
     console.print(_summary(result.drivers))
-    tell([f"calibrated in {seconds:.1f} s; results in {folder}"])
+    emit([f"calibrated in {seconds:.1f} s; results in {folder}"])
     return result.drivers
 
 
 def _named(result: Calibration, vehicles: Mapping[int, str]) -> Calibration:
-    """Add the names that the data have for followers and leaders."""
-    names = {who: result.drivers[f"{who}_id"].map(vehicles) for who in ("follower", "leader")}
+    """Add the data's names of followers and leaders."""
+    names = {role: result.drivers[f"{role}_id"].map(vehicles) for role in ("follower", "leader")}
     return replace(result, drivers=result.drivers.assign(**names))
 
 
@@ -120,17 +120,17 @@ def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: P
     save(joint_figure(result.drivers), folder / "joint_distribution.png", formats=formats)
     save(twins_figure(result.twins), folder / "twins.png", formats=formats)
     write_parquet(result.twins, folder / "twins.parquet", metadata)
-    # Last: it marks a finished calibration.
+    # Last, because it marks a finished calibration.
     write_parquet(result.drivers, folder / "drivers.parquet", metadata)
 
 
-def _say(console: Console, lines: Sequence[str]) -> None:
+def _print(console: Console, lines: Sequence[str]) -> None:
     for line in lines:
         console.print(line, markup=False, soft_wrap=True)
 
 
 def _summary(drivers: pd.DataFrame) -> Table:
-    """Mean and spread of the error and the parameters, by mode."""
+    """Return means and standard deviations of errors and parameters, by mode."""
     modes = list(drivers["mode"].unique())
     table = Table("", *modes, title="calibrated drivers, mean ± standard deviation", **PLAIN)
     parts = {mode: drivers[drivers["mode"] == mode] for mode in modes}
@@ -159,4 +159,4 @@ def _summary(drivers: pd.DataFrame) -> Table:
 def _spread(values: pd.Series) -> str:
     if values.nunique() == 1:
         return f"{values.iloc[0]:.2f} (all)"
-    return f"{values.mean():.2f} ± {values.std():.2f}"  # of a sample: n − 1
+    return f"{values.mean():.2f} ± {values.std():.2f}"  # n − 1 degrees of freedom

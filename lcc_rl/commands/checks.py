@@ -1,4 +1,4 @@
-"""Checks of settings before anything expensive starts."""
+"""Checks of settings before expensive work starts."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
 from lcc_rl.runs.loggers import Silent
 
-MESSAGES = "communication"  # the piece by which connected vehicles hear of each other
+MESSAGES = "communication"  # name of the piece with messages between connected vehicles
 MEASURED = {"episodes": ("ttc", "time_gap", "power"), "vehicles": (MESSAGES,)}
-KEPT_MOMENTS = 24  # that a step of a training keeps of every entry, its gradients included
-RECORD_BYTES = 4096  # bytes of an iteration's row in the record
+KEPT_MOMENTS = 24  # copies of every entry per step of a training, including gradients
+RECORD_BYTES = 4096  # size of an iteration's row in the record [bytes]
 
 
 def check_settings(cfg: TrainConfig, folder: Path) -> None:
-    """Check every setting of a training before the data are read, which may take long.
+    """Check all settings of a training before the data are read, which may take a long time.
 
-    Everything is built once, around a leader at constant speed.
+    Everything is built once with a leader at constant speed.
     """
     check_measured(cfg)
     if cfg.evaluation.shards > 1:
@@ -65,28 +65,28 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
 
 
 def check_evaluation(cfg: StudyConfig, inputs: Inputs) -> None:
-    """Check that an evaluation fits into memory, once the data are read."""
+    """Check that an evaluation fits into memory."""
     own, profiles = deployed(any_leader(cfg)), inputs.evaluation
     env = build_env(own, profiles, inputs.population, 1, 0, cfg.device, nominal=True)
     require_memory(evaluation_bytes(cfg, env.reset(), inputs), cfg.device)
 
 
 def check_strategies(strategies: Sequence[Strategy], inputs: Inputs) -> None:
-    """Check that the controllers of all strategies fit their strings, before anything is written.
+    """Check that the controllers of all strategies fit their strings, before files are written.
 
     Raises:
-        ConfigError: naming the controller, and the entry or shape at fault.
+        ConfigError: naming the controller and the wrong entry or shape.
     """
     for cfg in (any_leader(one.cfg) for one in strategies):
         build_env(cfg, inputs.evaluation, inputs.population, 1, 0, cfg.device, nominal=True)
 
 
 def training_bytes(cfg: StudyConfig, moment: TensorDictBase) -> dict[str, float]:
-    """Return the bytes that a training needs at the least, by the option that they are due to.
+    """Return the least memory that a training needs by option [bytes].
 
     Args:
         cfg: its configuration.
-        moment: the entries of one episode at one moment.
+        moment: the state of one episode.
     """
     settings, agent = cfg.training, cfg.agent.settings
     count, vehicles = settings.environments, moment[OBSERVATION].shape[-2]
@@ -103,7 +103,7 @@ def training_bytes(cfg: StudyConfig, moment: TensorDictBase) -> dict[str, float]
 
 
 def evaluation_bytes(cfg: StudyConfig, moment: TensorDictBase, inputs: Inputs) -> dict[str, float]:
-    """Return the bytes of the largest block of an evaluation; arguments as above."""
+    """Return the memory of the largest block of an evaluation by option [bytes]."""
     settings, count = cfg.evaluation, len(inputs.evaluation)
     steps = after_uncounted(cfg)[0].scenario.horizon
     if settings.rows == "episodes":
@@ -116,32 +116,31 @@ def evaluation_bytes(cfg: StudyConfig, moment: TensorDictBase, inputs: Inputs) -
 
 
 def check_installed(cfg: StudyConfig, compared: Sequence[Any] = ()) -> None:
-    """Refuse controllers whose package is not installed, before data are read.
+    """Refuse controllers that need a missing package, before data are read.
 
     Args:
-        cfg: configuration of a study, of which the baselines are checked, too.
+        cfg: configuration of a study, including its baselines.
         compared: further controllers, see :func:`lcc_rl.evaluation.named.controller_of`.
     """
     own = [name for name in cfg.evaluation.baselines if applies(cfg, name)]
-    others = [controller_of(who) for who in (*own, *compared) if who != DIRECT]
+    others = [controller_of(spec) for spec in (*own, *compared) if spec != DIRECT]
     for node in nodes_in([cfg.scenario.controllers, *others]):
         getattr(node.kind, "check_installed", lambda: None)()
 
 
 def build_logger(cfg: TrainConfig) -> Any:
-    """Build the logger of the training rows; a silent one where the run names none."""
+    """Build the logger of the training rows; by default a silent one."""
     return Silent() if cfg.logger is None else cfg.logger.made(("opened",))
 
 
 def check_variant(cfg: StudyConfig) -> None:
-    """Refuse a variant that the scenario does not fit.
+    """Refuse a variant that does not fit the scenario.
 
-    A learner does not go under the name of a variant that learns nothing, or the reverse, and
-    connected vehicles need messages.
+    Variant and configuration must both have an agent or none, and connected vehicles need messages.
     """
     try:
         own = load("train", [f"variant={cfg.variant}"])
-    except ConfigError:  # a variant of the user's own, known to this command line only
+    except ConfigError:  # a user's variant that only this command line defines
         return
     talks, heard = (MESSAGES in part.scenario.pieces for part in (own, cfg))
     if talks and not heard:
@@ -149,8 +148,8 @@ def check_variant(cfg: StudyConfig) -> None:
             f"variant={cfg.variant} is of connected vehicles, and scenario {cfg.scenario.name} has "
             "no messages: use task=platoon-us06, task=platoon-highway or scenario=platoon"
         )
-    if learns(cfg) and not learns(own):  # it has no automated vehicle, and the task has
-        raise ConfigError(f"variant={cfg.variant} learns nothing: use compare=[{cfg.variant}]")
+    if learns(cfg) and not learns(own):  # the variant has no automated vehicle, the task has
+        raise ConfigError(f"variant={cfg.variant} has no agent: use compare=[{cfg.variant}]")
     if learns(own) and not learns(cfg) and _is_driven_as(cfg, own):
         raise ConfigError(
             f"variant={cfg.variant} is a learned controller, but there is no agent; for a human "
@@ -159,13 +158,13 @@ def check_variant(cfg: StudyConfig) -> None:
 
 
 def _is_driven_as(cfg: StudyConfig, own: StudyConfig) -> bool:
-    """Whether the kind of controller of another configuration drives automated vehicles here."""
+    """Whether automated vehicles have the same kind of controller in two configurations."""
     kinds = [part.scenario.controllers[AUTOMATED].kind for part in (cfg, own)]
     return cfg.scenario.vehicles.count(AUTOMATED) > 0 and kinds[0] is kinds[1]
 
 
 def check_measured(cfg: StudyConfig) -> None:
-    """Check that the scenario has the pieces that write what an evaluation measures."""
+    """Check that the scenario has the pieces that an evaluation needs."""
     needed = MEASURED[cfg.evaluation.rows]
     lacking = [name for name in needed if cfg.scenario.pieces.get(name) is None]
     if lacking:

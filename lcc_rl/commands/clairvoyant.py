@@ -1,16 +1,16 @@
-"""Upper bound of the saving, and of what regard for the drivers behind can be worth.
+"""Upper bound of the saving, and of the benefit of regard for the drivers behind.
 
-    lcc-rl clairvoyant data=ngsim data.path=...   # beside idm and the policy
+    lcc-rl clairvoyant data=ngsim data.path=...   # with idm and the policy
     lcc-rl clairvoyant --policy outputs/train/<run> evaluation.drivers=3
     lcc-rl clairvoyant --regard --policy pretrained --iterations 100
 
-Plans every held-out episode by the gradient through the simulator, with knowledge of the whole
-profile, starting from a learned policy's actions, and evaluates the plan like any other strategy.
-With several policies every episode is planned from each, and the best plan counts. With --regard
-a second plan minimises the car's own energy only: what the first saves against it in the energy of
-all is the most that regard can save. Words that are no options are overrides of the evaluation
-(data, leader, drivers, split, evaluation, scenario, +filter, task); by default 12 drivers follow on
-each of 20 profiles. With task=i24-mixed a whole fleet is planned, at the flow of the learned one.
+Every held-out episode is planned by the gradient through the simulator, with knowledge of the whole
+profile. The plan starts from the actions of a learned policy and is evaluated as a strategy. With
+several policies the best plan of each episode counts. With --regard a second plan minimises the
+car's own energy only; the saving of the first plan against it, in the energy of all vehicles, is an
+upper bound of the benefit of regard. Further words are overrides of the evaluation (data, leader,
+drivers, split, evaluation, scenario, +filter, task); by default 12 drivers follow on each of 20
+profiles. With task=i24-mixed a whole fleet is planned at the flow of the learned one.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from lcc_rl.runs.states import PROGRESS, claim
 from lcc_rl.settings import Million
 
 DRIVER_COUNT = 12
-BLOCK = 1_000_000  # vehicles × steps planned side by side: some GiB
+BLOCK = 1_000_000  # vehicles × steps of parallel plans: some GiB
 SET_BY_BOUND = (
     "variant",
     "policy",
@@ -72,8 +72,8 @@ def plan(options: Namespace, cfg: EvaluateConfig, inputs: Inputs, folder: Path) 
     made, done = [], count(1)
     with ProgressReporter("clairvoyant", work, folder=folder) as progress:
         for first, block in parts:
-            tell = partial(_tell, progress, done)
-            rows = pd.concat(block_rows(cfg, learned, block, options, tell))
+            update = partial(_update, progress, done)
+            rows = pd.concat(block_rows(cfg, learned, block, options, update))
             rows["profile_id"] += first
             made.append(rows)
     episodes = pd.concat(made, ignore_index=True)
@@ -81,14 +81,14 @@ def plan(options: Namespace, cfg: EvaluateConfig, inputs: Inputs, folder: Path) 
     return episodes
 
 
-def _tell(
+def _update(
     progress: ProgressReporter, done: Iterator[int], _: int, values: dict[str, float]
 ) -> None:
     progress.update(next(done), values)
 
 
 def initial_strategy(cfg: EvaluateConfig, path: str, inputs: Inputs) -> Strategy:
-    """Read a policy to start from."""
+    """Read the initial policy."""
     policy = load_policy(path, cfg.variant, tuple(cfg.trust))
     if HUMAN not in policy[1].scenario.vehicles.names:
         raise ConfigError(
@@ -99,7 +99,7 @@ def initial_strategy(cfg: EvaluateConfig, path: str, inputs: Inputs) -> Strategy
 
 
 def blocks(inputs: Inputs, cfg: EvaluateConfig) -> Iterator[tuple[int, Inputs]]:
-    """Yield the windows in blocks that fit the memory, each with the number of its first."""
+    """Yield the windows in blocks that fit into memory, each with the index of its first one."""
     people = len(inputs.population.time_gap)
     episodes = min(cfg.evaluation.drivers or people, people)
     size = max(BLOCK // (episodes * len(cfg.scenario.vehicles) * cfg.scenario.horizon), 1)
@@ -113,9 +113,9 @@ def block_rows(
     learned: list[Strategy],
     block: Inputs,
     options: Namespace,
-    tell: Callable[[int, dict[str, float]], None],
+    update: Callable[[int, dict[str, float]], None],
 ) -> Iterator[pd.DataFrame]:
-    """Yield the rows of all strategies behind a block of windows."""
+    """Yield the rows of all strategies for a block of windows."""
     size = cfg.evaluation
     batch = len(block.evaluation) * len(block.population.time_gap)
     hold = round(options.hold / cfg.scenario.time_step)
@@ -137,7 +137,7 @@ def block_rows(
                 not options.no_compile,
                 own,
                 hold,
-                tell,
+                update,
             )
             for strategy in learned
         ]
@@ -145,37 +145,35 @@ def block_rows(
 
 
 def best(plans: list[pd.DataFrame]) -> pd.DataFrame:
-    """Return, of every episode, the plan that takes the least of what it minimises."""
+    """Return the plan with the lowest objective of every episode."""
     together = pd.concat(plans, ignore_index=True)
     energy = PATH_ENERGY[str(together["strategy"].iloc[0])]
     return together.loc[together.groupby(KEYS)[energy].idxmin()].reset_index(drop=True)
 
 
 def regard(episodes: pd.DataFrame) -> str:
-    """Say what regard for the drivers behind saves at most."""
+    """Return a sentence on the largest saving by regard for the drivers behind."""
     found = savings(episodes, PATH_ENERGY[BOUND_BOTH], BOUND_BOTH, BOUND_OWN)
     energy = episodes.groupby("strategy")[PATH_ENERGY[BOUND_BOTH]].mean()
     share = (energy[BOUND_OWN] - energy[BOUND_BOTH]) / energy["idm"]
     return (
-        f"Planned for all, all vehicles' paths take {100 * found.value:.2f} % less than planned "
-        f"for the car alone (95 % over windows: {100 * found.low:.2f} … {100 * found.high:.2f}); "
-        f"{share:.2%} of idm's."
+        f"With plans for all vehicles, their path energy is {100 * found.value:.2f} % lower than "
+        f"with plans for the car only (95 % interval over windows: {100 * found.low:.2f} … "
+        f"{100 * found.high:.2f}); {share:.2%} of idm's."
     )
 
 
 def main(arguments: list[str]) -> int:
     """Plan and print the table."""
     parser = Arguments(description=__doc__)
-    parser.add_argument("--policy", action="append", help="start of the plan (pretrained)")
-    parser.add_argument("--regard", action="store_true", help="plan for the car alone, too")
+    parser.add_argument("--policy", action="append", help="initial policy (pretrained)")
+    parser.add_argument("--regard", action="store_true", help="also plan for the car only")
     parser.add_argument("--iterations", type=typed(Million), default=400)
-    parser.add_argument("--hold", type=float, default=0.1, help="how long a shift acts [s]")
+    parser.add_argument("--hold", type=float, default=0.1, help="duration of a shift [s]")
     parser.add_argument("--no-compile", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("outputs/clairvoyant"))
     options, overrides = parser.parse_known_args(arguments)
-    check_overrides(
-        overrides, SET_BY_BOUND, "the controller is that of --policy, as it was trained"
-    )
+    check_overrides(overrides, SET_BY_BOUND, "the controller is that of --policy")
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     cfg = load("evaluate", ["variant=alcc", *overrides])
     cfg.evaluation.drivers = cfg.evaluation.drivers or DRIVER_COUNT

@@ -1,4 +1,4 @@
-"""Evaluates strategies in the scenario of a configuration and writes their rows."""
+"""Evaluation of strategies in the scenario of a configuration."""
 
 from __future__ import annotations
 
@@ -80,25 +80,25 @@ def run(
     replace: bool = False,
     policies: Mapping[str, GivenPolicy] | None = None,
 ) -> Rows:
-    """Evaluate a policy or rule, those it is compared with, and the baselines.
+    """Evaluate a policy or rule, compared strategies and baselines.
 
-    All meet the same profiles, drivers and noise. Writes config.yaml, steps.parquet,
+    All have the same profiles, drivers and noise. Writes config.yaml, steps.parquet,
     episodes.parquet and figures.
 
     Args:
-        cfg: configuration of the entry point ``evaluate``; with ``resume`` in it the run in that
-            folder is resumed with its own settings instead.
-        folder: where the files go.
-        own: evaluate the configuration's own variant, not only what it is compared with.
-        quiet: write the rows only: print no table, draw no figures.
-        replace: write over an evaluation of other settings.
-        policies: further ones that a program gives, by their names in tables.
+        cfg: configuration of the entry point ``evaluate``; with ``resume`` the run in that folder
+            is resumed with its settings.
+        folder: folder of the results.
+        own: evaluate the configuration's variant, too, not only compared strategies.
+        quiet: write the rows only, without tables and figures.
+        replace: overwrite an evaluation of other settings.
+        policies: further policies by their names in tables.
 
     Returns:
-        The rows of episodes.parquet; of many as a dataset, which is not read yet.
+        The rows of episodes.parquet; many rows as a dataset, which is read on demand.
 
     Raises:
-        LccError: one clear error for whatever is wrong with settings, data or files.
+        LccError: for any error in settings, data or files, in one line.
     """
     folder = Path(folder)
     if cfg.resume is not None:
@@ -112,17 +112,17 @@ def run(
 
 
 def made_by(table: Path) -> str | None:
-    """Return the hash of the configuration that a table was made by; None without a table."""
+    """Return the hash of the configuration of a table; None without a table."""
     return parquet_metadata(table).get(IDENTITY) if table.exists() else None
 
 
 def complete(cfg: EvaluateConfig, folder: Path) -> None:
-    """Bring a run of a sweep to its end: skip it where finished, resume it where it stopped."""
+    """Complete a run of a sweep: skip a finished one, resume a stopped one."""
     table = folder / EPISODES
     if made_by(table) == identity(cfg):
         log.info("%s: finished before", folder.name)
         return
-    check_folder(cfg, folder, "inputs")  # of other files it is made anew
+    check_folder(cfg, folder, "inputs")  # with other files it is repeated
     run(cfg, folder, quiet=cfg.evaluation.shards > 1, replace=True)
     forget(folder)
 
@@ -138,13 +138,13 @@ def _run(
     prepare_torch(cfg)
     check_measured(cfg)
     if cfg.policy not in (None, PRETRAINED) and not learns(cfg) and not _nobody_drives(cfg):
-        raise ConfigError(f"variant {cfg.variant} learns nothing: remove policy={cfg.policy}")
+        raise ConfigError(f"variant {cfg.variant} has no agent: remove policy={cfg.policy}")
     own = own and not only_named(cfg)
     if own:
         check_variant(cfg)
     strategies, inputs = strategies_of(cfg, own, policies)
     check_strategies(strategies, inputs)
-    if replace:  # rows of other settings must never stand beside this configuration
+    if replace:  # rows of other settings must not be in a folder with this configuration
         (folder / EPISODES).unlink(missing_ok=True)
     save_config(cfg, folder)
     rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
@@ -158,7 +158,7 @@ def draw(rows: Rows, cfg: EvaluateConfig, folder: Path) -> None:
     if not isinstance(rows, pd.DataFrame):
         log.info("no figures: there are more than %d rows", FEW)
         return
-    # Here: a training, which draws nothing, need not load matplotlib.
+    # Here, because a training draws nothing and need not load matplotlib.
     from lcc_rl.figures.evaluation import write_figures
 
     own = [name for name in rows["strategy"].unique() if not is_shipped(name)]
@@ -168,7 +168,7 @@ def draw(rows: Rows, cfg: EvaluateConfig, folder: Path) -> None:
 def task_of(cfg: StudyConfig) -> Task | None:
     """Return the task of a configuration; None without one.
 
-    If its unit is one of a single fuel, and scenario.fleet adds vehicles of another, it is kJ/km.
+    If its unit needs a single fuel and scenario.fleet adds vehicles of another, it is kJ/km.
     """
     if cfg.task is None:
         return None
@@ -189,44 +189,44 @@ def only_named(cfg: EvaluateConfig) -> bool:
 
 
 def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], list[tuple[str, str]]]:
-    """Return what ``compare`` names: controllers by their names in tables, and policies.
+    """Return the controllers of ``compare`` by their names in tables, and its policies.
 
-    Policies are their name, where one was given, and path; the folder of a sweep stands for those
-    of its runs. Nobody is left where no vehicle of the string is automated, as at the share 0 of a
-    sweep.
+    Policies are pairs of a name, if one was given, and a path; the folder of a sweep stands for
+    those of its runs. If no vehicle of the string is automated, as at the share 0 of a sweep,
+    nothing is compared.
 
     Raises:
-        ConfigError: if two have one name, or one has a reserved name, or a controller is
-            unknown or has no vehicle to drive.
+        ConfigError: if two share a name, a name is reserved, or a controller is unknown or has no
+            vehicle to drive.
     """
     named = cfg.compare
-    for who in named.values() if isinstance(named, Mapping) else named:
+    for spec in named.values() if isinstance(named, Mapping) else named:
         require(
-            isinstance(who, (str, Node)),
-            f"compare names {who!r}: expected a name, a path or a node; of several runs the folder "
-            "that holds them",
+            isinstance(spec, (str, Node)),
+            f"compare names {spec!r}: expected a name, a path or a node; for several runs, the "
+            "folder that holds them",
         )
     if not isinstance(named, Mapping):
-        labels = [who if is_policy(who) else label_of(who) for who in named]
+        labels = [spec if is_policy(spec) else label_of(spec) for spec in named]
         for label, count in Counter(labels).items():
             require(
                 count == 1,
                 f"compare names two {label}: give each a name, 'compare={{first: …, second: …}}'",
             )
         named = dict(zip(labels, named, strict=True))
-    task_of(cfg)  # its settings are checked before the data are read
+    task_of(cfg)  # checks its settings before the data are read
     task = _task_name(cfg)
     policies = [
         (label if named is cfg.compare else "", of_task(run, task))
-        for label, who in named.items()
-        if is_policy(who)
-        for run in _runs_of(Path(who))
+        for label, spec in named.items()
+        if is_policy(spec)
+        for run in _runs_of(Path(spec))
     ]
-    rivals = {label: who for label, who in named.items() if not is_policy(who)}
-    for label, who in rivals.items():
-        _check_label(label, who, str(who).removesuffix(FILTERED))
-        if who != DIRECT:
-            controller_of(who)
+    rivals = {label: spec for label, spec in named.items() if not is_policy(spec)}
+    for label, spec in rivals.items():
+        _check_label(label, spec, str(spec).removesuffix(FILTERED))
+        if spec != DIRECT:
+            controller_of(spec)
     if _nobody_drives(cfg):
         if left := [*named, *filter(None, [cfg.policy])]:
             log.warning("no vehicle is automated; left out: %s", ", ".join(left))
@@ -236,18 +236,18 @@ def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], list[tuple[str, str]]
     return rivals, policies
 
 
-def _check_label(label: str, who: Any, own: str) -> None:
+def _check_label(label: str, spec: Any, own: str) -> None:
     """Refuse reserved names of rows; ``own`` is allowed for the strategy of that name."""
     plain = label.removesuffix(FILTERED)
     require(
         in_words(plain) in (plain, in_words(own)),
-        f"compare names {label_of(who)} {label}, which stands for {in_words(label)!r}: choose "
+        f"compare names {label_of(spec)} {label}, which stands for {in_words(label)!r}: choose "
         "another",
     )
 
 
 def _runs_of(path: Path) -> list[str]:
-    """Return the runs that have a policy in the folder of a sweep; else the path."""
+    """Return the runs with a policy in the folder of a sweep; else the path."""
     sweep = path.is_dir() and not (path / CONFIG).exists()
     runs = [run for run in run_folders(path) if (run / POLICY).is_file()] if sweep else []
     return list(map(str, runs or [path]))
@@ -260,15 +260,15 @@ def _nobody_drives(cfg: StudyConfig) -> bool:
 def strategies_of(
     cfg: EvaluateConfig, own: bool | None = None, further: Mapping[str, GivenPolicy] | None = None
 ) -> tuple[list[Strategy], Inputs]:
-    """Build all strategies of an evaluation, and read what they are evaluated on.
+    """Build all strategies of an evaluation, and read its inputs.
 
     Args:
         cfg: configuration of the entry point ``evaluate``.
-        own: whether the configuration's own variant is among them; None: as the command decides.
-        further: policies that a program gives, by their names.
+        own: include the configuration's variant; None: unless ``compare`` names every policy.
+        further: further policies by name.
     """
     own = not only_named(cfg) if own is None else own
-    # Before the data: a missing file should not be noticed after minutes of reading.
+    # Before the data, so that a missing file is noticed before minutes of reading.
     rivals, paths = compared(cfg)
     policy, policies = _read_policies(cfg, paths)
     check_installed(cfg, list(rivals.values()))
@@ -288,7 +288,7 @@ def strategies_of(
         strategies += studied(cfg, policy, inputs.population)
     for name, policy_given in (further or {}).items():
         _check_label(name, "a policy", "")
-        require(learns(cfg), f"{name} is a policy, and variant {cfg.variant} learns nothing")
+        require(learns(cfg), f"{name} is a policy, and variant {cfg.variant} has no agent")
         env = build_env(cfg, inputs.evaluation, inputs.population, 1, 0, cfg.device, nominal=True)
         policy_given.tried(env.reset())
         strategies.append(Strategy(name, cfg, policy_given))
@@ -305,7 +305,7 @@ def strategies_of(
 def _read_policies(
     cfg: EvaluateConfig, compared: Sequence[tuple[str, str]]
 ) -> tuple[TrainedPolicy | None, list[TrainedPolicy]]:
-    """Read the policy under study, where there is one, and those compared."""
+    """Read the policy under study, if there is one, and compared policies."""
 
     def read(path: str) -> TrainedPolicy:
         weights, own = load_policy(path, cfg.variant, tuple(cfg.trust))
@@ -334,14 +334,14 @@ def _rules(cfg: EvaluateConfig, rivals: Mapping[str, Any], inputs: Inputs) -> li
 
 
 def _held_as_recorded(cfg: EvaluateConfig) -> list[str]:
-    """Return the limits of the task that are those of the recorded drivers."""
+    """Return the limits of the task that refer to the recorded drivers."""
     task = task_of(cfg)
     limits = task.limits if task else {}
     return [f"task.limits.{key}={RECORDED}" for key, bound in limits.items() if bound == RECORDED]
 
 
 def _lacking_record(cfg: EvaluateConfig, inputs: Inputs) -> str:
-    """Return why no vehicle drives as a recorded one; empty where one can."""
+    """Return why no vehicle can drive as a recorded driver; empty if one can."""
     if inputs.evaluation.followers is None:
         return "no driver was recorded behind these leaders"
     first = applies(cfg, RECORDED)
@@ -353,11 +353,11 @@ def evaluate_and_write(
 ) -> Rows:
     """Evaluate strategies on the held-out windows, write the rows and print the summary.
 
-    Of an evaluation of several blocks each block is written when it is played, and those that
-    the folder has are not played again.
+    With several blocks each block is written when it is played; blocks in the folder are not
+    played again.
 
     Returns:
-        The rows; of many a dataset, which is read only when asked.
+        The rows; many rows as a dataset, which is read on demand.
     """
     metadata = {IDENTITY: identity(cfg)}
     if cfg.evaluation.rows == "vehicles":
@@ -366,7 +366,7 @@ def evaluate_and_write(
         steps = pd.concat([trace for _, trace in results], ignore_index=True)
         check_present(folder)
         write_parquet(steps, folder / STEPS, metadata)
-        # Last: it marks a finished run.
+        # Last, because it marks a finished run.
         write_parquet(rows, folder / EPISODES, metadata)
     else:
         rows = _by_blocks(strategies, cfg, inputs, folder, metadata)
@@ -417,7 +417,7 @@ def _play_missing(
     done = sum(counts.values()) - sum(counts[block] for block in missing)
     if done:
         there = len(counts) - len(missing)
-        log.info("%s: %d of %d blocks are there already", strategy.name, there, len(counts))
+        log.info("%s: %d of %d blocks exist already", strategy.name, there, len(counts))
     where = folder if len(plan.own) > 1 else None
     title = f"evaluate {in_words(strategy.name)} ({place + 1} of {len(store.marks)})"
     with ProgressReporter(title, sum(counts.values()), "episode", done, where) as progress:
@@ -429,7 +429,7 @@ def _play_missing(
 
 
 def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterator[Report]:
-    """Yield the report of each source of leaders, or case of a platoon."""
+    """Yield the report of each source of leaders or case of a platoon."""
     if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":
         for source, part in by_source(rows):
             of = f"{source}: " if source else ""
@@ -444,7 +444,7 @@ def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterato
 
 
 def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
-    """Print the tables of an evaluation, in short or, as ``table=all``, in full."""
+    """Print the tables of an evaluation, short or, with ``table=all``, full."""
     plan = episodes.plan_of(cfg, inputs)
     drivers = several(len(plan.chosen), "driver")
     drivers += f" × {plan.repeats} repeats" if plan.repeats > 1 else ""

@@ -1,4 +1,4 @@
-"""The main job: from trajectories over calibration and training to an evaluation with figures."""
+"""The main job: trajectories, calibration, training and evaluation."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ from lcc_rl.results.runs import (
     resumed_config,
     save_config,
 )
-from lcc_rl.results.trust import own_modules, said_again
+from lcc_rl.results.trust import own_modules, trust_option
 from lcc_rl.runs.interrupts import INTERRUPTED
-from lcc_rl.runs.output import tell
+from lcc_rl.runs.output import show_headline
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch_jobs
 from lcc_rl.runs.states import claim
@@ -65,30 +65,30 @@ from lcc_rl.version import __version__
 
 log = logging.getLogger("lcc_rl")
 
-# Settings that only the pipeline has, and data, which a variant with other leaders would refuse;
-# all others are passed on to calibration and trainings.
+# Settings of the pipeline only, and data, which variants with other leaders refuse. All others are
+# passed to calibration and trainings.
 JOB_OPTIONS = ("calibration", "variants", "jobs", "variant", "resume", "hydra", "data")
 COMMAND_FILE, TRAJECTORIES = "command.txt", "trajectories.parquet"
-MADE = "lcc_rl.data"  # in the metadata of trajectories: which data they are
-NETWORKS = ("reference", "alcc")  # trained by default, and the rule by the gradient
+MADE = "lcc_rl.data"  # key of the data's hash in the metadata of trajectories
+NETWORKS = ("reference", "alcc")  # trained by default, besides the rule
 
 
 def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
     """Read trajectories, calibrate drivers, train the variants, evaluate and draw.
 
-    A folder that already holds parts of the same job is completed.
+    A folder with parts of the same job is completed.
 
     Args:
-        cfg: configuration of the entry point ``pipeline``; with ``resume`` in it the job in that
-            folder is resumed with its own settings instead.
-        folder: where everything goes: ``calibration``, a folder per variant, ``evaluation``.
-        overrides: what was typed on the command line; passed on to the parts.
+        cfg: configuration of the entry point ``pipeline``; with ``resume`` the job in that folder
+            is resumed with its settings.
+        folder: folder of ``calibration``, of a folder per variant and of ``evaluation``.
+        overrides: overrides of the command line, which are passed to the parts.
 
     Returns:
         The rows of evaluation/episodes.parquet.
 
     Raises:
-        LccError: one clear error for whatever is wrong with settings, data or files.
+        LccError: for any error in settings, data or files, in one line.
     """
     folder = Path(folder)
     with claim(folder):
@@ -98,7 +98,7 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
             check_folder(cfg, folder)
             command = shlex.join(["lcc-rl", "run", *overrides])
         elif (folder / COMMAND_FILE).is_file():
-            read = (folder / TRAJECTORIES).exists()  # then nothing else is
+            read = (folder / TRAJECTORIES).exists()  # then no other data are read
             cfg = (load_config if read else resumed_config)(folder, cfg.trust)
             trainings = {x: load_config(folder / PARTS / x, cfg.trust) for x in cfg.variants or ()}
             final = load_config(folder / PARTS / FINAL, cfg.trust)
@@ -120,7 +120,7 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
 def composed_part(
     cfg: PipelineConfig, overrides: list[str]
 ) -> tuple[dict[str, TrainConfig], EvaluateConfig]:
-    """Compose every part of a job: its trainings by variant, and the evaluation."""
+    """Compose the parts of a job: trainings by variant, and the evaluation."""
     for item in overrides:
         if top_key(item) == "variant":
             raise ConfigError(
@@ -134,7 +134,7 @@ def composed_part(
     final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={names[-1]}"])
     for part in (*trainings.values(), final):
         part.data = cfg.data
-    # It reads the policies of these trainings, whose classes the same command names.
+    # It reads the policies of these trainings, with classes of the same command.
     own = (module for part in trainings.values() for module in own_modules(part))
     final.trust = list(dict.fromkeys([*final.trust, *own]))
     return trainings, final
@@ -147,22 +147,22 @@ def _run(
     folder: Path,
     command: str,
 ) -> Rows:
-    tell(f"lcc_rl {__version__}: data, drivers, policies, results into {folder}")
+    show_headline(f"lcc_rl {__version__}: data, drivers, policies, results into {folder}")
     read_once(cfg, folder)
     drivers = calibrate_once(cfg, folder)
     for part in (*trainings.values(), final):
         part.data = _episodes(cfg, folder)
         part.drivers = Node.of({TARGET: path_of(bootstrap), "path": str(drivers)}, "drivers")
-    tell(f"training {', '.join(trainings)}, {cfg.jobs} at a time; details in */train.log")
+    show_headline(f"training {', '.join(trainings)}, {cfg.jobs} at a time; details in */train.log")
     try:
         train_all(trainings, folder, cfg.jobs)
     except Interrupted:
-        words = f"stopped; complete it with: lcc-rl run resume={folder}{said_again(final)}"
+        words = f"stopped; complete it with: lcc-rl run resume={folder}{trust_option(final)}"
         raise Interrupted(words) from None
     final.compare = [
         str(folder / name) for name in trainings if (folder / name / "policy.pt").exists()
     ]
-    tell("evaluating them and the baselines on held-out windows")
+    show_headline("evaluating them and the baselines on held-out windows")
     paged = final.evaluation.rows == "episodes"
     rows = evaluation.run(final, folder / FINAL, own=False, quiet=paged)
     if final.compare:
@@ -177,13 +177,13 @@ def _run(
         write_figures(folder / FINAL, reports=[one])
         page = write_page(folder, [command], one, size)
         print_table(terminal(one, f"Leader, car, human behind it: {size}"))
-        tell(f"rows, figures and policies: {folder}")
-        tell(f"page: {page}")
+        show_headline(f"rows, figures and policies: {folder}")
+        show_headline(f"page: {page}")
     return rows
 
 
 def _episodes(cfg: PipelineConfig, folder: Path) -> Node:
-    """Return the node of the trajectories that a job keeps in its folder."""
+    """Return the node of the trajectories in a job's folder."""
     settings = {TARGET: path_of(EpisodesSource), "path": str(folder / TRAJECTORIES)}
     if plausible := cfg.data.settings.get("plausible"):
         settings["plausible"] = plausible
@@ -191,12 +191,12 @@ def _episodes(cfg: PipelineConfig, folder: Path) -> Node:
 
 
 def read_once(cfg: PipelineConfig, folder: Path, learns: bool = True) -> None:
-    """Read the trajectories and keep them; skip what is there.
+    """Read the trajectories and store them, unless they exist.
 
-    If a policy ``learns`` from them, check first that they can be split.
+    If a policy ``learns`` from them, check that they can be divided.
 
     Raises:
-        ResultsError: if those that are there are of other settings or files.
+        ResultsError: if existing ones are of other settings or files.
     """
     path, own = folder / TRAJECTORIES, as_plain(cfg.data)
     made = config_hash([own, cfg.inputs.get("data")])
@@ -207,7 +207,7 @@ def read_once(cfg: PipelineConfig, folder: Path, learns: bool = True) -> None:
     loaded = cfg.data.made(LOADS).load()
     _pass_on(loaded.report)
     counts = [line for line in loaded.report if line.startswith(("kept ", "read "))]
-    tell(f"data: {(counts or loaded.report)[-1]}")
+    show_headline(f"data: {(counts or loaded.report)[-1]}")
     if learns:
         load_inputs(cfg, loaded.episodes).to_learn_from()
     episodes = loaded.episodes[list(SCHEMA)].astype({**SCHEMA, "recording": str})
@@ -215,40 +215,40 @@ def read_once(cfg: PipelineConfig, folder: Path, learns: bool = True) -> None:
 
 
 def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
-    """Calibrate drivers to the trajectories in the folder, unless that is done."""
+    """Calibrate drivers to the trajectories in the folder, unless this is done."""
     drivers = folder / "calibration" / "drivers.parquet"
     shared = {item.name: getattr(cfg, item.name) for item in fields(CalibrateConfig)}
     own = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})
     check_folder(own, drivers.parent)
     if not drivers.exists():
-        found = calibration.run(own, drivers.parent, Console(quiet=True), tell=_pass_on)
+        found = calibration.run(own, drivers.parent, Console(quiet=True), emit=_pass_on)
         modes = {str(mode): rows for mode, rows in found.groupby("mode", sort=False)}
         errors = (f"{mode} {100.0 * x['rmspe'].mean():.2f} %" for mode, x in modes.items())
         records = count_records(next(iter(modes.values())))
-        tell(f"calibrated {records}: mean RMSPE {', '.join(errors)}")
+        show_headline(f"calibrated {records}: mean RMSPE {', '.join(errors)}")
     return drivers
 
 
 def _pass_on(lines: Sequence[str]) -> None:
-    """Log what was read and calibrated; what changes the results is also on the terminal."""
+    """Log lines of a report; lines on changes of the results also appear on the terminal."""
     for line in lines:
         log.log(logging.WARNING if isinstance(line, Concern) else logging.INFO, line)
 
 
 def train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
-    """Train side by side, each in a process and a folder of its own; finished ones are skipped.
+    """Run trainings in parallel, each in its own process and folder; finished ones are skipped.
 
     Args:
-        parts: the trainings, by their folders below ``folder``.
+        parts: the trainings by their folders below ``folder``.
         folder: the job's folder.
-        jobs: trainings at a time.
+        jobs: number of parallel trainings.
 
     Raises:
-        LccError: the error of the first that failed, once all others ended.
-        Interrupted: on SIGINT or SIGTERM, after every running training saved its state.
+        LccError: the error of the first failed training, after all others ended.
+        Interrupted: on SIGINT or SIGTERM, after all running trainings saved their state.
     """
     todo = {name: cfg for name, cfg in parts.items() if not _finished(folder / name, cfg)}
-    # A fresh interpreter per training: forking a process that has used torch's threads can hang.
+    # A new interpreter per training: forking a process with torch's threads can hang.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, _end_with_parent) as pool:
         futures: dict[str, Future[None]] = {
@@ -266,9 +266,9 @@ def train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process once its parent was killed; it would wait for work forever."""
+    """End this process when its parent is killed; else it would wait for work forever."""
     logging.getLogger().setLevel(logging.INFO)
-    logging.raiseExceptions = False  # a log that cannot be written ends no training
+    logging.raiseExceptions = False  # a failing log must not end a training
     parent = multiprocessing.parent_process()
 
     def wait_for_end() -> None:
@@ -280,7 +280,7 @@ def _end_with_parent() -> None:
 
 
 def _train_one(cfg: TrainConfig, folder: str) -> None:
-    """Train one variant, with a log file of its own; runs in a process of the pool."""
+    """Train one variant with its own log file, in a process of the pool."""
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
     if (target / "checkpoint.pt").exists():
@@ -292,19 +292,19 @@ def _train_one(cfg: TrainConfig, folder: str) -> None:
     try:
         training.run(cfg, target, quiet=True)
     except Interrupted:
-        os._exit(INTERRUPTED)  # or the pool would give this process the next training
+        os._exit(INTERRUPTED)  # else the pool would start the next training in this process
     finally:
         root.removeHandler(handler)
         handler.close()
 
 
 def _finished(folder: Path, cfg: TrainConfig) -> bool:
-    """Whether a training is complete; one of other settings is refused."""
+    """Whether a training is complete; other settings are refused."""
     check_folder(with_inputs(cfg), folder, *NOT_IDENTITY)
     return (folder / EPISODES).exists()
 
 
 def known_settings(overrides: list[str], entry: str) -> list[str]:
-    """Keep the overrides that an entry point has settings for."""
+    """Return the overrides of settings that an entry point has."""
     known = {"experiment", *KINDS[entry].__dataclass_fields__}
     return [item for item in overrides if top_key(item) in known]

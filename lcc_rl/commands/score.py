@@ -1,13 +1,13 @@
-"""Score a policy or controller on every task that it fits, behind the leaders of every source.
+"""Score a policy or controller on all tasks that it fits, for all sources of leaders.
 
     lcc-rl score policy.onnx      # or a run, pretrained/<name>, idm_acc …
     lcc-rl score outputs/train/<run> --task i24-follow5 --on everyday
     lcc-rl score idm --source i24 leader=i24 leader.path=i24_leaders.parquet
 
-Prints one table and writes score.json: scores, intervals over drives, limits, and what they were
-measured on: hashes of the windows that leaders drove, of all settings and of the policy's file, and
-versions. The rows of all episodes stand beside it. Words that are no options are further settings
-of every task, but the variant, which is the task's; they change the hash of the settings.
+Prints a table and writes score.json with scores, intervals over drives, limits, versions, and
+hashes of the leaders' windows, of all settings and of the policy's file. The rows of all episodes
+are in the same folder. Further words are settings of all tasks, except the variant; they change the
+hash of the settings.
 """
 
 from __future__ import annotations
@@ -58,11 +58,11 @@ from lcc_rl.results.render import print_table
 from lcc_rl.results.report import summary, windows_for
 from lcc_rl.results.runs import EPISODES, save_config
 from lcc_rl.runs.arguments import Arguments
-from lcc_rl.runs.output import HEADLINE, tell
+from lcc_rl.runs.output import HEADLINE, show_headline
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import ERROR, LOCK, claim, forget, record
 
-# Sources of leaders, and human drivers that keep up with them.
+# Sources of leaders, with human drivers that are fast enough for them.
 LEADER_SOURCES: dict[str, tuple[str, ...]] = {
     "stream": ("data=stream", "drivers=i80"),
     "highway": ("data=highway", "drivers=highway"),
@@ -85,74 +85,74 @@ FILE = "score.json"
 
 
 class Scored(NamedTuple):
-    """A scored controller: its name in tables, what was given, and the policy if it is one."""
+    """A scored controller: name in tables, specification, and the policy if it is one."""
 
     label: str
-    who: str
+    spec: str
     policy: TrainedPolicy | None
 
     def strategy(self, cfg: EvaluateConfig) -> Strategy:
         """Return it as a strategy of a task.
 
         Raises:
-            LccError: if it does not fit the task's vehicles, observation or action.
+            LccError: if it does not fit the vehicles, observation or action of the task.
         """
         population, scenario = build_drivers(cfg), cfg.scenario
         if self.policy is not None:
-            found = replace(trained(cfg, self.who, self.policy, population), name=self.label)
+            found = replace(trained(cfg, self.spec, self.policy, population), name=self.label)
         else:
             require(applies(cfg, self.label), "it has no vehicle to drive in this string")
             require(
                 scenario.filters.get(AUTOMATED) is not None or not self.label.endswith(FILTERED),
-                f"the task has no safety filter: score {self.who.removesuffix(FILTERED)}, which "
-                "drives without one; with +filter=cbf the leaderboard refuses the row",
+                f"the task has no safety filter: score {self.spec.removesuffix(FILTERED)} without "
+                "one; with +filter=cbf the leaderboard refuses the row",
             )
-            found = baseline(cfg, self.label, self.who)
+            found = baseline(cfg, self.label, self.spec)
         road = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["trial"])
         build_env(any_leader(found.cfg), road, population, 1, nominal=True)
         return found
 
     def files(self) -> list[Path]:
-        """Return the files that it is made of; none of a controller of the package.
+        """Return its files; none for a controller of the package.
 
-        Those are a policy or a program; or a yaml file, and the module of an own class or function.
+        These are a policy or a program; or a yaml file, and the module of a user's class.
         """
         if self.policy is not None:
-            return [policy_file(self.who)]
-        return list(compared_files(self.who))
+            return [policy_file(self.spec)]
+        return list(compared_files(self.spec))
 
 
-def scored(who: str, trust: Sequence[str] = ()) -> Scored:
+def scored(spec: str, trust: Sequence[str] = ()) -> Scored:
     """Read a policy, or find a controller.
 
     Raises:
-        LccError: if there is none, or it drives no vehicle.
+        LccError: if there is none, or it cannot be scored.
     """
-    require(who not in (DIRECT, RECORDED), f"{who} is no controller that could be scored")
-    if is_policy(who):
-        return Scored(who, who, load_policy(who, trust=trust))
-    controller_of(who)
-    return Scored(label_of(who), who, None)
+    require(spec not in (DIRECT, RECORDED), f"{spec} cannot be scored")
+    if is_policy(spec):
+        return Scored(spec, spec, load_policy(spec, trust=trust))
+    controller_of(spec)
+    return Scored(label_of(spec), spec, None)
 
 
 def roads(
-    who: Scored, task: str, given: Mapping[str, Sequence[str]], further: Sequence[str]
+    entrant: Scored, task: str, given: Mapping[str, Sequence[str]], further: Sequence[str]
 ) -> dict[str, EvaluateConfig]:
     """Return the configurations of a task by the source of its leaders.
 
-    A ring has no leader, and a task that names its own record no others.
+    A ring has no leader; a task with its own record has no other sources.
 
     Raises:
         LccError: if a setting is wrong, or the policy does not fit the task.
     """
     words = (f"task={task}", *further)
     own: EvaluateConfig = load("evaluate", words)
-    who.strategy(own)
+    entrant.strategy(own)
     if own.scenario.road == RING:
         return {"ring": own}
     if own.leader is not None and "held_out" in own.leader.settings:
         return {" ".join(own.leader.settings["held_out"]): own}
-    # Drivers that a task fixes are part of it; a population is that of the source.
+    # Fixed drivers belong to a task; a population belongs to the source.
     people = HUMAN in own.scenario.vehicles.names and own.drivers.kind is not fixed
     left = () if people else ("drivers",)
     return {
@@ -161,14 +161,14 @@ def roads(
     }
 
 
-def play_source(who: Scored, source: str, cfg: EvaluateConfig, folder: Path) -> dict[str, Any]:
+def play_source(entrant: Scored, source: str, cfg: EvaluateConfig, folder: Path) -> dict[str, Any]:
     """Play a task behind the leaders of a source; return its row.
 
     Raises:
-        LccError: if it does not fit the task, or the source has no leaders for it.
+        LccError: if it does not fit the task, or the source has no suitable leaders.
     """
     prepare_torch(cfg)
-    task, strategy = task_of(cfg), who.strategy(cfg)
+    task, strategy = task_of(cfg), entrant.strategy(cfg)
     assert task is not None
     check_installed(cfg)
     inputs = load_inputs(cfg)
@@ -177,7 +177,7 @@ def play_source(who: Scored, source: str, cfg: EvaluateConfig, folder: Path) -> 
     save_config(cfg, folder)
     evaluate_and_write([*against, strategy], cfg, inputs, folder, quiet=True)
     rows = read_parquet(folder / EPISODES)
-    # Which other controllers are shown does not count, and "data" is the hash of what files hold.
+    # Further controllers do not count, and "data" is the hash of the contents of files.
     unused = ("evaluation.behind_filter", "inputs.data", "inputs.leader")
     settings = identity(cfg, *unused, changed=True)
     hashes = {"data": hash_of(inputs.evaluation), "settings": settings}
@@ -187,7 +187,7 @@ def play_source(who: Scored, source: str, cfg: EvaluateConfig, folder: Path) -> 
 
 
 def hash_of(windows: Profiles) -> str:
-    """Return the SHA-256 of what the leaders drive, in mm/s, window by window."""
+    """Return the SHA-256 of the leaders' speeds in mm/s, window by window."""
     digest = hashlib.sha256()
     for index in range(len(windows)):
         speeds = (1e3 * windows.record(index).double()).round().to("cpu").numpy().astype("<i4")
@@ -195,9 +195,9 @@ def hash_of(windows: Profiles) -> str:
     return digest.hexdigest()
 
 
-def about(who: Scored) -> dict[str, Any]:
+def about(entrant: Scored) -> dict[str, Any]:
     """Return the hash of the scored policy's files, and versions."""
-    contents = [file.read_bytes() for file in who.files()]
+    contents = [file.read_bytes() for file in entrant.files()]
     found: dict[str, str | None] = {}
     for name in ("lcc_rl", *SCORED_WITH):
         try:
@@ -210,25 +210,25 @@ def about(who: Scored) -> dict[str, Any]:
 
 
 def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
-    """Play all tasks that fit and write the scores; return them."""
-    who = scored(options.who, tuple(options.trust))
-    name = who.label if options.name is None else _own_name(options.name)
+    """Play all tasks that fit, and write and return the scores."""
+    entrant = scored(options.policy, tuple(options.trust))
+    name = entrant.label if options.name is None else _own_name(options.name)
     file = re.sub(r"\W+", "_", name)
     default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{file}"
-    mine = {*choices("task"), ERROR}.issuperset  # of a killed one, which is played again
+    mine = {*choices("task"), ERROR}.issuperset  # of a killed run, which is repeated
     folder = own_folder(options.out or default, "--out", mine)
     with claim(folder):
-        own_folder(folder, "--out", mine)  # another one may just have ended
+        own_folder(folder, "--out", mine)  # another process may just have ended
         try:
-            return _run(who, name, folder, options, further)
+            return _run(entrant, name, folder, options, further)
         except Exception as error:
-            if any(path.name != LOCK for path in folder.iterdir()):  # if refused, it leaves nothing
+            if any(path.name != LOCK for path in folder.iterdir()):  # not if refused
                 record(folder, error)
             raise
 
 
 def _run(
-    who: Scored, name: str, folder: Path, options: Namespace, further: Sequence[str]
+    entrant: Scored, name: str, folder: Path, options: Namespace, further: Sequence[str]
 ) -> dict[str, Any]:
     own = dict(map(_source, options.source))
     given, wanted = {**LEADER_SOURCES, **own}, {*options.on, *own} if options.on else None
@@ -237,20 +237,20 @@ def _run(
     for task in options.task or choices("task"):
         sources: dict[str, EvaluateConfig] = {}
         with leaving_out(task, left_out):
-            sources = roads(who, task, given, further)
+            sources = roads(entrant, task, given, further)
         chosen = [one for one in sources if one in (wanted or [one])]
         if sources and not chosen:
             left_out.append(f"{task}: no such source, only {', '.join(sources)}")
         for source in chosen:
             with leaving_out(f"{task}, {source}", left_out):
-                found.append(play_source(who, source, sources[source], folder / task / source))
+                found.append(play_source(entrant, source, sources[source], folder / task / source))
     why = "; ".join(left_out) or f"no such source, only {', '.join(given)}"
     require(bool(found), f"nothing could be played: {why}")
-    document = {"name": name, **about(who), "results": found, "left_out": left_out}
+    document = {"name": name, **about(entrant), "results": found, "left_out": left_out}
     with atomic_path(folder / FILE) as temporary:
         temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", "utf-8")
     forget(folder)
-    tell(f"scores in {folder / FILE}")
+    show_headline(f"scores in {folder / FILE}")
     played = {row["source"] for row in found}
     for source in own:
         require(source in played, f"--source {source} could not be played: {'; '.join(left_out)}")
@@ -259,7 +259,7 @@ def _run(
 
 @contextmanager
 def leaving_out(what: str, left_out: list[str]) -> Iterator[None]:
-    """Note why a task or a source of it cannot be played, instead of ending the command."""
+    """Note the error of a task or source that cannot be played, and continue."""
     try:
         yield
     except (ConfigError, DataError, ResultsError, Diverged) as error:
@@ -267,7 +267,7 @@ def leaving_out(what: str, left_out: list[str]) -> Iterator[None]:
 
 
 def _own_name(name: str) -> str:
-    """Return a name that the command line gives; reserved names are refused."""
+    """Return a name of the command line; reserved names are refused."""
     plain = name.removesuffix(FILTERED)
     new = not is_shipped(plain) and in_words(plain) == plain
     require(new, f"--name {name} stands for {in_words(name)!r} in tables: choose another")
@@ -279,7 +279,7 @@ def _own_name(name: str) -> str:
 
 
 def _source(given: Sequence[str]) -> tuple[str, tuple[str, ...]]:
-    """Return name and settings of a source that the command line names."""
+    """Return name and settings of a source of the command line."""
     name, *words = given
     require(
         re.fullmatch(r"\w[\w-]*", name) is not None and name not in LEADER_SOURCES,
@@ -288,8 +288,8 @@ def _source(given: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     for word in words:
         require(
             "=" in word and top_key(word) in OF_A_SOURCE,
-            f"--source {name}: expected settings of {', '.join(OF_A_SOURCE)}, got {word}; others "
-            "stand before it",
+            f"--source {name}: expected settings of {', '.join(OF_A_SOURCE)}, got {word}; put "
+            "others before --source",
         )
     people = () if any(top_key(word) == "drivers" for word in words) else ("drivers=highway",)
     return name, (*people, *words)
@@ -298,7 +298,7 @@ def _source(given: Sequence[str]) -> tuple[str, tuple[str, ...]]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Score and print the table."""
     parser = Arguments(prog="lcc-rl score", description=__doc__)
-    parser.add_argument("who", metavar="policy", help="ONNX file, run, policy file or controller")
+    parser.add_argument("policy", help="ONNX file, run, policy file or controller")
     parser.add_argument("--name", help="name in tables; by default that of the file")
     parser.add_argument("--task", action="append", help="only this task; repeat for several")
     parser.add_argument("--on", action="append", default=[], help="only this source")
@@ -314,7 +314,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
     options, further = parser.parse_known_args(arguments)
     check_overrides(further, SET_BY_SCORE, "each task has its own; --task and --source choose")
-    logging.basicConfig(level=HEADLINE, format="%(message)s")  # no detail of every task
+    logging.basicConfig(level=HEADLINE, format="%(message)s")  # without details
     document = run(options, further)
     print_table(score_table(document["name"], document["results"]))
     for line in document["left_out"]:

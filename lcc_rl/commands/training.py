@@ -1,4 +1,4 @@
-"""Trains the variant of a configuration, then evaluates it."""
+"""Training and evaluation of the variant of a configuration."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from lcc_rl.results.platoons import case_table
 from lcc_rl.results.policies import load_policy, save_policy
 from lcc_rl.results.report import summary, windows_for
 from lcc_rl.results.runs import EPISODES, check_folder, resumed_config, save_config
-from lcc_rl.results.trust import said_again
+from lcc_rl.results.trust import trust_option
 from lcc_rl.runs.loggers import RowLogger, Silent
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import working
@@ -40,24 +40,23 @@ RECORD = "training.parquet"
 def run(cfg: TrainConfig, folder: str | Path, quiet: bool = False, resume: bool = False) -> Rows:
     """Train the variant of a configuration, then evaluate it.
 
-    Writes config.yaml, training.parquet, timing.parquet, checkpoint.pt, policy.pt, steps.parquet
-    and, last, episodes.parquet; the first four after config.yaml only where something is learned,
-    policies/<iteration>.pt where training.keep_every says so, and policy_last.pt where
-    agent.best_window makes policy.pt another one.
+    Writes config.yaml; with an agent training.parquet, timing.parquet, checkpoint.pt, policy.pt,
+    policies/<iteration>.pt with training.keep_every, and policy_last.pt if agent.best_window
+    selects another policy; steps.parquet; and, last, episodes.parquet.
 
     Args:
-        cfg: configuration of the entry point ``train``; with ``resume`` in it the run in that
-            folder is resumed with its own settings instead.
-        folder: where the files go.
+        cfg: configuration of the entry point ``train``; with ``resume`` the run in that folder is
+            resumed with its settings.
+        folder: folder of the results.
         quiet: do not print the table.
-        resume: resume from a checkpoint of the same configuration where the folder has one.
+        resume: resume from a checkpoint of the same configuration if the folder has one.
 
     Returns:
-        The rows of episodes.parquet; of many as a dataset, which is not read yet.
+        The rows of episodes.parquet; many rows as a dataset, which is read on demand.
 
     Raises:
-        LccError: one clear error for whatever is wrong with settings, data or files; it is also
-            left in the folder as error.txt.
+        LccError: for any error in settings, data or files, in one line, which is also written to
+            error.txt.
     """
     folder, named = Path(folder), cfg.resume is not None
     if cfg.resume is not None:
@@ -75,9 +74,9 @@ def run(cfg: TrainConfig, folder: str | Path, quiet: bool = False, resume: bool 
 
 
 def _resumed(cfg: TrainConfig, folder: Path) -> TrainConfig:
-    """Return the configuration of the run in a folder, checked against what that run made.
+    """Return the configuration of the run in a folder, checked against its tables.
 
-    Where the rows are logged may be said anew: what is stored names no place to write.
+    The logger may be given again, because stored configurations name no path to write to.
     """
     own: TrainConfig = resumed_config(folder, cfg.trust)
     for table in (EPISODES, RECORD):
@@ -103,7 +102,7 @@ def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
         save_config(cfg, folder)
     if not learns(cfg):
         strategy = rule(cfg)
-        log.info("%s learns nothing: evaluating it", strategy.name)
+        log.info("%s has no agent: evaluating it", strategy.name)
     elif cfg.policy is not None:
         strategy = _given(cfg, inputs, folder)
     else:
@@ -117,11 +116,11 @@ def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
 
 
 def _given(cfg: TrainConfig, inputs: Inputs, folder: Path) -> Strategy:
-    """Build the strategy of a variant that builds on a trained policy."""
+    """Build the strategy of a variant that uses a trained policy."""
     if cfg.deployed is None:
         raise ConfigError(
-            f"policy={cfg.policy}: variant {cfg.variant} builds on no trained policy; remove it, "
-            "or use lcc-rl evaluate to evaluate one"
+            f"policy={cfg.policy}: variant {cfg.variant} uses no trained policy; remove it, "
+            "or evaluate a policy by lcc-rl evaluate"
         )
     weights, own = load_policy(str(cfg.policy), cfg.variant, cfg.trust)
     check_policy(cfg, own)
@@ -133,7 +132,7 @@ def _given(cfg: TrainConfig, inputs: Inputs, folder: Path) -> Strategy:
 
 
 def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume: bool) -> None:
-    """Train an agent to the end, write its policy and leave the agent with it."""
+    """Train an agent to the end and write its policy, which the agent then has."""
     profiles = inputs.to_learn_from()
     agent.take(profiles)
     trainer = make_trainer(cfg, agent, profiles, inputs.population, folder)
@@ -148,12 +147,12 @@ def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume:
         try:
             trainer.run()
         except Interrupted as error:
-            raise Interrupted(f"{error}{said_again(cfg)}") from error
+            raise Interrupted(f"{error}{trust_option(cfg)}") from error
     weights = agent.policy.state_dict()
     if all(torch.equal(weights[name], value) for name, value in first.items()):
         log.warning(
-            "the training changed nothing: it took no step, or every gradient was 0; the rows are "
-            "of the initial policy"
+            "the training changed nothing: it made no update, or every gradient was 0; the rows "
+            "are those of the initial policy"
         )
     if trainer.best is not None:
         save_policy(agent.policy.state_dict(), cfg, folder / LAST)
@@ -163,7 +162,7 @@ def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume:
 
 
 def complete(cfg: TrainConfig, folder: Path) -> Rows:
-    """Bring a run of a sweep to its end: skip it where finished, resume it where it stopped."""
+    """Complete a run of a sweep: skip a finished one, resume a stopped one."""
     table = folder / EPISODES
     if made_by(table) == identity(cfg):
         log.info("%s: finished before", folder.name)
@@ -172,8 +171,8 @@ def complete(cfg: TrainConfig, folder: Path) -> Rows:
 
 
 def measured(rows: Rows) -> dict[str, Any]:
-    """Return the last row of the summary, that of the strategy trained."""
-    # By its rows: a resumed run is not of the variant that the command line composed.
+    """Return the last row of the summary, that of the trained strategy."""
+    # From its rows, because a resumed run has its own variant.
     vehicles = isinstance(rows, pd.DataFrame) and "follower" in rows
     table = case_table(rows, WINDOW_CASES) if vehicles else summary(windows_for(rows))
     return {str(key): value for key, value in table.iloc[-1].items()}

@@ -1,4 +1,4 @@
-"""Configurations: composed by Hydra, parsed once into a typed tree whose nodes are checked."""
+"""Configurations: composed by Hydra and parsed once into a checked, typed tree."""
 
 from lcc_rl.config.compose import (
     HYDRA_ERRORS,

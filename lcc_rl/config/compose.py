@@ -43,36 +43,36 @@ from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
 from lcc_rl.settings import TARGET, find_target
 
 CONF = "lcc_rl.conf"
-# Settings that do not change any row of a result.
+# Settings that change no row of a result.
 NOT_IDENTITY = (
     *("resume", "jobs", "sweep", "logger", "trust", "figure_formats", "table"),
     "training.keep_every",
 )
-# Launchers that come with other packages: which extra brings them.
+# Extras that install launchers.
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
-# Settings that came later: without them a run is what it was before.
+# Settings of later versions, which older runs lack.
 LATER = ("evaluation.warm_up", "scenario.fleet")
-NEEDED = ("data", "split", "drivers", "observation", "calibration")  # of commands that have them
+NEEDED = ("data", "split", "drivers", "observation", "calibration")  # required nodes of commands
 NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =
-# Hydra's keys are without quotes.
+# Hint on Hydra's keys, which have no quotes.
 NAMES_HINT = (
-    "; names before a colon have no quotes but letters, digits, spaces and _-+./%*@?|, and begin "
-    "with a letter; lcc_rl.compare takes any"
+    "; names before a colon consist of letters, digits, spaces and _-+./%*@?|, begin with a letter "
+    "and have no quotes; lcc_rl.compare accepts any name"
 )
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
 
 def find_conf() -> None:
-    """Let a clone that hides the installed package find :data:`CONF`, which lies beside it."""
-    beside = Path(__file__).parents[2] / "conf" / "__init__.py"
-    if find_spec(CONF) is None and beside.is_file():
-        spec: Any = spec_from_file_location(CONF, beside)
+    """Make :data:`CONF` importable if a clone hides the installed package."""
+    cloned = Path(__file__).parents[2] / "conf" / "__init__.py"
+    if find_spec(CONF) is None and cloned.is_file():
+        spec: Any = spec_from_file_location(CONF, cloned)
         sys.modules[CONF] = module = module_from_spec(spec)
         spec.loader.exec_module(module)
 
 
 def terms_of_energy(string: Any) -> float:
-    """Return how many vehicles' energy counts for an automated one: its own and those behind."""
+    """Return how many vehicles count in the energy of an automated one: itself and those behind."""
     plain = OmegaConf.to_container(string) if OmegaConf.is_config(string) else string
     roles = parse_string(plain)
     return 1.0 + roles.count(HUMAN) / max(roles.count(AUTOMATED), 1)
@@ -85,11 +85,11 @@ OmegaConf.register_new_resolver("lcc.energies", terms_of_energy, replace=True)
 
 
 def load(entry: str, overrides: Sequence[str] = ()) -> Any:
-    """Compose a configuration in Python exactly as the command line would.
+    """Compose a configuration in Python as the command line does.
 
     Args:
         entry: ``"train"``, ``"evaluate"``, ``"calibrate"`` or ``"pipeline"``.
-        overrides: what one would type after the command.
+        overrides: the words after the command.
 
     Returns:
         The typed tree, see :mod:`lcc_rl.config.schemas`.
@@ -105,7 +105,7 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
 
 
 def composed(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
-    """Return what Hydra composes."""
+    """Return the configuration that Hydra composes."""
     hydra, meant = GlobalHydra.instance(), as_meant(overrides)
     try:
         where = str(hydra.config_loader().get_search_path()) if hydra.is_initialized() else ""
@@ -115,22 +115,22 @@ def composed(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
         ConfigLoaderImpl.validate_sweep_overrides_legal(read, RunMode.RUN, from_shell=False)
         ConfigLoaderImpl._apply_overrides_to_config(read, cfg)
         return cfg
-    except (*HYDRA_ERRORS, ValueError, TypeError) as error:  # Hydra raises some as plain ones
+    except (*HYDRA_ERRORS, ValueError, TypeError) as error:  # Hydra raises some plain ones
         raise explained(error, overrides) from None
 
 
 @lru_cache(maxsize=512)  # Hydra takes 0.1 s to read and merge the files, settings a hundredth
 def _composed(entry: str, chosen: tuple[str, ...], where: str) -> DictConfig:
-    """Compose files; ``where`` Hydra looks for them is empty if it has not been initialised."""
+    """Compose files; ``where`` is Hydra's search path, empty if Hydra is not initialised."""
     with nullcontext() if where else initialize_config_module(CONF, version_base="1.3"):
         return compose(entry, overrides=list(chosen))
 
 
 def as_meant(overrides: Sequence[str]) -> list[str]:
-    """Return overrides as Hydra has to read them.
+    """Return overrides in the form for Hydra.
 
-    The typed tree knows which settings exist, Hydra only those that stand in a file: it may add
-    any. Names of variants, which papers write in capitals, become lower case.
+    Hydra accepts only settings of a file, so ``++`` is added; the typed tree checks names. Names of
+    variants, which papers write in capitals, are converted to lower case.
 
     Examples:
         >>> as_meant(["variant=ALCC,HCFS", "reward.terms.safety.margin=0", "agent=td3"])
@@ -145,7 +145,7 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
         key, equals, value = item.partition("=")
         if key.lstrip("+") in ("variant", "variants"):
             found.append(f"{key}{equals}{value.lower()}")
-        elif key in ("compare", "policy", "resume"):  # a sweep's folders are named seed=0_…
+        elif key in ("compare", "policy", "resume"):  # folders of a sweep: seed=0_…
             quoted = "'" in value or '"' in value
             found.append(f"++{key}{equals}{value if quoted else NAMED.sub(QUOTED, value)}")
         else:
@@ -155,14 +155,14 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
 
 
 def _is_choice(item: str) -> bool:
-    """Whether Hydra reads files for an override, or its own settings; other ones follow on them."""
+    """Whether an override chooses files or sets Hydra's own settings; others are applied later."""
     key, _, value = item.lstrip("+~").partition("=")
     group = key.partition("@")[0]
     return "/" in group or group.startswith("hydra") or (value[:1] != "{" and bool(choices(group)))
 
 
 def choices(group: str) -> list[str]:
-    """Return the names of a group's files, those of ``--config-dir`` among them."""
+    """Return the names of a group's files, including those of ``--config-dir``."""
     if GlobalHydra.instance().is_initialized():
         loader: Any = GlobalHydra.instance().config_loader()
         return list(loader.repository.get_group_options(group))  # its own copies all, for 4 ms
@@ -184,35 +184,34 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     """Return the typed tree of a composed configuration.
 
     Args:
-        cfg: what Hydra composed.
+        cfg: the composed configuration.
         entry: the command.
-        overrides: what was typed.
-        sweep: the runs of a sweep share what was typed, so a setting that one of them uses may be
-            given to another.
+        overrides: overrides of the command line.
+        sweep: allow settings that this run does not use, because the runs of a sweep share them.
     """
     for item in overrides:
         if item.endswith(f"={MISSING}"):
             raise ConfigError(f"{item.removeprefix('++')}: expected a value")
     try:
-        # Settings may refer to the default of a class.
+        # Settings may refer to defaults of classes.
         whole = OmegaConf.create(with_defaults(OmegaConf.to_container(cfg, resolve=False)))
         content: Any = OmegaConf.to_container(whole, resolve=True)
     except InterpolationKeyError as error:
         missing = re.search("'[^']+'", str(error))
         raise ConfigError(
-            f"{error.full_key} takes its value from {missing and missing.group()}, which is not "
-            "there: do variant, task, scenario and reward fit each other?"
+            f"{error.full_key} takes its value from {missing and missing.group()}, which does not "
+            "exist: do variant, task, scenario and reward fit each other?"
         ) from None
-    except OmegaConfBaseException as error:  # a reference in a circle
+    except OmegaConfBaseException as error:  # a circular reference
         raise ConfigError(" ".join(str(error).split())) from None
     if "agent" in content and not _learns(content):
         content["agent"] = None
     leave_out_foreign(content, overrides)
     if "inputs" in content:
-        raise ConfigError("inputs: a run notes itself which files it reads; remove the setting")
+        raise ConfigError("inputs: runs record the files that they read; remove the setting")
     try:
         tree = parse_config(content, KINDS[entry])
-    except ConfigError as error:  # of a class that has no such setting; another choice may
+    except ConfigError as error:  # another choice of the group may have the setting
         found = re.match(r"unknown setting of (\w+) \(", str(error))
         group = found.group(1) if found else ""
         if not group or not choices(group):
@@ -226,15 +225,15 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
 
 
 def with_inputs(cfg: Any) -> Any:
-    """Note in a configuration which files it reads, as they are now; return it."""
+    """Record the present hashes of input files in a configuration; return it."""
     cfg.inputs = inputs_of(as_plain(cfg))
     return cfg
 
 
 def _learns(content: Mapping[str, Any]) -> bool:
-    """Whether there is an agent, and vehicles whose controller carries out its actions."""
+    """Whether there is an agent, and a controller that executes its actions."""
     agent, scenario = content.get("agent"), content.get("scenario", {})
-    if not isinstance(agent, dict) or TARGET not in agent:  # a recipe's settings of an agent
+    if not isinstance(agent, dict) or TARGET not in agent:  # a recipe's settings without an agent
         return False
     if "string" in scenario and not parse_string(scenario["string"]).count(AUTOMATED):
         return False
@@ -245,14 +244,14 @@ def _learns(content: Mapping[str, Any]) -> bool:
 
 
 def leave_out_foreign(content: dict[str, Any], overrides: Sequence[str]) -> None:
-    """Remove the settings of a class that was replaced on the command line by another one.
+    """Remove settings of classes that the command line replaces.
 
-    After ``scenario.controllers.automated._target_=mine.Rule`` the settings that a file gives for
-    the former class stay if the new one has them, too; what was typed always stays.
+    After ``scenario.controllers.automated._target_=mine.Rule`` the file's settings of the former
+    class are kept if the new class has them; those of the command line are always kept.
 
     Args:
         content: a configuration as plain containers, changed in place.
-        overrides: what was typed.
+        overrides: overrides of the command line.
     """
     typed = set()
     for item in overrides:
@@ -272,12 +271,12 @@ def leave_out_foreign(content: dict[str, Any], overrides: Sequence[str]) -> None
 
 
 def is_sweep() -> bool:
-    """Whether this process does a run of a sweep; False outside Hydra, too."""
+    """Whether this process executes a run of a sweep; False outside Hydra."""
     return HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN
 
 
 def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
-    """Return what Hydra refused in one line, with the nearest choice that exists."""
+    """Return an error of Hydra in one line, with the nearest choice."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         if group == "hydra/launcher" and name in EXTRAS:
@@ -309,7 +308,7 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
 
 
 def _unknown_option(name: str) -> ConfigError:
-    """Return the error for an option that does not exist; many belong into a section."""
+    """Return the error for an unknown option, with its section if there is one."""
     places = {key: at for at, kind in SECTIONS.items() for key in settings_of(kind) or ()}
     root, known = name.partition(".")[0], _top_level() | _groups()
     if root in places:
@@ -321,7 +320,7 @@ def _unknown_option(name: str) -> ConfigError:
 
 
 def check_own_files() -> None:
-    """Refuse files of ``--config-dir`` that Hydra passes over: the package's of that name is read.
+    """Refuse files of ``--config-dir`` with the name of a file of the package, which Hydra ignores.
 
     Raises:
         ConfigError: naming the file.
@@ -334,7 +333,7 @@ def check_own_files() -> None:
 
 
 def own_file(group: str, name: str) -> str:
-    """Return what makes a file of the user's own a choice."""
+    """Return a hint on user's files."""
     return f"A file of your own, {group}/{name}.yaml, needs --config-dir <its folder>."
 
 
@@ -349,8 +348,8 @@ def identity(cfg: Any, *unused: str, changed: bool = False) -> str:
 
     Args:
         cfg: the configuration.
-        *unused: further keys of settings that do not.
-        changed: only what differs from the defaults of the classes counts.
+        *unused: keys of further settings that do not count.
+        changed: only settings that differ from the defaults of classes count.
     """
     content = without_defaults(cfg) if changed else as_plain(cfg, places=False)
     for key in (*NOT_IDENTITY, *unused, *LATER):

@@ -1,4 +1,4 @@
-"""Files that a run reads, by their content: a part of what the run is."""
+"""Hashes of input files, which are part of a run's identity."""
 
 from __future__ import annotations
 
@@ -28,23 +28,22 @@ FileHashes = dict[str, dict[str, str]]
 NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
 NAMING_SECTIONS = ("compare", "policy")  # sections that name policies, controllers and classes
 OURS = "lcc_rl."
-PLACES = ("stdlib", "platstdlib", "purelib", "platlib")  # of what is installed
+PLACES = ("stdlib", "platstdlib", "purelib", "platlib")  # folders of installed modules
 INSTALLED = [Path(sysconfig.get_path(x)) for x in PLACES] + [Path(__file__).parents[1]]
 
 
 def inputs_of(content: Mapping[str, Any]) -> FileHashes:
-    """Return hashes of the files that a configuration names, as they are now.
+    """Return the present hashes of the files that a configuration names.
 
-    These are what ``path`` of any node names, a file, several, a folder or a pattern; policies and
-    controllers that are compared; and of classes of the user's own their module and each setting
-    that is a file. What comes with the package has its version.
+    These are the files of ``path`` of any node (a file, several, a folder or a pattern), compared
+    policies and controllers, and the modules of user's classes with settings that are files. Files
+    of the package are identified by its version.
 
     Args:
         content: a configuration as plain containers.
 
     Returns:
-        By section of the configuration, the first part of a setting's key, the hash of each file
-        by its path as given, of a module by its name.
+        By section of the configuration: hashes of files by their given path, of modules by name.
     """
     found: FileHashes = {}
     for key, holder, value in settings_at(content):
@@ -53,7 +52,7 @@ def inputs_of(content: Mapping[str, Any]) -> FileHashes:
         for name in value if isinstance(value, list) else [value]:
             if section in NOT_READ or not isinstance(name, str):
                 continue
-            with suppress(OSError, ValueError, ResultsError):  # its reader says so
+            with suppress(OSError, ValueError, ResultsError):  # the reader raises the error later
                 for path in filter(Path.is_file, _files(last, named, holder, name)):
                     stat = path.stat()
                     digest = _digest(str(path), stat.st_size, stat.st_mtime_ns)
@@ -77,19 +76,19 @@ def _files(last: str, named: bool, holder: Any, name: str) -> Iterator[Path]:
 
 
 def _ours(holder: Any) -> bool:
-    """Whether what holds a setting is not the node of a class or function of the user's own."""
+    """Whether the holder of a setting is not the node of a user's class or function."""
     target = holder.get(TARGET, OURS) if isinstance(holder, Mapping) else OURS
     return str(target).startswith(OURS)
 
 
 def compared_files(name: str) -> Iterator[Path]:
-    """Yield a policy's file, those of a folder of runs, or what a controller is made of."""
+    """Yield the file of a policy, of a folder of runs, or those of a controller."""
     path = Path(name.removesuffix(FILTERED))
     if path.is_dir():
         yield from sorted(path.rglob("policy.pt"))
     elif not path.exists():
         yield from _module(str(path))
-        if HydraConfig.initialized():  # a name may be that of a file of --config-dir
+        if HydraConfig.initialized():  # it may be a file of --config-dir
             for source in HydraConfig.get().runtime.config_sources:
                 file = Path(source.path) / "controller" / f"{path}.yaml"
                 if source.provider == "command-line" and file.is_file():
@@ -102,7 +101,7 @@ def compared_files(name: str) -> Iterator[Path]:
 
 
 def _module(target: str) -> Iterator[Path]:
-    """Yield the modules of a class or function of the user's own; a notebook's has no file."""
+    """Yield the modules of a user's class or function; a notebook has no file."""
     if "." in target and "/" not in target and not target.startswith(OURS):
         with suppress(ConfigError, TypeError):
             module = inspect.getmodule(inspect.unwrap(find_target(target, TARGET)))
@@ -110,7 +109,7 @@ def _module(target: str) -> Iterator[Path]:
 
 
 def _own_modules(module: Any, seen: set[Path]) -> Iterator[Path]:
-    """Yield the file of a module of the user's own, and those of all that it imports."""
+    """Yield the files of a user's module and of its imports."""
     path = Path(getattr(module, "__file__", None) or "")
     if path.suffix != ".py" or path in seen or any(path.is_relative_to(x) for x in INSTALLED):
         return
@@ -128,7 +127,7 @@ def _own_modules(module: Any, seen: set[Path]) -> Iterator[Path]:
         yield from _own_modules(sys.modules[name], seen)
 
 
-@lru_cache(maxsize=4096)  # once in a process for each file
+@lru_cache(maxsize=4096)  # once per file and process
 def _digest(path: str, size: int, modified: int) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:16]

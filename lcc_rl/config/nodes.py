@@ -1,7 +1,7 @@
-"""Nodes of a configuration: each describes an object by its class and its settings.
+"""Nodes of a configuration: descriptions of objects by class and settings.
 
-What is stored is a mapping whose ``_target_`` names the class. At the door of the package
-(:func:`lcc_rl.config.schemas.parse_config`) each becomes a :class:`Node`, nested ones too.
+A stored node is a mapping with the class under ``_target_``.
+:func:`lcc_rl.config.schemas.parse_config` converts each to a :class:`Node`, including nested ones.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lcc_rl.settings import as_plain as as_plain
 
 MISSING = "???"
 STORED = (str, int, float, type(None), list, Mapping)
-CALLED = ("__call__",)  # what a node that is used as a function makes
+CALLED = ("__call__",)  # required of objects that are used as functions
 
 
 def _place(kind: type) -> str:
@@ -26,14 +26,14 @@ def _place(kind: type) -> str:
 
 
 class Node:
-    """An object that a configuration describes: its class, its settings and their place.
+    """Description of an object: class, settings and their place in the configuration.
 
-    It does not change: :meth:`changed` returns another one. Copies share the object, and a node
-    that goes to another process takes its settings alone.
+    A node is immutable; :meth:`changed` returns another one. Copies share the object. Other
+    processes receive the settings only.
 
     Args:
-        settings: by name, as they are stored, with ``_target_`` and the defaults of the class;
-            those that describe objects are nodes.
+        settings: settings by name, as stored, with ``_target_`` and the defaults of the class;
+            descriptions of objects are nodes.
         where: their place in the configuration, for messages.
     """
 
@@ -48,10 +48,10 @@ class Node:
 
     @classmethod
     def of(cls, settings: Mapping[str, Any], where: str) -> Self:
-        """Return the node of a mapping with ``_target_``, its defaults completed and checked.
+        """Return the checked node of a mapping with ``_target_``, completed by defaults.
 
         Raises:
-            ConfigError: naming the setting at fault.
+            ConfigError: naming the wrong setting.
         """
         for key, _, value in settings_at(as_plain(settings), where):
             if not isinstance(value, STORED):
@@ -90,27 +90,27 @@ class Node:
 
     @property
     def name(self) -> str:
-        """What tables call it: ``ddpg`` of the agent DDPG."""
+        """Its name in tables: ``ddpg`` for the agent DDPG."""
         return str(self.settings[TARGET]).rpartition(".")[2].lower()
 
     @property
     def places(self) -> list[str]:
-        """The settings that name a place to write; a class lists them as ``WRITES``."""
+        """The settings that name a path to write to; a class lists them as ``WRITES``."""
         named = getattr(self.kind, "WRITES", ())
         return [name for name in named if self.settings.get(name) is not None]
 
     def stored(self, places: bool = True) -> dict[str, Any]:
-        """Return the settings; without ``places`` those that name one to write to are null."""
+        """Return the settings; without ``places``, paths to write to are null."""
         return {**self.settings, **dict.fromkeys(() if places else self.places)}
 
     def made(self, needed: type | Sequence[str] = object) -> Any:
-        """Return the object: of a class with :class:`Settings` always the same, else a new one.
+        """Return the object; for a class with :class:`Settings` it is always the same one.
 
         Args:
-            needed: the class of the object, or the methods and attributes that it must have.
+            needed: the class of the object, or its required methods and attributes.
 
         Raises:
-            ConfigError: if it cannot be made, or is another one.
+            ConfigError: if it cannot be built, or has another class.
         """
         made = self._object if has_settings(self.kind) else self._made()
         if isinstance(needed, type):
@@ -136,7 +136,7 @@ class Node:
         given = {
             key: value
             for key, value in self.settings.items()
-            # A default need not be what its annotation says, and may be any object.
+            # A default need not have the annotated type, and may be any object.
             if not (key == TARGET or (key in own and _same(as_plain(value), own[key])))
         }
         try:
@@ -147,9 +147,9 @@ class Node:
             for key in (key for key, value in given.items() if value == MISSING):
                 raise ConfigError(f"{self.where}.{key} is required: use {self.where}.{key}=…")
             return self.kind(**given)
-        except (LccError, OSError):  # an OSError names its file, which says more than the node
+        except (LccError, OSError):  # an OSError names its file
             raise
-        except Exception as error:  # a class of the user's own may raise anything
+        except Exception as error:  # a user's class may raise any error
             reason = f"{self.kind.__name__} cannot be built: {type(error).__name__}: {error}"
             raise ConfigError(f"{self.where}: {reason}") from error
 
@@ -166,7 +166,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _objects(value: Any) -> Any:
-    """Return a setting with the objects that its nodes describe."""
+    """Return a setting with objects in place of nodes."""
     if isinstance(value, Node):
         return value.made()
     if isinstance(value, Mapping):
@@ -190,9 +190,9 @@ def as_nodes(value: Any, where: str = "") -> Any:
 
 
 def without_defaults(value: Any) -> Any:
-    """Return settings as plain containers without those that have the default of their class.
+    """Return settings as plain containers without those that equal the default of their class.
 
-    A setting that a later version adds, and whose default changes nothing, is not in them.
+    Settings that a later version adds are thus absent if their default changes nothing.
     """
     if isinstance(value, Node):
         own = defaults(value.kind) if has_settings(value.kind) else {}
@@ -236,7 +236,7 @@ def settings_of(target: Any) -> list[str] | None:
     """Return the names of a class's or function's settings; None if it takes any."""
     try:
         found = inspect.signature(target).parameters
-    except (TypeError, ValueError):  # some builtins do not tell
+    except (TypeError, ValueError):  # some builtins have no signature
         return None
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in found.values()):
         return None
@@ -244,10 +244,10 @@ def settings_of(target: Any) -> list[str] | None:
 
 
 def with_defaults(value: Any, where: str = "") -> Any:
-    """Return a setting in which every mapping with ``_target_`` holds the defaults of its class.
+    """Return a setting in which every mapping with ``_target_`` contains the defaults of its class.
 
-    A class lists as ``LATER`` the settings that a later version added, and whose default changes
-    nothing: they are held only if they are given, so that the hashes of stored runs stay.
+    A class lists as ``LATER`` the settings of later versions with defaults that change nothing.
+    They are contained only if they are given, so the hashes of stored runs are unchanged.
 
     Args:
         value: a setting as plain containers; references to other settings may be unresolved.
@@ -276,13 +276,13 @@ def with_defaults(value: Any, where: str = "") -> Any:
 
 
 def takes_action(node: Node) -> bool:
-    """Whether a controller, or one inside it, carries out the action of a policy."""
+    """Whether a controller, or one inside it, executes the action of a policy."""
     reads = (getattr(inner.kind, "reads", ()) for inner in nodes_in(node))
     return any(name.endswith(".action") for names in reads for name in names)
 
 
 def check_numbers(value: Any, where: str) -> None:
-    """Refuse numbers that are not finite or too large, in lists and mappings, too."""
+    """Refuse numbers that are not finite or too large, also in lists and mappings."""
     for key, _, item in settings_at(value, where):
         if isinstance(item, float) and not abs(item) <= LARGEST:
             raise ConfigError(
@@ -293,7 +293,7 @@ def check_numbers(value: Any, where: str) -> None:
 
 
 def settings_at(content: Any, where: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield every value in nested mappings and lists: its dotted key, what holds it, and itself."""
+    """Yield dotted key, container and value of every value in nested mappings and lists."""
     if isinstance(content, (Mapping, list)):
         items = content.items() if isinstance(content, Mapping) else enumerate(content)
         for key, value in items:

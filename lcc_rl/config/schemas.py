@@ -1,6 +1,6 @@
-"""The typed tree of a configuration: its sections, with the types and ranges of their settings.
+"""The typed tree of a configuration: sections with types and ranges of settings.
 
-Values stand in conf/. What has a ``_target_`` (pieces, agents, data …) is a
+Values are in conf/. Objects with a ``_target_`` (pieces, agents, data …) are a
 :class:`lcc_rl.config.nodes.Node`.
 """
 
@@ -30,9 +30,9 @@ from lcc_rl.settings import (
 )
 
 Device = Annotated[str, Field(pattern=r"^(cpu|cuda)(:\d+)?$")]
-# Each names a folder in the job's.
+# Each variant has a folder in the job's folder.
 Variants = Annotated[list[Annotated[str, Field(pattern=r"^\w[\w.-]*$")]], Field(min_length=1)]
-FORMATS = ("png", "pdf", "svg")  # of figures; pages show the first
+FORMATS = ("png", "pdf", "svg")  # formats of figures; pages show the first
 Format = Literal["png", "pdf", "svg"]
 
 
@@ -58,15 +58,15 @@ AUTO = "scenario.controllers.automated"
 
 
 class ScenarioConfig(Settings):
-    """A scenario: its clock, its string of vehicles and its pieces."""
+    """A scenario: clock, string of vehicles and pieces."""
 
     name: str
     horizon: Million  # steps of an episode
     time_step: Annotated[float, Field(ge=0.001, le=10.0)]  # [s]
     string: str | dict[str, Any]  # roles from front to back, see docs/strings.md
     road: Literal["open", "ring"]
-    circumference: Positive | None = None  # of a ring [m]
-    # Least and largest factor of it in training; evaluation takes 1.
+    circumference: Positive | None = None  # circumference of a ring [m]
+    # Range of a factor on it in training; 1 in evaluation.
     circumference_range: list[Positive] = Field(default_factory=lambda: [1.0, 1.0])
     vehicle_length: Positive  # [m]
     initial_speed: Speed  # on a ring [m/s]
@@ -75,15 +75,15 @@ class ScenarioConfig(Settings):
     filters: Nodes
     actuators: Nodes = Field(default_factory=dict)
     sensors: Nodes = Field(default_factory=dict)
-    fleet: Nodes = Field(default_factory=dict)  # classes of vehicles besides those of energy
+    fleet: Nodes = Field(default_factory=dict)  # further classes of vehicles
     pieces: Nodes
 
     @property
     def vehicles(self) -> VehicleString:
-        """The string of vehicles that ``string`` and ``road`` describe.
+        """The string of vehicles of ``string`` and ``road``.
 
         Raises:
-            ConfigError: pointing at the place in the pattern where it cannot be read.
+            ConfigError: naming the position in the pattern that cannot be parsed.
         """
         return parse_string(self.string, self.road)
 
@@ -99,7 +99,7 @@ class RewardConfig(Settings):
 
 
 class TrainingConfig(Settings):
-    """Length and bookkeeping of a training; the algorithm's own settings are the agent's."""
+    """Length and checkpoints of a training; settings of the algorithm belong to the agent."""
 
     episodes: Count
     environments: Count
@@ -112,7 +112,7 @@ class TrainingConfig(Settings):
 
 
 class EvaluationConfig(Settings):
-    """Size of an evaluation, and what a row of its table is: an episode or a vehicle."""
+    """Size of an evaluation, and the subject of its rows: an episode or a vehicle."""
 
     rows: Literal["episodes", "vehicles"]
     baselines: list[str]
@@ -127,7 +127,7 @@ class EvaluationConfig(Settings):
     shard: Annotated[int, Field(ge=0)]
     compiled: bool | None = None
     full_length: bool = False
-    humans_first: NonNegative = 0.0  # on a ring: before what is measured [s]
+    humans_first: NonNegative = 0.0  # time with human drivers only, on a ring, not measured [s]
     warm_up: NonNegative = 0.0  # first seconds of an episode, in which only collisions count [s]
 
     def validate(self) -> None:
@@ -146,17 +146,11 @@ class BaseConfig(Settings):
     device: Device  # cpu, cuda or cuda:<number>
     threads: Parallel
     matmul_precision: Literal["highest", "high", "medium"] = "highest"
-    data: Described  # null, as drivers and split, in policies that ship
-    figure_formats: list[Format]
+    data: Described  # null in shipped policies, as drivers and split
+    figure_formats: list[Format]  # beside png, which pages show
     trust: list[str] = dataclasses.field(default_factory=list)
-    # Hashes of the files that it reads, see lcc_rl.config.inputs; a run notes them itself.
+    # Hashes of input files, see lcc_rl.config.inputs, recorded by a run.
     inputs: dict[str, dict[str, str]] = dataclasses.field(default_factory=dict)
-
-    def validate(self) -> None:
-        if "png" not in self.figure_formats:
-            raise ConfigError(
-                f"figure_formats must name png, which pages show, got {self.figure_formats}"
-            )
 
 
 class CalibrateConfig(BaseConfig):
@@ -166,7 +160,7 @@ class CalibrateConfig(BaseConfig):
 
 
 class StudyConfig(BaseConfig):
-    """Settings of all commands that drive vehicles."""
+    """Settings of all commands that simulate vehicles."""
 
     variant: str
     drivers: Described
@@ -179,15 +173,15 @@ class StudyConfig(BaseConfig):
     reward: RewardConfig
     agent: Described
     gains: Any = None
-    # Drives the automated vehicles once the policy is trained; None: the policy itself.
+    # Controller of the automated vehicles after training; None: the policy.
     deployed: Described = None
-    # Here, not in TrainConfig, so that one recipe serves every entry point.
+    # Here, not in TrainConfig, so that a recipe fits every entry point.
     training: TrainingConfig
     evaluation: EvaluationConfig
     resume: str | None = None
     sweep: str | None = None
     policy: str | None = None
-    table: Literal["short", "all"] = "short"  # what is printed: six columns, or every measure
+    table: Literal["short", "all"] = "short"  # printed table: six columns, or all measures
 
 
 class TrainConfig(StudyConfig):
@@ -199,7 +193,7 @@ class TrainConfig(StudyConfig):
 class EvaluateConfig(StudyConfig):
     """``lcc-rl evaluate``."""
 
-    # Policies and controllers, see lcc_rl.evaluation.named; or these by the names of their rows.
+    # Policies and controllers, see lcc_rl.evaluation.named, optionally by name.
     compare: list[Any] | dict[str, Any] = dataclasses.field(default_factory=list)
 
 
@@ -226,14 +220,14 @@ SECTIONS: dict[str, type[Settings]] = {
 
 
 def parse_config(content: Mapping[str, Any], kind: type[BaseConfig] | None = None) -> Any:
-    """Return the typed tree of a configuration: the door through which settings come in.
+    """Return the checked, typed tree of a configuration.
 
     Args:
-        content: a configuration as plain containers or nodes, each with the defaults of its class.
-        kind: class of the tree; by default the command's that has these settings.
+        content: a configuration as plain containers or nodes, with the defaults of classes.
+        kind: class of the tree; by default that of the command with these settings.
 
     Raises:
-        ConfigError: naming the first setting that is unknown or wrong.
+        ConfigError: naming the first unknown or wrong setting.
     """
     kind = kind or _kind_of(content)
     check_numbers(content, "")
@@ -255,5 +249,5 @@ def _kind_of(content: Mapping[str, Any]) -> type[BaseConfig]:
 
 
 def as_text(cfg: Settings) -> str:
-    """Return a typed tree as the text of a file, see :func:`parse_config`."""
+    """Return a typed tree as YAML, see :func:`parse_config`."""
     return str(yaml.safe_dump(as_plain(cfg), sort_keys=False, allow_unicode=True))

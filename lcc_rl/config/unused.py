@@ -1,4 +1,4 @@
-"""Refuses options that a configuration would ignore although ignoring them changes a result."""
+"""Refuses options without effect that would change a result."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ NO_AGENT = ("agent=none", "agent=null")
 
 
 def check_used(cfg: BaseConfig, overrides: Sequence[str], sweep: bool = False) -> None:
-    """Refuse options that the configuration at hand would ignore.
+    """Refuse options that the configuration would ignore.
 
     Args:
         cfg: the configuration.
-        overrides: what was typed.
-        sweep: the runs of a sweep share what was typed, so what one of them learns by may be
-            given to another that learns nothing.
+        overrides: overrides of the command line.
+        sweep: allow settings of an agent without one, because the runs of a sweep share them.
 
     Raises:
         ConfigError: naming the option and the reason.
@@ -52,7 +51,7 @@ def _of_road(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
 
 
 def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
-    """Yield settings of roles that no vehicle has, and why they have no effect."""
+    """Yield settings of roles without vehicles, and why they have no effect."""
     for group in ("controllers", "start", "filters", "actuators", "sensors"):
         for role in getattr(cfg.scenario, group):
             if role not in cfg.scenario.vehicles.names:
@@ -64,14 +63,14 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
 
 
 def _of_agent(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
-    """Yield settings of learning where nothing is learned, and why."""
+    """Yield settings of learning without effect, and why."""
     if cfg.agent is not None:
         return
     driver = cfg.scenario.controllers.get(AUTOMATED)
-    reason = f"variant {cfg.variant} learns nothing"
+    reason = f"variant {cfg.variant} has no agent"
     if not cfg.scenario.vehicles.count(AUTOMATED):
         reason = "no vehicle of the string is automated"
     elif driver is not None and not takes_action(driver):
-        reason += f": {driver.name} drives the automated vehicles and takes no action of a policy"
+        reason += f": {driver.name} drives the automated vehicles and uses no action of a policy"
     for key in ("agent", "training"):
         yield key, reason

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from lcc_rl.errors import ConfigError
 
-YAML = (".yaml", ".yml")  # files that hold a controller
+YAML = (".yaml", ".yml")  # endings of files of controllers
 DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")  # a class or function: my_pieces.PID
-FILTERED = "_filtered"  # ends the names of controllers behind the safety filter
-RECORDED = "recorded"  # the first vehicle drives, or a limit is kept, as the driver recorded there
+FILTERED = "_filtered"  # suffix of controllers behind the safety filter
+RECORDED = "recorded"  # the recorded driver as a controller, or its value as a limit
 
 
 def key_of(override: str) -> str:
@@ -33,12 +33,12 @@ def check_overrides(words: Sequence[str], given: Collection[str], reason: str) -
     """Check that the remaining words of a command line are overrides.
 
     Args:
-        words: what is left of the command line.
-        given: keys that the command sets itself.
+        words: the remaining words.
+        given: keys that the command sets.
         reason: why they cannot be given, for the message.
 
     Raises:
-        ConfigError: naming the word at fault.
+        ConfigError: naming the wrong word.
     """
     if any(word.startswith("-") or ("=" not in word and word[:1] != "~") for word in words):
         raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")
@@ -46,4 +46,4 @@ def check_overrides(words: Sequence[str], given: Collection[str], reason: str) -
         if top_key(word) in given:
             raise ConfigError(f"{word}: {reason}")
         if top_key(word) == "hydra":
-            raise ConfigError(f"{word} has no effect: this command chooses the folders itself")
+            raise ConfigError(f"{word} has no effect: this command chooses the folders")

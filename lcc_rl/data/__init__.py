@@ -1,1 +1,1 @@
-"""Trajectories, car-following episodes and speed profiles from files."""
+"""Readers of trajectories, car-following episodes and speed profiles."""

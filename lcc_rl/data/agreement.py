@@ -1,4 +1,4 @@
-"""Agreement of gaps with speeds: slope and lag of each pair, and the mistake that fits."""
+"""Agreement of gaps with speeds: slope and lag of each pair, and the probable mistake."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mp
 PAIR_SIGNALS = {"gap": "gap_m", "leader": "leader_speed_mps", "follower": "follower_speed_mps"}
 CHANGE_S, EVERY_S = 2.0, 1.0  # changes compared, and the time between them [s]
 LONGEST_LAG = 3.0  # [s]
-# Of changes [s], share explained, relative motion in a window [m]: less is too little to tell.
+# Least compared time [s], share explained and relative motion in a window [m] for a clear result.
 LEAST_S, LEAST_FIT, LEAST_MOTION, LEAST_ALL_S = 6.0, 0.9, 0.15, 100.0
-GAIN, FLOOR = 6.0, 2e-4  # a lag leaves so much less unexplained; what exact data leave
-RIDGE = np.diag([1e-6, 1e-6, 0.1])  # [m²]: of a bias of speeds, which steady traffic leaves open
-LEAST_WAY = 50.0  # a shorter way says nothing of the unit of a speed [m]
-NEAR_MISTAKE, ALIKE = 1.25, 1.05  # a mistake so near to the coefficients; to another mistake
+GAIN, FLOOR = 6.0, 2e-4  # factor on the residual by which a lag is accepted; that of exact data
+RIDGE = np.diag([1e-6, 1e-6, 0.1])  # [m²]: for a bias of speeds, unknown in steady traffic
+LEAST_WAY = 50.0  # least distance from which the unit of a speed is concluded [m]
+NEAR_MISTAKE, ALIKE = 1.25, 1.05  # largest factors to a mistake's coefficients; between mistakes
 LOUD = 0.3  # lag that is reported [s]
 STANDING, LEAST_STANDING = 0.5, 300  # speed [m/s], samples
 FAR_STANDING = 15.0  # gap that may be in feet [m]
@@ -35,21 +35,22 @@ FAR_STANDING = 15.0  # gap that may be in feet [m]
 def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     """Return how the gap of each pair depends on its speeds.
 
-    Least squares fit the change of the gap in 2 s by ``leader`` times the way of the leader less
-    ``follower`` times the way of the follower, and a constant for biased speeds: 1 and 1 for
-    consistent data, −1 and −1 where the cars are exchanged, other sizes for other units. One of the
-    three signals may be late by up to 3 s: the lag that explains most, if it leaves less than a
-    sixth of the rest without lag.
+    Least squares fit the change of the gap in 2 s by ``leader`` times the leader's distance minus
+    ``follower`` times the follower's distance, and a constant for biased speeds. Both coefficients
+    are 1 for consistent data, −1 for exchanged cars, and differ for other units. One of the three
+    signals may be late by up to 3 s: the lag that explains most, if its residual is below a sixth
+    of that without lag.
 
     Args:
-        episodes: rows of an episode lie together, 0.1 s apart: columns ``OF_PAIRS`` and, where
-            known, recording, follower_id and leader_id, which make a pair.
+        episodes: consecutive rows of each episode, 0.1 s apart: columns ``OF_PAIRS`` and, if known,
+            recording, follower_id and leader_id, which identify a pair.
 
     Returns:
-        A row for each pair and a last one of all, which has no lag: row (the pair's first), seconds
-        (compared), leader, follower, slope (of the gap over the relative way), fit (share of the
-        variance explained), motion (root mean square of the relative way [m]), late [s], signal
-        (that is late), ahead, own, grown (ways of leader and follower, growth of the gap [m]).
+        A row for each pair and a last one for all, without lag: row (the pair's first), seconds
+        (compared), leader, follower, slope (of the gap over the relative distance), fit (share of
+        the variance explained), motion (root mean square of the relative distance [m]), late [s],
+        signal (the late one), ahead, own, grown (distances of leader and follower, growth of the
+        gap [m]).
     """
     keys = [name for name in ("recording", "follower_id", "leader_id") if name in episodes]
     pair = episodes.groupby(keys or ["episode"], sort=False).ngroup().to_numpy()
@@ -63,9 +64,9 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     fit = partial(_fit, series, pair, pairs, width)
     shifts = [k * signal for k in range(-reach, reach + 1) if k for signal in np.eye(3)]
     lags = np.stack([np.zeros(3), *shifts])
-    with np.errstate(all="ignore"):  # of pairs without a change
+    with np.errstate(all="ignore"):  # pairs without a change
         *first, sums = fit(lags[0], rows)
-        unclear = rows[(first[1] > GAIN * FLOOR)[pair[rows]]]  # no lag could gain enough elsewhere
+        unclear = rows[(first[1] > GAIN * FLOOR)[pair[rows]]]  # elsewhere no lag could be accepted
         fits = [first, *(fit(late, unclear)[:2] for late in shifts if len(unclear))]
     found, rest = (np.array(x) for x in zip(*fits, strict=True))
     best = np.where(rest[0] >= GAIN * rest.min(axis=0), rest.argmin(axis=0), 0)
@@ -94,10 +95,10 @@ def _fit(
     late: Floats,
     rows: NDArray[np.intp],
 ) -> tuple[Floats, Floats, Floats]:
-    """Coefficients and slope of each pair and of all, what they leave unexplained, and products.
+    """Return coefficients and slope of each pair and of all, residuals and products.
 
-    ``series`` are the gap and the ways of leader and follower, each shifted by ``late``; changes
-    over ``width`` samples begin at ``rows``, of the pair with this number, of so many ``pairs``.
+    ``series`` are the gap and the distances of leader and follower, each shifted by ``late``.
+    Changes over ``width`` samples begin at ``rows``; ``pair`` is the number of each row's pair.
     """
     shifted, at = [rows + k for k in late.astype(int)], pair[rows]
     grown, ahead, own = (x[k + width] - x[k] for x, k in zip(series, shifted, strict=True))
@@ -113,14 +114,14 @@ def _fit(
 
 
 def mistakes(units: Units) -> Iterator[tuple[bool, str, str, float, float]]:
-    """Yield what may be wrong with a pair.
+    """Yield possible mistakes in the data of a pair.
 
     Args:
-        units: units that gap and speeds were read in, by their keys in ``data.units``.
+        units: units in which gap and speeds were read, by their keys in ``data.units``.
 
     Yields:
-        Whether it doubts SI, the signal at fault, a question to the user, and the coefficients of
-        leader and follower in :func:`agreement`.
+        Whether the mistake is a wrong SI unit, the signal at fault, a question to the user, and the
+        coefficients of leader and follower in :func:`agreement`.
     """
     yield True, "follower", "are leader and follower exchanged?", -1.0, -1.0
     for signal, subject, quantity, keys, leader, follower in (
@@ -146,31 +147,31 @@ def check_pairs(
 
     Args:
         episodes: see :func:`agreement`.
-        place: describes the sample of a row.
+        place: returns the description of a sample.
         units: see :func:`mistakes`.
         max_mismatch, max_lag: see :class:`lcc_rl.data.plausible.Plausible`.
 
     Returns:
-        Lines on lags, on gaps that fit nothing and on medians; and whether any pair agrees.
+        Lines on lags, on gaps that fit no unit and on medians; and whether any pair agrees.
 
     Raises:
-        DataError: naming the pair and what fits, if one is not as its speeds say, or none is.
+        DataError: naming the pair and the probable mistake, if one or all contradict their speeds.
     """
     found = agreement(episodes)
     pairs, every = found.iloc[:-1], found.iloc[-1]
     moves, span = found["motion"] >= LEAST_MOTION, (1 / max_mismatch, max_mismatch)
-    told = moves[:-1] & (pairs["seconds"] >= LEAST_S) & (pairs["fit"] >= LEAST_FIT)
-    right = told & pairs["leader"].between(*span) & pairs["follower"].between(*span)
+    clear = moves[:-1] & (pairs["seconds"] >= LEAST_S) & (pairs["fit"] >= LEAST_FIT)
+    right = clear & pairs["leader"].between(*span) & pairs["follower"].between(*span)
 
-    def said(cases: list[tuple[int, str, str]]) -> Iterator[str]:
-        """A line on the case in the middle of several, if there is one."""
+    def middle(cases: list[tuple[int, str, str]]) -> Iterator[str]:
+        """Yield a line on the middle one of several cases."""
         for row, signal, words in cases[len(cases) // 2 :][:1]:
             count = f"; {len(cases):,} of {len(pairs):,} pairs" if len(pairs) > 1 else ""
             yield f"{place(row, PAIR_SIGNALS[signal])}: {words}{count}"
 
     wrong = [
         fit
-        for pair in pairs.assign(told=told)[~right].to_dict("records")
+        for pair in pairs.assign(clear=clear)[~right].to_dict("records")
         for fit in _mistaken(pair, units, max_mismatch)
     ]
     late, too_late = [], []
@@ -179,28 +180,27 @@ def check_pairs(
         lag = f"{abs(pair['late']):.1f} s{most} {'late' if pair['late'] > 0 else 'early'}"
         late.append((pair["row"], pair["signal"], f"{pair['signal']} {lag}; are clocks apart?"))
         too_late += late[-1:] * (abs(pair["late"]) > max_lag)
-    for line in (*said(wrong), *said(too_late)):
+    for line in (*middle(wrong), *middle(too_late)):
         raise DataError(line)
-    odd = pairs[told & ~pairs["slope"].between(*span)].to_dict("records")
-    words = "the gap changes by {:.2f} m where both speeds say 1 m, and no unit fits"
+    odd = pairs[clear & ~pairs["slope"].between(*span)].to_dict("records")
+    words = "the gap changes by {:.2f} m where both speeds give 1 m, and no unit fits"
     strange = [(pair["row"], "gap", words.format(pair["slope"])) for pair in odd]
     enough = every["seconds"] >= LEAST_ALL_S and moves.iloc[-1]
-    if (enough or told.any()) and not (right.any() or span[0] <= every["slope"] <= span[1]):
+    if (enough or clear.any()) and not (right.any() or span[0] <= every["slope"] <= span[1]):
         raise DataError(
             f"{words.format(every['slope'])}: are times in another unit, or speeds to be smoothed?"
         )
-    lines = [Concern(line) for line in (*said(late), *said(strange))]
-    return [*lines, medians(episodes, pairs[told], len(pairs), units)], bool(right.any())
+    lines = [Concern(line) for line in (*middle(late), *middle(strange))]
+    return [*lines, medians(episodes, pairs[clear], len(pairs), units)], bool(right.any())
 
 
 def _mistaken(
     pair: Mapping[Any, Any], units: Units, max_mismatch: float
 ) -> list[tuple[int, str, str]]:
-    """Row, signal and words on the mistakes nearest to a pair; nothing if none is near.
+    """Return row, signal and words on the mistakes nearest to a pair; nothing if none is near.
 
-    Where the gap tells too little, the ways of both cars do. That of the leader may be less by what
-    the gap grows: whichever is nearer to the follower's counts, since a gap may jump to another
-    car.
+    If the gap is not clear, the distances of both cars are compared. The leader's distance may be
+    less by the growth of the gap. The nearer value counts, because a gap may jump to another car.
     """
     own, ahead, a, b = (pair[name] for name in ("own", "ahead", "leader", "follower"))
     ways = (max(way, 1.0) for way in (ahead, ahead - pair["grown"]))
@@ -209,39 +209,39 @@ def _mistaken(
         f"where the leader drives 1 m, the gap changes by {a:.2f} m, where the follower does, by "
         f"{-b:.2f} m"
     )
-    if not pair["told"]:
+    if not pair["clear"]:
         words = f"by their speeds, the follower drives {own:.4g} m, the leader {ahead:.4g} m"
         if max(own, ahead) < LEAST_WAY or abs(apart) < log(max_mismatch):
             return []
     near = []
     for default, signal, question, leader, follower in mistakes(units):
         ratios = [a / leader, b / follower]
-        if not pair["told"]:
+        if not pair["clear"]:
             ratios = [exp(apart) * follower / leader] if leader != follower else [0.0]
         off = max(abs(log(ratio)) for ratio in ratios) if min(ratios) > 0 else inf
         near.append((off, default, signal, question))
     least = min(near)[0]
-    if least >= log(NEAR_MISTAKE):  # of what the gap tells, or, in the end, of the ways
-        return _mistaken({**pair, "told": False}, units, max_mismatch) if pair["told"] else []
+    if least >= log(NEAR_MISTAKE):  # first by the gap, then by the distances
+        return _mistaken({**pair, "clear": False}, units, max_mismatch) if pair["clear"] else []
     near = [x for x in sorted(near, key=lambda x: x[1:2]) if x[0] < least + log(ALIKE)]
     questions = " or ".join(x[3] for x in near)
     return [(pair["row"], near[0][2], f"{words}; {questions}")]
 
 
-def medians(episodes: pd.DataFrame, told: pd.DataFrame, pairs: int, units: Units) -> str:
-    """Return the line by which a user sees whether units and clocks are right.
+def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Units) -> str:
+    """Return the line on medians, which shows whether units and clocks are right.
 
-    ``told`` are the rows of :func:`agreement` that tell something, of so many ``pairs``.
+    ``clear`` are the rows of :func:`agreement` with a clear result, out of ``pairs``.
     """
     speed, gap = episodes["follower_speed_mps"], episodes["gap_m"]
     behind = (gap / speed)[speed > 1.0].median()
-    slope, late = told["slope"].median(), told["late"].median()
-    known = f"slope of gaps over speeds {slope:.2f}, lag {late:.1f} s of {len(told):,} pair(s)"
-    few = f"too little to tell slope and lag of {pairs - len(told):,}"
-    said = [known] * (len(told) > 0) + [few] * (len(told) < pairs)
+    slope, late = clear["slope"].median(), clear["late"].median()
+    known = f"slope of gaps over speeds {slope:.2f}, lag {late:.1f} s of {len(clear):,} pair(s)"
+    few = f"slope and lag unknown for {pairs - len(clear):,}"
+    parts = [known] * (len(clear) > 0) + [few] * (len(clear) < pairs)
     line = (
         f"medians: speed {speed.median():.3g} m/s, gap {gap.median():.3g} m, time gap "
-        f"{behind:.2g} s above 1 m/s; {', '.join(said)}"
+        f"{behind:.2g} s above 1 m/s; {', '.join(parts)}"
     )
     stand = gap[episodes[["follower_speed_mps", "leader_speed_mps"]].max(axis=1) < STANDING]
     if len(stand) < LEAST_STANDING or stand.median() < FAR_STANDING or "ft" in units.values():

@@ -1,8 +1,8 @@
 """Extraction of car-following episodes from trajectories.
 
-A candidate is a maximal stretch of consecutive frames in which a vehicle names the same preceding
+A candidate is a maximal stretch of consecutive frames in which a vehicle has the same preceding
 vehicle, both have a row and the gap is within limits. Each criterion then removes whole
-candidates, in a fixed order, and the report counts how many.
+candidates, in a fixed order; the report counts them.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ SAMPLE_COLUMNS = (
 
 
 class Criteria(Settings):
-    """Criteria of a car-following episode; None stands for no limit.
+    """Criteria of a car-following episode; None: no limit.
 
-    Gaps are bumper to bumper; a candidate is cut where one is beyond its limits, and the parts are
-    judged. ``passenger_cars_only``: both vehicles are of class 2 throughout; where no vehicle has
-    a class this is skipped, with a note in the report. Both vehicles share one lane throughout:
-    ``split`` cuts a candidate where they do not; ``reject`` removes one with any lane change.
+    Gaps are bumper to bumper. A candidate is cut where a gap is beyond its limits, and the criteria
+    apply to the parts. ``passenger_cars_only``: both vehicles always have class 2; the criterion is
+    skipped, with a note in the report, if no vehicle has a class. Both vehicles must share a lane:
+    ``split`` cuts a candidate where they do not; ``reject`` removes candidates with a lane change.
     """
 
     min_duration_s: Annotated[float, Field(ge=FRAME, le=LARGEST)] = 15.0
     max_duration_s: NonNegative | None = None  # longer ones are removed, not cut
     min_gap_m: Number | None = 0.0
-    max_gap_m: NonNegative | None = 120.0  # beyond it, a driver does not follow
+    max_gap_m: NonNegative | None = 120.0  # a driver does not follow at longer gaps
     passenger_cars_only: bool = True
     lane_changes: Literal["split", "reject"] = "split"
 
@@ -54,16 +54,16 @@ class Criteria(Settings):
 
 @dataclass
 class ExtractionReport:
-    """Counts of what the extraction kept and removed.
+    """Counts of kept and removed candidates and samples.
 
     Args:
-        place: describes a sample to the user.
+        place: returns the description of a sample.
         candidates: stretches of one vehicle behind another.
         removed: candidates removed by each criterion, in the order of application.
         kept: episodes left.
         rows: samples in the episodes.
         left_out: samples left out, by reason.
-        first: where the first of these is, by reason.
+        first: place of the first such sample, by reason.
         notes: further remarks, one a line.
     """
 
@@ -110,17 +110,17 @@ def extract(
 
     Args:
         trajectories: samples in the shape of :class:`lcc_rl.data.trajectories.Trajectories`.
-        criteria: what counts as an episode.
-        place: makes of an episode table what describes its samples to the user.
+        criteria: criteria of an episode.
+        place: returns for an episode table the function that describes its samples.
 
     Returns:
         The episode table (:data:`lcc_rl.data.episodes.SCHEMA`), numbered from 0 in the order of
-        recording, follower and time, with file and rows where the samples have them; gap_m is the
-        space headway less the leader's length. And a report on what each criterion removed.
+        recording, follower and time, with file and rows if the samples have them; gap_m is the
+        space headway minus the leader's length. And a report on the candidates.
 
     Raises:
-        DataError: if no vehicle follows another, or a criterion removes the last candidate; it
-            names the criterion.
+        DataError: if no vehicle follows another, or naming the criterion that removes the last
+            candidate.
     """
     table = trajectories.samples
     known = [*SAMPLE_COLUMNS, *(name for name in ORIGIN if name in table)]
@@ -135,7 +135,7 @@ def extract(
     gap = samples["space_headway_m"][follower] - samples["length_m"][leader]
     near = _near(gap, follower, criteria, report)
     follower, leader, gap = follower[near], leader[near], gap[near]
-    # A candidate begins after a row left out, or a change of segment, leader or lane.
+    # A candidate begins after a left-out row or a change of segment, leader or lane.
     cut = np.append(True, np.diff(follower) != 1)
     for name in ("segment", "preceding", *(["lane"] if criteria.lane_changes == "split" else [])):
         values = samples[name][follower]
@@ -167,7 +167,7 @@ def _episodes(
     leader: NDArray[np.int64],
     gap: NDArray,
 ) -> pd.DataFrame:
-    """The episode table of rows of followers and of their leaders."""
+    """Return the episode table from rows of followers and of their leaders."""
     episodes = {
         "episode": number,
         "recording": recording,
@@ -184,14 +184,14 @@ def _episodes(
     if "row" in samples:
         episodes |= {"row": samples["row"][follower], "leader_row": samples["row"][leader]}
         episodes["file"] = samples["file"][follower]
-    # The samples have the schema's types; a conversion would copy what may be millions of rows.
+    # The samples have the schema's types; a conversion would copy millions of rows.
     return pd.DataFrame(episodes, copy=False)
 
 
 def _pairs(
     samples: dict[str, NDArray], recording: NDArray, criteria: Criteria, report: ExtractionReport
 ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """Rows of followers whose leader has a row in the frame, and those rows of the leaders."""
+    """Return rows of followers with a leader in the same frame, and the rows of the leaders."""
     preceding, lane = samples["preceding"], samples["lane"]
     ahead = find_leaders(recording, samples["vehicle"], samples["frame"], preceding)
     follows, seen = preceding > 0, ahead >= 0
@@ -206,9 +206,9 @@ def _pairs(
     if len(follower) == 0:
         raise DataError(
             f"no vehicle follows another in the same lane and frame: of {len(lane):,} samples "
-            f"{int(follows.sum()):,} name a preceding vehicle, and none of those is seen; "
-            "expected a Preceding column that names vehicles in the file; a table of pairs, a "
-            "follower and its leader in each row, is read by data=episodes"
+            f"{int(follows.sum()):,} name a preceding vehicle, and none of these has a row; "
+            "expected a Preceding column that names vehicles in the file; data=episodes reads "
+            "tables of pairs, with a follower and its leader in each row"
         )
     return follower, ahead[follower]
 
@@ -216,7 +216,7 @@ def _pairs(
 def _near(
     gap: NDArray, follower: NDArray[np.intp], criteria: Criteria, report: ExtractionReport
 ) -> Mask:
-    """Samples whose gap is neither too short nor too long; candidates are cut at the others."""
+    """Return the samples with a gap within limits; candidates are cut at the others."""
     low, high = criteria.min_gap_m, criteria.max_gap_m
     keep = np.ones(len(gap), dtype=bool)
     for name, limit, sign in (("min_gap_m", low, -1.0), ("max_gap_m", high, 1.0)):
@@ -239,7 +239,7 @@ def _criteria(
     criteria: Criteria,
     report: ExtractionReport,
 ) -> Iterator[tuple[str, Mask]]:
-    """Name of each criterion and which candidates pass it, in the order of application."""
+    """Yield the name of each criterion and the candidates that pass it, in order."""
     lengths = np.diff(np.append(starts, len(follower)))
 
     def both(holds: Mask) -> Mask:
@@ -252,7 +252,7 @@ def _criteria(
         lane = samples["lane"]
         first = np.repeat(lane[follower[starts]], lengths)
         yield "lane_changes: reject", always((lane[follower] == first) & (lane[leader] == first))
-    # Half a frame of slack: durations are sums of inexact tenths.
+    # Half a frame of tolerance: durations are sums of inexact tenths.
     duration = (lengths - 1) * FRAME
     shortest, longest = criteria.min_duration_s, criteria.max_duration_s
     yield f"min_duration_s: {shortest:g}", duration > shortest - FRAME / 2
@@ -263,5 +263,5 @@ def _criteria(
     elif criteria.passenger_cars_only:
         report.notes.append(
             "passenger_cars_only: no vehicle has a class (v_Class is all zero or blank), so "
-            "there is nothing to filter on and every vehicle stays"
+            "all vehicles are kept"
         )

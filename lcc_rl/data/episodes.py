@@ -1,4 +1,4 @@
-"""Table of car-following episodes: schema and reading."""
+"""Tables of car-following episodes: schema and reader."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SCHEMA: dict[str, str] = {
     "leader_length_m": "float32",
     "gap_m": "float32",
 }
-# What a table of pairs may tell; a configuration names the columns by these keys.
+# Columns of a table of pairs; a configuration names them by these keys.
 PAIR_FIELDS = (
     Column("episode", "text", required=False),
     Column("recording", "text", required=False),
@@ -42,8 +42,8 @@ PAIR_FIELDS = (
     Column("leader_length", "length", least=0.0, required=False),
     Column("gap", "length", blank=True),
 )
-PAIR_MEASURED = [column.key for column in PAIR_FIELDS if column.blank]  # a blank cell costs the row
-# Names by default.
+PAIR_MEASURED = [column.key for column in PAIR_FIELDS if column.blank]  # not blank
+# Default names.
 EPISODE_NAMES = dict(zip((column.key for column in PAIR_FIELDS), SCHEMA, strict=True))
 EPISODE_ALIASES = {"event": "episode", "period": "recording"}
 DERIVED_POSITIONS = "no positions given: those of leaders are the integral of their speeds"
@@ -53,18 +53,18 @@ MOTION_COLUMNS = [name for name in SCHEMA if name.endswith(("_position_m", "_spe
 def read_episodes(
     paths: Sequence[str], columns: Names | None = None, units: Units | None = None
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Read tables of pairs: a row per pair and moment, at any rate and with holes.
+    """Read tables of pairs: a row per pair and time, at any rate, possibly with holes.
 
     Args:
-        paths: .csv or .parquet files, see :class:`lcc_rl.data.tables.TableFile`. Columns that are
-            not required in ``FIELDS`` may be missing; ``event`` and ``period`` are taken for
+        paths: .csv or .parquet files, see :class:`lcc_rl.data.tables.TableFile`. Columns that
+            ``FIELDS`` does not require may be missing; ``event`` and ``period`` may stand for
             ``episode`` and ``recording``.
-        columns: what they call the columns, by the keys of ``FIELDS``; others as in ``SCHEMA``.
-        units: their units by key; SI for those that are not named.
+        columns: names of the columns by the keys of ``FIELDS``; by default those of ``SCHEMA``.
+        units: units by key; by default SI.
 
     Returns:
-        The columns ``SCHEMA``, samples 0.1 s apart, ``file`` and ``row`` there, from 0, and
-        ``label``, the file's name of the episode; and lines on what was read. Holes divide an
+        The columns ``SCHEMA``, samples 0.1 s apart, ``file`` and its ``row``, from 0, and
+        ``label``, the file's name of the episode; and lines on the tables. Holes divide an
         episode. Speeds and gaps may be negative.
 
     Raises:
@@ -86,13 +86,13 @@ def read_episodes(
 def _table(
     path: str, number: int, columns: Names, units: Units, place: Places
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Read one file, the ``number``-th, and bring it to the grid."""
+    """Read file ``number`` and resample it to the grid."""
     file = TableFile(path)
     names = _names(file, columns)
     table, numbers = _rows(file, number, names, units)
     notes = list(file.notes)
     for name, words in (
-        ("recording", f"no column recording: all of {path} is one"),
+        ("recording", f"no column recording: {path} is one recording"),
         ("leader_length", "no column leader_length_m: lengths are not known"),
     ):
         if names.get(name) is None:
@@ -113,7 +113,7 @@ def _table(
 def _rows(
     file: TableFile, number: int, names: Names, units: Units
 ) -> tuple[pd.DataFrame, NDArray[np.int64]]:
-    """Rows of a file with episodes counted from 0, and the file's numbers of these."""
+    """Return rows of a file with episodes numbered from 0, and the file's own numbers."""
     read = file.read(PAIR_FIELDS, names, units, "data.columns", PAIR_MEASURED)
     if not len(read["time"]):
         raise DataError(f"{file.path}: has no episodes; expected at least one row")
@@ -132,20 +132,20 @@ def _rows(
         "follower_id": read.get("follower_id", follower),
         "leader_id": read.get("leader_id", follower - 1),
     }
-    table = pd.DataFrame({**values, "time_s": read["time"].round(6)})  # a moment is a microsecond
+    table = pd.DataFrame({**values, "time_s": read["time"].round(6)})  # resolution 1 µs
     table = table.assign(file=number, row=kept, label=labels, episode=codes)
     _check_pairs(table, file)
     return table, numbers
 
 
 def _numbered(episode: NDArray, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The file's numbers of episodes counted from 0; parts after holes have further ones."""
+    """Return the file's numbers of episodes; parts after holes have further numbers."""
     more = np.arange(episode.max() + 1 - len(numbers)) + numbers.max() + 1
     return np.append(numbers, more)[episode]
 
 
 def _names(file: TableFile, columns: Names) -> dict[str, str | None]:
-    """What a file calls the columns, by the keys of ``FIELDS``."""
+    """Return the file's names of columns by the keys of ``FIELDS``."""
     names: dict[str, str | None] = {
         key: own for key, own in EPISODE_NAMES.items() if own in file.header
     }
@@ -160,7 +160,7 @@ def _names(file: TableFile, columns: Names) -> dict[str, str | None]:
 
 
 def _check_pairs(table: pd.DataFrame, file: TableFile) -> None:
-    """Check that each episode is of one pair."""
+    """Check that each episode has one pair."""
     episode, rows = table["episode"].to_numpy(), np.arange(len(table))
     first = np.zeros(int(episode.max()) + 1, dtype=np.int64)
     first[episode[::-1]] = rows[::-1]
@@ -173,10 +173,10 @@ def _check_pairs(table: pd.DataFrame, file: TableFile) -> None:
 
 
 def derive_positions(episodes: pd.DataFrame) -> None:
-    """Write positions that agree with speeds and gaps: the leader's is 0 m at an episode's start.
+    """Derive positions from speeds and gaps; the leader's is 0 m at an episode's start.
 
     Args:
-        episodes: the table in SI; changed in place.
+        episodes: the table in SI; it is changed in place.
     """
     speed = episodes["leader_speed_mps"].to_numpy(np.float64)
     time = episodes["time_s"].to_numpy(np.float64)

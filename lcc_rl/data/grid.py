@@ -1,8 +1,8 @@
-"""One grid for every table: rows by record and time, divided at holes, every 0.1 s.
+"""Resampling of tables: rows by record and time, divided at holes, every 0.1 s.
 
-A record holds the rows of a vehicle, a pair or a drive; its number stands in the column
-``episode``. Rows carry the number of their file (``file``) and of their row there (``row``), so
-that :func:`places` describes a sample of any table to the user.
+A record holds the rows of a vehicle, a pair or a drive; its number is in the column ``episode``.
+Rows have the number of their file (``file``) and of their row in it (``row``), from which
+:func:`places` describes a sample of any table.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from lcc_rl.arrays import Floats, Integers, Mask
 from lcc_rl.data.trajectories import FRAME, ReadReport, starts_of
 from lcc_rl.errors import DataError
 
-HOLE = 1.75  # of the usual step; a longer one is a missing sample
-HOLE_S, MANY_HOLES = 2.0, 0.1  # least hole [s] where more than this share of steps would be one
-UNEVEN = 0.1  # of a step; one that is further off is irregular
-REGULAR = 0.01  # of 0.1 s, by which samples may be off the grid: times in float32 are by 10 µs
-SHORTEST_STEP, LONGEST_STEP = 0.002, 10.0  # s; samples so near, or so far apart, are not in seconds
-MOST_TWICE = 0.1  # of the rows may be second ones of their moment that say something else
-LAST_FRAME = 2**31 - 1  # frame
-ORIGIN = ["file", "row", "leader_row", "label"]  # columns that only describe where a row is from
-Place = Callable[[int, str], str]  # describes the sample of a row, and a column, to the user
+HOLE = 1.75  # steps longer than this multiple of the usual one are holes
+HOLE_S, MANY_HOLES = 2.0, 0.1  # least hole [s] if more than this share of steps would be holes
+UNEVEN = 0.1  # deviation from the usual step from which a step is irregular, as a share of it
+REGULAR = 0.01  # tolerance of the grid as a share of 0.1 s; float32 times are off by 10 µs
+SHORTEST_STEP, LONGEST_STEP = 0.002, 10.0  # steps beyond these are not in seconds [s]
+MOST_TWICE = 0.1  # largest share of rows that repeat a time with other values
+LAST_FRAME = 2**31 - 1  # largest number of a frame
+ORIGIN = ["file", "row", "leader_row", "label"]  # columns that describe the origin of a row
+Place = Callable[[int, str], str]  # returns a description of a row's sample and a column
 Places = Callable[[pd.DataFrame], Place]
 
 
@@ -36,14 +36,14 @@ def places(
     columns: Mapping[str, str | None] | None = None,
     vehicles: Mapping[int, str] | None = None,
 ) -> Place:
-    """Return what describes a sample: its file, recording, episode, row, vehicle and column.
+    """Return a function that describes a sample: file, recording, episode, row, vehicle, column.
 
-    What the table does not know is left out. Without a row, the time stands for it.
+    Unknown parts are left out. Without a row number, the time is given.
 
     Args:
-        table: of vehicles, pairs or drives.
-        files: by the numbers in its column ``file``.
-        columns: what the files call their columns, by key.
+        table: table of vehicles, pairs or drives.
+        files: the files, indexed by the column ``file``.
+        columns: the files' names of columns, by key.
         vehicles: names of numbered vehicles.
 
     Examples:
@@ -80,21 +80,21 @@ def places(
 def continuous(
     samples: pd.DataFrame, what: str, place: Places, report: ReadReport, divide: bool = True
 ) -> pd.DataFrame:
-    """Sort records by time, keep the first row of a moment, and divide records at holes.
+    """Sort records by time, keep the first row of each time, and divide records at holes.
 
     Args:
         samples: rows in any order: ``episode`` (number of the record, from 0), ``time_s``, ``row``
-            and what else there is.
-        what: key of the column that tells records apart: vehicle, episode or drive.
-        place: makes of a table what describes its rows.
-        report: counts what is left out.
+            and further columns.
+        what: key of the column that identifies records: vehicle, episode or drive.
+        place: returns for a table the function that describes its rows.
+        report: counts the rows left out.
         divide: whether holes divide a record.
 
     Returns:
-        The rows in order; a record of several parts has several numbers.
+        The sorted rows; the parts of a divided record have different numbers.
 
     Raises:
-        DataError: if too many rows of a moment differ, or no record has two samples.
+        DataError: if too many rows of one time differ, or no record has two samples.
     """
     samples = _first_of_moments(_sorted(samples, report), what, place, report)
     same = np.append(False, np.diff(samples["episode"]) == 0)
@@ -117,7 +117,7 @@ def continuous(
 
 
 def _sorted(samples: pd.DataFrame, report: ReadReport) -> pd.DataFrame:
-    """Rows by record and time."""
+    """Return the rows sorted by record and time."""
     record, later = samples["episode"].diff(), samples["time_s"].diff() >= 0
     if ((record > 0) | ((record == 0) & later)).iloc[1:].all():
         return samples
@@ -130,26 +130,26 @@ def _sorted(samples: pd.DataFrame, report: ReadReport) -> pd.DataFrame:
 def _first_of_moments(
     samples: pd.DataFrame, what: str, place: Places, report: ReadReport
 ) -> pd.DataFrame:
-    """One row for each moment of sorted records."""
+    """Return the first row of each time of sorted records."""
     again = samples.duplicated(["episode", "time_s"]).to_numpy()
     if not again.any():
         return samples
-    said = samples.columns.drop(["file", "row"], errors="ignore")
-    others = again & ~samples.duplicated(said).to_numpy()
+    given = samples.columns.drop(["file", "row"], errors="ignore")
+    others = again & ~samples.duplicated(given).to_numpy()
     rows = np.flatnonzero(others if others.any() else again)
     where = place(samples)(int(rows[samples["row"].to_numpy()[rows].argmin()]), "time_s")
     if others.sum() > MOST_TWICE * len(samples):
         raise DataError(
-            f"{where} repeats a moment of its {what} with other values, as do "
+            f"{where} repeats a time of its {what} with other values, as do "
             f"{100 * others.mean():.0f} % of the rows; does a column name the {what}?"
         )
-    words = f"rows of a moment that their {what} has already, {int(others.sum()):,} of them with"
+    words = f"rows that repeat a time of their {what}, {int(others.sum()):,} of them with"
     report.drop(f"{words} other values, the first: {where}", int(again.sum()))
     return samples[~again].reset_index(drop=True)
 
 
 def _usual_steps(samples: pd.DataFrame, same: Mask, what: str, source: str) -> Floats:
-    """Usual time between samples of each row's record [s]; ``same``: as that of the row before."""
+    """Return the usual step of each row's record [s]; ``same``: as that of the row before."""
     steps = samples["time_s"].diff().where(same)
     step = float(steps.median())
     if not SHORTEST_STEP <= step < LONGEST_STEP:
@@ -166,20 +166,20 @@ def _usual_steps(samples: pd.DataFrame, same: Mask, what: str, source: str) -> F
 
 
 def is_hole(steps: Floats, usual: Floats) -> Mask:
-    """Return which steps [s] are holes, which divide a record; irregular sampling has few."""
+    """Return which steps [s] are holes; irregular sampling has few."""
     long = steps > HOLE * usual
     return long & (steps > HOLE_S) if long.mean() > MANY_HOLES else long
 
 
 def divided(table: pd.DataFrame, wrong: Mask, begins: Mask, shortest: float) -> pd.DataFrame:
-    """Leave rows out of records, which are divided there.
+    """Remove rows from records and divide the records there.
 
     Args:
-        table: rows of a record (whole numbers in the column ``episode``) lie together, in order of
+        table: consecutive rows of each record (whole numbers in the column ``episode``), sorted by
             ``time_s``.
-        wrong: the rows to leave out.
-        begins: rows before which a record is divided, too.
-        shortest: parts of a divided record that are shorter than this go as well [s].
+        wrong: the rows to remove.
+        begins: further rows before which a record is divided.
+        shortest: shorter parts of a divided record are removed, too [s].
 
     Returns:
         The other rows. The first part of a record keeps its number.
@@ -205,7 +205,7 @@ def divided(table: pd.DataFrame, wrong: Mask, begins: Mask, shortest: float) -> 
 
 
 def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First row and number of rows of each stretch of equal values."""
+    """Return first row and number of rows of each stretch of equal values."""
     starts = starts_of(values)
     return starts, np.diff(np.append(starts, len(values)))
 
@@ -216,21 +216,20 @@ def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 def on_grid(
     samples: pd.DataFrame, origin: Floats, smooth: Sequence[str], place: Places, report: ReadReport
 ) -> tuple[pd.DataFrame, Integers]:
-    """Bring continuous records to samples 0.1 s apart.
+    """Resample continuous records to samples 0.1 s apart.
 
-    Columns of motion are interpolated monotonically (PCHIP), ``gap`` linearly and only where both
-    samples beside a moment have one; a ``leader`` is that of both. Other columns are those of the
-    sample before.
+    Columns of motion are interpolated monotonically (PCHIP), ``gap`` linearly between two samples
+    that have one; a ``leader`` must be that of both. Other columns are those of the sample before.
 
     Args:
         samples: see :func:`continuous`.
-        origin: time of frame 0, of each row [s].
+        origin: time of frame 0 for each row [s].
         smooth: the columns of motion.
-        place: makes of a table what describes its rows.
-        report: counts what is left out.
+        place: returns for a table the function that describes its rows.
+        report: counts the rows left out.
 
     Returns:
-        The samples, their ``time_s`` that of a frame, and the frame of each.
+        The samples, with the frames' ``time_s``, and the frame of each.
     """
     at = ((samples["time_s"] - origin) / FRAME).to_numpy()
     if at.max() > LAST_FRAME:
@@ -257,7 +256,7 @@ def on_grid(
 def _interpolated(
     samples: pd.DataFrame, at: Floats, smooth: list[str], report: ReadReport
 ) -> tuple[pd.DataFrame, Integers]:
-    """Samples at the whole frames within each record; ``at`` are the frames of the samples."""
+    """Return samples at the whole frames of each record; ``at``: frames of the given samples."""
     from scipy.interpolate import PchipInterpolator  # here: it loads for a second
 
     table, episode = samples[smooth].to_numpy(np.float64), samples["episode"].to_numpy()

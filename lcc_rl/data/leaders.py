@@ -1,4 +1,4 @@
-"""Leaders of a study: stretches of speed records, tables of drives, recorded traffic, mixtures."""
+"""Leaders of a study: speed records, tables of drives, recorded traffic and mixtures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lcc_rl.data.profiles import (
     from_records,
     joined,
     leader_profiles,
-    nothing,
+    no_profiles,
     resample,
 )
 from lcc_rl.data.sources import find_files
@@ -33,18 +33,18 @@ from lcc_rl.data.trajectories import FRAME
 from lcc_rl.errors import ConfigError, DataError, require_positive, unknown_name
 from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, parse
 
-LISTED = 8  # names in a line
-WHOLE_RECORD = "full length"  # a case that is a whole record, before the record's name
+LISTED = 8  # most names in a line
+WHOLE_RECORD = "full length"  # name of a case with a whole record, before the record's name
 StretchNodes = Mapping[str, Mapping[str, Any] | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Evaluation run of a platoon behind a given stretch of a record.
+    """Evaluation case of a platoon behind a given stretch of a record.
 
     Args:
         name: name in tables and figures.
-        profile: speed of the leader, one record.
+        profile: speed of the leader; one record.
         followers: number of vehicles behind the leader.
     """
 
@@ -63,11 +63,11 @@ class Leaders:
     """Speed profiles of leaders, for training and for evaluation.
 
     Args:
-        training: records to draw windows from.
+        training: records from which windows are drawn.
         windows: held-out windows of one horizon.
         cases: named evaluation cases.
         full_length: whole held-out records.
-        report: lines on what was read.
+        report: lines on the data.
     """
 
     training: Profiles
@@ -81,13 +81,13 @@ class Stretch(Settings):
     """A part of a speed record."""
 
     path: str | None = None  # see lcc_rl.data.speed_records.read_speed_record
-    scale: Positive = 1.0  # factor of the speeds (the paper drives its record "twice as slow", 0.5)
-    from_s: Number | None = None  # beginning, by the record's own time [s]; None for its start
-    to_s: Number | None = None  # end [s]; None for its end
+    scale: Positive = 1.0  # factor on the speeds (the paper's "twice as slow" is 0.5)
+    from_s: Number | None = None  # start in the record's time [s]; None: start of the record
+    to_s: Number | None = None  # end [s]; None: end of the record
 
 
 class CaseSettings(Settings):
-    """An evaluation case: a part of a speed record that lasts one horizon."""
+    """An evaluation case: a part of a speed record, one horizon long."""
 
     path: str | None = None
     scale: Positive = 1.0
@@ -109,7 +109,7 @@ def stretch(
         path: see :func:`lcc_rl.data.speed_records.read_speed_record`.
         time_step: step of the scenario [s].
         scale, from_s, to_s: see :class:`Stretch`.
-        plausible: thresholds of every sample, of its speed also after scaling.
+        plausible: thresholds of every sample, also for the scaled speed.
 
     Raises:
         DataError: if the record cannot be read or does not cover the stretch.
@@ -123,7 +123,7 @@ def stretch(
     if begin < time[0] or end > time[-1] + 1e-6:
         raise DataError(
             f"{path}: covers {time[0]:g}–{time[-1]:g} s, not the stretch {begin:g}–{end:g} s; "
-            "leader=record takes a record of any length"
+            "leader=record accepts records of any length"
         )
     limit = (plausible or Plausible()).max_speed
     if scale * speed.max() > limit:
@@ -137,28 +137,28 @@ def stretch(
 
 
 class RecordLeaders(Settings):
-    """Leaders that drive speed records or drive cycles from files."""
+    """Leaders that follow speed records or drive cycles from files."""
 
     training: StretchNodes  # stretches by name, see Stretch
-    held_out: StretchNodes  # stretches that windows for evaluation are cut from
+    held_out: StretchNodes  # stretches from which windows for evaluation are cut
     cases: StretchNodes = Field(default_factory=dict)  # ``case_1`` for "case 1", see CaseSettings
-    full_length: StretchNodes | None = None  # stretches driven from end to end
+    full_length: StretchNodes | None = None  # stretches driven as a whole
     # Evaluation windows whose total speed change is below this are left out [m/s].
     least_variation: NonNegative = 2.0
-    path: str | None = None  # of stretches that name none
-    plausible: Plausible | None = None  # None for the defaults
+    path: str | None = None  # file of stretches without a path
+    plausible: Plausible | None = None  # None: the defaults
 
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
-        """Read everything.
+        """Read all records.
 
         Args:
             time_step: step of the scenario [s].
             horizon: steps of a window and of a case.
-            followers: vehicles behind a whole record; None reads neither these nor the cases.
+            followers: vehicles behind a whole record; None: neither whole records nor cases.
 
         Raises:
-            DataError: if a record cannot be used, naming the file.
-            ConfigError: if an option is unknown or impossible, naming it.
+            DataError: naming the file of an unusable record.
+            ConfigError: naming an unknown or impossible option.
         """
         parts: dict[str, list[Profiles]] = {}
         for group in ("training", "held_out"):
@@ -196,7 +196,7 @@ class RecordLeaders(Settings):
         return parts
 
     def _parsed(self, kind: type[Settings], node: Mapping[str, Any] | None, where: str) -> Any:
-        """Settings of a stretch or case; it or ``self`` has a path."""
+        """Return settings of a stretch or case; it or ``self`` has a path."""
         settings: Any = parse(kind, node or {}, where)
         settings.path = settings.path or self.path
         if not settings.path:
@@ -207,12 +207,12 @@ class RecordLeaders(Settings):
 class TrajectoryLeaders(Settings):
     """Leaders recorded in traffic: those of car-following episodes, such as NGSIM's."""
 
-    source: Any  # where the episodes come from, like the nodes of ``data``
-    split: Callable  # how they are divided, like the nodes of ``split``
+    source: Any  # source of the episodes, like the nodes of ``data``
+    split: Callable  # their division, like the nodes of ``split``
     least_variation: NonNegative = 2.0  # see RecordLeaders
 
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
-        """Read everything; see :meth:`RecordLeaders.load`."""
+        """Read all records; see :meth:`RecordLeaders.load`."""
         loaded = self.source.load()
         profiles = at_step(leader_profiles(loaded.episodes, FRAME), time_step)
         training, held_out = self.split(profiles.at_least(horizon))
@@ -225,11 +225,11 @@ class TrajectoryLeaders(Settings):
 def apart(
     training: Profiles, held_out: Profiles, vehicles: Mapping[int, str] | None = None
 ) -> list[str]:
-    """Return a line on the recordings or vehicles that are held out; none where nothing is.
+    """Return a line on the held-out recordings or vehicles, if there are any.
 
     Args:
-        training, held_out: the two sides.
-        vehicles: names of the numbered vehicles, where the file names them.
+        training, held_out: profiles of both sides.
+        vehicles: names of the numbered vehicles, if the file names them.
     """
 
     def leader(name: str) -> str:
@@ -248,27 +248,27 @@ def apart(
 
 
 class DriveLeaders(Settings):
-    """Leaders that drive the speed records of a table.
+    """Leaders that follow the speed records of a table.
 
-    Several drives are divided by name: whether a drive is held out depends on a SHA-256 hash of
-    its name alone, or of the part that drives of one day share, so that it is on the same side in
-    every file. The end of a single record is held out.
+    Several drives are divided by name: whether a drive is held out depends only on a SHA-256 hash
+    of its name, or of the part that drives of one day share, so it is on the same side in every
+    file. Of a single record the end is held out.
     """
 
-    # A .csv or .parquet file, of drives also several, a pattern or a folder. A file without the
-    # column of drives is one, named after the file; a native OpenACC file that of its first car.
+    # One or several .csv or .parquet files, a pattern or a folder. A file without the column of
+    # drives is one drive with the file's name; a native OpenACC file is that of its first car.
     path: str | Sequence[str]
-    # What its columns are called: ``drive``, the name of the record, null for a table that holds
-    # one record; ``time``, even in a record; ``speed``.
+    # Names of its columns: ``drive``, the name of the record, null for a table with one record;
+    # ``time``, evenly spaced within a record; ``speed``.
     columns: Mapping[str, str | None] = Field(default_factory=lambda: dict(DRIVE_COLUMNS))
     units: Mapping[str, str] = Field(default_factory=dict)  # such as {speed: km/h}; else SI
     evaluation_share: EvaluationShare = 1 / 3  # of the names, or of the single record
-    # Regular expression; drives whose names begin with the same match are on the same side.
+    # Regular expression; drives with names that begin with the same match are on the same side.
     together: str | None = None
-    tuning: bool = False  # leave the evaluation's part out and divide the rest again
+    tuning: bool = False  # leave out the evaluation's part and divide the rest again
     least_variation: NonNegative = 2.0  # see RecordLeaders
-    fastest: Positive | None = None  # highest mean speed of the leader in held-out windows [m/s]
-    plausible: Plausible | None = None  # None for the defaults
+    fastest: Positive | None = None  # largest mean speed of the leader in held-out windows [m/s]
+    plausible: Plausible | None = None  # None: the defaults
 
     def validate(self) -> None:
         self.columns = {**DRIVE_COLUMNS, **self.columns}
@@ -283,7 +283,7 @@ class DriveLeaders(Settings):
             raise ConfigError(f"leader.together={self.together}: {error}") from error
 
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
-        """Read everything; see :meth:`RecordLeaders.load`."""
+        """Read all records; see :meth:`RecordLeaders.load`."""
         single = self.columns["drive"] is None
         profiles, report = read_drives(
             self.path, self.columns, time_step, self.plausible, self.units
@@ -292,17 +292,17 @@ class DriveLeaders(Settings):
         each = 1 < len(drives) == len(find_files(self.path))  # a file is a drive
         if each and self.together and len({*map(self._family, drives)}) == 1:
             report.append(f"each file is a trip: leader.together={self.together} is in all names")
-            self = copy(self)  # the settings stay
+            self = copy(self)  # self is not changed
             self.together = None
         divide = self._by_time if single else self._by_name
-        training, held_out = nothing(time_step), profiles
+        training, held_out = no_profiles(time_step), profiles
         if self.evaluation_share < 1:
             training, held_out = divide(profiles)
             if self.tuning:
                 training, held_out = divide(training, again=True)
             training = training.at_least(horizon)
         windows = varying(held_out.windows(horizon), self.least_variation, self.fastest)
-        if not single:  # what is on one side together is one drive in intervals, too
+        if not single:  # parts of one drive count as one in intervals, too
             windows = replace(windows, recordings=tuple(map(self._family, windows.recordings)))
         by = "at the end" if single else f"by name (a hash, {self.evaluation_share:.2g} each)"
         count = f"{len(held_out)} of {len(profiles)} record(s) for evaluation, {by}: "
@@ -310,10 +310,10 @@ class DriveLeaders(Settings):
         return Leaders(training, windows, report=(*report, *described_records(profiles), line))
 
     def _by_name(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
-        """Divide drives by a hash of their names; once more for tuning."""
+        """Divide drives by a hash of their names; twice for tuning."""
         share = self.evaluation_share
         place = np.array([hashed(self._family(name)) for name in profiles.recordings])
-        if again:  # what is left lies in share…1
+        if again:  # the other hashes lie in share…1
             place = (place - share) / (1 - share)
         held = place < share
         if held.all() or not held.any():
@@ -328,7 +328,7 @@ class DriveLeaders(Settings):
         return profiles.select(np.flatnonzero(~held)), profiles.select(np.flatnonzero(held))
 
     def _family(self, name: str) -> str:
-        """The part of a name that tells on which side its drive is."""
+        """Return the part of a name that determines the side of its drive."""
         if self.together is None:
             return name
         found = re.match(self.together, name)
@@ -337,7 +337,7 @@ class DriveLeaders(Settings):
         return found.group()
 
     def _by_time(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
-        """Divide the one record, whose end is held out."""
+        """Divide a single record; its end is held out."""
         record, name = profiles.record(0), profiles.names[0]
         cut = len(record) - round(self.evaluation_share * len(record))
         if not 1 < cut < len(record) - 1:
@@ -352,12 +352,12 @@ class DriveLeaders(Settings):
 
 
 def varying(profiles: Profiles, least: float, fastest: float | None = None) -> Profiles:
-    """Return the records whose speed changes by at least so much in total.
+    """Return the records with a total change of speed of at least ``least``.
 
     Args:
         profiles: the records.
         least: sum of the changes of speed [m/s].
-        fastest: mean speed that a record must not exceed [m/s]; None for no limit.
+        fastest: largest mean speed of a record [m/s]; None: no limit.
 
     Raises:
         DataError: if there is none.
@@ -379,27 +379,26 @@ def varying(profiles: Profiles, least: float, fastest: float | None = None) -> P
 
 
 def hashed(name: str) -> float:
-    """Return a number in [0, 1) that depends on a name alone, the same on every machine.
+    """Return a number in [0, 1) that depends on a name only, the same on every machine.
 
-    The prefix keeps it apart from other divisions by the plain hash of the same names.
+    The prefix makes it independent of other divisions by the plain hash of the same names.
     """
     digest = hashlib.sha256(f"lcc_rl held out: {name}".encode()).digest()
     return int.from_bytes(digest[:6], "big") / 2**48
 
 
 class Mixture:
-    """Leaders from several sources side by side.
+    """Leaders from several sources.
 
-    Training draws a source by its weight, then one of its records. Evaluation takes
-    the windows of every source.
+    Training draws a source by its weight, then one of its records. Evaluation uses the windows of
+    all sources.
 
     Args:
-        weights: how often a source is drawn, relative to the others, by name; those not named
-            have 1.
-        **sources: by name, each like a node of ``leader``.
+        weights: relative frequency of a source in training, by name; 1 by default.
+        **sources: sources by name, each like a node of ``leader``.
 
     Raises:
-        ConfigError: if there is no source, a weight is not positive or names no source.
+        ConfigError: if there is no source, or a weight is not positive or of no source.
     """
 
     def __init__(self, weights: Mapping[str, float] | None = None, **sources: Any) -> None:
@@ -418,14 +417,14 @@ class Mixture:
         self.sources, self.weights = sources, dict(weights or {})
 
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
-        """Read everything; see :meth:`RecordLeaders.load`."""
+        """Read all records; see :meth:`RecordLeaders.load`."""
         found: dict[str, Leaders] = {}
         for name, source in self.sources.items():
             try:
                 found[name] = source.load(time_step, horizon, followers)
             except DataError as error:
                 raise DataError(f"leader.{name}: {error}") from error
-        # A source that is for evaluation only has nothing to draw from.
+        # A source for evaluation only has no training records.
         learned = {name: one for name, one in found.items() if len(one.training)}
         parts = [one.training.at_least(horizon) for one in learned.values()]
         training = joined(parts) if parts else next(iter(found.values())).training

@@ -1,9 +1,9 @@
 """Reader of NGSIM files in any published layout.
 
-Three layouts are read, plain or gzipped, distinguished by their first line: the native headerless
-18 columns separated by white space, the 18-column CSV with header (19 with Location), and the
-25-column export of the public portal. Files are read in blocks and only the needed columns are
-kept, in compact types, so that the whole portal export fits in a few gigabytes.
+Three layouts are read, plain or gzipped, and distinguished by their first line: the native 18
+columns without header, separated by white space; the 18-column CSV with header (19 with Location);
+and the 25-column export of the public portal. Files are read in blocks, and only the needed columns
+are kept in compact types, so the whole portal export fits in a few gigabytes.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _column(name: str, least: float = -1e9, most: float = 1e9, **more: Any) -> C
     return Column(name, least=least, most=most, **more)
 
 
-# Columns of the files by what they are in the samples.
+# Columns of the files by their keys in the samples.
 NGSIM_FIELDS = {
     "vehicle": _column("Vehicle_ID", 1, LARGEST_ID, whole=True),
     "frame": _column("Frame_ID", 0, 2**31 - 1, whole=True),
@@ -72,20 +72,20 @@ NGSIM_FIELDS = {
 NGSIM_NAMES = {own: column.key for own, column in NGSIM_FIELDS.items()}
 KNOWN = [*NGSIM_NAMES.values(), "Location"]
 SPELLED = {name.replace("_", "").lower(): name for name in KNOWN} | HEADER_ALIASES
-# What follows from a column that is all zero or blank.
+# Consequence of a column that is all zero or blank.
 CONSEQUENCES = {
-    "Global_Time": "recordings are told apart by file",
+    "Global_Time": "recordings are identified by file",
     "v_Length": "gaps are front to front, not bumper to bumper",
     "v_Class": "nothing to filter vehicle classes on",
-    "v_Vel": "nothing to learn from it",
-    "v_Acc": "nothing to learn from it",
-    "Lane_ID": "nothing to learn from it",
+    "v_Vel": "it contains no data",
+    "v_Acc": "it contains no data",
+    "Lane_ID": "it contains no data",
     "Preceding": "no vehicle follows another",
     "Space_Headway": "space headways are derived from positions",
 }
 METRES = {"feet": FOOT, "metres": 1.0}
-CAR_LENGTH = (2.0, 12.0)  # m; between them lies the median length of vehicles on any road
-JAM = 3.0  # m; front to front, no two cars are closer in a queue
+CAR_LENGTH = (2.0, 12.0)  # range of the median length of vehicles on any road [m]
+JAM = 3.0  # least distance of cars in a queue, front to front [m]
 EXACT_DUPLICATE = "exact duplicate (vehicle, frame)"
 CONFLICTING_DUPLICATE = "conflicting duplicate (vehicle, frame)"
 NgsimColumns = dict[str, NDArray]
@@ -96,27 +96,27 @@ def read_ngsim(
     location: str | None = None,
     units: str = "feet",
 ) -> Trajectories:
-    """Read one or several NGSIM files, of any published layout, into SI.
+    """Read one or several NGSIM files of any published layout and convert them to SI.
 
-    Header names match whatever their letter case, spaces and underscores. Required are Vehicle_ID,
-    Frame_ID, Local_Y, v_Length, v_Class, v_Vel, v_Acc, Lane_ID and Preceding; Global_Time,
-    Space_Headway and Location are used where present. Cells may be blank in every other column
-    and in Preceding, Space_Headway, Global_Time, v_Class and Location.
+    Case, spaces and underscores of header names are ignored. Required columns are Vehicle_ID,
+    Frame_ID, Local_Y, v_Length, v_Class, v_Vel, v_Acc, Lane_ID and Preceding. Global_Time,
+    Space_Headway and Location are used if present. Cells may be blank in Preceding, Space_Headway,
+    Global_Time, v_Class, Location and all columns that are not read.
 
     Vehicle ids repeat between recordings. A recording is identified by its location and the time
     of its frame 0 (see :mod:`lcc_rl.data.ngsim_recordings`); several files may hold parts of one.
-    Exact duplicate rows are dropped; of rows that disagree on one vehicle and frame the first is
-    kept. A Preceding that is blank, negative or the vehicle itself counts as none. A space headway
-    that is blank or zero is derived from the positions in the same frame.
+    Exact duplicate rows are dropped; of different rows of one vehicle and frame the first is kept.
+    A Preceding that is blank, negative or the vehicle itself counts as none. A space headway that
+    is blank or zero is derived from the positions in the same frame.
 
     Args:
         path: file or files, plain or gzipped.
-        location: keep only rows of this Location (such as ``i-80``), whatever its letter case.
-        units: what the files are in: ``feet``, as published, or ``metres``.
+        location: keep only rows of this Location (such as ``i-80``), in any case.
+        units: unit of the files: ``feet``, as published, or ``metres``.
 
     Raises:
-        DataError: naming the file, the row and the column at fault, or if the vehicles are too
-            short or long for these units.
+        DataError: naming file, row and column, or if the vehicles are too short or long for these
+            units.
     """
     paths = [path] if isinstance(path, (str, Path)) else path
     rows = _Rows(ReadReport(files=[str(name) for name in paths]), METRES[units])
@@ -147,7 +147,7 @@ def read_ngsim(
 
 
 def _official(name: str) -> str:
-    """The official spelling of a column's name."""
+    """Return the official spelling of a column's name."""
     folded = re.sub(r"[\s_]+", "", name).lower()
     return SPELLED.get(folded, name.strip())
 
@@ -158,12 +158,12 @@ class _Rows:
 
     Args:
         report: counts, updated with every block.
-        metres: size of the unit that lengths, speeds and accelerations are in.
+        metres: size of the unit of lengths, speeds and accelerations.
         chunks: the columns of each block; ``group`` is an index into ``groups``.
         groups: index of every (file, location, time of frame 0).
         rows_of: rows of each group.
-        locations: rows of each location met.
-        filled: columns that held anything but blanks and zeros.
+        locations: rows of each location.
+        filled: columns with values other than blanks and zeros.
         blank_classes: rows without a vehicle class.
     """
 
@@ -217,7 +217,7 @@ class _Rows:
 
 
 def _frame_zero(clock: NDArray[np.float64], frame: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Time of frame 0 by each row's clock [ms]; 0 where the clock cannot be an epoch."""
+    """Return the time of frame 0 by each row's clock [ms]; 0 if the clock is no epoch."""
     plausible = (clock >= 1e8) & (clock < 1e14)
     starts = np.rint(np.where(plausible, clock, 0.0)).astype(np.int64) - 100 * frame.astype("i8")
     return np.where(plausible & (starts > 0), starts, 0)
@@ -227,8 +227,8 @@ def _frame_zero(clock: NDArray[np.float64], frame: NDArray[np.int32]) -> NDArray
 
 
 def _sorted(read: _Rows) -> Trajectories:
-    """All collected rows, sorted, without duplicates."""
-    # A block's part is freed as soon as it is copied.
+    """Return all rows, sorted, without duplicates."""
+    # A part of a block is freed as soon as it is copied.
     columns = {
         name: np.concatenate([chunk.pop(name) for chunk in read.chunks])
         for name in list(read.chunks[0])
@@ -250,14 +250,14 @@ def _sorted(read: _Rows) -> Trajectories:
 
 
 def _recordings(read: _Rows, group: NDArray[np.int32]) -> tuple[NDArray[np.int16], list[str]]:
-    """Recording code of every row and the sorted names of the recordings."""
+    """Return the recording code of every row and the sorted names of the recordings."""
     named, notes = name_recordings(read.rows_of)
     read.report.notes += notes
     names = sorted(set(named.values()))
     if len(names) > INT16:
         raise DataError(
             f"{', '.join(read.report.files)}: {len(names):,} recordings; expected a handful. "
-            "Global_Time does not run 100 ms a frame"
+            "Global_Time does not advance by 100 ms a frame"
         )
     place = {name: code for code, name in enumerate(names)}
     return np.array([place[named[key]] for key in read.groups], dtype=np.int16)[group], names
@@ -266,8 +266,8 @@ def _recordings(read: _Rows, group: NDArray[np.int32]) -> tuple[NDArray[np.int16
 def _kept_order(
     report: ReadReport, columns: NgsimColumns, key: NDArray[np.int64]
 ) -> NDArray[np.intp]:
-    """Rows to keep in sorted order; duplicates are counted by kind."""
-    order = np.argsort(key, kind="stable")  # stable: the first in the files stays
+    """Return the rows to keep in sorted order; count duplicates by kind."""
+    order = np.argsort(key, kind="stable")  # stable: the first in the files is kept
     key = key[order]
     repeated = np.append(False, key[1:] == key[:-1])
     if not repeated.any():
@@ -279,16 +279,16 @@ def _kept_order(
     report.drop(CONFLICTING_DUPLICATE, int((~same).sum()))
     if not same.all():
         report.notes.append(
-            "rows that disagree on the same vehicle and frame: the first in the files was kept; "
-            "the files may mix recordings that Global_Time cannot tell apart"
+            "different rows of the same vehicle and frame: the first in the files was kept; "
+            "the files may mix recordings that Global_Time does not distinguish"
         )
     return order[~repeated]
 
 
 def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> None:
-    """Check that the vehicles of every recording are as long as vehicles are.
+    """Check that the vehicles of every recording have plausible lengths.
 
-    If a file gives no lengths, the shortest headways (1 % quantile) are checked instead.
+    Without lengths, the shortest headways (1 % quantile) are checked.
     """
     for name, part in samples.groupby("recording", observed=True):
         lengths = part.groupby("vehicle")["length_m"].first()

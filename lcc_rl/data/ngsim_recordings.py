@@ -1,18 +1,18 @@
-"""Identification of the recordings that NGSIM rows belong to, as vehicle ids are reused.
+"""Identification of the recordings of NGSIM rows, because vehicle ids are reused.
 
-Within a recording the clock advances 100 ms a frame, so Global_Time − 100·Frame_ID, the time of
-frame 0, is constant and differs between recordings by minutes. Published clocks have errors; those
+Within a recording the clock advances by 100 ms a frame, so Global_Time − 100·Frame_ID, the time of
+frame 0, is constant. It differs between recordings by minutes. Published clocks have errors; those
 of one file and location are processed in three steps:
 
 1. A clock that is blank, zero or not a plausible epoch is unusable. The site Peachtree publishes
    its epoch in seconds (and 100 a frame), which is usable.
 2. Times of frame 0 within ``JITTER`` of the next one form a cluster, so that jitter, truncation and
    rounding do not split a recording.
-3. Clusters that spread over more than ``SPREAD`` (a constant clock, for example) are unusable.
+3. Clusters that spread over more than ``CLUSTER_SPREAD``, such as a constant clock, are unusable.
 
-Rows with a usable clock are identified by location and time, over all files. Rows without one join
-the recording of their file and location where there is exactly one, and otherwise form a recording
-of their own per file and location.
+Rows with a usable clock are identified by location and time, over all files. Rows without one
+belong to the recording of their file and location if there is exactly one; otherwise they form a
+recording per file and location.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from lcc_rl.data.text import stem
 
 JITTER = 5_000  # ms; recordings of one site start at least 11,700 clock units apart
 CLUSTER_SPREAD = 300_000  # ms; periods last 15 min, and a float32 clock is off by up to 66 s
-SECONDS_BELOW = 10**11  # an epoch below this is in seconds: in ms it would be in 1973
+SECONDS_BELOW = 10**11  # a smaller epoch is in seconds; in ms it would be in 1973
 
 
 class Group(NamedTuple):
@@ -34,8 +34,8 @@ class Group(NamedTuple):
 
     Args:
         file: path of the file.
-        location: Location in lower case, '' where there is none.
-        start: Global_Time − 100·Frame_ID as published; 0 where the clock is unusable.
+        location: Location in lower case, '' if there is none.
+        start: Global_Time − 100·Frame_ID as published; 0 if the clock is unusable.
     """
 
     file: str
@@ -74,7 +74,7 @@ def name_recordings(rows: Counter[Group]) -> tuple[dict[Group, str], list[str]]:
 
 
 def _clusters(groups: Iterable[Group]) -> list[list[Group]]:
-    """Groups in order of their start, cut where the next one is more than JITTER away."""
+    """Return groups sorted by start, divided where the next one is more than JITTER away."""
     clusters: list[list[Group]] = []
     for group in sorted(groups, key=lambda group: group.start):
         if clusters and group.start - clusters[-1][-1].start <= JITTER:
@@ -91,7 +91,7 @@ def _time_name(location: str, start: int) -> str:
 
 
 def _name_by_file(named: dict[Group, str], rows: Counter[Group]) -> list[str]:
-    """Name the groups whose clock is unusable, in place; returns notes."""
+    """Name the groups with an unusable clock, in place; return notes."""
     recordings: dict[tuple[str, str], set[str]] = defaultdict(set)
     for group, name in named.items():
         recordings[group[:2]].add(name)
@@ -105,14 +105,14 @@ def _name_by_file(named: dict[Group, str], rows: Counter[Group]) -> list[str]:
             own[place] = min(recordings[place]) if alone else _file_name(place[0], own)
         named[group] = own[place]
     return [
-        f"Global_Time does not tell the recording of {count:,} rows of {file}"
-        f"{f' at {location}' if location else ''}: taken as {own[file, location]}"
+        f"Global_Time does not identify the recording of {count:,} rows of {file}"
+        f"{f' at {location}' if location else ''}: read as {own[file, location]}"
         for (file, location), count in unclocked.items()
     ]
 
 
 def _file_name(file: str, own: dict[tuple[str, str], str]) -> str:
-    """``<stem>#k`` with the smallest k that is free."""
+    """Return ``<stem>#k`` with the smallest free k."""
     number = 1
     while (name := f"{stem(file)}#{number}") in own.values():
         number += 1

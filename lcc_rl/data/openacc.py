@@ -1,8 +1,8 @@
 """Car-following episodes from native OpenACC files: every car behind the car before it.
 
-OpenACC (European Commission, Joint Research Centre; CC BY 4.0) has a row per moment: ``Time``, and
+OpenACC (European Commission, Joint Research Centre; CC BY 4.0) has a row per time: ``Time``, and
 for car i ``Speed<i>`` [m/s], ``IVS<i>``, the gap from car i + 1 to car i [m], and in some campaigns
-``Driver<i>``. Cells are blank, or columns absent, where a car was not measured.
+``Driver<i>``. Cells are blank or columns absent for cars that were not measured.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from lcc_rl.errors import DataError
 
 
 class OpenAccSource(TrajectorySource):
-    """Episodes of native OpenACC files; each is a recording, in which car i follows car i − 1.
+    """Episodes of native OpenACC files; each is a recording in which car i follows car i − 1.
 
-    A blank cell divides the trajectory of its car. Positions are derived from speeds and gaps:
-    those in the files are antennas', in the plane.
+    A blank cell divides the trajectory of its car. Positions are derived from speeds and gaps,
+    because those in the files are positions of antennas in the plane.
     """
 
     path: str | Sequence[str]  # a file, several files, or a pattern
-    driver: Literal["human", "acc"] | None = None  # only followers whose Driver<i> says so
+    driver: Literal["human", "acc"] | None = None  # only followers with this Driver<i>
 
     def load(self) -> LoadedEpisodes:
         """Read and extract.
@@ -53,7 +53,7 @@ class OpenAccSource(TrajectorySource):
 
 
 def _cars(table: TableFile, driver: str | None, report: ReadReport) -> pd.DataFrame:
-    """All cars of a file, one below the other; see :func:`to_trajectories`."""
+    """Return the rows of all cars of a file; see :func:`to_trajectories`."""
     numbers, followers, columns = _columns(table)
     read = table.read(columns, {column.key: column.key for column in columns})
     rows = len(read["Time"])
@@ -80,15 +80,15 @@ def _cars(table: TableFile, driver: str | None, report: ReadReport) -> pd.DataFr
         report.notes.append(f"{table.path}: {unknown:,} samples with a blank gap follow no vehicle")
     if driver is not None:
         none = np.full(rows, "")
-        who = np.concatenate([read.get(f"Driver{n}", none) for n in numbers])
-        cars["gap"], note = _driven_by(driver, cars.gap, who)
+        drivers = np.concatenate([read.get(f"Driver{n}", none) for n in numbers])
+        cars["gap"], note = _driven_by(driver, cars.gap, drivers)
         report.notes.append(f"{table.path}: {note}")
     cars["leader"] = (cars.vehicle - 1).where(cars.gap.notna(), 0)
     return cars[seen]
 
 
 def _columns(table: TableFile) -> tuple[list[int], list[int], list[Column]]:
-    """Numbers of the cars and of those whose gap there is, and the columns to be read."""
+    """Return the numbers of the cars and of cars with a gap, and the columns to read."""
     numbers = [int(name[5:]) for name in table.header if re.fullmatch(r"Speed[1-9]\d?", name)]
     if len(numbers) < 2:
         raise DataError(f"{table.path}: lacks Speed1 and Speed2; expected a native OpenACC file")
@@ -104,21 +104,21 @@ def _columns(table: TableFile) -> tuple[list[int], list[int], list[Column]]:
     return numbers, followers, [x for x in columns if x.key == "Time" or x.key in table.header]
 
 
-def _driven_by(driver: str, gap: pd.Series, who: NDArray) -> tuple[pd.Series, str]:
-    """Return the gaps of the samples that a kind of driver drives, and a line on both kinds."""
-    other = gap.notna() & (np.char.lower(who.astype(str)) != driver)
+def _driven_by(driver: str, gap: pd.Series, drivers: NDArray) -> tuple[pd.Series, str]:
+    """Return the gaps of samples with a kind of driver, and a line on both kinds."""
+    other = gap.notna() & (np.char.lower(drivers.astype(str)) != driver)
     own = gap.mask(other)
     words = f"{int(own.notna().sum()):,} samples of followers driven by {driver}"
     return own, f"{words}, {int(other.sum()):,} of others"
 
 
 def _marked(table: TableFile, followers: Iterable[int], read: Mapping[str, NDArray]) -> str:
-    """Describe the drivers of the followers by their column ``Driver`` and the header."""
+    """Describe the drivers of the followers by the columns ``Driver`` and the header."""
     marks = [
         " and ".join(sorted({*np.unique(read.get(f"Driver{n}", [""]))} - {""})) or "unmarked"
         for n in followers
     ]
     counts = ", ".join(f"{marks.count(mark)} {mark}" for mark in sorted({*marks}))
     header = table.preamble.get("ACC")
-    said = f" (header: ACC,{header})" if header else ""
-    return f"followers by driver: {counts}{said}; data.driver=human keeps those marked Human"
+    extra = f" (header: ACC,{header})" if header else ""
+    return f"followers by driver: {counts}{extra}; data.driver=human keeps those marked Human"

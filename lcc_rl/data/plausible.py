@@ -1,4 +1,4 @@
-"""Plausibility of recorded motion: one check, by the same thresholds, for every reader."""
+"""Plausibility of recorded motion: the same thresholds for all readers."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
 SMOOTHING = "'data.smoothing={_target_:lcc_rl.data.smoothing.SavitzkyGolay,window_s:1.5}'"
-SHORTEST_PART = 10.0  # parts of a record that was cut are at least so long [s]
-HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; fewer samples say nothing
-# Column, words with a place for the number found, these numbers, the threshold's name and which
-# samples are outside of it; both are ``[rows]``.
+SHORTEST_PART = 10.0  # least length of parts of a cut record [s]
+HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; least samples of a share
+# Column, words with a place for a number, the numbers ``[rows]``, name of the threshold, and the
+# samples outside of it ``[rows]``.
 Finding = tuple[str, str, NDArray[np.float64], str, Mask]
 
 
 class Plausible(Settings):
     """Thresholds of recorded motion; records are cut where a sample is outside of one.
 
-    The data are refused where more than ``max_share`` of the samples would be left out, or where
-    gap and speeds of a pair contradict each other (:func:`lcc_rl.data.agreement.check_pairs`).
+    The data are refused if more than ``max_share`` of the samples would be left out, or if gap and
+    speeds of a pair contradict each other (:func:`lcc_rl.data.agreement.check_pairs`).
     """
 
-    max_speed: Positive = 70.0  # beyond it, a column is rather in km/h or ft/s [m/s]
-    # Slower ones are left out; between this and 0 a speed counts as 0 [m/s].
+    max_speed: Positive = 70.0  # larger speeds are probably in km/h or ft/s [m/s]
+    # Smaller speeds are left out; those between this and 0 count as 0 [m/s].
     min_speed: Annotated[float, Field(le=0.0)] = -0.5
-    max_acceleration: Positive = 10.0  # change of speed between samples, either sign [m/s²]
+    max_acceleration: Positive = 10.0  # absolute change of speed between samples [m/s²]
     min_length: NonNegative = 2.0  # length of a vehicle [m]; 0 counts as not given
     max_length: Positive = 30.0
     min_gap: Number = 0.0  # between bumpers [m]
     max_gap: Positive = 500.0
     max_step: Positive = 10.0  # time between consecutive samples [s]
-    max_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1  # of the samples
-    # Factor by which the change of a gap may differ from what the speeds say.
+    max_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1  # largest share of implausible samples
+    # Largest factor between the change of a gap and that by the speeds.
     max_mismatch: Annotated[float, Field(ge=1.0, le=LARGEST)] = 1.5
     max_lag: NonNegative = 1.0  # of a gap or a speed behind the others [s]
-    # Share of the time with a change of speed above 4 m/s in a second; of recorded traffic it is
-    # 0.0001 or less, of the same speeds in km/h about 0.06.
+    # Largest share of the time with a change of speed above 4 m/s in a second. It is at most
+    # 0.0001 in recorded traffic, and about 0.06 for the same speeds in km/h.
     max_hard: Annotated[float, Field(ge=0.0, le=1.0)] = 0.005
 
     def select(
@@ -59,20 +59,20 @@ class Plausible(Settings):
         remedy: str = "",
         units: Units | None = None,
     ) -> tuple[pd.DataFrame, list[str]]:
-        """Cut records where a sample is implausible; parts of less than 10 s go as well.
+        """Cut records where a sample is implausible; parts shorter than 10 s are left out, too.
 
         Args:
-            table: rows of a record (column ``episode``) lie together, in order of time: time_s
-                and, where present, gap_m and columns that end in ``speed_mps`` and ``length_m``.
+            table: consecutive rows of each record (column ``episode``), sorted by time: time_s
+                and, if present, gap_m and columns that end in ``speed_mps`` and ``length_m``.
             source: the file or files, for messages.
-            place: makes of a table what describes its rows, see :func:`lcc_rl.data.grid.places`.
-            setting: where the configuration has these thresholds.
-            remedy: what else a user may do about accelerations.
+            place: see :func:`lcc_rl.data.grid.places`.
+            setting: place of these thresholds in the configuration.
+            remedy: further remedy for accelerations.
             units: see :func:`lcc_rl.data.agreement.mistakes`.
 
         Returns:
-            What is left, numbered by :func:`lcc_rl.data.grid.divided`, its speeds at least 0, and a
-            line for each kind of fault.
+            The other rows, numbered by :func:`lcc_rl.data.grid.divided`, with speeds of at least 0,
+            and a line for each kind of fault.
 
         Raises:
             DataError: if more than ``max_share`` of the samples, or all, would be left out, or
@@ -117,41 +117,41 @@ class Plausible(Settings):
         setting: str,
         remedy: str,
     ) -> tuple[Mask, list[str], str]:
-        """Samples outside of a threshold, a line for each kind, and what to do about the first."""
+        """Return samples outside of a threshold, a line for each kind, and advice on the first."""
         first = np.isin(np.arange(len(table)), starts)
         wrong, lines, advice = np.zeros(len(table), dtype=bool), [], ""
         for column, words, values, name, found in self._faults(table, first):
             new = found & ~wrong
-            if name == "max_acceleration":  # not of the change from a sample that is left out
+            if name == "max_acceleration":  # not the change from a sample that is left out
                 new[1:] &= ~wrong[:-1]
             if not new.any():
                 continue
             row = int(np.argmax(new))
             limit = f"{setting}.{name}={getattr(self, name):g}"
-            said = f"{place(row, column)} {words.format(values[row])}, {limit}"
+            example = f"{place(row, column)} {words.format(values[row])}, {limit}"
             more = remedy if name == "max_acceleration" else ""
-            line = f"left out {int(new.sum()):,} implausible sample(s), the first: {said}"
+            line = f"left out {int(new.sum()):,} implausible sample(s), the first: {example}"
             lines.append(f"{line}{more and '; to keep it'}{more}")
-            advice = advice or f"{said}; mend the file or its units{more}, or raise that threshold"
+            advice = advice or f"{example}; correct the file or units{more}, or raise the threshold"
             wrong |= new
         return wrong, lines, advice
 
     def _check_hard(self, kept: pd.DataFrame, source: str, setting: str, agree: bool) -> list[str]:
-        """Check that speeds change as cars' do; ``agree``: the gaps change as they say."""
+        """Check that speeds change as those of cars; ``agree``: the gaps agree with them."""
         hard = hard_share(kept)
         if hard is not None and hard > self.max_hard:
             hint = "are they in km/h, mph or ft/s, or do they need smoothing?"
             if agree:
-                hint = "gaps agree: are both in another unit, or are such starts real?"
+                hint = "gaps agree: are both in another unit, or are such changes real?"
             raise DataError(
                 f"{source}: speeds change by more than {HARD:g} m/s within a second for "
                 f"{100 * hard:.2g} % of the time, {setting}.max_hard={self.max_hard:g}; {hint}"
             )
-        few = f"too few samples to tell whether speeds are in m/s: fewer than {LEAST_SAMPLES}"
+        few = f"unit of speeds not checked: fewer than {LEAST_SAMPLES} samples"
         return [f"{few} a second apart"] if hard is None else []
 
     def _faults(self, table: pd.DataFrame, first: Mask) -> Iterator[Finding]:
-        """What may be outside of a threshold; ``first`` marks the first row of each record."""
+        """Yield the checks of all thresholds; ``first`` marks the first row of each record."""
         time = table["time_s"].to_numpy(np.float64)
         step = np.diff(time, prepend=time[0])
         step[first] = 0.0
@@ -178,14 +178,13 @@ class Plausible(Settings):
 
 
 def hard_share(table: pd.DataFrame) -> float | None:
-    """Return the largest share of samples whose speed changes by more than 4 m/s in a second.
+    """Return the share of samples with a change of speed above 4 m/s in a second.
 
     Args:
-        table: see :meth:`Plausible.select`; of the columns that end in ``speed_mps`` the worst
-            counts.
+        table: see :meth:`Plausible.select`; the worst column that ends in ``speed_mps`` counts.
 
     Returns:
-        The share; None where there are too few samples to tell.
+        The share; None if there are too few samples.
     """
     step = usual_step(table)
     reach = max(1, round(1 / step)) if step > 0 else 1
@@ -199,13 +198,13 @@ def hard_share(table: pd.DataFrame) -> float | None:
 
 
 def usual_step(table: pd.DataFrame) -> float:
-    """Return the median time between samples of a record [s]; 0 if none has two."""
+    """Return the median step within records [s]; 0 if no record has two samples."""
     step = table["time_s"].diff()[table["episode"].diff() == 0].median()
     return float(step) if step == step else 0.0
 
 
 def _not_negative(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
-    """Speeds a little below 0, which are noise, as 0; and a line if there are any."""
+    """Set negative speeds, which are noise, to 0; return a line if there are any."""
     names = [str(name) for name in table.columns if str(name).endswith("speed_mps")]
     below = {name: table[name] < 0.0 for name in names}
     count = sum(int(mask.sum()) for mask in below.values())

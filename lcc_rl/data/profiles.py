@@ -1,4 +1,4 @@
-"""Speed profiles of leaders: extraction, windows, split into training and evaluation."""
+"""Speed profiles of leaders: extraction, windows, division into training and evaluation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Settings
 
 EvaluationShare = Annotated[float, Field(gt=0.0, le=1.0)]
-MOST_LINES = 5  # records, each of which has a line
+MOST_LINES = 5  # most records with a line
 NONE_LEFT = "no speed profile left: at least one leader's record is needed"
 
 
@@ -28,16 +28,16 @@ class Profiles:
         speeds: all records, shape ``[samples]``, float32 [m/s].
         offsets: where each record starts, shape ``[profiles]``, int64.
         lengths: samples of each record, shape ``[profiles]``, int64.
-        names: a readable identity of each record: recording, vehicle and start.
-        recordings: the recording that each record comes from.
+        names: name of each record: recording, vehicle and start.
+        recordings: the recording of each record.
         time_step: time between samples [s].
         reach: samples of each record including those after a window's end, shape ``[profiles]``,
-            for previews; None for ``lengths``.
-        weights: how often a training draws each record, relative to the others, ``[profiles]``,
-            float64; None: all alike.
-        sources: the source of each record, where there are several; empty for one.
-        followers: speed [m/s] and gap [m] of the driver recorded behind each leader,
-            ``[samples, 2]``, float32; None where there is none.
+            for previews; None: ``lengths``.
+        weights: relative frequency of each record in training, ``[profiles]``, float64; None: all
+            are equal.
+        sources: the source of each record, if there are several; else empty.
+        followers: speed [m/s] and gap [m] of the recorded driver behind each leader,
+            ``[samples, 2]``, float32; None if there is none.
     """
 
     speeds: Tensor
@@ -94,7 +94,7 @@ class Profiles:
 
         Args:
             horizon: steps per window; a window has one sample more.
-            limit: keep at most this many, spread evenly over all; None keeps every window.
+            limit: most windows, spread evenly over all; None: all windows.
 
         Raises:
             DataError: if no record is long enough.
@@ -118,17 +118,17 @@ class Profiles:
         return replace(whole, lengths=played, reach=whole.lengths)
 
     def spread(self, limit: int | None) -> Profiles:
-        """Return at most ``limit`` records of each source, spread evenly; None for all."""
+        """Return at most ``limit`` records of each source, spread evenly; None: all."""
         groups: dict[str, list[int]] = {}
         for place, source in enumerate(self.sources or [""] * len(self)):
             groups.setdefault(source, []).append(place)
         return self.select(g[i] for g in groups.values() for i in evenly(len(g), limit))
 
     def at_least(self, horizon: int) -> Profiles:
-        """Return the records that hold at least ``horizon`` steps.
+        """Return the records with at least ``horizon`` steps.
 
         Raises:
-            DataError: if none does.
+            DataError: if there is none.
         """
         long = [i for i in range(len(self)) if int(self.lengths[i]) > horizon]
         if not long:
@@ -149,7 +149,7 @@ class Profiles:
 
 
 def evenly(count: int, limit: int | None) -> list[int]:
-    """Return at most ``limit`` of the indices below ``count``, spread evenly; None for all."""
+    """Return at most ``limit`` of the indices below ``count``, spread evenly; None: all."""
     if limit is None or limit >= count:
         return list(range(count))
     return [int(i) for i in np.linspace(0, count - 1, limit).round()]
@@ -162,10 +162,10 @@ def from_records(
     time_step: float,
     followers: Sequence[Tensor] | None = None,
 ) -> Profiles:
-    """Build profiles from separate speed records; arguments as in :class:`Profiles`.
+    """Build profiles from separate speed records; arguments as for :class:`Profiles`.
 
     Raises:
-        DataError: if there is none, or one holds a negative or missing speed.
+        DataError: if there is none, or a speed is negative or missing.
     """
     if not records:
         raise DataError(NONE_LEFT)
@@ -184,14 +184,14 @@ def from_records(
     )
 
 
-def nothing(time_step: float) -> Profiles:
-    """Return no profile: what is left to train on where all are for evaluation."""
+def no_profiles(time_step: float) -> Profiles:
+    """Return empty profiles, for training if all are for evaluation."""
     none = torch.zeros(0, dtype=torch.int64)
     return Profiles(torch.zeros(0), none, none, (), (), time_step)
 
 
 def joined(parts: Sequence[Profiles]) -> Profiles:
-    """Put several profiles of one step into one collection."""
+    """Concatenate several profiles with one time step."""
     sizes = [len(part.speeds) for part in parts]
     known = [part.lengths if part.reach is None else part.reach for part in parts]
     behind = [part.followers for part in parts if part.followers is not None]
@@ -208,7 +208,7 @@ def joined(parts: Sequence[Profiles]) -> Profiles:
 
 
 def described_records(profiles: Profiles) -> list[str]:
-    """Return duration, mean and greatest speed of each record in lines; of many, of the fastest."""
+    """Return lines on duration, mean and largest speed of the records, fastest first."""
     lines = []
     for index, name in enumerate(profiles.names):
         x = profiles.record(index)
@@ -220,14 +220,14 @@ def described_records(profiles: Profiles) -> list[str]:
 
 
 def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
-    """Take the leader's speed record of every episode, and its follower's speed and gap.
+    """Return the leader's speed record of every episode, with its follower's speed and gap.
 
     Args:
         episodes: the SI table of episodes (see :mod:`lcc_rl.data.episodes`).
         time_step: step of the table [s].
 
     Raises:
-        DataError: if the table is sampled at another step, or holds no episode.
+        DataError: if the table has another time step, or no episode.
     """
     records, names, recordings, followers = [], [], [], []
     for number, episode in episodes.groupby("episode", sort=True):
@@ -236,7 +236,7 @@ def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
             raise DataError(
                 f"episode {number}: samples are {np.median(np.diff(time)):g} s apart (or not "
                 f"evenly spaced), but scenario.time_step={time_step:g}: leaders are played at the "
-                "rate at which they were recorded, so leave it at that"
+                "rate at which they were recorded; remove the setting"
             )
         recording, leader = str(episode["recording"].iloc[0]), int(episode["leader_id"].iloc[0])
         records.append(torch.tensor(episode["leader_speed_mps"].to_numpy(np.float32)))
@@ -256,13 +256,13 @@ def resample(
 ) -> Tensor:
     """Interpolate a record to another step, monotonically between samples (PCHIP).
 
-    The interpolant never overshoots its samples, so no speed becomes negative and no peak grows.
+    The interpolant does not overshoot its samples: no speed becomes negative and no peak grows.
 
     Args:
-        time: increasing [s].
-        speed: [m/s].
-        time_step: step wanted [s].
-        begin, end: part of the record wanted [s]; None for all of it.
+        time: increasing times [s].
+        speed: speeds [m/s].
+        time_step: new step [s].
+        begin, end: part of the record [s]; None: the whole record.
 
     Returns:
         Speeds, ``[steps]``, float32 [m/s].
@@ -292,17 +292,17 @@ def at_step(profiles: Profiles, time_step: float) -> Profiles:
 
 
 class Split(Settings):
-    """Split into training and evaluation profiles that share no recording or vehicle.
+    """Division into training and evaluation profiles that share no recording or vehicle.
 
-    ``recording`` holds out whole recordings (no shared traffic wave at all); ``vehicle`` holds out
-    leaders within every recording. An ``evaluation_share`` of 1 evaluates on all and leaves
-    nothing to train on.
+    ``recording`` holds out whole recordings, which share no traffic wave. ``vehicle`` holds out
+    leaders within every recording. With an ``evaluation_share`` of 1 all profiles are for
+    evaluation.
     """
 
     by: Literal["recording", "vehicle"] = "recording"
     evaluation_share: EvaluationShare = 0.34  # of the recordings or vehicles
-    # For choosing settings: leave the evaluation profiles out and split the training profiles
-    # once more, by the same rule.
+    # For choosing settings: leave out the evaluation profiles and divide the training profiles
+    # again by the same rule.
     tuning: bool = False
 
     def __call__(self, profiles: Profiles) -> tuple[Profiles, Profiles]:
@@ -312,14 +312,14 @@ class Split(Settings):
             DataError: if there are not at least two recordings (or vehicles) to divide.
         """
         if self.evaluation_share == 1:
-            return nothing(profiles.time_step), profiles
+            return no_profiles(profiles.time_step), profiles
         if self.tuning:
             profiles, _ = self._divide(profiles)
         return self._divide(profiles)
 
     def _divide(self, profiles: Profiles) -> tuple[Profiles, Profiles]:
-        # The vehicle is the part of the name before the time, so that two episodes behind the
-        # same leader never end up on both sides.
+        # The vehicle is the part of the name before the time, so that episodes behind the same
+        # leader are on one side.
         vehicles = [vehicle.rsplit("@", 1)[0] for vehicle in profiles.names]
         groups = [*profiles.recordings] if self.by == "recording" else vehicles
         distinct = sorted(set(groups))
@@ -331,8 +331,8 @@ class Split(Settings):
                 f"give more data, or use {use}; evaluations also take split.evaluation_share=1"
             )
         held = min(max(round(self.evaluation_share * len(distinct)), 1), len(distinct) - 1)
-        # Evenly spread over the sorted groups, the last always among them: deterministic and
-        # independent of any seed, so that every run holds out the same data.
+        # Evenly spread over the sorted groups, always with the last one. No seed is used, so all
+        # runs hold out the same data.
         picks = np.linspace(len(distinct) - 1, 0, held, endpoint=False).round().astype(int)
         evaluation = {distinct[i] for i in picks}
         inside = [i for i, group in enumerate(groups) if group in evaluation]
@@ -341,12 +341,12 @@ class Split(Settings):
 
 
 class SingleProfile(Settings):
-    """Train on one profile only, as the ALCC paper probably did."""
+    """One profile for training, as probably in the ALCC paper."""
 
-    # Its number; without ``held_out`` among all profiles long enough, with it among those that
-    # ``held_out`` leaves for training.
+    # Its number among all profiles that are long enough, or, with ``held_out``, among its training
+    # profiles.
     profile: int = 0
-    # The split whose evaluation profiles are kept; None evaluates on the training profile itself.
+    # Division that provides the evaluation profiles; None: evaluate on the training profile.
     held_out: Split | None = None
 
     def __call__(self, profiles: Profiles) -> tuple[Profiles, Profiles]:

@@ -1,16 +1,16 @@
 """Smoothing of recorded motion: positions of trajectories, or averages of whole episodes.
 
-Positions are smoothed, then differentiated, by :class:`SavitzkyGolay`. :func:`averaged` takes a
-moving average of the episodes of any source, as energies that no noise of a sensor decides need.
+:class:`SavitzkyGolay` smooths positions and differentiates them. :func:`averaged` returns moving
+averages of the episodes of any source, for energies that do not depend on the noise of sensors.
 
-Raw NGSIM speeds and accelerations are noisy and disagree with the positions. Per stretch without a
+Raw NGSIM speeds and accelerations are noisy and disagree with the positions. In stretches without a
 missing frame the positions are smoothed, speed and acceleration are their derivatives, and space
-headways are derived again. Smoothing is off unless a configuration names this class
-or a function of trajectories.
+headways are derived again. Smoothing is off unless a configuration names this class or a function
+of trajectories.
 
-At the ends of a stretch a window is one-sided. On noisy positions of known motion, the error of the
-speed there is 3 times that of the interior, and that of the acceleration 6 times. Rows whose window
-is not whole are left out, by default 0.7 s at each end; shorter stretches are left out entirely.
+At the ends of a stretch a window is one-sided. With noisy positions of known motion, the error of
+the speed is there 3 times that of the interior, and that of the acceleration 6 times. Rows without
+a whole window are therefore left out, by default 0.7 s at each end, with all shorter stretches.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from lcc_rl.settings import Settings
 
 
 class SavitzkyGolay(Settings):
-    """Local polynomial fits of positions, called with trajectories.
+    """Local polynomial fits of positions.
 
-    Speed and acceleration are the derivatives of the polynomial.
+    Speed and acceleration are the derivatives of the polynomial. Called with trajectories.
     """
 
-    # Length of the window [s]; an odd number of frames is taken, at least this long.
+    # Length of the window [s], rounded up to an odd number of frames.
     window_s: Annotated[float, Field(gt=0.0, lt=600.0)] = 1.5
-    order: Annotated[int, Field(ge=2, le=100)] = 3  # of the polynomial
+    order: Annotated[int, Field(ge=2, le=100)] = 3  # order of the polynomial
 
     def validate(self) -> None:
         if self.window_s < FRAME * (self.order + 1):
@@ -50,10 +50,10 @@ class SavitzkyGolay(Settings):
             )
 
     def __call__(self, trajectories: Trajectories) -> Trajectories:
-        """Return smoothed trajectories; the given ones are not changed.
+        """Return smoothed trajectories; the argument is not changed.
 
         Rows within ``margin`` of an end of a stretch are left out. Negative smoothed speeds, as at
-        standstill, become zero. Both are counted in the report.
+        standstill, are set to zero. The report counts both.
 
         Raises:
             DataError: if no stretch is long enough.
@@ -97,11 +97,11 @@ class SavitzkyGolay(Settings):
 
     @property
     def margin(self) -> int:
-        """Rows at each end of a stretch whose window is not whole."""
+        """Rows at each end of a stretch without a whole window."""
         return self.window // 2
 
     def smooth(self, position: Floats) -> tuple[Floats, Floats, Floats]:
-        """Smooth stretches that lie one after another, as if they were one.
+        """Smooth concatenated stretches as one.
 
         Args:
             position: positions ``[rows]`` [m].
@@ -119,20 +119,20 @@ class SavitzkyGolay(Settings):
 
 
 def _within(starts: NDArray[np.intp], lengths: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return how many rows of its stretch lie between each row and the nearer end."""
+    """Return the number of rows between each row and the nearer end of its stretch."""
     place = np.arange(lengths.sum()) - np.repeat(starts, lengths)
     return np.minimum(place, np.repeat(lengths, lengths) - 1 - place)
 
 
 def averaged(episodes: pd.DataFrame, seconds: float, source: str) -> tuple[pd.DataFrame, str]:
-    """Return centred moving averages of the motion of episodes, and a line on what was left out.
+    """Return centred moving averages of the motion of episodes, and a line on rows left out.
 
-    Speeds, gaps and positions have the same average, so that a gap still changes as the speeds
-    say. Rows whose window is not whole are left out.
+    Speeds, gaps and positions have the same average, so gaps still agree with speeds. Rows without
+    a whole window are left out.
 
     Args:
         episodes: see :data:`lcc_rl.data.episodes.SCHEMA`; not changed.
-        seconds: width of the window; an odd number of frames is taken, at least this long [s].
+        seconds: width of the window [s], rounded up to an odd number of frames.
         source: the file or files, for messages.
 
     Raises:

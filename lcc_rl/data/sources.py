@@ -46,8 +46,8 @@ class LoadedEpisodes:
 
     Args:
         episodes: the episode table, see :data:`lcc_rl.data.episodes.SCHEMA`.
-        report: lines on what was read, dropped, filtered and kept.
-        vehicles: names of the numbered vehicles, where the file names them.
+        report: lines on rows read, dropped and kept.
+        vehicles: names of the numbered vehicles, if the file names them.
     """
 
     episodes: pd.DataFrame
@@ -55,18 +55,18 @@ class LoadedEpisodes:
     vehicles: Mapping[int, str] = field(default_factory=dict)
 
     def load(self) -> LoadedEpisodes:
-        """Return itself: a table at hand is a source, too."""
+        """Return itself, so that a loaded table is a source, too."""
         return self
 
 
 class Source(Settings):
-    """Base of sources of recorded episodes: steps that all of them share."""
+    """Base of sources of recorded episodes."""
 
     LATER = ("average_s",)
 
-    plausible: Plausible | None = None  # None for the defaults
+    plausible: Plausible | None = None  # None: the defaults
     # Width of a moving average of speeds, gaps and positions, see
-    # :func:`lcc_rl.data.smoothing.averaged`; 0 for none [s].
+    # :func:`lcc_rl.data.smoothing.averaged`; 0: none [s].
     average_s: Annotated[float, Field(ge=0.0, lt=600.0)] = 0.0
 
     def select(
@@ -78,32 +78,32 @@ class Source(Settings):
         place: Places = places,
         units: Units | None = None,
     ) -> LoadedEpisodes:
-        """Return the plausible episodes, averaged; see :meth:`Plausible.select`."""
+        """Return the averaged plausible episodes; see :meth:`Plausible.select`."""
         thresholds = self.plausible or Plausible()
-        kept, said = thresholds.select(episodes, source, place, remedy=remedy, units=units)
+        kept, notes = thresholds.select(episodes, source, place, remedy=remedy, units=units)
         if self.average_s:
             kept, line = averaged(kept, self.average_s, source)
-            said.append(line)
-        return LoadedEpisodes(kept, [*lines, *said])
+            notes.append(line)
+        return LoadedEpisodes(kept, [*lines, *notes])
 
 
 class TrajectorySource(Source):
-    """Base of sources whose episodes are extracted from trajectories."""
+    """Base of sources that extract episodes from trajectories."""
 
-    criteria: Criteria | None = None  # None for the defaults
+    criteria: Criteria | None = None  # None: the defaults
 
     def extracted(
         self, trajectories: Trajectories, remedy: str = "", place: Places = places
     ) -> LoadedEpisodes:
-        """Extract episodes; positions that no file gives are derived from speeds and gaps.
+        """Extract episodes; missing positions are derived from speeds and gaps.
 
         Args:
             trajectories: samples and report.
-            remedy: what a user may do about implausible accelerations.
-            place: makes of an episode table what describes its samples to the user.
+            remedy: remedy for implausible accelerations.
+            place: returns for an episode table the function that describes its samples.
 
         Raises:
-            DataError: naming the files, if there is none, or too many are implausible.
+            DataError: naming the files, if there is no episode, or too many are implausible.
         """
         report, source = trajectories.report, trajectories.report.source
         try:
@@ -122,16 +122,16 @@ class NgsimSource(TrajectorySource):
     """Episodes extracted from NGSIM files of any published layout."""
 
     path: str | Path | Sequence[str]  # a file, several, or a pattern such as data/*.csv.gz
-    location: str | None = None  # keep only i-80, us-101 … of a file that has several
+    location: str | None = None  # keep only this location, such as i-80 or us-101
     smoothing: Callable | None = None  # of the trajectories, see lcc_rl.data.smoothing
     units: Literal["feet", "metres"] = "feet"
 
     def load(self) -> LoadedEpisodes:
-        """Read, smooth where asked, and extract.
+        """Read, smooth if configured, and extract.
 
         Raises:
-            DataError: if a file is missing or not what was expected, no episode is left, or more
-                are implausible than ``plausible`` allows.
+            DataError: if a file is missing or not valid, no episode is left, or more are
+                implausible than ``plausible`` allows.
         """
         files = find_files(self.path)
         trajectories = read_ngsim(files, self.location, self.units)
@@ -142,12 +142,12 @@ class NgsimSource(TrajectorySource):
 
 
 class EpisodesSource(Source):
-    """Episodes from tables of pairs: a row per pair and moment, at any rate and with holes."""
+    """Episodes from tables of pairs: a row per pair and time, at any rate, possibly with holes."""
 
     path: str | Sequence[str]  # a file, several, or a pattern; each is a recording
-    # What the table calls ``episode``, ``recording``, ``follower_id``, ``leader_id``, ``time``,
+    # Names in the table of ``episode``, ``recording``, ``follower_id``, ``leader_id``, ``time``,
     # ``follower_speed``, ``leader_speed``, ``gap`` (bumper to bumper), ``follower_position`` and
-    # ``leader_position`` (front bumpers) and ``leader_length``; others as the package writes them.
+    # ``leader_position`` (front bumpers) and ``leader_length``; by default those of the package.
     columns: Mapping[str, str | None] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)  # such as {gap: ft}; else SI
 
@@ -173,12 +173,12 @@ class EpisodesSource(Source):
 
 
 def read_as(columns: Iterable[Column], names: Names, units: Units) -> str:
-    """Return words on measured columns that a user names, and their units, for messages on both.
+    """Return words on named measured columns and their units, for messages.
 
     Args:
-        columns: those that there may be.
-        names: what the file calls them, by key.
-        units: their units by key; SI for those that are not named.
+        columns: all possible columns.
+        names: the file's names, by key.
+        units: units by key; by default SI.
     """
     found = units_of(columns, names, units)
     if not found:
@@ -188,15 +188,15 @@ def read_as(columns: Iterable[Column], names: Names, units: Units) -> str:
 
 
 def units_of(columns: Iterable[Column], names: Names, units: Units) -> dict[str, str]:
-    """Return the units of measured columns that have a name, by key; see :func:`read_as`."""
+    """Return the units of named measured columns, by key; see :func:`read_as`."""
     found = [x for x in columns if x.quantity in SI and names.get(x.key)]
     return {x.key: units.get(x.key, SI[x.quantity]) for x in found}
 
 
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
-    """List the files of a path, a pattern or a list of them; those of a pattern are sorted.
+    """Return the files of a path, a pattern or a list of them; those of a pattern are sorted.
 
-    The name of a shipped recording or cycle is that file. A folder stands for its files.
+    A path may be the name of a shipped recording or cycle. A folder stands for its files.
 
     Raises:
         DataError: if a pattern matches no file, or a file is named twice.

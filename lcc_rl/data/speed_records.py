@@ -20,7 +20,7 @@ from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
 
 TIME_COLUMN, SPEED_COLUMN = "time_s", "speed_mps"
-# What a table of drives has, and how the columns are called by default.
+# Columns of a table of drives, and their default names.
 DRIVE_FIELDS = (
     Column("drive", "text", required=False),
     Column("time", "time"),
@@ -43,15 +43,14 @@ def read_speed_record(
     Args:
         path: name of a shipped cycle (``udds``, ``us06``, ``wltc_3b``, ``hwfet``), or a .csv or
             .parquet file with the columns ``time_s`` [s] and ``speed_mps`` [m/s], or a native
-            OpenACC file, of which the first car is taken.
-        plausible: thresholds that every sample must keep; None for the defaults.
+            OpenACC file, of which the first car is read.
+        plausible: thresholds of every sample; None: the defaults.
 
     Returns:
         Time [s], increasing, and speed [m/s], both ``[samples]``, float64.
 
     Raises:
-        DataError: naming the file and the row or column at fault, also where a number is not
-            malformed but implausible.
+        DataError: naming the file and the row or column, if a value is malformed or implausible.
     """
     file = SHIPPED_FILES.get(path, path)
     if not Path(expanduser(file)).is_file():
@@ -72,20 +71,19 @@ def read_drives(
 ) -> tuple[Profiles, list[str]]:
     """Read the speed records of tables.
 
-    A table without the column ``drive`` is one drive, unless another name is asked for.
+    A table without the column ``drive`` is one drive, unless another name is configured.
 
     Args:
         path, columns, plausible, units: see :class:`lcc_rl.data.leaders.DriveLeaders`.
         time_step: step of the profiles [s]; the records are interpolated to it.
 
     Returns:
-        A profile for each record, in the order of their names, and lines on what was read. Its
-        recording is the drive, which has several profiles where blank cells, holes or implausible
-        samples divide it.
+        A profile for each record, sorted by name, and lines on the data. Its recording is the
+        drive, which has several profiles if blank cells, holes or implausible samples divide it.
 
     Raises:
         DataError: naming file, row and column, if a value is missing or no number, a time is
-            there twice, or too much is implausible.
+            repeated, or too many samples are implausible.
     """
     files = find_files(path)
     if len(files) > 1 and columns["drive"] is None:
@@ -108,7 +106,7 @@ def read_drives(
 def _read(
     table: TableFile, columns: Names, plausible: Plausible | None, units: Units, divide: bool = True
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Name, drive, time and speed of the plausible samples of one file, and the report."""
+    """Return name, drive, time and speed of the plausible samples of a file, and the report."""
     samples, report = _samples(table, columns, units), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
     samples = continuous(samples, "drive", place, report, divide)
@@ -126,14 +124,14 @@ def _read(
 
 
 def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:
-    """Drive, as recording, time and speed of every row that has a speed."""
+    """Return drive (as recording), time and speed of every row with a speed."""
     fields: Sequence[Column] = DRIVE_FIELDS
     if table.preamble:
         fields = DRIVE_FIELDS if columns["drive"] is None else NATIVE
         native = {TIME_COLUMN: "Time", SPEED_COLUMN: "Speed1"}
         columns = {key: native.get(str(columns[key]), columns[key]) for key in ("time", "speed")}
     elif columns["drive"] == DRIVE_COLUMNS["drive"] and columns["drive"] not in table.header:
-        columns = {**columns, "drive": None}  # each file is one
+        columns = {**columns, "drive": None}  # each file is one drive
     read = table.read(fields, columns, units, "leader.columns", ["speed"])
     if not len(read["time"]):
         raise DataError(f"{table.path}: holds 0 samples, at least 2 are needed")

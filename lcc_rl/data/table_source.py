@@ -1,4 +1,4 @@
-"""Car-following episodes from trajectories in a table of any layout, by a map of its columns."""
+"""Car-following episodes from tables of trajectories, by a map of their columns."""
 
 from __future__ import annotations
 
@@ -44,29 +44,29 @@ TABLE_COLUMNS: dict[str, str | None] = {
     "time": "time_s",
     "speed": "speed_mps",
 }
-NOBODY = ("", "0", "-1", "0.0", "-1.0")  # in the column leader
-TABLE_MEASURED = ("time", "speed", "position")  # a row in which one is blank is left out
-IDENTIFYING = ("vehicle", "lane", "recording")  # of the rows that are left none may be blank
-AGREE = (0.8, 1.25)  # way by positions over way by speeds
-JUMP = 10.0  # m between samples, more than driven: positions begin anew
+NO_LEADER = ("", "0", "-1", "0.0", "-1.0")  # in the column leader
+TABLE_MEASURED = ("time", "speed", "position")  # rows with a blank cell are left out
+IDENTIFYING = ("vehicle", "lane", "recording")  # must not be blank in the other rows
+AGREE = (0.8, 1.25)  # range of distance by positions divided by distance by speeds
+JUMP = 10.0  # jump of positions between samples beyond the driven distance [m]
 
 
 class TableSource(TrajectorySource):
     """Episodes extracted from trajectories in CSV or parquet tables; each file is a recording.
 
-    The vehicle ahead is named by the column ``leader``, or is the nearest one on the lane. The gap
-    is that of a column, or the difference of positions less the leader's length. Samples are
-    brought to 0.1 s.
+    The vehicle ahead is that of the column ``leader``, or the nearest one on the lane. The gap is
+    that of a column, or the difference of positions minus the leader's length. Samples are
+    interpolated to 0.1 s.
     """
 
     path: str | Sequence[str]  # a file, several files, or a pattern
-    # What the table calls ``vehicle``, ``time``, ``speed``, ``position`` (front bumper along the
+    # Names in the table of ``vehicle``, ``time``, ``speed``, ``position`` (front bumper along the
     # road), ``lane``, ``leader`` (blank or 0 for none), ``gap`` (bumper to bumper), ``length`` and
-    # ``recording``; null for what it does not have.
+    # ``recording``; null for missing ones.
     columns: Mapping[str, str | None] = Field(default_factory=lambda: dict(TABLE_COLUMNS))
     units: Mapping[str, str] = Field(default_factory=dict)  # such as {speed: km/h}; else SI
-    vehicle_length: Positive | None = None  # of vehicles whose length no column gives [m]
-    smoothing: Callable | None = None  # of positions, see lcc_rl.data.smoothing
+    vehicle_length: Positive | None = None  # length of vehicles without one in a column [m]
+    smoothing: Callable | None = None  # smoothing of positions, see lcc_rl.data.smoothing
 
     def validate(self) -> None:
         self.columns = {**TABLE_COLUMNS, **self.columns}
@@ -85,11 +85,11 @@ class TableSource(TrajectorySource):
             )
 
     def load(self) -> LoadedEpisodes:
-        """Read, smooth where asked, and extract.
+        """Read, smooth if configured, and extract.
 
         Raises:
-            DataError: naming the file, row and column, if a file is missing, damaged or holds what
-                it must not, no episode is left, or more are implausible than ``plausible`` allows.
+            DataError: naming the file, row and column, if a file is missing, damaged or not valid,
+                no episode is left, or more are implausible than ``plausible`` allows.
         """
         how = TABLE_FIELDS, self.columns, self.units
         report = ReadReport(find_files(self.path), read_as(*how), units_of(*how))
@@ -104,7 +104,7 @@ class TableSource(TrajectorySource):
         return self.extracted(trajectories, remedy, place)
 
     def _rows(self, report: ReadReport) -> pd.DataFrame:
-        """Rows of all files in SI."""
+        """Return the rows of all files in SI."""
         parts = []
         for number, label in enumerate(labels(report.files)):
             name = report.files[number]
@@ -139,7 +139,7 @@ def _report_blank_gaps(table: TableFile, read: Mapping[str, NDArray]) -> None:
     """Count samples that name a leader but have a blank gap, in the notes of the file."""
     if "gap" not in read or "leader" not in read:
         return
-    blank = np.isnan(read["gap"]) & ~np.isin(read["leader"], NOBODY)
+    blank = np.isnan(read["gap"]) & ~np.isin(read["leader"], NO_LEADER)
     if blank.any():
         first = table.fault(int(read["row"][np.argmax(blank)]), "gap", "is blank")
         table.notes.append(
@@ -149,7 +149,7 @@ def _report_blank_gaps(table: TableFile, read: Mapping[str, NDArray]) -> None:
 
 
 def labels(files: Sequence[str]) -> list[str]:
-    """Return the names of files' recordings: without their folders, if that is enough."""
+    """Return the names of files' recordings, without folders if these are unique."""
     stems = [stem(name) for name in files]
     return [x if stems.count(x) == 1 else name for x, name in zip(stems, files, strict=True)]
 
@@ -157,19 +157,19 @@ def labels(files: Sequence[str]) -> list[str]:
 def _vehicles(
     vehicle: NDArray, leader: NDArray | None, report: ReadReport
 ) -> dict[str, NDArray[np.int64]]:
-    """Vehicles and leaders as positive whole numbers; 0 for no leader."""
+    """Return vehicles and leaders as positive whole numbers; 0 for no leader."""
     ahead = np.full(len(vehicle), "") if leader is None else leader
     numbers, leaders = whole_numbers(vehicle), whole_numbers(np.where(ahead == "", "0", ahead))
     if numbers is None or numbers.min() <= 0 or leaders is None:
-        if numbers is not None and leaders is not None:  # "0.0" of a column with blanks is "0"
+        if numbers is not None and leaders is not None:  # columns with blanks have "0.0" for "0"
             vehicle, ahead = numbers.astype(str), np.where(ahead == "", "", leaders.astype(str))
         names, codes = np.unique(vehicle, return_inverse=True)
         report.names = dict(enumerate(names.tolist(), 1))
         shown = listed(names.tolist())
         report.notes.append(f"{len(names):,} vehicles are numbered from 1 by name: {shown}")
         numbers, known = codes.astype(np.int64) + 1, pd.Index(names).get_indexer(ahead) + 1
-        none = np.isin(ahead, NOBODY) & (known == 0)
-        # A leader without a row is a number that no vehicle has.
+        none = np.isin(ahead, NO_LEADER) & (known == 0)
+        # A leader without a row gets a number that no vehicle has.
         leaders = np.where(none, 0, np.where(known == 0, len(names) + 1, known))
     if leader is None:
         return {"vehicle": numbers}
@@ -178,15 +178,15 @@ def _vehicles(
 
 
 def to_trajectories(rows: pd.DataFrame, place: Places, report: ReadReport) -> Trajectories:
-    """Bring rows into the shape that episodes are extracted from.
+    """Convert rows to trajectories.
 
     Args:
-        rows: one per vehicle and moment, in any order and in SI: recording (its name), vehicle
-            (positive), time_s, speed, file and row (numbers from 0) and, where known, leader (0
+        rows: one per vehicle and time, in any order and in SI: recording (its name), vehicle
+            (positive), time_s, speed, file and row (numbers from 0) and, if known, leader (0
             for none), position (front bumper, along the road), lane (a number), gap (bumper to
-            bumper; NaN for none), length (NaN or 0 for not given).
-        place: makes of a table what describes its rows.
-        report: completed here.
+            bumper; NaN for none), length (NaN or 0 for unknown).
+        place: returns for a table the function that describes its rows.
+        report: the report, which is completed.
 
     Raises:
         DataError: if rows contradict each other, times are uneven, or speeds and positions do not
@@ -203,9 +203,9 @@ def to_trajectories(rows: pd.DataFrame, place: Places, report: ReadReport) -> Tr
 
 
 def _check_way(rows: pd.DataFrame, place: Places, report: ReadReport) -> None:
-    """Check that positions and speeds tell of the same way: direction and units.
+    """Check that positions and speeds agree in direction and units.
 
-    Where some vehicles agree, the worst is named: it hides among many, and spoils a mean of few.
+    If some vehicles agree, the worst one is named first, else the sum over all.
     """
     if "position" not in rows:
         return
@@ -223,7 +223,7 @@ def _check_way(rows: pd.DataFrame, place: Places, report: ReadReport) -> None:
         (f"the vehicle from {where}, on drives", "its", each.iloc[worst]),
         ("the vehicles drive", "their", each.sum()),
     ]
-    for who, whose, (way, driven) in (
+    for subject, owner, (way, driven) in (
         found if (far & (off < np.log(AGREE[1]))).any() else found[::-1]
     ):
         if max(way, driven) >= LEAST_WAY and not AGREE[0] * driven <= way <= AGREE[1] * driven:
@@ -240,13 +240,13 @@ def _check_way(rows: pd.DataFrame, place: Places, report: ReadReport) -> None:
             elif way < 0:
                 hint = f"positions must grow in the direction of travel; {hint}"
             raise DataError(
-                f"{report.source}: by {whose} positions {who} {way:.4g} m, by {whose} speeds "
+                f"{report.source}: by {owner} positions {subject} {way:.4g} m, by {owner} speeds "
                 f"{driven:.4g} m; {hint}"
             )
 
 
 def _samples(rows: pd.DataFrame, frame: Integers, report: ReadReport) -> Trajectories:
-    """The rows as trajectories, with leaders and headways."""
+    """Return the rows as trajectories, with leaders and headways."""
     recording = rows["recording"].cat
     rows = rows.assign(recording=recording.codes)
     columns, zero = {str(name): rows[name].to_numpy() for name in rows}, np.zeros(len(rows))
@@ -282,7 +282,7 @@ def _samples(rows: pd.DataFrame, frame: Integers, report: ReadReport) -> Traject
 
 
 def _next_ahead(rows: pd.DataFrame, frame: Integers) -> Integers:
-    """The nearest vehicle ahead on the same lane in the same frame; 0 for none."""
+    """Return the nearest vehicle ahead on the same lane in the same frame; 0 for none."""
     table = rows[["recording", "lane", "position", "vehicle"]].assign(frame=frame)
     ordered = table.sort_values(["recording", "frame", "lane", "position"], kind="stable")
     leader = ordered.groupby(["recording", "frame", "lane"]).vehicle.shift(-1, fill_value=0)

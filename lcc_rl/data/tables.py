@@ -1,7 +1,7 @@
-"""Tables of measurements in files, CSV or parquet: opened, parsed and checked in one place.
+"""Reader of tables of measurements in CSV or parquet files.
 
-Each reader lists its columns as :class:`Column`, and :meth:`TableFile.read` checks every cell of
-them: numbers are finite, in SI and within the range of their quantity.
+Each reader lists its columns as :class:`Column`. :meth:`TableFile.read` checks every cell: numbers
+are finite, in SI and within the range of their quantity.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from itertools import chain
-from os.path import expanduser  # that of pathlib raises for an unknown user
+from os.path import expanduser  # pathlib's raises for an unknown user
 from pathlib import Path
 from typing import Any
 
@@ -36,23 +36,23 @@ from lcc_rl.data.trajectories import FOOT
 from lcc_rl.errors import ConfigError, DataError, unknown_name
 
 PARQUET = (".parquet", ".pq")
-LARGEST_CELL = 1e12  # in SI: beyond any time or place, and within every type
-LONGEST_TEXT = 1000  # of a name, signs
-LARGEST_ID = 2**53  # beyond this, whole numbers no longer fit a float
+LARGEST_CELL = 1e12  # in SI: beyond any time or position, and within every type
+LONGEST_TEXT = 1000  # most characters of a name
+LARGEST_ID = 2**53  # larger whole numbers do not fit a float
 THOUSANDS = r"^-?[0-9]{1,3}(,[0-9]{3})+(\.[0-9]*)?$"
 NUMBER = r"^-?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI][nN][fF]|[nN][aA][nN])$"
 NUMERIC_TYPES = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null, pa.types.is_decimal)
-ISO, FRAMES = "iso", "frames/"  # dates and times of ISO 8601; before the frames a second
+ISO, FRAMES = "iso", "frames/"  # dates and times of ISO 8601; prefix of the frames per second
 CLOCK, CLOCK_TIME = "hh:mm:ss", r"^ *([01]?[0-9]|2[0-3]):[0-5][0-9]:[0-5][0-9]([.,][0-9]+)? *$"
 SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": FOOT, "kn": 1852 / 3600}
-# Units by quantity, and their size; the first is the SI unit.
+# Units by quantity and their sizes; the first is the SI unit.
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, ISO: 1.0, CLOCK: 1.0},
     "speed": {**SPEEDS, "kph": SPEEDS["km/h"]},
     "length": {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT},
 }
 SI = {quantity: next(iter(units)) for quantity, units in UNITS.items()}
-# What names of columns call units other than SI; "min" is also the least.
+# Spellings of units other than SI in names of columns; "min" may also mean the minimum.
 UNIT_WORDS = {
     "time": {"ms": "ms|msecs?|milliseconds?", "us": "us|µs|microseconds?", "ns": "ns|nanoseconds?"},
     "speed": {
@@ -64,9 +64,9 @@ UNIT_WORDS = {
     "length": {"ft": "ft|feet|foot", "cm": "cm", "km": "km"},
 }
 Cells = Any  # a pyarrow array, chunked or not
-Names = Mapping[str, str | None]  # of columns in a file, by key
-Units = Mapping[str, str]  # of columns, by key
-Fault = Callable[[int, str], DataError]  # the error for a row and words
+Names = Mapping[str, str | None]  # names of columns in a file, by key
+Units = Mapping[str, str]  # units of columns, by key
+Fault = Callable[[int, str], DataError]  # returns the error for a row and words
 
 
 @dataclass(frozen=True)
@@ -92,24 +92,24 @@ class Column:
 
     @property
     def expected(self) -> str:
-        """Words for messages."""
+        """Description of valid values for messages."""
         unit = f" {SI[self.quantity]}" if self.quantity in SI else ""
         kind = "a whole number" if self.whole else "a number"
         return f"{kind} from {self.least:g} to {self.most:g}{unit}"
 
 
 def check_map(columns: Iterable[Column], names: Names, units: Units, at: str) -> None:
-    """Check the columns and units of a file as a configuration names them.
+    """Check the names and units of columns in a configuration.
 
     Args:
-        columns: those that there may be.
-        names: what the file calls them, by key.
-        units: their units by key; SI for those that are not named.
+        columns: all possible columns.
+        names: the file's names, by key.
+        units: units by key; by default SI.
         at: the node of the configuration, ``data`` or ``leader``.
 
     Raises:
-        ConfigError: naming a key or unit that is unknown, a required column without name, or a
-            column that is named twice.
+        ConfigError: naming an unknown key or unit, a required column without name, or a column that
+            is named twice.
     """
     known = {column.key: column for column in columns}
     measured = {key: UNITS[c.quantity] for key, c in known.items() if c.quantity in UNITS}
@@ -129,7 +129,7 @@ def check_map(columns: Iterable[Column], names: Names, units: Units, at: str) ->
 
 
 def unit_size(quantity: str, unit: str) -> float | None:
-    """Return the size of a unit in SI, also of ``frames/25``; None if it is unknown."""
+    """Return the size of a unit in SI, including ``frames/25``; None if it is unknown."""
     if quantity == "time" and unit.startswith(FRAMES):
         with suppress(ValueError):
             rate = float(unit.removeprefix(FRAMES))
@@ -138,7 +138,7 @@ def unit_size(quantity: str, unit: str) -> float | None:
 
 
 def named_unit(name: str, quantity: str) -> str | None:
-    """Return the unit that the name of a column says, unless it is SI: ``mph`` of ``v (mph)``."""
+    """Return the unit in the name of a column, unless it is SI: ``mph`` for ``v (mph)``."""
     words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^\w/]|_", " ", name).lower()
     for unit, spelled in UNIT_WORDS.get(quantity, {}).items():
         if re.search(rf"(?<![^\W\d])({spelled})(?![^\W\d])", words):
@@ -147,15 +147,15 @@ def named_unit(name: str, quantity: str) -> str | None:
 
 
 class TableFile:
-    """Table in a file; its columns are read when asked, once.
+    """Table in a file; its columns are read once, on demand.
 
-    The separator of text is the one that divides the header and the row after it alike: comma,
+    The separator of text is the one that divides the header and the next row equally: comma,
     semicolon, tab, bar or spaces. With semicolons, numbers may have a decimal comma. ``preamble``
-    keeps the lines before the header of a native OpenACC file.
+    holds the lines before the header of a native OpenACC file.
 
     Args:
-        path: a .csv file or the like, gzipped or not, or a .parquet file.
-        spelled: makes of a name in the header that of a column.
+        path: a .csv or other text file, gzipped or not, or a .parquet file.
+        spelled: maps a name in the header to that of a column.
         bare: names of the columns of text without a header.
 
     Raises:
@@ -172,7 +172,7 @@ class TableFile:
         self.preamble: dict[str, str] = {}
         self.notes: list[str] = []
         self.names: dict[str, str] = {}
-        self.count = 0  # rows, once they are read
+        self.count = 0  # number of rows, known after reading
         self.comma = False  # whether numbers have a decimal comma
         if not self.path.is_file():
             raise DataError(f"{self.path}: no such file; expected a table, .csv or .parquet")
@@ -194,11 +194,11 @@ class TableFile:
         """Read columns and check every cell.
 
         Args:
-            columns: those wanted.
-            names: what they are called in the file, by key; None for one that there is not.
-            units: their units by key; SI for those that are not named.
-            option: where the configuration has the names, for messages.
-            measured: keys of the columns in which a blank cell costs the row.
+            columns: the columns to read.
+            names: the file's names, by key; None for a missing column.
+            units: units by key; by default SI.
+            option: place of the names in the configuration, for messages.
+            measured: keys of columns; rows with a blank cell in one of them are left out.
 
         Returns:
             The columns by key, in SI, and ``row``, the number of each row in the file, from 0.
@@ -229,7 +229,7 @@ class TableFile:
         return self._measured({**read, "row": np.arange(self.count)}, measured)
 
     def _measured(self, read: dict[str, NDArray], keys: Iterable[str]) -> dict[str, NDArray]:
-        """Columns without rows in which one of ``keys`` is blank, which the notes count."""
+        """Return columns without rows in which one of ``keys`` is blank; the notes count them."""
         blank = {key: np.isnan(read[key]) for key in keys if key in read}
         wrong = np.logical_or.reduce([np.zeros(self.count, dtype=bool), *blank.values()])
         if not wrong.any():
@@ -243,23 +243,23 @@ class TableFile:
         return {key: values[~wrong] for key, values in read.items()}
 
     def _scale(self, column: Column, units: Units, option: str) -> float:
-        """The size in SI of the unit that a column is read in, unless its name says another."""
+        """Return the size of a column's unit in SI; refuse another unit in its name."""
         unit, name = units.get(column.key, SI.get(column.quantity, "")), self.names[column.key]
         scale = (unit and unit_size(column.quantity, unit)) or 1.0
-        said = named_unit(name, column.quantity)
-        if option and said and UNITS[column.quantity][said] != scale:
-            where = f"{option.removesuffix('columns')}units.{column.key}={said}"
+        named = named_unit(name, column.quantity)
+        if option and named and UNITS[column.quantity][named] != scale:
+            where = f"{option.removesuffix('columns')}units.{column.key}={named}"
             raise DataError(
-                f"{self.path}: the name of column {name!r} says {said}, and it is read in "
-                f"{unit}; set {where}, or give the column another name"
+                f"{self.path}: the name of column {name!r} contains {named}, but it is read in "
+                f"{unit}; set {where}, or rename the column"
             )
         return scale
 
     def blocks(self, names: Sequence[str]) -> Iterator[Block]:
-        """Yield the rows in blocks, of text some megabytes each; at least one, if without rows.
+        """Yield the rows in blocks, some megabytes each for text; at least one, possibly empty.
 
         Args:
-            names: the columns wanted, as in the header.
+            names: the columns to read, as in the header.
         """
         for name in names:
             if self.header.count(name) > 1:
@@ -289,7 +289,7 @@ class TableFile:
     def _parquet(self, names: Sequence[str]) -> pa.Table:
         with _readable(self.path):
             table = pq.read_table(self.path, columns=[*names])
-            table.validate(full=True)  # damaged text would fail only when used
+            table.validate(full=True)  # else damaged text would fail only when used
         return table
 
     def _open_text(self, spelled: Callable[[str], str], bare: Sequence[str]) -> None:
@@ -323,12 +323,12 @@ class TableFile:
 
 
 class Block:
-    """Consecutive rows of a table; cells are converted and checked when asked for.
+    """Consecutive rows of a table; cells are converted and checked on demand.
 
     Args:
         file: the table.
-        cells: as they were read, by the names in the header.
-        before: rows before these in the file.
+        cells: unconverted cells by the names in the header.
+        before: number of rows before these in the file.
     """
 
     def __init__(self, file: TableFile, cells: pa.Table, before: int = 0) -> None:
@@ -339,7 +339,7 @@ class Block:
         return int(self.cells.num_rows)
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
-        """Keep only the rows where ``mask`` holds; messages still name rows of the file."""
+        """Keep only the rows where ``mask`` is true; messages still name rows of the file."""
         self.row, self.cells = self.row[mask], self.cells.filter(pa.array(mask))
 
     def values(self, column: Column, name: str, scale: float = 1.0) -> NDArray:
@@ -352,7 +352,7 @@ class Block:
 
 
 def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: str) -> DataError:
-    """Return the error about columns that a table lacks."""
+    """Return the error for missing columns of a table."""
     folded = {name.lower(): name for name in header}
     near = get_close_matches(missing[0].lower(), folded, n=1)
     hint = f" (is it {folded[near[0]]!r}?)" if near else ""
@@ -369,24 +369,24 @@ def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: 
 def checked_cells(
     cells: Cells, column: Column, fault: Fault, scale: float = 1.0, comma: bool = False
 ) -> NDArray:
-    """Return the values of a column, checked.
+    """Return the checked values of a column.
 
     Args:
-        cells: as they were read.
-        column: what they have to be.
-        fault: makes the error.
+        cells: unconverted cells.
+        column: the column, with the valid range.
+        fault: returns the error for a row.
         scale: factor to SI.
         comma: whether numbers have a decimal comma.
 
     Raises:
-        DataError: for the first cell at fault.
+        DataError: for the first wrong cell.
     """
     if column.quantity == "text":
         texts = pc.utf8_trim_whitespace(pc.cast(cells, pa.string()))
         lengths = np.asarray(pc.fill_null(pc.utf8_length(texts), 0))
-        if (lengths > LONGEST_TEXT).any():  # every cell would take as much memory
+        if (lengths > LONGEST_TEXT).any():  # every cell would need as much memory
             row = int(np.argmax(lengths > LONGEST_TEXT))
-            raise fault(row, f"holds a text of {lengths[row]:,} signs; expected a name")
+            raise fault(row, f"holds a text of {lengths[row]:,} characters; expected a name")
         found = np.asarray(pc.fill_null(texts, "")).astype(str)
         if not column.blank and (found == "").any():
             raise fault(int(np.argmax(found == "")), "is blank")
@@ -415,7 +415,7 @@ def _shown(cell: pa.Scalar) -> str:
 
 
 def _seconds(cells: Cells) -> Cells:
-    """Dates and times of ISO 8601 as seconds since 1970, of a clock since midnight; else as is."""
+    """Return ISO 8601 times as seconds since 1970, clock times since midnight; others unchanged."""
     if not (pa.types.is_string(cells.type) or pa.types.is_timestamp(cells.type)):
         return cells
     for kind in (pa.timestamp("ns"), pa.timestamp("ns", "UTC")):
@@ -433,7 +433,7 @@ def _seconds(cells: Cells) -> Cells:
 
 
 def numbers_of(cells: Cells, fault: Fault, comma: bool = False) -> NDArray[np.float64]:
-    """Return cells as numbers, NaN for blank ones; with decimal commas or thousands separators.
+    """Return cells as numbers, NaN for blank ones; decimal commas or thousands are allowed.
 
     Raises:
         DataError: for the first cell that is no number.
@@ -447,7 +447,7 @@ def numbers_of(cells: Cells, fault: Fault, comma: bool = False) -> NDArray[np.fl
         with suppress(pa.ArrowInvalid):
             return np.asarray(pc.cast(cells, pa.float64()), dtype=np.float64)
         cells = pc.utf8_trim_whitespace(cells)
-        # Only true thousands: a comma anywhere else would silently change the number.
+        # Only true thousands: another comma would silently change the number.
         grouped = pc.match_substring_regex(cells, THOUSANDS)
         cells = pc.if_else(grouped, pc.replace_substring(cells, ",", ""), cells)
         cells = pc.if_else(pc.equal(cells, ""), pa.scalar(None, cells.type), cells)
@@ -461,7 +461,7 @@ def numbers_of(cells: Cells, fault: Fault, comma: bool = False) -> NDArray[np.fl
 
 
 def whole_numbers(texts: NDArray) -> NDArray[np.int64] | None:
-    """Return the numbers that texts are, if all are whole numbers."""
+    """Return texts as numbers if all are whole numbers, else None."""
     try:
         values = texts.astype(np.float64)
     except ValueError:
@@ -473,7 +473,7 @@ def whole_numbers(texts: NDArray) -> NDArray[np.int64] | None:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Turn what a damaged parquet file raises, errors of many kinds, into a DataError."""
+    """Convert the errors of a damaged parquet file, which are of many kinds, to a DataError."""
     try:
         yield
     except Exception as error:

@@ -1,4 +1,4 @@
-"""Text files: opened, unpacked, their columns told apart, and parsed into columns of text."""
+"""Text files: decompression, encodings, separators and parsing into columns of text."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from lcc_rl.errors import Concern, DataError
 BLANK = ["", "NA", "N/A", "n/a", "nan", "NaN", "NAN", "NULL", "null", "None", "-"]
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 PREAMBLE = 20  # lines within which the header of a native OpenACC file begins
-BLOCK_BYTES, LONGEST_LINE = 1 << 22, 1 << 24  # read at once
+BLOCK_BYTES, LONGEST_LINE = 1 << 22, 1 << 24  # bytes per block; longest line
 UTF16 = b"\xff\xfe", b"\xfe\xff"
-# What files are that are no table in UTF-8, by their first bytes, and the remedy.
+# Other formats by their first bytes, with the remedy.
 OTHER_FORMATS = {
     b"PK\x03\x04": " but a spreadsheet (xlsx, ods) or zip archive; save the table as CSV",
     b"\xd0\xcf\x11\xe0": " but an Excel workbook (xls); save the table as CSV",
@@ -41,7 +41,7 @@ def opened(name: str | Path) -> Iterator[BufferedReader]:
     Raises:
         DataError: if it cannot be read or is damaged.
     """
-    if Path(name).exists() and not Path(name).is_file():  # a pipe would be waited for
+    if Path(name).exists() and not Path(name).is_file():  # opening a pipe would block
         raise DataError(f"{name}: cannot be read: a folder, pipe or device; expected a file")
     try:
         with open(name, "rb") as file:
@@ -67,7 +67,7 @@ def line_chunks(path: Path, notes: list[str]) -> Iterator[bytes]:
 
     Args:
         path: the file, in UTF-8, UTF-16 or else Latin-1.
-        notes: where a line says so if it is not in UTF-8.
+        notes: gets a line if the file is not in UTF-8.
 
     Raises:
         DataError: if it cannot be read, or is no text.
@@ -91,7 +91,7 @@ def line_chunks(path: Path, notes: list[str]) -> Iterator[bytes]:
 
 
 def _as_utf8(content: bytes, path: Path, notes: list[str]) -> bytes:
-    """Text as UTF-8, also where it is Latin-1."""
+    """Return text in UTF-8, converted from Latin-1 if necessary."""
     if is_text(content):
         return content
     if content.startswith((b"\0", *OTHER_FORMATS)) or b"\0" in content:
@@ -110,14 +110,14 @@ def single_spaces(lines: bytes) -> bytes:
 
 
 def cells_of(line: bytes, separator: str) -> list[str]:
-    """Return the cells of a line; none if it cannot be divided, as with a stray line end in it."""
+    """Return the cells of a line; none if it cannot be divided, e.g. at a stray line end."""
     with suppress(csv.Error):
         return next(csv.reader([line.decode().rstrip("\r\n")], delimiter=separator), [])
     return []
 
 
 def preamble(content: bytes) -> tuple[dict[str, str], bytes]:
-    """Lines before the header of a native OpenACC file, by their first cell, and what follows."""
+    """Return the lines before the header of a native OpenACC file by first cell, and the rest."""
     lines: list[bytes] = []
     rest = content
     for _ in range(PREAMBLE):
@@ -133,13 +133,13 @@ def preamble(content: bytes) -> tuple[dict[str, str], bytes]:
 
 
 def separator_of(content: bytes) -> str:
-    """The separator that divides the header and the row after it alike, into most cells."""
+    """Return the separator that divides the header and the next row equally, into most cells."""
     first, second = [*content.split(b"\n", 2)[:2], b""][:2]
     best, most = ",", 1
     for separator in SEPARATORS:
         lines = first, second
         if separator == " ":
-            if most > 1:  # names may hold spaces
+            if most > 1:  # names may contain spaces
                 break
             lines = single_spaces(first), single_spaces(second)
         counts = [len(cells_of(line, separator)) for line in lines]
@@ -150,22 +150,22 @@ def separator_of(content: bytes) -> str:
 
 
 def stem(file: str | Path) -> str:
-    """Return the name of a file without folder and endings, ``a`` of ``x/a.csv.gz``."""
+    """Return the name of a file without folder and endings, ``a`` for ``x/a.csv.gz``."""
     return Path(Path(file).name.removesuffix(".gz")).stem
 
 
 def parse_text(
     rows: bytes, width: int, separator: str, places: Sequence[str], source: str, before: int
 ) -> pa.Table:
-    """Parse rows of text into columns of text, each named by its place, from 0.
+    """Parse rows of text into columns of text, named by index from 0.
 
     Args:
         rows: the lines, without header.
-        width: columns of every row.
-        separator: between columns.
-        places: those wanted.
+        width: number of columns.
+        separator: separator of columns.
+        places: indices of the columns to return.
         source: the file, for messages.
-        before: data rows before these in the file.
+        before: number of data rows before these in the file.
 
     Raises:
         DataError: if a row has more or fewer columns, or a quote is not closed.
@@ -206,10 +206,10 @@ def parse_text(
 
 
 def unended(rows: bytes, place: str) -> list[Concern]:
-    """Return a warning if the last row has no line end, so that its last cell may be cut.
+    """Return a warning if the last row has no line end, so its last cell may be truncated.
 
-    It is no error: many programs write no last line end, and nothing tells a number that lost
-    its last digits from a whole one.
+    It is no error: many programs write no last line end, and a truncated number cannot be
+    recognised.
     """
     if rows.endswith(b"\n"):
         return []
@@ -222,9 +222,9 @@ def unended(rows: bytes, place: str) -> list[Concern]:
 def _odd_row(
     row: pa_csv.InvalidRow, rows: bytes, width: int, source: str, before: int
 ) -> DataError:
-    """Return the error for a row of another number of columns."""
+    """Return the error for a row with another number of columns."""
     text, held = row.text.encode(), row.actual_columns
-    lines = re.findall(rb"[^\r\n]+", rows)  # blank ones hold no row
+    lines = re.findall(rb"[^\r\n]+", rows)  # blank lines are no rows
     number = lines.index(text) if text in lines else 0
     place = f"data row {before + number + 1}"
     last = number == len(lines) - 1 and held < width

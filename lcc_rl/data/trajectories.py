@@ -1,4 +1,4 @@
-"""Vehicle trajectories in SI units, the report on reading them, and vehicles ahead of others."""
+"""Vehicle trajectories in SI units, the report of their reader, and leaders of vehicles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 FOOT = 0.3048  # m
 FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
 SAMPLE_KEYS = ("recording", "vehicle", "frame", "preceding")
-# Columns of trajectories beside the recording.
+# Columns of trajectories besides the recording.
 SAMPLE_TYPES = {
     "vehicle": np.int64,
     "frame": np.int32,
@@ -32,23 +32,23 @@ SAMPLE_TYPES = {
 
 @dataclass
 class ReadReport:
-    """Counts of what was read and dropped; every dropped row is counted.
+    """Counts of rows read and dropped.
 
     Args:
-        files: the files, in the order they were read.
-        read_as: their columns and the units these were read in, where a user names them.
+        files: the files, in the order of reading.
+        read_as: words on columns with configured units.
         units: these units, by the keys of ``data.units``.
         rows_read: rows in the files; equals ``rows_kept`` plus every ``dropped``.
         rows_kept: rows in the result.
         dropped: rows dropped, by reason.
         recordings: rows kept, by recording.
         vehicles: vehicles, counted per recording.
-        names: those of numbered vehicles, by number, where the files name vehicles.
+        names: names of numbered vehicles, by number, if the files name vehicles.
         segments: stretches without a missing frame.
-        headways_given: space headways taken from the file.
+        headways_given: space headways read from the file.
         headways_derived: space headways derived from Preceding and Local_Y.
-        headways_unknown: rows that name a preceding vehicle which has no row in that frame,
-            and give no headway.
+        headways_unknown: rows without a headway and with a preceding vehicle that has no row in
+            that frame.
         empty_columns: columns that are absent, blank or zero throughout.
         notes: further remarks, one a line.
     """
@@ -74,7 +74,7 @@ class ReadReport:
 
     @property
     def source(self) -> str:
-        """The files, and how they were read: the subject of messages in which units matter."""
+        """The files and their units, the subject of messages."""
         return ", ".join(self.files) + self.read_as
 
     def drop(self, reason: str, count: int) -> None:
@@ -83,11 +83,11 @@ class ReadReport:
             self.dropped[reason] = self.dropped.get(reason, 0) + count
 
     def left_out(self) -> list[str]:
-        """A line for each reason to drop rows."""
+        """Return a line for each reason to drop rows."""
         return [f"dropped {count:,} rows: {reason}" for reason, count in self.dropped.items()]
 
     def lines(self) -> list[str]:
-        """The report as plain lines."""
+        """Return the report as plain lines."""
         recordings = [f"{name} ({rows:,} rows)" for name, rows in self.recordings.items()]
         return [
             f"read {self.rows_read:,} rows from {listed(self.files)}; kept {self.rows_kept:,}",
@@ -102,7 +102,7 @@ class ReadReport:
 
 
 def listed(names: Sequence[str], most: int = 3) -> str:
-    """Return names in words, the first and the last of many.
+    """Return a list of names, only the first and last ones of many.
 
     Examples:
         >>> listed(["a", "b", "c", "d", "e"])
@@ -115,7 +115,7 @@ def listed(names: Sequence[str], most: int = 3) -> str:
 
 @dataclass
 class Trajectories:
-    """Trajectories of any layout, in one shape.
+    """Trajectories in one layout.
 
     Args:
         samples: one row per vehicle and frame, sorted by recording, vehicle and frame: recording
@@ -123,8 +123,8 @@ class Trajectories:
             table, a stretch without a missing frame), time_s (0.1·frame), position_m (front
             bumper, Local_Y), lane (int16), length_m, vehicle_class (int8; 1 motorcycle, 2 car,
             3 truck, 0 unknown), speed_mps, acceleration_mps2, preceding (int64; 0 none) and
-            space_headway_m (front to front; NaN where there is none).
-        report: what was read and what was dropped.
+            space_headway_m (front to front; NaN if there is none).
+        report: report of the reader.
     """
 
     samples: pd.DataFrame
@@ -137,19 +137,19 @@ def assembled(
     """Return sorted rows as trajectories, and count them in the report.
 
     Args:
-        columns: recording (a number), vehicle, frame and what else there is of ``TYPES``, and
-            further columns; consumed, since a table may hold millions of rows. Columns that are
-            missing are 0, ``segment`` and ``time_s`` follow from the frames, and space headways
-            that are blank or 0 from the positions in the frame.
+        columns: recording (a number), vehicle, frame, further columns of ``TYPES``, and others. The
+            mapping is emptied, because a table may hold millions of rows. Missing columns are 0,
+            ``segment`` and ``time_s`` follow from the frames, and space headways that are blank or
+            0 from the positions in the frame.
         recordings: names of the recordings.
-        report: completed here.
+        report: the report, which is completed.
     """
     _fill_headways(columns, report)
     code, vehicle, frame = columns.pop("recording"), columns["vehicle"], columns["frame"]
     changes = np.append(True, (np.diff(vehicle) != 0) | (np.diff(code) != 0))
     if "segment" not in columns:
         columns["segment"] = np.cumsum(changes | (np.diff(frame, prepend=0) != 1)) - 1
-    if "time_s" not in columns:  # division rounds correctly where the product 0.1·frame does not
+    if "time_s" not in columns:  # division rounds correctly, the product 0.1·frame does not
         columns["time_s"] = frame / round(1 / FRAME)
     report.rows_kept, report.vehicles = len(code), int(changes.sum())
     report.segments = len(starts_of(columns["segment"]))
@@ -165,7 +165,7 @@ def assembled(
 
 
 def _fill_headways(columns: dict[str, NDArray], report: ReadReport) -> None:
-    """Derive blank or zero headways from the positions of a frame; NaN where there is none."""
+    """Derive blank or zero headways from the positions of a frame; NaN if there is none."""
     code, vehicle, frame, preceding = (columns[name] for name in SAMPLE_KEYS)
     headway = columns.setdefault("space_headway_m", np.zeros(len(code)))
     follows = preceding > 0
@@ -187,7 +187,7 @@ class RowIndex:
     """One number per (recording, vehicle, frame), ascending in that order.
 
     Args:
-        recording, vehicle, frame: of every row; vehicles are positive, frames from 0.
+        recording, vehicle, frame: those of every row; vehicles are positive, frames from 0.
     """
 
     def __init__(self, recording: NDArray, vehicle: NDArray, frame: NDArray) -> None:
@@ -195,11 +195,11 @@ class RowIndex:
         self.ids: NDArray | None = None
         self.vehicles = int(vehicle.max()) + 1
         if (int(recording.max()) + 1) * self.vehicles * self.frames >= 2**62:
-            self.ids = np.unique(vehicle)  # ids too far apart to pack: use their ranks
+            self.ids = np.unique(vehicle)  # ids are too far apart to pack: use their ranks
             self.vehicles = len(self.ids)
 
     def keys(self, recording: NDArray, vehicle: NDArray, frame: NDArray) -> NDArray[np.int64]:
-        """Keys of places; −1 for a vehicle or frame that no row has."""
+        """Return the keys of places; −1 for an unknown vehicle or frame."""
         rank, known = vehicle, (vehicle > 0) & (vehicle < self.vehicles)
         if self.ids is not None:
             rank = np.minimum(np.searchsorted(self.ids, vehicle), len(self.ids) - 1)
@@ -210,7 +210,7 @@ class RowIndex:
 
 
 def find(wanted: NDArray[np.int64], ascending: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Row of each wanted key among ascending keys; −1 where it is not there."""
+    """Return the row of each wanted key among ascending keys; −1 if it is missing."""
     row = np.minimum(np.searchsorted(ascending, wanted), len(ascending) - 1)
     return np.where(ascending[row] == wanted, row, -1)
 
@@ -218,19 +218,19 @@ def find(wanted: NDArray[np.int64], ascending: NDArray[np.int64]) -> NDArray[np.
 def find_leaders(
     recording: NDArray, vehicle: NDArray, frame: NDArray, preceding: NDArray
 ) -> NDArray[np.int64]:
-    """Row of each row's preceding vehicle in the same frame.
+    """Return the row of each row's preceding vehicle in the same frame.
 
     Args:
-        recording, vehicle, frame: the rows, sorted by them.
-        preceding: id of the vehicle ahead of every row; 0 where there is none.
+        recording, vehicle, frame: those of the rows, which are sorted by them.
+        preceding: id of the vehicle ahead of every row; 0 for none.
 
     Returns:
-        Row numbers; −1 where there is no vehicle ahead or it has no row in that frame.
+        Row numbers; −1 if there is no vehicle ahead or it has no row in that frame.
     """
     index = RowIndex(recording, vehicle, frame)
     return find(index.keys(recording, preceding, frame), index.keys(recording, vehicle, frame))
 
 
 def starts_of(values: NDArray) -> NDArray[np.intp]:
-    """First row of each stretch of equal values."""
+    """Return the first row of each stretch of equal values."""
     return np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]]))

@@ -1,1 +1,1 @@
-"""Driver models, their calibration and driver populations."""
+"""Calibration of driver models, and driver populations."""

@@ -39,17 +39,17 @@ from lcc_rl.functional.driver_models import (
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.settings import Positive, Settings
 
-# Genetic algorithms of the choice of constants: over constants, and within each over (v0, T).
+# Genetic algorithms for shared constants: over the constants, and for each over (v0, T).
 OUTER = GeneticSettings(population=12, generations=12, founders=2, patience=4)
 INNER = GeneticSettings(population=16, generations=8)
 
-# Columns of the errors; those of the part held out end in ``_out``.
+# Columns of the errors; those of the held-out part end in ``_out``.
 ERROR_COLUMNS = {SPEED_RMSPE: "rmspe", GAP_RMSE: "gap_rmse_m", GAP_NRMSE: "gap_nrmse"}
 OUT = "_out"
-GAPS_OFF = 0.1  # relative error of gaps from which on speeds alone may be too little to fit
+GAPS_OFF = 0.1  # relative error of gaps from which the report advises to fit gaps, too
 MEAN_SPEED, MEAN_GAP, EQUILIBRIUM = "mean_speed_mps", "mean_gap_m", "equilibrium_gap_m"
-IMPLAUSIBLE = 1.0  # relative error of the median driver's gap from which on the report says so
-CONGESTED = "; followers that never drive freely do not tell it"
+IMPLAUSIBLE = 1.0  # relative error of the median driver's gap from which the report warns
+CONGESTED = "; it is unknown for followers that never drive freely"
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,11 @@ class Calibration:
 
     Args:
         drivers: one row per driver, in the order of the episodes in the input.
-        compared: returns the two below; the drivers are driven when one of them is asked for.
+        compared: returns both attributes below; called when one of them is read.
 
     Attributes:
-        report: what was dropped, chosen and found, in plain lines.
-        twins: what :func:`lcc_rl.drivers.twins.compare_twins` measured of the recorded and of the
+        report: lines on dropped episodes, chosen constants and errors.
+        twins: results of :func:`lcc_rl.drivers.twins.compare_twins` for the recorded and the
             calibrated drivers, with the column mode.
     """
 
@@ -78,12 +78,12 @@ class Calibration:
         return self.compared()[1]
 
 
-# The parameters that the local mode does not fit; None: the default of the driver model.
+# Parameters that the local mode does not fit; None: the default of the driver model.
 DEFAULT_CONSTANTS = dict.fromkeys(list(PARAMETERS)[len(INDIVIDUAL) :])
 
 
 class Calibrator(Settings):
-    """Calibration of one driver per episode in one or both modes (A6), all of them at once.
+    """Calibration of one driver per episode in one or both modes, all drivers at once (A6).
 
     The mode ``local`` fits (v0, T), ``global`` all parameters of the model.
     """
@@ -91,9 +91,9 @@ class Calibrator(Settings):
     LATER = ("perception",)
 
     modes: Annotated[Sequence[Mode], Field(min_length=1)] = ("local",)
-    model: str = DEFAULT_MODEL  # idm, ovm, fvdm, gipps or the dotted path of a class of your own
+    model: str = DEFAULT_MODEL  # idm, ovm, fvdm, gipps or the dotted path of your own class
     objective: FitMeasure = "speed_rmspe"  # see lcc_rl.drivers.fit_error.FitError
-    # Share of each episode, its end, that is predicted instead of fitted.
+    # Share of each episode, at its end, that is predicted and not fitted.
     holdout: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
     # Lower and upper bound by parameter, see lcc_rl.functional.driver_models.PARAMETERS.
     bounds: Mapping[str, BoundPair] = field(default_factory=lambda: dict(DEFAULT_BOUNDS))
@@ -101,11 +101,11 @@ class Calibrator(Settings):
     constants: Mapping[str, Positive | None] = field(
         default_factory=lambda: dict(DEFAULT_CONSTANTS)
     )
-    # Choose a reaction delay and a noise of the acceleration that all drivers share, so that they
-    # need the energy of the recorded ones; see lcc_rl.drivers.twins.
+    # Choose a shared reaction delay and acceleration noise with which the drivers' energy equals
+    # that of the recorded drivers; see lcc_rl.drivers.twins.
     reaction: bool = False
-    perception: bool = False  # also try noises of the perceived gap, and weigh rough leaders
-    choose_constants: bool = False  # local: choose them by the mean error of all drivers first
+    perception: bool = False  # try noises of the perceived gap, too; see lcc_rl.drivers.twins
+    choose_constants: bool = False  # local: choose the constants by the mean error of all drivers
     selection: Selection = field(default_factory=Selection)
     local_genetic: GeneticSettings = field(default_factory=GeneticSettings)
     global_genetic: GeneticSettings = field(
@@ -144,17 +144,17 @@ class Calibrator(Settings):
         """Calibrate the drivers of an episode table.
 
         Args:
-            episodes: the table, or what :func:`lcc_rl.drivers.observed.observe` made of it.
-            seed: seed of all randomness; equal seeds give equal drivers.
-            device: where to simulate, in float32; reported errors are evaluated in float64.
+            episodes: the table, or the result of :func:`lcc_rl.drivers.observed.observe`.
+            seed: seed of all random numbers; equal seeds give equal drivers.
+            device: device of the simulation in float32; reported errors are computed in float64.
             progress: called as ``progress(generation, total, text)``.
 
         Returns:
             The drivers of all modes, with the column ``mode``, and one report.
 
         Raises:
-            DataError: if the table lacks a column or holds no usable episode, or an episode's
-                error is no number whatever the parameters.
+            DataError: if the table lacks a column or a usable episode, or an episode's error is not
+                finite for any parameters.
         """
         observed = episodes
         if not isinstance(observed, Observed):
@@ -188,7 +188,7 @@ class Calibrator(Settings):
 
 
 class _Fit:
-    """Calibration in one mode; the arguments are those of :class:`Calibrator`."""
+    """Calibration in one mode; arguments as for :class:`Calibrator`."""
 
     def __init__(
         self,
@@ -209,7 +209,7 @@ class _Fit:
         self.simulated = self.parts[""].to(device, torch.float32)
 
     def drivers(self) -> tuple[pd.DataFrame, list[str]]:
-        """Return one row per driver, and lines on what was chosen and found."""
+        """Return one row per driver, and the lines of the report."""
         constants, lines = self.settings.shared, []
         if self.settings.choose_constants and self.mode == "local":
             constants = self.chosen_constants()
@@ -224,7 +224,7 @@ class _Fit:
         return drivers, lines + _findings(drivers, *what)
 
     def error(self, constants: DriverConstants) -> FitError:
-        """Return what is minimised, as a function of the fitted parameters."""
+        """Return the objective as a function of the fitted parameters."""
         objective = self.settings.objective
         return FitError(self.simulated, constants, self.names, objective)
 
@@ -242,9 +242,9 @@ class _Fit:
         return minimise(error, lower, upper, problems, generator, genetic, progress)
 
     def chosen_constants(self) -> DriverConstants:
-        """Choose what drivers share, by a search whose objective is the mean error of local fits.
+        """Choose the shared constants by the mean error of local fits.
 
-        Its candidates have the shape ``[1, candidates, constants]``.
+        Candidates have the shape ``[1, candidates, constants]``.
         """
         drivers, shared, start = (
             self.observed.count,
@@ -256,7 +256,7 @@ class _Fit:
             count = candidates.shape[1]
 
             def error(genes: Tensor) -> Tensor:
-                # Every pair of driver and candidate is a problem of its own.
+                # Every pair of driver and candidate is one problem.
                 own = candidates[0].repeat_interleave(genes.shape[1], dim=0).unbind(-1)
                 trial = start.with_(**dict(zip(shared, own, strict=True)))
                 side_by_side = genes.reshape(drivers, -1, genes.shape[-1])
@@ -272,7 +272,7 @@ class _Fit:
         """Return identities, parameters ``[drivers, names]``, errors and flags, a row per driver.
 
         Raises:
-            DataError: if no parameters give a driver an error that is a number.
+            DataError: if no parameters give a finite error.
         """
         columns: dict[str, Any] = {str(key): held for key, held in self.observed.identity.items()}
         own = dict(zip(self.names, best.numpy().T, strict=True))
@@ -306,7 +306,7 @@ class _Fit:
         return drivers.sort_values("episode", kind="stable", ignore_index=True)
 
     def equilibrium(self, own: Mapping[str, Any], constants: DriverConstants) -> dict[str, Any]:
-        """Return each record's mean speed and gap, and the driver's equilibrium gap at it."""
+        """Return each record's mean speed and gap, and the equilibrium gap at this speed."""
         seen, samples = self.observed, torch.tensor(self.observed.samples)
         speed, gap = (x.cpu().sum(0) / samples for x in (seen.follower_speed, seen.gaps))
         given = {name: torch.tensor(values) for name, values in own.items()}
@@ -317,10 +317,10 @@ class _Fit:
 
 
 def count_records(drivers: pd.DataFrame) -> str:
-    """Return how many records a calibration in one mode fitted, and of how many drivers."""
+    """Return the numbers of fitted records and of drivers as text."""
     people = len(drivers[["recording", "follower_id"]].drop_duplicates())
-    whose = f"{people} driver{'s' * (people > 1)}"
-    return whose if people == len(drivers) else f"{len(drivers)} records of {whose}"
+    counted = f"{people} driver{'s' * (people > 1)}"
+    return counted if people == len(drivers) else f"{len(drivers)} records of {counted}"
 
 
 def _findings(
@@ -330,7 +330,7 @@ def _findings(
     table: Mapping[str, Parameter],
     objective: FitMeasure,
 ) -> list[str]:
-    """Lines on the quality of the fit and on what it could not identify."""
+    """Return lines on the quality of the fit and on unidentified parameters."""
     error = 100.0 * drivers["rmspe"]
     lines = [
         f"RMSPE of {count_records(drivers)}: mean {error.mean():.2f} %, "
@@ -344,8 +344,8 @@ def _findings(
     speed, share = drivers["rmspe"].mean(), drivers["gap_nrmse"].mean()
     if objective == SPEED_RMSPE and share > max(GAPS_OFF, 3.0 * speed):
         line = (
-            f"gaps are off by {100.0 * share:.0f} %, speeds by {100.0 * speed:.1f} %: speeds alone "
-            "tell little here; calibration.objective=both fits gaps, too"
+            f"gaps are off by {100.0 * share:.0f} %, speeds by {100.0 * speed:.1f} %: "
+            "calibration.objective=both fits gaps, too"
         )
         lines.append(Concern(line))
     for name in names:

@@ -17,7 +17,7 @@ from lcc_rl.functional.recorder import Untranslatable
 log = logging.getLogger("lcc_rl")
 
 SPEED_RMSPE, GAP_RMSE, GAP_NRMSE = "speed_rmspe", "gap_rmse", "gap_nrmse"
-# What a calibration may minimise; ``both`` is the sum of the two relative errors.
+# Errors that a calibration may minimise; ``both`` is the sum of the two relative errors.
 FitMeasure = Literal["speed_rmspe", "gap_rmse", "gap_nrmse", "both"]
 
 
@@ -25,17 +25,17 @@ class FitError:
     """Error of simulated followers for many candidates of every driver (A6).
 
     A follower starts at its observed speed and gap and drives behind the observed leader. The
-    trajectories are those of :func:`lcc_rl.functional.driver_models.follow`, but only the error is
-    kept, and no episode is simulated beyond its end. On a CPU, the simulation is the compiled
+    trajectories are those of :func:`lcc_rl.functional.driver_models.follow`. Only the error is
+    stored, and no episode is simulated beyond its end. On a CPU the simulation is the compiled
     :func:`lcc_rl.drivers.kernel.squared_errors`.
 
     Args:
         observed: the episodes; its device and dtype are those of the simulation.
-        law: the driver model, with the parameters that are not among the candidates'.
+        law: the driver model with its other parameters.
         names: the candidates' parameters, in the order of the last dimension.
-        objective: which error: of the speed, √(Σ(v_sim − v_obs)²/Σv_obs²) (``speed_rmspe``); of
-            the gap, the root of the mean square [m] (``gap_rmse``) or relative to the observed
-            one as of the speed (``gap_nrmse``); or the sum of both relative ones (``both``).
+        objective: the error: ``speed_rmspe``, √(Σ(v_sim − v_obs)²/Σv_obs²); ``gap_rmse``, the root
+            mean square error of the gap [m]; ``gap_nrmse``, that of the gap relative to the
+            observed gap; or ``both``, the sum of both relative errors.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class FitError:
             self._episodes = (*by_driver, np.array(observed.samples))
 
     def __call__(self, candidates: Tensor) -> Tensor:
-        """Return the error ``[drivers, candidates]`` of ``[drivers, candidates, dims]``.
+        """Return the error ``[drivers, candidates]`` for ``[drivers, candidates, dims]``.
 
         The law's parameters may be tensors that broadcast to ``[drivers, candidates]``.
         """
@@ -70,8 +70,8 @@ class FitError:
         """Return every error by name, each as :meth:`__call__` does.
 
         Args:
-            candidates: see there.
-            apart: whether the errors of the gap are wanted; without them they are zero.
+            candidates: see :meth:`__call__`.
+            apart: compute the errors of the gap; else they are zero.
         """
         with torch.no_grad():
             simulate = self._by_kernel if self.compiled else self._by_tensors
@@ -94,7 +94,7 @@ class FitError:
         }
 
     def _by_tensors(self, parameters: dict[str, Tensor], apart: bool) -> tuple[Tensor, Tensor]:
-        """Sums of squared errors, ``[drivers, candidates]``: all of them a step at a time."""
+        """Return sums of squared errors, ``[drivers, candidates]``; all drivers step by step."""
         observed = self.observed
         shape = parameters["time_gap"].shape
         first = observed.follower_speed[0], observed.gaps[0]
@@ -116,7 +116,7 @@ class FitError:
         return totals[0], totals[1]
 
     def _by_kernel(self, parameters: dict[str, Tensor], apart: bool) -> tuple[Tensor, Tensor]:
-        """The same: all steps of a driver at once."""
+        """Return the same by the kernel, driver by driver."""
         from lcc_rl.drivers.kernel import squared_errors  # here: numba loads for half a second
 
         observed, dtype = self.observed, self.observed.gaps.dtype

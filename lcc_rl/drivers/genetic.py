@@ -25,18 +25,18 @@ class GeneticSettings(Settings):
     """Settings of the genetic algorithm."""
 
     population: Annotated[int, Field(ge=4, le=100_000)] = 32  # individuals per problem
-    generations: Individuals = 20  # at most
-    founders: Individuals = 8  # size of the first generation, in populations; the fittest stay
+    generations: Individuals = 20  # largest number of generations
+    founders: Individuals = 8  # size of the first generation, in populations; the fittest survive
     elites: Probability = 0.5  # share of a generation that may survive by its fitness
     tournament: Individuals = 2  # individuals drawn per tournament; the fittest is a parent
-    # How far a child may lie outside its parents' interval (BLX-α), as a share of it.
+    # Largest distance of a child from its parents' interval (BLX-α), as a share of it.
     blend: NonNegative = 0.5
-    difference_rate: Probability = 1.0  # of a shift by the difference of two individuals
-    mutation_rate: Probability = 0.3  # of Gaussian noise on a gene
+    difference_rate: Probability = 1.0  # probability of a shift by a difference of individuals
+    mutation_rate: Probability = 0.3  # probability of Gaussian noise on a gene
     mutation_start: Positive = 0.1  # standard deviation of that noise, as a share of the bounds
-    mutation_end: Positive = 1e-4  # the same in the last generation; it falls geometrically
-    patience: Individuals = 5  # generations without any improvement after which the search stops
-    tolerance: NonNegative = 1e-5  # relative improvement of the best fitness that counts as one
+    mutation_end: Positive = 1e-4  # that in the last generation; geometric in between
+    patience: Individuals = 5  # generations without improvement after which the search stops
+    tolerance: NonNegative = 1e-5  # least relative improvement of the best fitness
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Evolution:
 
     Args:
         best: fittest individual of every problem, ``[problems, dims]``, in the bounds' units.
-        fitness: its objective, ``[problems]``; infinite where every individual was unfit.
-        generations: generations evolved before the stopping rule ended the run.
+        fitness: its objective, ``[problems]``; infinite if no individual was valid.
+        generations: number of generations.
         evaluations: objective evaluations per problem.
     """
 
@@ -67,16 +67,16 @@ def minimise(
 ) -> Evolution:
     """Minimise an objective inside a box, for all problems at once.
 
-    Tournament selection, blend crossover (Eshelman & Schaffer 1993), mutation by differences of
-    individuals and by annealed Gaussian noise, elitist survival. All problems share the random
-    numbers of a generation, so that a problem's result does not depend on the others.
+    The algorithm uses tournament selection, blend crossover (Eshelman & Schaffer 1993), mutation by
+    differences of individuals and by annealed Gaussian noise, and elitist survival. All problems
+    share the random numbers of a generation, so a result does not depend on other problems.
 
     Args:
-        objective: maps ``[problems, population, dims]`` to ``[problems, population]``; an
-            individual whose value is not finite is unfit.
+        objective: maps ``[problems, population, dims]`` to ``[problems, population]``; values that
+            are not finite count as infinite.
         lower, upper: bounds, ``[dims]``; the search has the device and dtype of ``lower``.
         problems: number of problems.
-        generator: source of all randomness (on the CPU, so that devices agree).
+        generator: generator of all random numbers, on the CPU, so that devices agree.
         settings: settings of the algorithm.
         progress: called as ``progress(generation, total, text)`` after each generation.
 
@@ -98,7 +98,7 @@ def _evolve(
     settings: GeneticSettings,
     progress: Progress | None,
 ) -> Evolution:
-    """Evolve in the unit box, so that one mutation strength suits every parameter."""
+    """Evolve in the unit box, where all parameters have one scale of mutations."""
     genes = _latin_hypercube(random, settings.founders * settings.population)
     genes = genes.expand(problems, -1, -1).contiguous()
     genes, fitness = _fittest(genes, evaluate(genes), settings.population)
@@ -136,14 +136,14 @@ class _Random:
 
 
 def _latin_hypercube(random: _Random, count: int) -> Tensor:
-    """``count`` individuals, one in each of ``count`` equal parts of every parameter's range."""
+    """Return ``count`` individuals, one in each of ``count`` equal parts of every range."""
     dims = random.like.numel()
     strata = torch.stack([random.permutation(count) for _ in range(dims)], dim=1)
     return (strata + random.uniform(count, dims)) / count
 
 
 def _in_units(objective: Fitness, lower: Tensor, upper: Tensor) -> Fitness:
-    """Wrap the objective: genes of the unit box in, finite fitness out."""
+    """Return the objective as a function of genes in the unit box, without NaN."""
     span = upper - lower
 
     def evaluate(genes: Tensor) -> Tensor:
@@ -162,7 +162,7 @@ def _children(
     second = _tournament(genes, fitness, random, settings.tournament)
     weight = random.uniform(count, dims) * (1.0 + 2.0 * settings.blend) - settings.blend
     child = first + weight * (second - first)
-    # The population's own spread scales this step: wide at first, fine once it contracts.
+    # The spread of the population scales this step, which therefore decreases with it.
     shift = genes[:, random.permutation(count)] - genes[:, random.permutation(count)]
     chosen = random.uniform(count, 1) < settings.difference_rate
     child = child + torch.where(chosen, random.uniform(count, 1), 0.0) * shift
@@ -171,12 +171,12 @@ def _children(
     strength = settings.mutation_start ** (1.0 - share) * settings.mutation_end**share
     noise = random.normal(count, dims) * strength
     child = child + torch.where(chosen, noise, 0.0)
-    # Clamped, not reflected: an optimum on a bound is then reached exactly and can be flagged.
+    # Clamped, not reflected: an optimum on a bound is reached exactly and can be flagged.
     return child.clamp_(0.0, 1.0)
 
 
 def _tournament(genes: Tensor, fitness: Tensor, random: _Random, size: int) -> Tensor:
-    """Tournament selection: one parent per place, the fittest of ``size`` random individuals."""
+    """Return one parent per place, the fittest of ``size`` random individuals."""
     count = genes.shape[1]
     entrants = random.index(count, count, size)
     winner = fitness[:, entrants].argmin(-1, keepdim=True)
@@ -187,15 +187,15 @@ def _tournament(genes: Tensor, fitness: Tensor, random: _Random, size: int) -> T
 def _survivors(
     genes: Tensor, fitness: Tensor, children: Tensor, born: Tensor, settings: GeneticSettings
 ) -> tuple[Tensor, Tensor]:
-    """Let the elite of the parents compete with the children; sorted, fittest first."""
+    """Return the fittest of the parents' elite and the children, sorted."""
     count = genes.shape[1]
     elites = max(1, round(settings.elites * count))
-    everyone = torch.cat([genes[:, :elites], children], 1)  # the parents are sorted
-    return _fittest(everyone, torch.cat([fitness[:, :elites], born], 1), count)
+    united = torch.cat([genes[:, :elites], children], 1)  # the parents are sorted
+    return _fittest(united, torch.cat([fitness[:, :elites], born], 1), count)
 
 
 def _fittest(genes: Tensor, fitness: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The ``count`` fittest individuals of every problem, fittest first."""
+    """Return the ``count`` fittest individuals of every problem, fittest first."""
     order = fitness.argsort(dim=1, stable=True)[:, :count]
     index = order.unsqueeze(-1).expand(-1, -1, genes.shape[-1])
     return genes.gather(1, index), fitness.gather(1, order)

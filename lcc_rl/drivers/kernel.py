@@ -13,9 +13,9 @@ from lcc_rl.functional.driver_models import DriverConstants, follow
 from lcc_rl.functional.machine_code import kept
 from lcc_rl.functional.recorder import NUMBER_TYPES, Recorder
 
-# The inner loop runs over the candidates of one driver, in which it becomes vector instructions.
-# numba drops the branch for an argument that is None. Gaps follow the trapezoidal rule (A18d), the
-# leader's part of which is the same for all candidates.
+# The inner loop over the candidates of a driver compiles to vector instructions. numba removes the
+# branch for an argument that is None. Gaps follow the trapezoidal rule (A18d); its leader's part is
+# the same for all candidates.
 TEMPLATE = """
 def kernel(apart, leader, follower, gaps, samples, parameters, total):
     speed, gap = np.empty_like(total[0, 0]), np.empty_like(total[0, 0])
@@ -39,27 +39,27 @@ def kernel(apart, leader, follower, gaps, samples, parameters, total):
                 if apart is not None:
                     distance[i] += (gap[i] - seen) * (gap[i] - seen)
 """
-STEP_INPUTS = ("speed[i]", "gap[i]", "ahead", "ahead_reached")  # what a step changes
+STEP_INPUTS = ("speed[i]", "gap[i]", "ahead", "ahead_reached")  # variables that a step changes
 
 
 def squared_errors(
     law: DriverConstants, time_step: float, dtype: torch.dtype
 ) -> Callable[..., None]:
-    """Return what sums up the squared errors of followers, for many candidates of each driver.
+    """Return a function that sums squared errors of followers for many candidates of each driver.
 
-    It is made from :func:`lcc_rl.functional.driver_models.follow` with the law itself, as
-    ``kernel(apart, leader, follower, gaps, samples, parameters, total)``:
+    It is compiled from :func:`lcc_rl.functional.driver_models.follow` with the law:
+    ``kernel(apart, leader, follower, gaps, samples, parameters, total)``.
 
-    * apart: None unless the errors of the gap are summed up; else they are zero;
+    * apart: None: the errors of the gap are not summed and zero;
     * leader, follower: observed speeds, ``[drivers, time]`` [m/s]; gaps: likewise [m];
     * samples: number of samples, ``[drivers]``;
     * parameters: those of the law's table, each ``[drivers, candidates]``;
-    * total: is overwritten with the sums of speed and gap, ``[2, drivers, candidates]``.
+    * total: overwritten by the sums for speed and gap, ``[2, drivers, candidates]``.
 
     Args:
-        law: the driver model; of its constants those count that a calibration does not fit.
+        law: the driver model with the constants that the calibration does not fit.
         time_step: T [s].
-        dtype: of all numbers.
+        dtype: type of all numbers.
 
     Raises:
         Untranslatable: if the law has an operation without a counterpart on numbers.
@@ -75,7 +75,7 @@ def _source(
     time_step: float,
     dtype: torch.dtype,
 ) -> str:
-    """Return the source of a kernel, in which one step of a follower is recorded."""
+    """Return the source of a kernel from one recorded step of a follower."""
     recorder, names = Recorder(), list(kind.table())
 
     def number(expression: str) -> Tensor:
@@ -94,9 +94,9 @@ def _source(
 
 
 def _written(recorder: Recorder, reached: int, time_step: float, number: str) -> str:
-    """Return the source: what depends on a driver's parameters only is computed before its steps.
+    """Return the source; expressions of a driver's parameters only are computed before its steps.
 
-    So is the reciprocal of such a divisor: a step multiplies by it.
+    This includes reciprocals of such divisors, by which a step multiplies.
     """
     statements, inputs = recorder.statements, range(len(STEP_INPUTS))
     changing = recorder.dependents(inputs)
@@ -111,7 +111,7 @@ def _written(recorder: Recorder, reached: int, time_step: float, number: str) ->
     texts = {i: statements[i][0] for i in (*inputs, *parameters)}
     before: list[str] = []
     step: list[str] = []
-    # Reciprocals are the last that were recorded.
+    # Reciprocals were recorded last.
     for i in sorted(set(used) - set(texts), key=lambda i: (i in changing, i)):
         formula, reads = statements[i]
         expression = formula.format(*(texts[x] for x in reads))

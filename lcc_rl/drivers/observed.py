@@ -24,11 +24,11 @@ class Selection(Settings):
     """Criteria of the episodes used for calibration."""
 
     min_gap_m: NonNegative = 1.0  # smallest plausible gap [m]
-    # Where a gap is smaller: cut there and use the longest part, or drop the whole episode.
+    # At smaller gaps: cut the episode and use its longest part, or drop the episode.
     low_gaps: Literal["cut", "drop"] = "cut"
-    max_duration_s: NonNegative | None = 60.0  # the first part of each is used; None: all [s]
+    max_duration_s: NonNegative | None = 60.0  # only the first part is used; None: all [s]
     min_duration_s: NonNegative = 10.0  # shorter episodes are dropped [s]
-    # Slower episodes are dropped: the relative error divides by speed [m/s].
+    # Slower episodes are dropped, because the relative error divides by speed [m/s].
     min_mean_speed_mps: NonNegative = 0.5
 
     def validate(self) -> None:
@@ -42,16 +42,16 @@ class Selection(Settings):
 
 @dataclass(frozen=True)
 class Observed:
-    """Episodes side by side, sorted by falling length so that the running ones are a prefix.
+    """Parallel episodes, sorted by decreasing length, so that the running ones are a prefix.
 
     Args:
-        leader_speed: ``[time, episodes]`` [m/s]; beyond an episode's end, zero.
-        follower_speed: the same for the follower [m/s].
-        gaps: the same for the gap, ``[time, episodes]`` [m].
-        samples: samples per episode, falling, on the CPU.
+        leader_speed: ``[time, episodes]`` [m/s]; zero after the end of an episode.
+        follower_speed: likewise for the follower [m/s].
+        gaps: likewise [m].
+        samples: samples per episode, decreasing, on the CPU.
         identity: one row per episode: episode, recording, follower_id, leader_id.
         time_step: sampling interval [s].
-        report: lines on what was dropped.
+        report: lines on dropped episodes and samples.
     """
 
     leader_speed: Tensor
@@ -76,10 +76,10 @@ class Observed:
         """Cut off the end of every episode; the sample at the cut belongs to both parts.
 
         Args:
-            share: of the samples that are cut off.
+            share: share of the samples that are cut off.
 
         Raises:
-            DataError: if a part of the shortest episode has less than two samples.
+            DataError: if a part of the shortest episode has fewer than two samples.
         """
         last = np.floor(share * self.samples).astype(np.int64)
         first = self.samples - last
@@ -89,7 +89,7 @@ class Observed:
                 "part without a step; expected longer episodes or another share"
             )
         length = int(last.max()) + 1
-        # Rows of the second part, as seen from the first sample of each episode.
+        # Rows of the second part, counted from the first sample of each episode.
         rows = torch.from_numpy(first - 1) + torch.arange(length).unsqueeze(-1)
         inside = torch.arange(length).unsqueeze(-1) <= torch.from_numpy(last)
         rows = torch.where(inside, rows, 0).to(self.gaps.device)
@@ -109,7 +109,7 @@ class Observed:
         return one, other
 
     def segments(self) -> Iterator[tuple[int, int, int]]:
-        """Cut time where episodes end, so that none is simulated beyond its end.
+        """Yield intervals between the ends of episodes, so that none is simulated beyond its end.
 
         Yields:
             First step, step after the last, number of episodes (a prefix) still running.
@@ -130,13 +130,13 @@ class Observed:
 
 
 def observe(episodes: pd.DataFrame, selection: Selection | None = None) -> Observed:
-    """Turn an episode table into tensors, dropping what cannot be calibrated.
+    """Convert an episode table to tensors, without episodes that cannot be calibrated.
 
     Args:
         episodes: one row per sample: episode, time_s, follower_speed_mps, leader_speed_mps,
-            gap_m and, where known, recording, follower_id, leader_id (or event and period for
-            episode and recording). Without follower_id, each episode is one driver's.
-        selection: which episodes to use.
+            gap_m and, if known, recording, follower_id, leader_id (or event and period for episode
+            and recording). Without follower_id every episode has another driver.
+        selection: criteria of the episodes.
 
     Returns:
         The episodes in float64 on the CPU.
@@ -191,7 +191,7 @@ def _canonical(episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def _time_step(frame: pd.DataFrame) -> float:
-    """Sampling interval of the table: the median over all of it [s]."""
+    """Return the sampling interval, the median over the table [s]."""
     difference = frame.groupby("episode", sort=False)["time_s"].diff()
     step = float(difference.median())
     if not step > 0.0:
@@ -201,7 +201,7 @@ def _time_step(frame: pd.DataFrame) -> float:
 
 
 def _above(frame: pd.DataFrame, selection: Selection) -> tuple[pd.DataFrame, list[str]]:
-    """The longest part of each episode without a gap that is too small, and a line on them."""
+    """Return the longest part of each episode without small gaps, and a line on cut episodes."""
     low = frame["gap_m"].to_numpy() < selection.min_gap_m
     if selection.low_gaps == "drop" or not low.any() or low.all():
         return frame, []
@@ -220,7 +220,7 @@ def _above(frame: pd.DataFrame, selection: Selection) -> tuple[pd.DataFrame, lis
 
 
 def _truncate(frame: pd.DataFrame, duration: float | None) -> tuple[pd.DataFrame, list[str]]:
-    """The first seconds of each episode, and a line where that leaves samples out."""
+    """Return the first seconds of each episode, and a line if samples are left out."""
     if duration is None:
         return frame, []
     elapsed = frame["time_s"] - frame.groupby("episode", sort=False)["time_s"].transform("first")
@@ -233,7 +233,7 @@ def _truncate(frame: pd.DataFrame, duration: float | None) -> tuple[pd.DataFrame
 
 
 def _summary(frame: pd.DataFrame, step: float) -> pd.DataFrame:
-    """One row per episode: its first row and the values that the selection checks."""
+    """Return one row per episode: its first row and the values that the selection checks."""
     values = frame[list(NUMERIC_COLUMNS)]
     frame = frame.assign(
         finite=np.isfinite(values.to_numpy(np.float64)).all(axis=1)
@@ -260,7 +260,7 @@ def _summary(frame: pd.DataFrame, step: float) -> pd.DataFrame:
 
 
 def _select(table: pd.DataFrame, selection: Selection) -> tuple[pd.DataFrame, list[str]]:
-    """Drop unusable episodes; each is counted under its first reason."""
+    """Drop unusable episodes; each counts for its first reason."""
     reasons = {
         "missing, infinite or negative values": ~table["finite"],
         "uneven sampling": table["uneven"],

@@ -14,16 +14,15 @@ from lcc_rl.functional.driver_models import PARAMETERS, DriverConstants, Paramet
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.settings import Number
 
-# What the drivers of a table share where they react late or stray from their model: its column and
-# its plausible range.
+# Columns of the reaction that the drivers of a table share, with their plausible ranges.
 REACTION = {
     "delay": ("reaction_delay_s", 0.0, 3.0),
     "noise": ("acceleration_noise_mps2", 0.0, 3.0),
     "gap_noise": ("gap_noise", 0.0, 1.0),
 }
 DEFAULT_MODEL = "idm"
-MODEL = "model"  # the column that names a driver's model; a table without it is of the IDM
-# A parameter this close to a bound, as a share of the range, counts as being on it.
+MODEL = "model"  # column of a driver's model; without it all drivers are IDM drivers
+# Distance from a bound within which a parameter counts as on it, as a share of the range.
 BOUND_TOLERANCE = 0.005
 
 Mode = Literal["local", "global"]
@@ -35,8 +34,8 @@ def find_law(name: str) -> type[DriverConstants]:
     """Return a driver model.
 
     Args:
-        name: one of :data:`lcc_rl.functional.laws.LAWS`, or the dotted path of a class of one's
-            own, ``my_models.Helly``, which then belongs to them.
+        name: one of :data:`lcc_rl.functional.laws.LAWS`, or the dotted path of your own class,
+            ``my_models.Helly``, which is added to them.
 
     Raises:
         ConfigError: if there is none, or it is no driver model.
@@ -52,13 +51,13 @@ def find_law(name: str) -> type[DriverConstants]:
 
 
 def parameters_of(models: Iterable[str]) -> dict[str, Parameter]:
-    """Return the parameters that some of several models have, in the order of the table."""
+    """Return the parameters of one or several models, in the order of the table."""
     found = {name: one for model in models for name, one in LAWS[model].table().items()}
     return {name: found[name] for name in (*PARAMETERS, *found) if name in found}
 
 
 def fitted(mode: str, model: str = DEFAULT_MODEL) -> tuple[str, ...]:
-    """Return the parameters that a mode fits: (v0, T), or all of the model."""
+    """Return the parameters that a mode fits: (v0, T), or all parameters of the model."""
     parameters = tuple(LAWS[model].table())
     return parameters[:2] if mode == "local" else parameters
 

@@ -1,4 +1,4 @@
-"""Populations of human drivers, from which episodes draw."""
+"""Populations of human drivers, from which episodes draw drivers."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ class DriverPopulation:
     Args:
         desired_speed: v0, ``[drivers]`` [m/s].
         time_gap: T, ``[drivers]`` [s].
-        constants: the other parameters of the IDM: numbers where all drivers share them, else
-            tensors ``[drivers]`` (a globally calibrated population). For drivers of other
-            models they are what an estimator by the IDM assumes.
-        ids: the drivers' identities, one per driver.
-        at_bound: which desired speeds lie on a calibration bound, ``[drivers]``.
-        models: the model of every driver; None: the IDM of all.
-        reaction: delay and noises, which the drivers share.
-        mode: the calibration of which they are, ``local`` or ``global``, where known.
-        own: further parameters by name, ``[drivers]``, where drivers have other models; NaN
-            where a driver's model lacks one.
+        constants: the other parameters of the IDM: numbers if all drivers share them, else
+            tensors ``[drivers]`` (a globally calibrated population). With other driver models,
+            estimators that use the IDM read them.
+        ids: identity of each driver.
+        at_bound: whether a desired speed lies on a calibration bound, ``[drivers]``.
+        models: model of each driver; None: the IDM for all.
+        reaction: shared delay and noises.
+        mode: mode of the calibration, ``local`` or ``global``, if known.
+        own: further parameters of other models by name, ``[drivers]``; NaN where a driver's model
+            lacks one.
 
     Raises:
-        ConfigError: if there is no driver, or a parameter is not one that a driver can have.
+        ConfigError: if there is no driver, or a parameter is not plausible.
     """
 
     desired_speed: Tensor
@@ -85,7 +85,7 @@ class DriverPopulation:
         return len(self.ids)
 
     def select(self, index: Tensor) -> DriverPopulation:
-        """Return the drivers at ``index`` ``[chosen]``, in that order, repetitions included."""
+        """Return the drivers at ``index`` ``[chosen]``, in that order, with repetitions."""
         constants = vars(self.constants).items()
         own = {name: value[index] for name, value in constants if isinstance(value, Tensor)}
         return DriverPopulation(
@@ -101,10 +101,10 @@ class DriverPopulation:
         )
 
     def summary(self) -> dict[str, float]:
-        """Means, standard deviations (n − 1) and correlation of (v0, T), and share at a bound."""
+        """Return means, standard deviations (n − 1), correlation of (v0, T), share at a bound."""
         speed = self.desired_speed.double().cpu().numpy()
         gap = self.time_gap.double().cpu().numpy()
-        deviations = [float(pd.Series(x).std()) for x in (speed, gap)]  # NaN of a single driver
+        deviations = [float(pd.Series(x).std()) for x in (speed, gap)]  # NaN for one driver
         spread = min(deviations) > 0.0
         return {
             "drivers": float(len(self)),
@@ -119,7 +119,7 @@ class DriverPopulation:
     def parameters(self) -> dict[str, Tensor]:
         """Return the drivers' parameters by name, each ``[drivers]``, float64.
 
-        Of IDM drivers these are five; of a mixture of models NaN stands for what a driver lacks.
+        IDM drivers have five. In a mixture of models, parameters that a driver lacks are NaN.
         """
         own = {"desired_speed": self.desired_speed, "time_gap": self.time_gap}
         shared = {name: getattr(self.constants, name) for name in LAWS[DEFAULT_MODEL].shared()}
@@ -141,21 +141,21 @@ def bootstrap(
     gap_noise: NonNegative | None = None,
     law: str | None = None,
 ) -> DriverPopulation:
-    """Population of the calibrated drivers themselves, the empirical joint distribution.
+    """Return the calibrated drivers as a population, the empirical joint distribution.
 
     Args:
-        path: table of calibrated drivers; None takes the shipped I-80 drivers.
+        path: table of calibrated drivers; None: the shipped I-80 drivers.
         mode: see :func:`load_drivers`.
-        least_speed: to which lower desired speeds are raised, for faster leaders than those of
-            the calibration [m/s]; None raises none. Time gaps stay.
-        reaction_delay: of all drivers [s]; None: as the table says, 0 where it says nothing.
+        least_speed: lower bound of desired speeds, for leaders faster than those of the calibration
+            [m/s]; None: no bound. Time gaps are unchanged.
+        reaction_delay: delay of all drivers [s]; None: that of the table, 0 if it has none.
         acceleration_noise: standard deviation [m/s²], likewise; see
             :class:`lcc_rl.functional.driver_models.Reaction`.
         gap_noise: standard deviation of the perceived gap's logarithm, likewise.
-        law: dotted path of a driver model of your own that drivers of the table have.
+        law: dotted path of your own driver model, if drivers of the table have it.
 
     Raises:
-        DataError: if the table is not sound.
+        DataError: if the table is not valid.
     """
     if law is not None:
         find_law(law)
@@ -176,7 +176,7 @@ def from_table(table: pd.DataFrame) -> DriverPopulation:
     """Build a population from a driver table, one driver per row.
 
     Raises:
-        DataError: if the table is not sound.
+        DataError: if the table is not valid.
     """
     check_drivers(table, "driver table")
     models = models_of(table, "driver table")
@@ -209,7 +209,7 @@ def _tensor(values: np.ndarray | pd.Series) -> Tensor:
 
 
 def _identities(table: pd.DataFrame) -> tuple[str, ...]:
-    """``recording/follower/leader`` where known, else the row's number."""
+    """Return ``recording/follower/leader`` if known, else the row's number."""
     if not set(PAIR_IDENTITY) <= set(table.columns):
         return tuple(str(number) for number in range(len(table)))
     return tuple(
@@ -218,7 +218,7 @@ def _identities(table: pd.DataFrame) -> tuple[str, ...]:
 
 
 def _flags(table: pd.DataFrame) -> Tensor:
-    """Which desired speeds lie on a bound, as calibrated, or by the default bounds."""
+    """Return which desired speeds lie on a bound of the calibration, else on a default bound."""
     if "desired_speed_at_bound" in table.columns:
         return torch.tensor(table["desired_speed_at_bound"].to_numpy(bool))
     values = table[PARAMETERS["desired_speed"].column].to_numpy(np.float64)
@@ -236,7 +236,7 @@ def fixed(
     acceleration_noise: NonNegative = 0.0,
     gap_noise: NonNegative = 0.0,
 ) -> DriverPopulation:
-    """Population of one given driver.
+    """Return a population of one given driver.
 
     Args:
         desired_speed: v0 [m/s].
@@ -244,7 +244,7 @@ def fixed(
         acceleration: a [m/s²].
         deceleration: b [m/s²].
         min_gap: s0 [m].
-        reaction_delay: [s].
+        reaction_delay: delay [s].
         acceleration_noise: standard deviation [m/s²].
         gap_noise: standard deviation of the perceived gap's logarithm.
     """

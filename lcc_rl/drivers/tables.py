@@ -22,15 +22,15 @@ def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.
     """Read a table of calibrated drivers and check it.
 
     Args:
-        path: a ``drivers.parquet`` written by the calibration; None reads the shipped I-80 drivers.
-        mode: which calibration to keep, ``local`` or ``global``; by default the one that the
-            table has, local where it has both.
+        path: a ``drivers.parquet`` of a calibration; None: the shipped I-80 drivers.
+        mode: mode of the calibration, ``local`` or ``global``; by default that of the table,
+            ``local`` if it has both.
 
     Returns:
         One row per driver, columns as written by :class:`lcc_rl.drivers.calibrator.Calibrator`.
 
     Raises:
-        DataError: naming file, row and column, if the table is missing, empty or not sound.
+        DataError: naming file, row and column, if the table is missing, empty or not valid.
     """
     try:
         if path is None:
@@ -57,7 +57,7 @@ def _of_mode(frame: pd.DataFrame, mode: str | None, name: str) -> pd.DataFrame:
 
 
 def models_of(frame: pd.DataFrame, name: str) -> pd.Series:
-    """Return the model of every driver of a table; without the column, the IDM.
+    """Return the model of every driver of a table; the IDM if the column is missing.
 
     Raises:
         DataError: naming the table and row, if a model is unknown.
@@ -69,13 +69,13 @@ def models_of(frame: pd.DataFrame, name: str) -> pd.Series:
         row = int(unknown.argmax())
         raise DataError(
             f"{name}: row {row}, column {MODEL!r}: must be one of {', '.join(LAWS)}, got "
-            f"{frame[MODEL].iloc[row]!r}; +drivers.law=<module.Class> adds a model of your own"
+            f"{frame[MODEL].iloc[row]!r}; +drivers.law=<module.Class> adds your own model"
         )
     return frame[MODEL]
 
 
 def check_drivers(frame: pd.DataFrame, name: str) -> None:
-    """Check that a table holds drivers: their parameters, each within its plausible range, once.
+    """Check that a table holds drivers with plausible parameters, each driver once.
 
     Raises:
         DataError: naming the table, row and column of the first fault.
@@ -102,7 +102,7 @@ def check_drivers(frame: pd.DataFrame, name: str) -> None:
 
 
 def reaction_of(frame: pd.DataFrame, name: str) -> Reaction:
-    """Return the delay and noise that the drivers of a table share; without the columns, none.
+    """Return the shared reaction of a table's drivers; 0 for missing columns.
 
     Raises:
         DataError: naming the table and column, if one differs by driver or is implausible.
@@ -121,10 +121,10 @@ def reaction_of(frame: pd.DataFrame, name: str) -> Reaction:
 
 
 def _check_identities(frame: pd.DataFrame, name: str) -> None:
-    """Raise a DataError where a driver appears twice."""
+    """Raise a DataError if a driver appears twice."""
     if not set(PAIR_IDENTITY) <= set(frame.columns):
         return
-    # A pair that was cut by a lane change is two drivers: its episodes tell them apart.
+    # A pair that was cut by a lane change counts as two drivers with different episodes.
     columns = [
         column for column in ("mode", MODEL, "episode", *PAIR_IDENTITY) if column in frame.columns
     ]

@@ -1,13 +1,13 @@
-"""Twins: calibrated drivers, each behind the leader of the driver that it was fitted to.
+"""Twins: calibrated drivers, each behind the leader of the driver to which it was fitted.
 
-A calibration that minimises the error of speed or gap finds drivers that accelerate too little,
-because it punishes every acceleration at the wrong moment. Energy is compared by driving each
-calibrated driver behind its own recorded leader. The reaction that the fit leaves out is a delay
-and a noise that all drivers share. It is chosen by the spectrum of the acceleration, by the energy
-spent on accelerating, and so that energy does not grow along a string of such drivers. With a
-delay alone the first driver fits, but its successors amplify its motion until they collide. A noise
-of the perceived gap is chosen with them where asked for: that of the acceleration makes drivers too
-lively behind calm leaders and too calm behind rough ones, where leaders differ much.
+A calibration that minimises the error of speed or gap gives drivers that accelerate too little,
+because it penalises every acceleration at the wrong time. Energy is compared by driving each
+calibrated driver behind its own recorded leader. The fit has no reaction, a delay and a noise that
+all drivers share. These are chosen by the spectrum of the acceleration, the energy lost to
+accelerating and the growth of energy along a string of such drivers. With a delay only, the first
+driver fits, but its successors amplify its motion until they collide. A noise of the perceived gap
+is optional. With the noise of the acceleration only, drivers are too lively behind calm leaders and
+too calm behind rough ones, if leaders differ much.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from lcc_rl.functional.driver_models import (
 from lcc_rl.functional.laws import LAWS
 
 FREQUENCIES = (0.04, 0.26)  # frequencies compared; above them the records are smoothed [Hz]
-SPECTRUM_WINDOW = 20.0  # part of a record whose spectrum is taken; parts overlap by half [s]
-LONG_GAP = 2.5  # time gap above which a driver is far behind, above 1 m/s [s]
+SPECTRUM_WINDOW = 20.0  # length of parts of a record in its spectrum; parts overlap by half [s]
+LONG_GAP = 2.5  # time gap that counts as long, above 1 m/s [s]
 REPEATS = 2  # draws of the noise of every driver
-AT_ONCE = 20_000  # trajectories side by side; more would only take memory
+AT_ONCE = 20_000  # parallel trajectories; more would only need memory
 DRIVER_FOLDS = 5  # each fold is evaluated with the reaction chosen on the other folds
-DELAYS = tuple(round(0.1 * number, 1) for number in range(10))  # among which is chosen [s]
+DELAYS = tuple(round(0.1 * number, 1) for number in range(10))  # candidates [s]
 NOISES = tuple(round(0.05 * number, 2) for number in range(13))  # likewise [m/s²]
-GAP_NOISES = tuple(round(0.1 * number, 1) for number in range(1, 7))  # likewise, beside none
-# Relative; see choose_reaction.
+# Candidates of the relative noise of gaps, in addition to none; see choose_reaction.
+GAP_NOISES = tuple(round(0.1 * number, 1) for number in range(1, 7))
 TOLERANCES = {"lost": 0.05, "spectrum": 0.2, "growth": 0.05, "slope": 0.1}
 LEADER_LOST, LEADER_WAY = "leader_lost_1.1s_j", "leader_distance_1.1s_m"
 CARS = 5  # cars in the string over which energy must not grow
@@ -60,22 +60,22 @@ People = tuple[DriverConstants, tuple[Tensor, Tensor]]  # model and (v0, T) of d
 def measure_motion(
     speed: _Array, gap: _Array, samples: NDArray[np.int64], time_step: float
 ) -> pd.DataFrame:
-    """Measure drivers in motion, means over the draws of their noise.
+    """Measure the motion of drivers, means over draws of their noise.
 
-    The energy is that of the paper's motor (A2) without the kinetic energy stored at the end.
+    The energy is that of the paper's motor (A2) net of kinetic energy.
 
     Args:
         speed: ``[time, draws, drivers]`` [m/s].
-        gap: the same [m].
-        samples: of every record, ``[drivers]``.
-        time_step: [s].
+        gap: ``[time, draws, drivers]`` [m].
+        samples: samples of every record, ``[drivers]``.
+        time_step: T [s].
 
     Returns:
         A row per driver: mean gap_m and long_gap_share of the time; for each of
-        :data:`lcc_rl.energy.AVERAGES`,
-        such as 1.1 s, energy_1.1s_j, its part lost_1.1s_j and distance_1.1s_m; and for each
-        frequency within :data:`FREQUENCIES`, such as 0.1 Hz, density_0.1hz of the acceleration
-        [m²/s⁴/Hz], NaN for records shorter than :data:`SPECTRUM_WINDOW`.
+        :data:`lcc_rl.energy.AVERAGES`, such as 1.1 s, energy_1.1s_j, its part lost_1.1s_j and
+        distance_1.1s_m; and for each frequency within :data:`FREQUENCIES`, such as 0.1 Hz,
+        density_0.1hz of the acceleration [m²/s⁴/Hz], NaN for records shorter than
+        :data:`SPECTRUM_WINDOW`.
     """
     table: dict[str, _Array] = {}
     for smoothing in AVERAGES:
@@ -91,7 +91,7 @@ def measure_motion(
 
 
 def _inside(length: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which of so many samples belong to a record, ``[length, 1, drivers]``."""
+    """Return which of ``length`` samples belong to a record, ``[length, 1, drivers]``."""
     return (np.arange(length)[:, None] < samples)[:, None]
 
 
@@ -141,7 +141,7 @@ def densities(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def measure_recorded(observed: Observed) -> pd.DataFrame:
-    """Measure the recorded drivers, and what their leaders lose to accelerating [J] on what way."""
+    """Measure the recorded drivers, and loss by accelerating [J] and distance [m] of leaders."""
     series = (observed.follower_speed, observed.gaps, observed.leader_speed)
     speed, gap, leader = (x.double().cpu().numpy()[:, None] for x in series)
     table = measure_motion(speed, gap, observed.samples, observed.time_step)
@@ -152,22 +152,22 @@ def measure_recorded(observed: Observed) -> pd.DataFrame:
 def drive_twins(
     observed: Observed, drivers: pd.DataFrame, reactions: Sequence[Reaction], repeats: int = REPEATS
 ) -> list[pd.DataFrame]:
-    """Drive twins: calibrated drivers from the first speed and gap of the recorded ones.
+    """Drive calibrated drivers from the first speed and gap of the recorded ones.
 
     Args:
         observed: the records.
         drivers: their calibrated parameters by one model, a row for each episode.
-        reactions: of one delay; all meet the same draws of the noise.
+        reactions: reactions with one delay; all have the same draws of the noise.
         repeats: draws of the noise.
 
     Returns:
-        What was measured, for every reaction, with the error of the speed rmspe (A6).
+        Measured tables for every reaction, with the error of the speed, rmspe (A6).
     """
     series = (observed.leader_speed, observed.follower_speed[0], observed.gaps[0])
     leader, *start = (x.double().cpu() for x in series)
     generator = torch.Generator().manual_seed(0)
-    who, shape = _people(observed, drivers), (len(reactions), repeats, observed.count)
-    motion = _follow(who, leader, start, reactions, shape, generator, observed.time_step)
+    people, shape = _people(observed, drivers), (len(reactions), repeats, observed.count)
+    motion = _follow(people, leader, start, reactions, shape, generator, observed.time_step)
     truth = observed.follower_speed.double().cpu().numpy()[:, None]
     alive = _inside(len(truth), observed.samples)
     norm = (truth**2).sum(0)
@@ -180,11 +180,11 @@ def drive_twins(
 
 
 def growth(observed: Observed, drivers: pd.DataFrame, reactions: Sequence[Reaction]) -> list[float]:
-    """Return how much more energy the last of :data:`CARS` drivers needs than the first.
+    """Return the growth of energy from the first to the last of :data:`CARS` drivers.
 
-    Behind every recorded leader, drivers follow one another, drawn from all of them, from their
-    own equilibrium. What is returned is the logarithm of the ratio of both energies per distance,
-    for every reaction; infinity after a collision.
+    Behind every recorded leader, drivers drawn from all of them follow one another and start at
+    equilibrium. The growth is the logarithm of the ratio of both energies per distance, for every
+    reaction; it is infinite after a collision.
     """
     law, own = _people(observed, drivers)
     leader = observed.leader_speed.double().cpu()
@@ -195,9 +195,9 @@ def growth(observed: Observed, drivers: pd.DataFrame, reactions: Sequence[Reacti
     for car in range(CARS):
         order = torch.from_numpy(chance.permutation(observed.count))
         shared = {name: getattr(law, name)[order] for name in law.shared()}
-        who = (law.with_(**shared), (own[0][order], own[1][order]))
-        gap = who[0].equilibrium_gap(leader[0], *who[1])
-        motion = _follow(who, leader, (leader[0], gap), reactions, shape, generator, step)
+        people = (law.with_(**shared), (own[0][order], own[1][order]))
+        gap = people[0].equilibrium_gap(leader[0], *people[1])
+        motion = _follow(people, leader, (leader[0], gap), reactions, shape, generator, step)
         collided |= [bool(((gaps <= 0.0) & inside).any()) for _, gaps in motion]
         if car in (0, CARS - 1):
             each = [_energies(x, observed.samples, step, AVERAGES[0]) for x, _ in motion]
@@ -208,7 +208,7 @@ def growth(observed: Observed, drivers: pd.DataFrame, reactions: Sequence[Reacti
 
 
 def _follow(
-    who: People,
+    people: People,
     leader: Tensor,
     start: Sequence[Tensor],
     reactions: Sequence[Reaction],
@@ -220,7 +220,7 @@ def _follow(
 
     The leader's speed is ``[time, …]``, broadcast to ``shape``: reactions, draws, drivers.
     """
-    law, own = who
+    law, own = people
     level, gap_level = (
         torch.tensor(x).double().view(-1, 1, 1)
         for x in ([one.noise for one in reactions], [one.gap_noise for one in reactions])
@@ -253,10 +253,10 @@ def _follow(
 
 
 def one_step_error(observed: Observed, drivers: pd.DataFrame, delay: float) -> float:
-    """Return the standard deviation of what a model leaves open of the next acceleration [m/s²].
+    """Return the standard deviation of a model's error of the next acceleration [m/s²].
 
-    The model acts on the recorded state, as old as the delay; the logarithm of this number is, but
-    for a constant, the negative likelihood of a sample.
+    The model reads the recorded state, delayed by the reaction delay. Except for a constant, the
+    logarithm of this number is the negative log-likelihood of a sample.
     """
     law, own = _people(observed, drivers)
     series = (observed.leader_speed, observed.follower_speed, observed.gaps)
@@ -281,18 +281,17 @@ def _people(observed: Observed, drivers: pd.DataFrame) -> People:
 def ratios(
     twins: pd.DataFrame, records: pd.DataFrame, smoothing: float = AVERAGES[0]
 ) -> dict[str, float]:
-    """Compare drivers with the recorded ones, as ratios of sums over them.
+    """Compare drivers with the recorded ones by ratios of sums over them.
 
     Args:
-        twins, records: what was measured of both, see :func:`measure_motion`; the same drivers.
+        twins, records: tables of :func:`measure_motion` for the same drivers.
         smoothing: one of :data:`lcc_rl.energy.AVERAGES` [s].
 
     Returns:
-        ``energy`` and ``lost`` (to accelerating) per distance, ``distance``, ``lost_1`` to
-        ``lost_3`` behind the calmest, middle and roughest third of the leaders, by what these lose
-        per distance, where it is known; and roots of mean squares of logarithms of ratios:
-        ``slope`` of these three, and ``spectrum`` of both densities, 0 if all records are too
-        short.
+        ``energy`` and ``lost`` (to accelerating) per distance; ``distance``; ``lost_1`` to
+        ``lost_3``, the loss behind the calmest, middle and roughest third of the leaders, by their
+        loss per distance, if it is known; and root mean squares of logarithms of ratios: ``slope``
+        of these three, and ``spectrum`` of the densities, 0 if all records are too short.
     """
 
     def over(column: str, rows: Any = slice(None)) -> Any:
@@ -303,7 +302,11 @@ def ratios(
         f"{name}_{smoothing}s_{unit}"
         for name, unit in (("energy", "j"), ("lost", "j"), ("distance", "m"))
     )
-    by_third = [over(lost, rows) / over(distance, rows) for rows in _thirds(records)]
+    thirds: list[NDArray[np.intp]] = []  # of their leaders, the calmest first
+    if LEADER_LOST in records and len(records) >= 3:
+        calm_first = (records[LEADER_LOST] / records[LEADER_WAY]).to_numpy().argsort()
+        thirds = np.array_split(calm_first, 3)
+    by_third = [over(lost, rows) / over(distance, rows) for rows in thirds]
     own, recorded = (densities(table).to_numpy().sum(0) for table in (twins, records))
     apart = np.log(np.divide(own, recorded, out=np.ones_like(own), where=recorded > 0.0))
     return {
@@ -316,17 +319,9 @@ def ratios(
     }
 
 
-def _thirds(records: pd.DataFrame) -> list[NDArray[np.intp]]:
-    """Return the rows of recorded drivers by thirds of their leaders, the calmest first."""
-    if LEADER_LOST not in records or len(records) < 3:
-        return []
-    calm_first = (records[LEADER_LOST] / records[LEADER_WAY]).to_numpy().argsort()
-    return np.array_split(calm_first, 3)
-
-
 @dataclass(frozen=True)
 class Tried:
-    """Twins with one reaction: what was measured of them, and :func:`growth`."""
+    """Twins with one reaction: their measured table, and :func:`growth`."""
 
     twins: pd.DataFrame
     growth: float
@@ -343,7 +338,7 @@ def tried(
     Args:
         observed, drivers: see :func:`drive_twins`.
         progress: called as ``progress(tried, total, text)``.
-        perception: also with every second of both × :data:`GAP_NOISES`.
+        perception: also drive every second of both with all :data:`GAP_NOISES`.
     """
     found: dict[Reaction, Tried] = {}
     together = max(1, AT_ONCE // (REPEATS * observed.count))
@@ -365,12 +360,12 @@ def tried(
 def choose_reaction(
     tries: Mapping[Reaction, Tried], records: pd.DataFrame, rows: _Rows
 ) -> Reaction:
-    """Choose the reaction with which some drivers come closest to the recorded ones.
+    """Choose the reaction with which the drivers are nearest to the recorded ones.
 
-    What is minimised is the sum of squares of three logarithms, each over its
-    :data:`TOLERANCES`: of the energy lost to accelerating and of the spectrum, both over the
-    recorded, and of the growth of energy along a string of such drivers. Where noises of the
-    perceived gap were tried, that of the ``slope`` of :func:`ratios` is the fourth.
+    The objective is the sum of squares of three logarithms, each divided by its
+    :data:`TOLERANCES`: the ratios of the energy lost to accelerating and of the spectrum to the
+    recorded ones, and the growth of energy along a string of such drivers. If noises of the
+    perceived gap were tried, the ``slope`` of :func:`ratios` is the fourth.
     """
     sized = {name: size for name, size in TOLERANCES.items() if name != "slope"}
     if any(reaction.gap_noise for reaction in tries):
@@ -390,7 +385,7 @@ def choose_reaction(
 
 
 def cross_chosen(tries: Mapping[Reaction, Tried], records: pd.DataFrame) -> pd.DataFrame:
-    """Return drivers with the reaction that was chosen on the other folds."""
+    """Return tables of drivers with the reaction that was chosen on the other folds."""
     fold = np.arange(len(records)) % DRIVER_FOLDS
     parts = []
     for own in (fold == number for number in range(min(DRIVER_FOLDS, len(records)))):
@@ -415,9 +410,9 @@ def compare_twins(
         progress, perception: see :func:`tried`.
 
     Returns:
-        The reaction; what was measured (:func:`measure_motion`, with the columns episode and
-        driver) of the recorded drivers, of their twins and of those with the reaction, each as it
-        was chosen on other drivers; and lines on both.
+        The reaction; tables (:func:`measure_motion`, with the columns episode and driver) of the
+        recorded drivers, of their twins and of twins with the reaction that was chosen on other
+        drivers; and lines on both.
     """
     records = measure_recorded(observed)
     if not react:
@@ -425,7 +420,7 @@ def compare_twins(
             RECORDED_DRIVERS: records,
             TWINS: drive_twins(observed, drivers, [Reaction()], 1)[0],
         }
-        line = f"{HELD}: too little to tell how true calibrated ones are in energy"
+        line = f"{HELD}: too little to compare the energy of calibrated ones"
         if accelerate(records):
             line = _line(TWINS, found, one_step_error(observed, drivers, 0.0))
         return Reaction(), _together(found, observed), [line]
@@ -437,16 +432,16 @@ def compare_twins(
         REACTING: cross_chosen(tries, records),
     }
     errors = {
-        who: one_step_error(observed, drivers, delay)
-        for who, delay in ((TWINS, 0.0), (REACTING, reaction.delay))
+        kind: one_step_error(observed, drivers, delay)
+        for kind, delay in ((TWINS, 0.0), (REACTING, reaction.delay))
     }
     line = (
         f"reaction delay {reaction.delay:g} s and acceleration noise {reaction.noise:g} m/s²"
         f"{f', noise of perceived gaps {reaction.gap_noise:g},' * bool(reaction.gap_noise)} "
         f"chosen ({100 * np.expm1(tries[reaction].growth):+.0f} % of energy from the first to the "
-        f"{CARS}th in a row); below, each driver has what was chosen on others"
+        f"{CARS}th in a row); below, each driver has the choice on others"
     )
-    lines = [Concern(line), *(_line(who, found, one) for who, one in errors.items())]
+    lines = [Concern(line), *(_line(kind, found, one) for kind, one in errors.items())]
     return reaction, _together(found, observed), lines
 
 
@@ -458,20 +453,20 @@ def accelerate(records: pd.DataFrame) -> bool:
 
 def _together(found: Mapping[str, pd.DataFrame], observed: Observed) -> pd.DataFrame:
     episode = observed.identity["episode"]
-    parts = [part.assign(episode=episode, driver=who) for who, part in found.items()]
+    parts = [part.assign(episode=episode, driver=kind) for kind, part in found.items()]
     return pd.concat(parts, ignore_index=True)
 
 
-def _line(who: str, found: Mapping[str, pd.DataFrame], one_step: float) -> str:
-    each = [ratios(found[who], found[RECORDED_DRIVERS], smoothing=width) for width in AVERAGES]
+def _line(kind: str, found: Mapping[str, pd.DataFrame], one_step: float) -> str:
+    each = [ratios(found[kind], found[RECORDED_DRIVERS], smoothing=width) for width in AVERAGES]
     energies = ", ".join(f"{one['energy']:.3f}" for one in each)
     losses = ", ".join(f"{one['lost']:.2f}" for one in each)
     parts = ", ".join(f"{value:.2f}" for name, value in each[0].items() if "lost_" in name)
-    own, theirs = (found[x].mean(numeric_only=True) for x in (who, RECORDED_DRIVERS))
+    own, theirs = (found[x].mean(numeric_only=True) for x in (kind, RECORDED_DRIVERS))
     return (
-        f"drivers {who}: RMSPE {100 * own.rmspe:.1f} %; {energies} of the recorded energy per km, "
-        f"{losses} of what accelerating loses (speeds smoothed over {AVERAGES[0]}, "
-        f"{AVERAGES[1]} s), {parts} of it behind the calmest, middle and roughest leaders; "
+        f"drivers {kind}: RMSPE {100 * own.rmspe:.1f} %; {energies} of the recorded energy per km, "
+        f"{losses} of the loss by accelerating (speeds smoothed over {AVERAGES[0]}, "
+        f"{AVERAGES[1]} s), {parts} of this loss behind the calmest, middle and roughest leaders; "
         f"spectrum off by a factor {np.exp(each[0]['spectrum']):.2f}, one-step error "
         f"{one_step:.2f} m/s²; distance {each[0]['distance']:.3f} of the recorded one, gap "
         f"{own.gap_m:.1f} m against {theirs.gap_m:.1f} m, long time gaps "

@@ -1,4 +1,4 @@
-"""Energy models: the power that driving draws, and which vehicle has which model."""
+"""Energy models and their assignment to vehicles."""
 
 from lcc_rl.energy.base import AVERAGED, AVERAGES, BURNT, EnergyModel
 from lcc_rl.energy.electric import ElectricCar, PaperMotor

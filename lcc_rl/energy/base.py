@@ -1,4 +1,4 @@
-"""What an energy model is: power from speed and acceleration, and what a motion stores."""
+"""Base of energy models: power from speed and acceleration, and kinetic energy."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from torch import Tensor
 
 from lcc_rl.settings import Settings
 
-# Widths of moving averages of speeds before their energy is computed [s]: with a shorter one the
-# noise of records counts, with a longer one what drivers do does not.
+# Widths of moving averages of speeds before their energy is computed [s]. Shorter ones keep the
+# noise of records; longer ones remove the drivers' own accelerations.
 AVERAGES = (1.1, 3.1)
-AVERAGED = tuple(f"path_energy_{seconds:g}s_kj" for seconds in AVERAGES)  # such energies [kJ]
-BURNT = ("fuel_l", "co2_g")  # what an energy of fuel is in litres, and its carbon dioxide [g]
+AVERAGED = tuple(f"path_energy_{seconds:g}s_kj" for seconds in AVERAGES)  # their energies [kJ]
+BURNT = ("fuel_l", "co2_g")  # fuel of an energy [L] and its carbon dioxide [g]
 
-Grade = Annotated[float, Field(ge=-0.3, le=0.3)]  # of the road [rad]
+Grade = Annotated[float, Field(ge=-0.3, le=0.3)]  # grade of the road [rad]
 
 
 class EnergyModel(Settings, ABC):
     """Base of all energy models: power [W] that a vehicle draws from its battery or tank.
 
-    A model of your own is a class with ``mass`` and :meth:`power`. What a trip takes net of what
-    the last speed stores follows from ``mass`` and ``efficiency``.
+    Your own model is a class with ``mass`` and :meth:`power`. The energy of a trip net of kinetic
+    energy follows from ``mass`` and ``efficiency``.
 
     Attributes:
-        mass: of the vehicle and those in it [kg].
-        rotating_mass: factor of the mass that is accelerated.
-        efficiency: share of what is drawn that becomes kinetic energy; what the speed of the
-            vehicle stores counts as kinetic energy over efficiency.
-        heating_value: of the fuel [J/g]; 0 for a vehicle without fuel.
-        density: of the fuel [kg/L].
-        carbon_dioxide: of a gram of the fuel [g]; NaN where it is not known.
+        mass: mass of the vehicle with its passengers [kg].
+        rotating_mass: factor on the mass for rotating parts.
+        efficiency: share of the drawn energy that becomes kinetic energy; kinetic energy counts as
+            itself divided by this efficiency.
+        heating_value: heating value of the fuel [J/g]; 0 for a vehicle without fuel.
+        density: density of the fuel [kg/L].
+        carbon_dioxide: carbon dioxide per gram of fuel [g]; NaN if unknown.
     """
 
     mass = 1500.0
@@ -58,7 +58,7 @@ class EnergyModel(Settings, ABC):
 
     @abstractmethod
     def power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
-        """Return the power drawn [W], negative where something is returned; same shape.
+        """Return the power drawn [W], negative where energy is recovered; same shape.
 
         Args:
             speed: speed at the start of a step, any shape [m/s].
@@ -66,27 +66,27 @@ class EnergyModel(Settings, ABC):
         """
 
     def smooth_power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
-        """Return :meth:`power` without its jumps, for objectives that a gradient follows."""
+        """Return :meth:`power` without its jumps, for objectives with a gradient."""
         return self.power(speed, acceleration)
 
     def path_power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
-        """Return the power that a path takes [W]: without what the motion stores; smooth."""
+        """Return the smooth power [W] minus the change of kinetic energy."""
         stored = self.inertia / self.efficiency * speed * acceleration
         return self.smooth_power(speed, acceleration) - stored
 
     def stored_energy(self, speed: Tensor) -> Tensor:
-        """Return what a speed is worth: kinetic energy over efficiency [J], same shape."""
+        """Return kinetic energy divided by efficiency [J], same shape."""
         return 0.5 * self.inertia / self.efficiency * speed * speed
 
     def acceleration_loss(self, speed: Tensor, acceleration: Tensor) -> Tensor | None:
-        """Return what accelerating loses for good [W]; None where the model has no such part."""
+        """Return the power dissipated by accelerating [W]; None if the model has no such part."""
         return None
 
     def strongest(self, speed: Tensor) -> Tensor | None:
-        """Return the largest acceleration at a speed [m/s²]; None where the model is silent."""
+        """Return the largest acceleration at a speed [m/s²]; None if the model defines none."""
         return None
 
     def infeasible(self, speed: Tensor, acceleration: Tensor) -> Tensor | None:
-        """Return where the vehicle cannot accelerate like this; None where the model is silent."""
+        """Return where an acceleration is infeasible; None if the model does not define it."""
         strongest = self.strongest(speed)
         return None if strongest is None else acceleration > strongest

@@ -1,4 +1,4 @@
-"""Electric cars: one with losses and limits of what braking returns, and the ALCC paper's."""
+"""Electric cars: a model with losses and limited recuperation, and the ALCC paper's."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ GRAVITY, AIR = 9.81, 1.2  # [m/s²], [kg/m³]
 
 
 class ElectricCar(EnergyModel):
-    """Battery power of an electric car; what braking cannot return, friction brakes take.
+    """Battery power of an electric car; friction brakes dissipate the rest of braking.
 
-    At the wheels P = m a v + ½ ρ C_D A v³ + m g (c_rr cos θ + sin θ) v. Driving, the battery gives
-    P over the efficiency of the drivetrain; braking, the motor takes at most its limit, fading
-    out at low speed, and the battery gets that times the efficiency. The values are those of a
-    2016 Nissan Leaf of 30 kWh in the vehicle files of FASTSim (NREL), a driver and passenger on
-    board; the efficiency is the product of motor (0.9 at partial load), gear (0.98) and one way
-    through the battery (0.985).
+    At the wheels P = m a v + ½ ρ C_D A v³ + m g (c_rr cos θ + sin θ) v. For P > 0 the battery
+    delivers P divided by the efficiency of the drivetrain. In braking the motor recovers at most
+    its limit, which fades out at low speed, times the efficiency. The values are those of a 2016
+    Nissan Leaf of 30 kWh in the vehicle files of FASTSim (NREL) with driver and passenger. The
+    efficiency is the product of motor (0.9 at partial load), gear (0.98) and one way through the
+    battery (0.985).
     """
 
     # Mass of the car and its passengers [kg].
     mass: Annotated[float, Field(ge=100.0, le=100_000.0)] = 1636.0
-    rotating_mass: Positive = 1.03  # factor of the mass that is accelerated
+    rotating_mass: Positive = 1.03  # factor on the mass for rotating parts
     drag: Positive = 0.315  # drag coefficient
     area: Positive = 2.755  # frontal area [m²]
     rolling: NonNegative = 0.008  # rolling resistance coefficient
     efficiency: Annotated[float, Field(gt=0.0, le=1.0)] = 0.87  # of the drivetrain, either way
-    auxiliary: NonNegative = 250.0  # power of everything that does not drive [W]
-    regeneration_limit: NonNegative = 50_000.0  # braking power that the motor takes [W]
-    fade_speed: Positive = 5.0  # below it recuperation fades in proportion to it [m/s]
+    auxiliary: NonNegative = 250.0  # power of auxiliary consumers [W]
+    regeneration_limit: NonNegative = 50_000.0  # largest braking power of the motor [W]
+    fade_speed: Positive = 5.0  # below this speed recuperation is proportional to speed [m/s]
     grade: Grade = 0.0  # of the road [rad]
     power_limit: Positive | None = None  # at the wheels; None: no limit [W]
 
@@ -66,8 +66,8 @@ class ElectricCar(EnergyModel):
 class PaperMotor(EnergyModel):
     """Electric power of the ALCC paper's car (A2); braking returns 2.4 times its kinetic energy.
 
-    Steady power, what the motion stores and what accelerating loses add up to A2 exactly. Of the
-    force at the wheels (A1) and Table I, the kinetic energy ½ δ m v² alone is needed.
+    Steady power, change of kinetic energy and loss by acceleration add up to A2 exactly. Of the
+    force at the wheels (A1) and Table I, only the kinetic energy ½ δ m v² is used.
     """
 
     mass = 1005.0  # m of A1 [kg]
@@ -78,7 +78,7 @@ class PaperMotor(EnergyModel):
         return motor_power(speed, acceleration)
 
     def path_power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
-        """Return A2 without the part that the motion stores [W]."""
+        """Return A2 without the change of kinetic energy [W]."""
         return path_power(speed, acceleration)
 
     def acceleration_loss(self, speed: Tensor, acceleration: Tensor) -> Tensor:

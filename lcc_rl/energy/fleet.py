@@ -1,4 +1,4 @@
-"""Which vehicle is of which class: what it draws, how long it is, and what it can do."""
+"""Classes of vehicles: energy model, length and limits."""
 
 from __future__ import annotations
 
@@ -19,28 +19,27 @@ from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.settings import Positive, Settings, values
 
 Quantity = Callable[[EnergyModel, Tensor, Tensor], Tensor]
-# By how much commands stay below the largest acceleration, so that the rounding of speeds does
-# not exceed it [m/s²].
+# Distance of commands from the largest acceleration, which rounded speeds would exceed [m/s²].
 ROUNDING = 1e-3
 
 
 class VehicleClass(Settings):
-    """A class of vehicles: the vehicle of its energy model, its length and its limits.
+    """A class of vehicles: energy model, length and limits.
 
-    It accelerates as hard as that vehicle can (:meth:`lcc_rl.energy.EnergyModel.strongest`: power
-    over mass and speed, less the resistances), and drives no faster than its speed limit.
+    Its acceleration is at most :meth:`lcc_rl.energy.EnergyModel.strongest` (power divided by mass
+    and speed, minus the resistances), and its speed at most its speed limit.
     """
 
-    energy: InstanceOf[EnergyModel]  # its mass, power, resistances, and what it draws
+    energy: InstanceOf[EnergyModel]  # mass, power, resistances and energy
     share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0  # of the vehicles of its roles
-    # Of the vehicles that are of this class.
+    # Roles of the vehicles of this class.
     roles: Annotated[tuple[str, ...], Field(min_length=1)] = (HUMAN,)
     length: Positive = 5.0  # [m]
-    speed_limit: Positive | None = None  # None: as fast as its power allows [m/s]
-    bounded: bool = True  # False: it accelerates as commanded, whatever its power
+    speed_limit: Positive | None = None  # None: limited by its power only [m/s]
+    bounded: bool = True  # False: it accelerates as commanded, without limits of power
 
     def within(self, command: Tensor, speed: Tensor, time_step: float) -> Tensor:
-        """Return commands within what the vehicle can do, and within its speed limit [m/s²].
+        """Return commands within the vehicle's power and its speed limit [m/s²].
 
         Args:
             command: commanded acceleration, any shape [m/s²].
@@ -59,9 +58,9 @@ class Fleet:
     """The classes of the vehicles of a string.
 
     Args:
-        models: energy models by the name of the class; such a class knows no limits.
+        models: energy models by the name of the class; such a class has no limits.
         shares: share of each class among the vehicles; None for equal shares.
-        roles: shares among the vehicles of a role, where they differ.
+        roles: shares among the vehicles of a role, if they differ.
     """
 
     def __init__(
@@ -103,8 +102,8 @@ class Fleet:
         """Return the fleet with further classes.
 
         Args:
-            classes: by name; what their shares leave of a role is divided as before.
-            length: of the vehicles of all other classes [m].
+            classes: classes by name; the rest of a role is divided as before.
+            length: length of the vehicles of all other classes [m].
 
         Raises:
             ConfigError: if a name is taken, or the shares of a role exceed 1.
@@ -134,7 +133,7 @@ class Fleet:
         return any(one.bounded or one.speed_limit for one in self.classes.values())
 
     def longest(self, role: str) -> float:
-        """Return the length of the longest vehicle that a role may have [m]."""
+        """Return the length of the longest vehicle of a role [m]."""
         shares = self.roles.get(role, self.shares)
         met = zip(self.classes.values(), shares, strict=True)
         return max(one.length for one, share in met if share > 0.0)
@@ -170,29 +169,29 @@ class Fleet:
         return self._of(lambda model, *motion: model.power(*motion), speed, acceleration, kind)
 
     def path_power(self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None) -> Tensor:
-        """Return the power without what the motion stores [W]; arguments as of :meth:`power`."""
+        """Return the power net of kinetic energy [W]; arguments as for :meth:`power`."""
         return self._of(lambda model, *motion: model.path_power(*motion), speed, acceleration, kind)
 
     def stored_energy(self, speed: Tensor, kind: Tensor | None = None) -> Tensor:
-        """Return what a speed is worth [J], see :meth:`EnergyModel.stored_energy`."""
+        """Return the kinetic energy [J], see :meth:`EnergyModel.stored_energy`."""
         return self._of(lambda model, v, _: model.stored_energy(v), speed, speed, kind)
 
     def acceleration_loss(
         self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None
     ) -> Tensor | None:
-        """Return what accelerating loses [W]; None unless all models have such a part."""
+        """Return the power dissipated by accelerating [W]; None unless all models define it."""
         return self._known("acceleration_loss", all, speed, acceleration, kind)
 
     def infeasible(
         self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None
     ) -> Tensor | None:
-        """Return where a vehicle cannot accelerate like this; None if no model defines it."""
+        """Return where an acceleration is infeasible; None if no model defines it."""
         return self._known("infeasible", any, speed, acceleration, kind)
 
     def burnt(self, energy: Tensor, kind: Tensor | None = None) -> dict[str, Tensor]:
-        """Return :data:`BURNT` of energies drawn [J], of whatever shape; empty if none burns fuel.
+        """Return :data:`BURNT` of energies drawn [J], same shape; empty if no model burns fuel.
 
-        Vehicles without fuel add nothing.
+        They are 0 for vehicles without fuel.
         """
         if not any(model.heating_value for model in self.models):
             return {}
@@ -203,7 +202,7 @@ class Fleet:
         return {name: part(number) for number, name in enumerate(BURNT)}
 
     def _known(self, name: str, enough: Any, *motion: Any) -> Tensor | None:
-        """Return what models define, false of the others; None unless enough define it."""
+        """Return a quantity of the models, false for others; None unless enough define it."""
         nothing = torch.empty(0)
         if not enough(getattr(x, name)(nothing, nothing) is not None for x in self.models):
             return None
@@ -229,7 +228,7 @@ class Fleet:
 
 
 def as_fleet(energy: EnergyModel | Fleet | None) -> Fleet:
-    """Return one model, or that of the ALCC paper for None, as that of a whole fleet."""
+    """Return a fleet with one model; None: that of the ALCC paper."""
     if isinstance(energy, Fleet):
         return energy
     return Fleet({"all": PaperMotor() if energy is None else energy})

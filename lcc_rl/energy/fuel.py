@@ -19,15 +19,15 @@ GASOLINE, DIESEL = 0.745, 0.832  # [kg/L]
 # Emissions from a Typical Passenger Vehicle, EPA-420-F-11-041, 2011).
 CARBON_DIOXIDE = {GASOLINE: 2.348, DIESEL: 2.689}
 TRUCKS = ("Class4PND", "Class8Tractor")
-STANDSTILL, STILL = 0.1, 0.01  # slower than the first [m/s], weaker than the second [m/s²]: idle
-# Fuel that gives a vehicle its kinetic energy: 15.4 kJ of it per gram, 35 % of 44 kJ.
+STANDSTILL, STILL = 0.1, 0.01  # idle: below both, speed [m/s] and |acceleration| [m/s²]
+# Kinetic energy per gram of fuel: 35 % of 44 kJ.
 KINETIC = 15.4e3  # [J/g]
 KILOWATT = 1e3
 
 
 @cache
 def coefficients() -> dict[str, dict[str, float]]:
-    """Return the published coefficients of every vehicle; those that one lacks are zero."""
+    """Return the published coefficients of every vehicle; missing ones are zero."""
     text = files("lcc_rl.assets").joinpath("energy", FUEL).read_text(encoding="utf-8")
     rows = csv.DictReader(text.splitlines())
     return {
@@ -39,16 +39,16 @@ def coefficients() -> dict[str, dict[str, float]]:
 class CirclesFuel(EnergyModel):
     """Fuel rate of a vehicle as a polynomial of speed, acceleration and grade, as power [W].
 
-    Below a deceleration that grows with speed the engine gets no fuel: a jump, exact in
-    :meth:`power` and bridged over a ``width`` in :meth:`smooth_power`. An acceleration beyond
-    what the vehicle can do counts as the largest that it can (:meth:`infeasible` tells where).
-    The published model does the same at speeds that the engine cannot hold, where this largest
-    acceleration is a deceleration. Here it is zero there: the speed is driven, so it is paid for.
+    Below a deceleration that grows with speed the engine gets no fuel. This jump is exact in
+    :meth:`power` and smoothed over ``width`` in :meth:`smooth_power`. Infeasible accelerations
+    count as the largest feasible one (:meth:`infeasible` returns where). At speeds that the engine
+    cannot hold, this would be a deceleration, as in the published model. Here it is zero, so that
+    the driven speed is paid for.
     """
 
     vehicle: str = "midBase"  # Compact, midBase, midSUV, Pickup, Class4PND or Class8Tractor
     grade: Grade = 0.0  # of the road [rad]
-    width: Positive = 0.1  # range over which the cut of the fuel is bridged [m/s²]
+    width: Positive = 0.1  # range over which the cut of the fuel is smoothed [m/s²]
 
     def validate(self) -> None:
         if self.vehicle not in coefficients():
@@ -65,7 +65,7 @@ class CirclesFuel(EnergyModel):
         return self.fuel(speed, acceleration) * self.heating_value
 
     def smooth_power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
-        """Return the same with the fuel cut bridged and without the state of idling."""
+        """Return the heat with a smoothed fuel cut and without idling."""
         speed = speed.clamp(min=0.0)
         rate = self._rate(speed, acceleration)
         if not self.truck:
@@ -74,10 +74,10 @@ class CirclesFuel(EnergyModel):
         return rate * self.heating_value
 
     def fuel(self, speed: Tensor, acceleration: Tensor) -> Tensor:
-        """Return the fuel rate [g/s], same shape; arguments as of :meth:`power`."""
+        """Return the fuel rate [g/s], same shape; arguments as for :meth:`power`."""
         own, idle = self.own, (speed.abs() < STANDSTILL) & (acceleration.abs() < STILL)
         speed = speed.clamp(min=0.0)
-        # The cut looks at what is asked for, the engine gives what it can.
+        # The cut depends on the given acceleration, the rate on the feasible one.
         rate = self._rate(speed, acceleration)
         if not self.truck:
             cut = (speed > own["vc"]) & (acceleration <= self._cut(speed))
@@ -85,14 +85,14 @@ class CirclesFuel(EnergyModel):
         return rate.masked_fill(idle, own["fc_idle"])
 
     def strongest(self, speed: Tensor) -> Tensor:
-        """Return the largest acceleration that is feasible [m/s²]."""
+        """Return the largest feasible acceleration [m/s²]."""
         own, speed = self.own, speed.clamp(min=0.0)
         force = own["b2"] / speed.clamp(min=1e-6) - own["b3"] * speed.square()
         uphill = (own["b5"] + own["b6"] * speed).clamp(max=own["b4"])
         return force.clamp(max=own["b1"]) - uphill * self.grade
 
     def _rate(self, speed: Tensor, acceleration: Tensor) -> Tensor:
-        """Return the fuel rate [g/s] of an engine that gets fuel."""
+        """Return the fuel rate [g/s] without the fuel cut."""
         own, grade = self.own, self.grade
         acceleration = torch.minimum(acceleration, self.strongest(speed).clamp(min=0.0))
         linear = own["p0"] + speed * (own["p1"] + speed * own["p2"])

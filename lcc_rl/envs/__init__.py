@@ -1,4 +1,4 @@
-"""Environments: a thin clock plus the pieces that a configuration names."""
+"""Environments: a clock and the pieces that a configuration names."""
 
 from lcc_rl.envs.clock import Clock
 from lcc_rl.envs.collector import StringCollector

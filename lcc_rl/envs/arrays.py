@@ -1,4 +1,4 @@
-"""Episodes side by side as arrays: what Gymnasium's environments step."""
+"""Parallel episodes as arrays, the engine of the Gymnasium environments."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ from lcc_rl.pieces.rewards import TERMS, TotalReward
 class ArrayEpisodes:
     """Episodes of one automated vehicle, stepped as rows of arrays by :class:`Rowwise`.
 
-    Everything random in an episode follows from its seed; each place draws the seeds of its
-    episodes from a generator of its own, as an environment of one episode does.
+    All random numbers of an episode follow from its seed. Each place has its own generator of
+    seeds, as an environment of one episode has.
 
     Args:
         env: an environment in the view of one automated vehicle, ``[n]`` episodes.
 
     Attributes:
-        terms: names of the terms of the reward.
-        observation: the observations, ``[n, entries]``, float32; never written to.
-        films: what records the motion of each place, if anything does.
+        terms: names of the reward terms.
+        observation: the observations, ``[n, entries]``, float32; not changed in place.
+        films: recorder of the motion of each place, or None.
     """
 
     def __init__(self, env: TransformedEnv) -> None:
@@ -70,7 +70,7 @@ class ArrayEpisodes:
         self.state = np.zeros((self.count, sum(self.sizes)))
 
     def _first(self, pieces: Sequence[Any]) -> State:
-        """Return the first moment of an episode, and choose what a step reads of a moment."""
+        """Return the first state of an episode, and choose the entries that a step reads."""
         with torch.no_grad():
             first = self.one_step.begin(torch.zeros(1, 1, dtype=torch.int64))
         read = read_before(pieces)
@@ -81,11 +81,11 @@ class ArrayEpisodes:
         return first
 
     def _packed(self, moment: State) -> Tensor:
-        """Return what a step reads as rows of numbers; double ones also hold a seed exactly."""
+        """Return the entries that a step reads as rows; double precision represents any seed."""
         return torch.cat([moment[key].flatten(1).double() for key in self.keys], 1)
 
     def _advance(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return state, observation and what :meth:`step` returns, after a step."""
+        """Return state and observation after a step, and the result of :meth:`step`."""
         columns = zip(self.keys, self.types, state.split(self.sizes, 1), strict=True)
         before = {key: x.to(dtype).reshape(-1, *shape) for key, (shape, dtype), x in columns}
         before[ACTION] = action.unsqueeze(1)
@@ -93,11 +93,11 @@ class ArrayEpisodes:
         seen = reached[OBSERVATION].flatten(1)
         results = [reached[key].flatten(1).to(seen.dtype) for key in self.written]
         total = seen.sum(1, keepdim=True) + results[0]
-        finite = (total - total == 0.0).to(seen.dtype)  # neither infinity nor NaN is
+        finite = (total - total == 0.0).to(seen.dtype)  # False for NaN and infinity
         return self._packed(reached), seen, torch.cat([*results, finite], 1)
 
     def _begin(self, seeds: Tensor) -> tuple[Tensor, Tensor]:
-        """Return state and observation at the beginning of episodes."""
+        """Return state and observation at the start of episodes."""
         first = self.one_step.begin(seeds)
         return self._packed(first), first[OBSERVATION].flatten(1)
 
@@ -107,19 +107,19 @@ class ArrayEpisodes:
         seeds: Sequence[int | None] | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> Array:
-        """Begin new episodes in some places; what is refused changes nothing.
+        """Begin new episodes in some places; nothing changes if an argument is refused.
 
         Args:
-            places: numbers of the places.
-            seeds: for the generator of every place of the batch; None where it goes on.
-            options: by the dotted names of the environment's reset options, ``"leader.profile"``:
-                a whole number for all episodes, or those of every episode of the batch.
+            places: indices of the places.
+            seeds: seed of the generator of every place; None: the generator continues.
+            options: reset options by their dotted names, such as ``"leader.profile"``: a whole
+                number for all episodes, or one for each episode of the batch.
 
         Returns:
             The observations of all places.
 
         Raises:
-            ConfigError: naming the option that does not exist, or its range.
+            ConfigError: naming an unknown option, or the range of an option.
         """
         generators = [self.generators[place].clone_state() for place in places]
         for place, generator in zip(places, generators, strict=True):
@@ -144,7 +144,7 @@ class ArrayEpisodes:
         return self.observation
 
     def _given(self, seeds: Tensor, options: Mapping[str, Any]) -> TensorDict:
-        """Return seeds and reset options as the TorchRL environment takes them."""
+        """Return seeds and reset options as an argument of the TorchRL environment's reset."""
         given = TensorDict({SEED: seeds}, [self.count])
         specs = {".".join(key): spec for key, spec in option_specs(self.env).items()}
         for name, value in options.items():
@@ -158,13 +158,13 @@ class ArrayEpisodes:
         return given
 
     def step(self, actions: Any) -> Array:
-        """Take every episode a step further, also those that have ended.
+        """Advance every episode by a step, including episodes that have ended.
 
         Args:
             actions: ``[n, 1]``, in [−1, 1].
 
         Returns:
-            ``[n, 3 + terms]``, float32: reward, terminated, truncated and the terms of the reward.
+            ``[n, 3 + terms]``, float32: reward, terminated, truncated and the reward terms.
 
         Raises:
             ConfigError: if the actions have another shape, or are no real numbers.
@@ -188,7 +188,7 @@ class ArrayEpisodes:
         return results[:, :-1]
 
     def _check(self, named: dict[Key, Array], step: int) -> None:
-        """Raise Diverged where an entry is no finite number."""
+        """Raise Diverged if an entry is not finite."""
         numbers = {key: torch.as_tensor(x).unsqueeze(0) for key, x in named.items()}
         require_finite(numbers, torch.ones(1, self.count, 1, dtype=torch.bool), step)
 

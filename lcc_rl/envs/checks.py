@@ -1,4 +1,4 @@
-"""Checks of a list of pieces when an environment is built: what is read is written, and fits."""
+"""Checks of pieces when an environment is built: every entry read is written and fits."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def check_pieces(
     _check_wiring(pieces, [as_key(key) for key in actions])
     episodes = torch.arange(BATCH).unsqueeze(-1)
     _play(pieces, horizon, actions, episodes)
-    # What the first step computed once and for all, it may keep.
+    # Values that the first step computed and stored may be kept.
     before = [_kept(piece) for piece in pieces]
     _play(pieces, horizon, actions, episodes + BATCH)
     for piece, held in zip(pieces, before, strict=True):
@@ -50,7 +50,7 @@ def _play(
     actions: Mapping[NestedKey, tuple[int, ...]],
     episodes: Tensor,
 ) -> None:
-    """Reset episodes by their seeds, take a step, and compare what is written with the specs."""
+    """Reset episodes by their seeds, take a step, and compare written entries with the specs."""
     moment = TensorDict(batch_size=[BATCH])
     for key, value in tick(episodes, torch.zeros_like(episodes), horizon).items():
         moment.set(key, value)
@@ -69,12 +69,12 @@ def _play(
 
 
 def check_step(piece: Piece, before: State, reached: State) -> None:
-    """Compare what a piece writes in a step of :data:`BATCH` episodes with what its specs promise.
+    """Compare the entries that a piece writes for :data:`BATCH` episodes with its specs.
 
     Args:
         piece: the piece.
         before: entries of the state before the step.
-        reached: entries of the state after it, to which those written are added.
+        reached: entries of the state after the step, to which the written ones are added.
 
     Raises:
         ConfigError: naming the piece, and the number of entries, shape or type at fault.
@@ -82,16 +82,16 @@ def check_step(piece: Piece, before: State, reached: State) -> None:
     read = {key: (reached if late else before)[key] for late, key in piece.needs}
     kept = {key: value.clone() for key, value in read.items()}
     _attempt(piece, lambda: piece.derive(before, reached))
-    for key, value in kept.items():  # by way of .data or NumPy a change is not counted
+    for key, value in kept.items():  # torch does not count changes by .data or NumPy
         if not torch.equal(read[key].nan_to_num(), value.nan_to_num()):
             raise changed(type(piece).__name__, ".".join(key))
     _compare(piece, {key: reached[key] for key in piece.targets}, "after a step")
 
 
 def _kept(piece: Piece) -> dict[str, list[Any]]:
-    """Return what a piece and the modules in it hold in attributes, so that a change shows.
+    """Return the attributes of a piece and its modules in a form that shows changes.
 
-    A tensor counts with the number of its changes in place, a list or mapping with its items.
+    A tensor is accompanied by the number of its changes in place, a list or mapping by its items.
     """
     held = {}
     for path, module in piece.named_modules():
@@ -109,10 +109,10 @@ def _kept(piece: Piece) -> dict[str, list[Any]]:
 
 
 def _check_forgets(piece: Piece, before: Mapping[str, list[Any]]) -> None:
-    """Refuse a piece that remembers in an attribute: episodes would share what it holds.
+    """Refuse a piece that stores state in an attribute, which all episodes would share.
 
     Raises:
-        ConfigError: naming the attribute, and where to remember instead.
+        ConfigError: naming the attribute and the place for state.
     """
     after = _kept(piece)
     for name, parts in after.items():
@@ -123,13 +123,13 @@ def _check_forgets(piece: Piece, before: Mapping[str, list[Any]]) -> None:
         ):
             raise ConfigError(
                 f"{type(piece).__name__} remembers in its attribute {name!r}, which all episodes "
-                "share; what lasts from step to step must be an entry, which a controller names in "
-                "remembers, see docs/extend.md"
+                "share; a state must be an entry, which a controller names in remembers, see "
+                "docs/extend.md"
             )
 
 
 def _attempt(piece: Piece, action: object) -> None:
-    """Call a function, naming the piece where it fails."""
+    """Call a function; an error names the piece."""
     try:
         action()  # type: ignore[operator]
     except LccError:
@@ -145,7 +145,7 @@ def _attempt(piece: Piece, action: object) -> None:
 
 
 def _compare(piece: Piece, found: Mapping[Key, Tensor], when: str) -> None:
-    """Compare what a piece wrote with what its spec promises."""
+    """Compare the written entries of a piece with its specs."""
     layouts = piece.layouts(torch.Size([BATCH]))
     for key, value in found.items():
         if key not in layouts or key in (DONE, TERMINATED):
@@ -160,7 +160,7 @@ def _compare(piece: Piece, found: Mapping[Key, Tensor], when: str) -> None:
 
 
 def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
-    """Check that a piece writes every entry that is read, and no two write one.
+    """Check that every entry that is read is written by one piece.
 
     Raises:
         ConfigError: naming the entry and the piece.

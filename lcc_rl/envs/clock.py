@@ -1,4 +1,4 @@
-"""The clock: the thin environment under every scenario; it owns time, the action and done."""
+"""The clock: the base environment of every scenario, with time, action and done."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def batch_shape(batch_size: Sequence[int] | int) -> torch.Size:
     """Return the shape of a batch of episodes.
 
     Raises:
-        ConfigError: if it is empty or no whole numbers.
+        ConfigError: if it is empty or not of whole numbers.
     """
     try:
         batch = torch.Size([batch_size] if isinstance(batch_size, int) else batch_size)
@@ -35,7 +35,7 @@ def batch_shape(batch_size: Sequence[int] | int) -> torch.Size:
 
 
 def is_whole(value: Any) -> bool:
-    """Whether a value is a whole number of 64 bits; truth values are none."""
+    """Whether a value is a whole number of 64 bits and no truth value."""
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     return whole and -(2**63) <= value < 2**63
 
@@ -54,29 +54,29 @@ def checked_seed(seed: Any) -> int | None:
 
 
 class Clock(EnvBase):
-    """Counts steps, truncates at the horizon and gives every episode a seed of its own.
+    """Counts steps, truncates at the horizon and draws a seed for every episode.
 
-    Everything random in an episode is a function of that seed (see
-    :mod:`lcc_rl.functional.random`), so the generator of this class is the only random state of
-    an environment. ``env.reset(TensorDict({("episode", "seed"): ...}))`` replays an episode.
+    All random numbers of an episode are functions of its seed (:mod:`lcc_rl.functional.random`),
+    so the generator of this class is the only random state of an environment.
+    ``env.reset(TensorDict({("episode", "seed"): ...}))`` replays an episode.
 
     Args:
         horizon: steps per episode, after which it is truncated.
         batch_size: shape of the batch of episodes.
         actions: shape of each action after the batch dimensions, by key; entries lie in [−1, 1].
-        seed: seed of the generator that draws the episodes' seeds; None: one is drawn at random.
-        device: where the tensors live.
+        seed: seed of the generator of the episodes' seeds; None: drawn at random.
+        device: device of the tensors.
 
     Raises:
-        ConfigError: if the horizon is not positive, the batch is empty or no whole numbers, or the
-            seed is out of range.
+        ConfigError: if the horizon is not positive, the batch is empty or not of whole numbers, or
+            the seed is out of range.
     """
 
     entries = (
-        Entry(SEED, "–", "seed from which everything random in the episode follows"),
+        Entry(SEED, "–", "seed of all random numbers of the episode"),
         Entry(STEP, "–", "steps since the start of the episode"),
         Entry("done", "–", "terminated or truncated"),
-        Entry("terminated", "–", "a collision ended the episode, where collisions do"),
+        Entry("terminated", "–", "a collision ended the episode"),
         Entry("truncated", "–", "the horizon is reached"),
         Entry("automated.action", "–", "action in [−1, 1]"),
     )
@@ -95,7 +95,7 @@ class Clock(EnvBase):
         super().__init__(device=device, batch_size=batch)
         self.horizon = horizon
         self.generator = torch.Generator()
-        # As TorchRL's multi-agent environments name the members of each group.
+        # The members of each group, as in TorchRL's multi-agent environments.
         self.group_map = {
             str(key[0]): [f"{key[0]}_{i}" for i in range(shape[0])]
             for key, shape in (actions or {}).items()
@@ -122,7 +122,7 @@ class Clock(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         seed = checked_seed(seed)
-        # Not from torch's own generator, which is the same in every new process.
+        # Not from torch's global generator, which starts equally in every process.
         self.generator.manual_seed(randbelow(LAST_SEED + 1) if seed is None else seed)
 
     def draw_seeds(self) -> torch.Tensor:
@@ -150,7 +150,7 @@ class Clock(EnvBase):
 
 
 def option_specs(env: EnvBase) -> dict[Key, Any]:
-    """Return the spec of every entry that a caller may give to ``env.reset``."""
+    """Return the spec of every entry that ``env.reset`` accepts."""
     specs = {as_key(key): spec for key, spec in env.state_spec.items(True, True)}
     return {key: spec for key, spec in specs.items() if key != STEP}
 
@@ -158,7 +158,7 @@ def option_specs(env: EnvBase) -> dict[Key, Any]:
 class Traffic(TransformedEnv):
     """A clock and the pieces that move the vehicles, as one environment."""
 
-    # Else environments around it would draw actions for the clock and not for themselves.
+    # Without this, environments around it would draw actions for the clock.
     rand_action = EnvBase.rand_action
 
     def _reset(self, tensordict: TensorDictBase | None = None, **settings: Any) -> TensorDictBase:
@@ -169,27 +169,27 @@ class Traffic(TransformedEnv):
     def compile(self, *, warmup: int | None = None, **given: Any) -> Traffic:
         """Compile ``step_and_maybe_reset``, see TorchRL's ``EnvBase.compile``.
 
-        Settings of pieces are not compared at every step, unless a ``mode``, a ``backend`` or
-        ``options`` are given.
+        Settings of pieces are compared at every step only with a ``mode``, a ``backend`` or
+        ``options``.
         """
-        own = {} if {"mode", "backend", "options"} & set(given) else compile_settings()
+        own = {} if {"mode", "backend", "options"} & set(given) else compile_settings(self.device)
         super().compile(warmup=warmup, **{**own, **given})
         return self
 
     def rand_step(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        """Take a step by a random action; without a TensorDict, the first of new episodes."""
+        """Take a step with a random action; without a TensorDict, reset first."""
         return super().rand_step(self.reset() if tensordict is None else tensordict)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if tensordict.get(SEED, None) is None or tensordict.get(STEP, None) is None:
             raise ConfigError(
-                "a step begins at what reset or step_mdp returned: the state of the episodes is "
-                f"in the TensorDict, here only {', '.join(map(str, tensordict.keys()))}"
+                "a step needs the TensorDict of reset or step_mdp, which holds the state of the "
+                f"episodes, got only {', '.join(map(str, tensordict.keys()))}"
             )
         return super()._step(tensordict)
 
     def _moment_keys(self) -> set[Key]:
-        """Return the keys of everything that a reset writes."""
+        """Return the keys that a reset writes."""
         specs = (self.full_observation_spec, self.full_done_spec)
         return {as_key(key) for spec in specs for key in spec.keys(True, True)}
 
@@ -200,12 +200,12 @@ class Traffic(TransformedEnv):
                 f"has, got {list(tensordict.batch_size)}"
             )
         for key in self.action_keys:
-            # Another shape may fit nevertheless: one action would drive every vehicle.
-            # Another type would spread to what is observed.
+            # Other shapes may broadcast: one action would drive every vehicle. Other types would
+            # change the type of observations.
             found, wanted = tensordict.get(key, None), self.full_action_spec[key]
             if found is None:
                 continue
-            # A transform may take any size, −1, of several actions in a row.
+            # −1 stands for any size: a transform may take several actions in a row.
             sizes = zip(found.shape, wanted.shape, strict=False)
             fits = found.ndim == wanted.ndim and all(x == y or y < 0 for x, y in sizes)
             if fits and found.dtype == wanted.dtype:
@@ -214,17 +214,17 @@ class Traffic(TransformedEnv):
             raise ConfigError(f"{'.'.join(as_key(key))} must be {expected}, got {got}")
 
     def _check_options(self, given: TensorDictBase) -> None:
-        """Check what a caller gives to ``reset``; TorchRL would ignore what it does not know.
+        """Check the argument of ``reset``; TorchRL would ignore unknown entries.
 
         Raises:
-            ConfigError: naming the key, what was expected and the options that exist.
+            ConfigError: naming the key, what was expected and the valid options.
         """
         options = option_specs(self)
         names = ", ".join(".".join(key) for key in options)
         keys = set(map(as_key, given.keys(True, True, is_leaf=is_leaf_nontensor)))
         keys -= {as_key(key) for key in (*self.reset_keys, AsyncEnvPool._env_idx_key)}
         if keys - set(options) and self._moment_keys() <= keys:
-            # TorchRL writes the first moment into what it is given; that may be given again.
+            # TorchRL writes the first state into its argument, which may be passed again.
             keys &= set(options)
         for key in sorted(keys):
             name, value = ".".join(key), given.get(key)
@@ -240,6 +240,6 @@ class Traffic(TransformedEnv):
                 raise ConfigError(f"{wanted} and finite, got {value.flatten().tolist()}")
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
-        # TorchRL looks up the shape of every reward here at every step, a twentieth of its time;
-        # the shapes were checked when the environment was built.
+        # TorchRL looks up the shape of every reward here, a twentieth of the time of a step. The
+        # shapes were checked when the environment was built.
         return next_tensordict_out

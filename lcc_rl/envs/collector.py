@@ -1,4 +1,4 @@
-"""A TorchRL collector that plays an environment with as little bookkeeping as possible."""
+"""A TorchRL collector with little overhead."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from lcc_rl.pieces.base import NEXT, Key, State, as_key, root_key
 
 
 class StringCollector(BaseCollector):
-    """Plays an environment without end and yields batches of so many frames.
+    """Plays an environment and yields batches of a number of frames.
 
-    The transitions are those of TorchRL's ``Collector``, an episode that is over being followed
-    by a new one. But TensorDicts are made once per batch, not several per step, and hold only
-    what is asked for, so that the policy and the physics are what takes the time.
+    The transitions are those of TorchRL's ``Collector``; a new episode follows one that is over.
+    TensorDicts are made once per batch, not several times per step, and hold the requested entries
+    only, so most of the time is spent in the policy and the physics.
 
     Args:
-        create_env_fn: the environment, ``[batch]`` episodes side by side, or a function that
-            makes it.
+        create_env_fn: the environment with ``[batch]`` parallel episodes, or a function that
+            returns it.
         policy: writes the action into a TensorDict with its ``in_keys``; None for random actions.
-        frames_per_batch: frames of one batch: steps times episodes side by side.
+        frames_per_batch: frames of a batch: steps times parallel episodes.
         total_frames: frames after which iteration ends; −1: never.
-        keys: the entries of a batch, those of the next state under ``"next"``; a key of
-            several entries stands for all of them. None: all entries.
-        compiled: compile the step, policy included; where there is no compiler, one line of the
-            log says so and the plain step is used.
+        keys: entries of a batch, those of the next state under ``"next"``; a nested key stands
+            for all entries below it. None: all entries.
+        compiled: compile the step and the policy; without a compiler the plain step is used, which
+            is logged.
 
     Raises:
-        ConfigError: if the frames are no multiple of the episodes side by side, or the
-            environment has transforms other than pieces and the single-agent view.
+        ConfigError: if the frames are no multiple of the parallel episodes, or the environment has
+            transforms other than pieces and the single-agent view.
     """
 
     def __init__(
@@ -76,18 +76,18 @@ class StringCollector(BaseCollector):
         self.keys = self._asked(keys, list(state))
         wanted = {*(self._inner(root_key(key)) for key in self.keys), DONE}
         wanted |= {self._inner(key) for key in self.reads}
-        # Pieces that none of this depends on, which only an evaluation measures, are left out.
+        # Pieces on which none of these entries depend are left out.
         self.step = Step(closure(pieces_of(env), wanted), env.base_env.horizon)
         self.first = Step(pieces_of(env), env.base_env.horizon)  # a reset may read more
         self.carried = self._needed()
         self.state = {key: value for key, value in state.items() if key in self.carried}
-        self.advance = Compiled(self._advance, "the environment", compiled)
-        self.renew = Compiled(self._renewed, "its resets", compiled)
-        # A compiled reset takes so many episodes at once, about twice as many as end in a step.
+        self.advance = Compiled(self._advance, "the environment", compiled, env.device)
+        self.renew = Compiled(self._renewed, "its resets", compiled, env.device)
+        # Number of episodes of a compiled reset, about twice as many as end in a step.
         self.rows = min(episodes, max(32, episodes // 64)) if compiled else 0
 
     def _asked(self, keys: Sequence[NestedKey] | None, state: list[Key]) -> list[Key]:
-        """Return the leaves that a batch holds; by default all entries before and after a step."""
+        """Return the leaves of a batch; by default all entries before and after a step."""
         rewards = [as_key(key) for key in self.env.full_reward_spec.keys(True, True)]
         known = [self._shown(key) for key in [*state, self._inner(self.action)]]
         after = [(NEXT, *self._shown(key)) for key in [*state, *rewards]]
@@ -96,22 +96,22 @@ class StringCollector(BaseCollector):
         return list(dict.fromkeys(leaf for key in asked for leaf in leaf_keys(key, every)))
 
     def _inner(self, key: Key) -> Key:
-        """Return the key under which the pieces know an entry."""
+        """Return the key of an entry for the pieces."""
         return group_key(key) if self.single else key
 
     def _shown(self, key: Key) -> Key:
-        """Return the key under which the environment shows an entry of the pieces."""
+        """Return the key of an entry of the pieces in the environment."""
         inner = self.single and key[:1] == ("automated",) and group_key(key[1:]) == key
         return key[1:] if inner else key
 
     def _needed(self) -> set[Key]:
-        """Return the entries of a moment that the next step reads, or that a batch shows."""
+        """Return the entries of a state that the next step reads or a batch contains."""
         read = {DONE, *map(self._inner, self.reads)}
         read |= {self._inner(key) for key in self.keys if key[0] != NEXT}
         return read | read_before(piece for piece, _ in self.step.pieces)
 
     def reset(self) -> None:
-        """Begin new episodes everywhere."""
+        """Begin new episodes in all places."""
         begun = self._entries(self.env.reset())
         self.state = {key: value for key, value in begun.items() if key in self.carried}
 
@@ -145,7 +145,7 @@ class StringCollector(BaseCollector):
         return segment
 
     def _act(self, state: State) -> State:
-        """Return a moment with the policy's action."""
+        """Return a state with the policy's action."""
         seen = TensorDict(batch_size=self.env.batch_size)
         for key in self.reads:
             seen.set(key, self._look(state, key))
@@ -165,29 +165,29 @@ class StringCollector(BaseCollector):
         return after, kept, reached[DONE].any()
 
     def _look(self, state: State, key: Key) -> Tensor:
-        """Return an entry as the environment shows it."""
+        """Return an entry in the form that the environment shows."""
         inner = self._inner(key)
         return state[key] if inner == key else state[inner].squeeze(-2)
 
     def _renew(self, state: State, renewed: Callable[..., State], size: int = 0) -> State:
-        """Begin a new episode where one is over.
+        """Begin a new episode in every place where one is over.
 
         Args:
             state: the next state.
-            renewed: :meth:`_renewed`, or the same compiled.
-            size: for how many episodes it is compiled; 0 for any number.
+            renewed: :meth:`_renewed`, plain or compiled.
+            size: number of episodes for which it is compiled; 0 for any number.
         """
         rows = state[DONE].flatten().nonzero().flatten()
         seeds = self.env.base_env.draw_seeds().view(-1, 1)[rows]
         for first in range(0, len(rows), size or len(rows)):
-            # The last one repeated fills up what is lacking: it is written twice.
+            # Missing episodes are filled by repeating the last one, which is written twice.
             last = first + (size or len(rows))
             places = torch.arange(first, last, device=rows.device).clamp(max=len(rows) - 1)
             state = renewed(state, rows[places], seeds[places])
         return state
 
     def _renewed(self, state: State, rows: Tensor, seeds: Tensor) -> State:
-        """Return the moment with the first one of new episodes, by their seeds, in some rows."""
+        """Return the state with the first states of new episodes, by their seeds, in some rows."""
         begun = self.first.begin(seeds)
 
         def put(value: Tensor, new: Tensor) -> Tensor:
@@ -206,12 +206,12 @@ class StringCollector(BaseCollector):
         return int(following)
 
     def state_dict(self) -> OrderedDict[str, Any]:
-        """Return the moment at which the episodes are and the frames played."""
+        """Return the state of the episodes and the number of frames played."""
         state = {".".join(key): value for key, value in self.state.items()}
         return OrderedDict(frames=self._frames, iter=self._iter, state=state)
 
     def load_state_dict(self, state_dict: OrderedDict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
+        """Restore the result of :meth:`state_dict`."""
         self._frames, self._iter = state_dict["frames"], state_dict["iter"]
         self.state = {tuple(key.split(".")): value for key, value in state_dict["state"].items()}
 
@@ -227,7 +227,7 @@ def _is_single(env: TransformedEnv) -> bool:
     """Whether an environment shows the single-agent view.
 
     Raises:
-        ConfigError: if it has other transforms, whose effect a collector of pieces would lose.
+        ConfigError: if it has other transforms, which a collector of pieces would not apply.
     """
     others = [t for t in env.transform if t not in pieces_of(env)]
     strange = [type(t).__name__ for t in others if not isinstance(t, SingleAgent)]

@@ -1,4 +1,4 @@
-"""From a configuration to an environment."""
+"""Builds environments from configurations."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from lcc_rl.pieces.hybrid import check_spacing
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import TARGET, parse, path_of
 
-MOMENTS = 3  # in memory at the least: the one left, the one reached, and what they are made with
+MOMENTS = 3  # least states in memory: before and after a step, and intermediate results
 
 
 def build_env(
@@ -62,16 +62,16 @@ def build_env(
         cfg: configuration with the nodes ``scenario``, ``observation`` and ``reward``.
         profiles: speed profiles of the leader.
         population: the human drivers.
-        batch_size: episodes side by side.
-        seed: seed of the episodes' seeds; None: one is drawn at random.
-        device: where the tensors live.
+        batch_size: parallel episodes.
+        seed: seed of the generator of the episodes' seeds; None: drawn at random.
+        device: device of the tensors.
         nominal: leaders and starts as in an evaluation, without the deviations of training.
 
     Returns:
         A TorchRL environment; docs/entries.md lists its entries.
 
     Raises:
-        ConfigError: naming the option at fault, or saying what the batch needs in memory.
+        ConfigError: naming the option at fault, or the memory that the batch needs.
     """
     scenario, device = cfg.scenario, device and torch_device(device)
     world = world_of(cfg, profiles, population, nominal)
@@ -94,7 +94,7 @@ def build_env(
 def world_of(
     cfg: StudyConfig, profiles: Any = None, population: Any = None, nominal: bool = False
 ) -> World:
-    """Return what the pieces of a configuration share; arguments as of :func:`build_env`."""
+    """Return the world of a configuration's pieces; arguments as for :func:`build_env`."""
     scenario = cfg.scenario
     return World(
         scenario.vehicles,
@@ -111,10 +111,10 @@ def world_of(
 
 
 def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
-    """Return a configuration whose episodes begin with some seconds in which humans drive all.
+    """Return a configuration in which human drivers drive all vehicles for the first seconds.
 
     Raises:
-        ConfigError: if that is no number of steps, or the road is open.
+        ConfigError: if that is no multiple of the time step, or the road is open.
     """
     if not seconds:
         return cfg
@@ -132,10 +132,10 @@ def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
 
 
 def after_uncounted(cfg: StudyConfig) -> tuple[StudyConfig, int, int]:
-    """Return what an evaluation drives, its first steps for humans alone, and its warm-up's steps.
+    """Return the configuration of an evaluation, the steps of human drivers and of the warm-up.
 
     Raises:
-        ConfigError: if a duration is no number of steps, or nothing is left to count.
+        ConfigError: if a duration is no multiple of the time step, or the warm-up is too long.
     """
     settings, scenario = cfg.evaluation, cfg.scenario
     warm = World(time_step=scenario.time_step).steps(settings.warm_up, "evaluation.warm_up")
@@ -149,7 +149,7 @@ def after_uncounted(cfg: StudyConfig) -> tuple[StudyConfig, int, int]:
 
 
 def _by_role(scenario: ScenarioConfig, group: str) -> list[tuple[str, Node]]:
-    """Return what a group describes by role, of the roles that the string has.
+    """Return the nodes of a group by role, for the roles in the string.
 
     Raises:
         ConfigError: if it names a role that has no controller.
@@ -166,7 +166,7 @@ def _check_roles(roles: Iterable[str], where: str, scenario: ScenarioConfig) -> 
 
 
 def _size(pieces: Sequence[Piece], batch_size: Sequence[int] | int) -> int:
-    """Return the bytes that a step of a batch of episodes needs at the least."""
+    """Return the least memory that a step of a batch of episodes needs [bytes]."""
     size = torch.Size([1])
     layouts = [one for piece in pieces for one in piece.layouts(size, piece.targets).values()]
     moment = sum(shape.numel() * dtype.itemsize for shape, dtype in layouts)
@@ -176,13 +176,12 @@ def _size(pieces: Sequence[Piece], batch_size: Sequence[int] | int) -> int:
 def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
     """Build the pieces of a configuration in the order in which they act.
 
-    The leader; the controllers of the roles that occur, their filters and actuators; the motion of
-    the string; sensors; the further pieces of the scenario; and, where there are automated
-    vehicles, what they observe and are rewarded with.
+    The order is: leader; controllers of the roles, filters and actuators; motion of the string;
+    sensors; further pieces of the scenario; and, with automated vehicles, observation and reward.
 
     Args:
         cfg: configuration with the nodes ``scenario``, ``observation`` and ``reward``.
-        world: what the pieces share.
+        world: see :class:`lcc_rl.pieces.world.World`.
 
     Raises:
         ConfigError: naming the option at fault.
@@ -209,19 +208,19 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
     pieces.append(cfg.observation.made(Piece).bind(world))
     terms = cfg.reward.terms
     pieces += [node.made(Piece).bind(world, name) for name, node in terms.items()]
-    # The sum stays last, before collisions of the next step.
+    # The sum is last, before collisions of the next step.
     return [*pieces, TotalReward(terms=list(terms)).bind(world)]
 
 
 def _watchers(drivers: Sequence[Controller | CBFFilter], world: World) -> list[Piece]:
-    """Build the pieces that record what the filters promise, and what they change."""
+    """Build the pieces that record the filters' guarantees and corrections."""
     filters = {piece.role: piece for piece in drivers if isinstance(piece, CBFFilter)}
     changed = [
         Corrected(max_acceleration=piece.max_acceleration).bind(world, piece.role)
         for piece in drivers
         if isinstance(piece, Action) and piece.role in filters
     ]
-    return [*(piece.watch() for piece in filters.values() if piece.answers), *changed]
+    return [*(piece.watch() for piece in filters.values() if piece.guaranteed), *changed]
 
 
 def _leader(scenario: ScenarioConfig, node: Any, world: World) -> list[Piece]:
@@ -235,7 +234,7 @@ def _leader(scenario: ScenarioConfig, node: Any, world: World) -> list[Piece]:
 
 
 def _drivers(scenario: ScenarioConfig, world: World) -> list[Any]:
-    """Build the controllers of the roles that occur, and their safety filters."""
+    """Build the controllers of the roles in the string, and their safety filters."""
     for role in world.string.names:
         if scenario.controllers.get(role) is None:
             known = ", ".join(name for name, node in scenario.controllers.items() if node)
@@ -250,7 +249,7 @@ def _drivers(scenario: ScenarioConfig, world: World) -> list[Any]:
 def _motion(scenario: ScenarioConfig, world: World) -> StringMotion:
     string = world.string
     if not string.ring and scenario.circumference is not None:
-        raise ConfigError("scenario.circumference is of use on scenario.road=ring only")
+        raise ConfigError("scenario.circumference needs scenario.road=ring")
     named = {role: node for role, node in scenario.start.items() if role in string.names and node}
     start = {} if string.ring else {role: node.made(CALLED) for role, node in named.items()}
     names = ("circumference", "circumference_range", "vehicle_length", "initial_speed")
@@ -267,22 +266,22 @@ def make_env(
     held_out: bool = False,
     single: bool | None = None,
 ) -> TransformedEnv:
-    """Build the environment of a variant, as the command line would.
+    """Build the environment of a variant, as the command line does.
 
     Args:
         variant: ``"alcc"``, ``"reference"``, ``"idm"`` … (``conf/variant``).
-        batch_size: episodes side by side.
+        batch_size: parallel episodes.
         overrides: further command-line overrides, e.g. ``["scenario.horizon=100"]``.
-        seed: seed of the episodes' seeds; None: one is drawn at random, so that the environments
-            of several workers play different episodes. ``env.set_seed`` begins another series.
-        device: where the tensors live.
-        held_out: play the evaluation profiles instead of the training ones, as an evaluation.
+        seed: seed of the generator of the episodes' seeds; None: drawn at random, so that workers
+            play different episodes. ``env.set_seed`` sets it anew.
+        device: device of the tensors.
+        held_out: play the evaluation profiles instead of the training profiles.
         single: show the entries of the one automated vehicle at the root, see
-            :class:`lcc_rl.envs.SingleAgent`; None: where there is just one.
+            :class:`lcc_rl.envs.SingleAgent`; None: if there is exactly one.
 
     Raises:
-        ConfigError: if the variant or an override is unknown, or ``single`` is asked for and
-            there is not just one automated vehicle.
+        ConfigError: if the variant or an override is unknown, or with ``single`` there is not
+            exactly one automated vehicle.
 
     Examples:
         >>> env = make_env("alcc", batch_size=1024)  # doctest: +SKIP

@@ -1,4 +1,4 @@
-"""What a study is made from: leaders' speed profiles to train and to evaluate on, and drivers."""
+"""Inputs of a study: speed profiles of leaders for training and evaluation, and drivers."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from lcc_rl.pieces.controllers import Population
 from lcc_rl.settings import TARGET
 
 BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"  # of a table, by default the shipped one
-LOADS = ("load",)  # what sources of episodes and of leaders have
+LOADS = ("load",)  # method of sources of episodes and of leaders
 MEANT = ("power", "path_power", "stored_energy", "acceleration_loss", "infeasible")
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a study is made from.
+    """Inputs of a study.
 
     Args:
-        training: speed profiles for training; none where all are for evaluation.
-        evaluation: speed profiles held out, as windows of one horizon.
+        training: speed profiles for training; none if all are for evaluation.
+        evaluation: held-out speed profiles, windows of one horizon.
         population: the human drivers.
-        report: what was read and dropped, as plain lines.
-        cases: runs that are looked at closely.
+        report: lines on the data that were read and dropped.
+        cases: records that are shown as time series.
         full_length: whole records to drive.
     """
 
@@ -58,7 +58,7 @@ class Inputs:
         if not len(self.training):
             raise ConfigError(
                 "no profile is left to train on: evaluation_share=1 of split or "
-                "leader, is for evaluations of what no training has seen; hold out less"
+                "leader holds out all of them; hold out less"
             )
         return self.training
 
@@ -76,7 +76,7 @@ def build_drivers(cfg: StudyConfig) -> Population:
 def build_energy(cfg: StudyConfig) -> Fleet:
     """Build the classes of vehicles of a configuration: those of ``energy``, then of the scenario.
 
-    Without the node ``energy``, its only class has the energy model of the ALCC paper.
+    Without the node ``energy`` the only class has the energy model of the ALCC paper.
 
     Raises:
         ConfigError: naming the option at fault.
@@ -87,11 +87,11 @@ def build_energy(cfg: StudyConfig) -> Fleet:
 
 
 def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
-    """Read what the leader drives, split it and build the population.
+    """Read the leaders' records, split them and build the population.
 
     Args:
         cfg: configuration of a study.
-        episodes: table of episodes if already at hand; else ``cfg.data`` is read.
+        episodes: table of episodes; None: ``cfg.data`` is read.
 
     Raises:
         DataError, ConfigError: naming the file, row or option at fault.
@@ -100,8 +100,8 @@ def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
     population = build_drivers(cfg)
     if scenario.road == RING:
         names = [f"ring {number}" for number in range(cfg.evaluation.profiles or 1)]
-        nobody = constant_profiles(0.0, scenario.horizon, scenario.time_step, names)
-        return Inputs(nobody, nobody, population, (described(population, cfg),))
+        empty = constant_profiles(0.0, scenario.horizon, scenario.time_step, names)
+        return Inputs(empty, empty, population, (described(population, cfg),))
     wanted = len(cfg.scenario.vehicles) if cfg.evaluation.rows == "vehicles" else None
     leaders = _source_of_leaders(cfg, episodes).load(scenario.time_step, scenario.horizon, wanted)
     windows, training = leaders.windows, leaders.training
@@ -122,7 +122,7 @@ def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
 
 
 def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
-    """Build what ``leader`` describes; without it, the leaders of ``data`` divided by ``split``."""
+    """Build the node ``leader``; without it, the leaders of ``data`` divided by ``split``."""
     if cfg.leader is not None:
         return cfg.leader.made(LOADS)
     loaded = load_episodes(cfg.data) if episodes is None else LoadedEpisodes(episodes, [])
@@ -136,12 +136,12 @@ def described(population: Population, cfg: StudyConfig) -> str:
     speed, gap = population.desired_speed, population.time_gap
     own = cfg.leader is not None and "source" not in cfg.leader.settings
     leaders = cfg.leader if own else cfg.data
-    whose = leaders.settings.get("path") or "synthetic or shipped traffic"
-    behind = "on a ring" if cfg.scenario.road == RING else f"behind leaders of {whose}"
+    source = leaders.settings.get("path") or "synthetic or shipped traffic"
+    behind = "on a ring" if cfg.scenario.road == RING else f"behind leaders of {source}"
     mode = getattr(population, "mode", None)
     taken = f", drivers.mode={mode}" if mode else ""
-    who = f"{len(gap)} human drivers ({origin_of(cfg.drivers)}{taken})"
-    line = f"{who} {behind}: mean v0 {speed.mean():.1f} m/s, mean T {gap.mean():.2f} s"
+    drivers = f"{len(gap)} human drivers ({origin_of(cfg.drivers)}{taken})"
+    line = f"{drivers} {behind}: mean v0 {speed.mean():.1f} m/s, mean T {gap.mean():.2f} s"
     reaction = getattr(population, "reaction", None)
     if reaction is None or reaction == Reaction():
         return line
@@ -150,7 +150,7 @@ def described(population: Population, cfg: StudyConfig) -> str:
 
 
 def origin_of(drivers: Node) -> str:
-    """Return where drivers come from; of a function of the user's own only its name is known."""
+    """Return the origin of drivers, or the name of the user's function that returns them."""
     if drivers.settings[TARGET] != BOOTSTRAP:
         return drivers.name
     path = drivers.settings.get("path")
@@ -165,13 +165,13 @@ def constant_profiles(
     return from_records(records, list(names), list(names), time_step)
 
 
-# What this process read last: its key and the value, by what it is.
+# Values that this process read last, with their keys, by kind.
 _last: dict[str, tuple[str, Any]] = {}
-SHARED = "data: read once, by an earlier run of this process; the lines of that reading:"
+SHARED = "data: read by an earlier run of this process, which reported:"
 
 
 def _once(what: str, plain: dict[str, Any], make: Callable[[], Any]) -> tuple[Any, bool]:
-    """Return what settings and the files that they name make, and whether it was at hand."""
+    """Return the value of settings and the files that they name, and whether it was cached."""
     key = json.dumps([plain, inputs_of(plain)], default=str)
     known = what in _last and _last[what][0] == key
     if not known:
@@ -180,7 +180,7 @@ def _once(what: str, plain: dict[str, Any], make: Callable[[], Any]) -> tuple[An
 
 
 def shared_inputs(cfg: StudyConfig) -> Inputs:
-    """Load inputs as :func:`load_inputs`; environments made in a row of equal settings share them.
+    """Load inputs as :func:`load_inputs`; consecutive environments of equal settings share them.
 
     Raises:
         DataError, ConfigError: naming the file, row or option at fault.
@@ -190,7 +190,7 @@ def shared_inputs(cfg: StudyConfig) -> Inputs:
 
 
 def load_episodes(node: Node) -> LoadedEpisodes:
-    """Load episodes; the runs of a sweep that one process does share those of the same files.
+    """Load episodes; runs of a sweep in one process share those of the same files.
 
     Args:
         node: the node ``data`` of a configuration.
@@ -206,11 +206,11 @@ def load_episodes(node: Node) -> LoadedEpisodes:
 
 
 def shortfalls(cfg: StudyConfig, available: Mapping[str, int]) -> list[str]:
-    """Return a line for everything that an evaluation asks more of than there is.
+    """Return a line for every count of an evaluation that exceeds the available data.
 
     Args:
         cfg: configuration of a study.
-        available: how many there are, by setting, and by the source's name after it.
+        available: available numbers by ``"<setting>"`` or ``"<setting> <source>"``.
     """
     lines = []
     for what, count in available.items():

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.compiled import Traced
@@ -26,8 +26,6 @@ from lcc_rl.pieces.base import (
 )
 from lcc_rl.pieces.views import NEXT
 
-ActionFunction = Callable[[Tensor], Tensor]
-
 
 class DifferentiableRollout:
     """Plays an environment step by step without its bookkeeping, keeping the graph of gradients.
@@ -40,6 +38,8 @@ class DifferentiableRollout:
 
     Args:
         env: the environment, without the single-agent view.
+        policy: maps an observation ``[…, A, observations]`` to an action in [−1, 1], for each
+            vehicle by itself. Parameters that need no gradient yet get none later.
         wanted: entries of the next state that the record must hold, with their gradient.
         observed: further entries that the record must hold; what only they need gets none.
         compiled: compile the step, for a batch size once; where there is no compiler, one line
@@ -49,6 +49,7 @@ class DifferentiableRollout:
     def __init__(
         self,
         env: TransformedEnv,
+        policy: nn.Module,
         wanted: Iterable[NestedKey],
         observed: Iterable[NestedKey] = (),
         compiled: bool = False,
@@ -70,7 +71,12 @@ class DifferentiableRollout:
         read = read_before(inside) & known
         self.moving = sorted((kept | read | {STEP}) - {ACTION, *self.constants})
         self.recorded = sorted(kept)
+        self.policy = policy
+        self.learned = {name: x for name, x in policy.named_parameters() if x.requires_grad}
+        tensors = dict(policy.named_parameters()) | dict(policy.named_buffers())
+        self.fixed = {name: x for name, x in tensors.items() if name not in self.learned}
         self.advance = Traced(self._advance, "the simulator", compiled)
+        self.drive = Traced(self._drive, "the simulator with its policy", compiled)
         self.pull = Traced(self._pull, "its gradient", compiled)
 
     def start(self, given: TensorDictBase | None = None) -> State:
@@ -86,18 +92,14 @@ class DifferentiableRollout:
         action = self.env.full_action_spec[ACTION].zero()
         row, held = self._packed(state), [state[key] for key in self.constants]
         for _ in range(steps):
-            row, _ = self.advance(row, action, *held)
+            (row,) = self.advance(row, action, *held)
         return state | self._entries(row)
 
-    def play(
-        self, state: State, network: ActionFunction, steps: int, shifts: Tensor | None = None
-    ) -> tuple[State, State]:
-        """Let a policy drive for some steps.
+    def play(self, state: State, steps: int, shifts: Tensor | None = None) -> tuple[State, State]:
+        """Let the policy drive for some steps.
 
         Args:
             state: the moment to begin at, to which no gradient flows back.
-            network: from observation ``[…, A, observations]`` to action in [−1, 1], for each
-                vehicle by itself.
             steps: how many.
             shifts: added to the actions, which stay in [−1, 1], ``[steps, batch, A, 1]``.
 
@@ -105,26 +107,20 @@ class DifferentiableRollout:
             The last moment, and the :attr:`recorded` entries of each moment, ``[batch, steps + 1,
             …]``, those of the last one with action zero.
         """
-
-        def act(seen: Tensor, step: Any) -> Tensor:
-            action = network(seen)
-            return action if shifts is None else (action + shifts[step]).clamp(-1.0, 1.0)
-
-        held, taken = [state[key] for key in self.constants], []
+        if shifts is None:
+            shifts = self.env.full_action_spec[ACTION].zero().expand(steps, -1, -1, -1)
+        held = [state[key] for key in self.constants] + list(self.fixed.values())
+        passed, taken = [self._packed(state)], []
         with torch.no_grad():
-            passed, seen = [self._packed(state)], [state[OBSERVATION]]
             for step in range(steps):
-                taken.append(act(seen[-1], step).contiguous())
-                row, reached = self.advance(passed[-1], taken[-1], *held)
+                given = passed[-1], shifts[step], *held, *self.learned.values()
+                row, action = self.drive(*given)
                 passed.append(row)
-                seen.append(reached)
-            rows, actions, known = (torch.stack(x) for x in (passed, taken, seen[:-1]))
-        # What was seen is known: the policy is differentiated for all steps at once.
-        if torch.is_grad_enabled() and (again := act(known.requires_grad_(), ...)).requires_grad:
-            slopes = torch.autograd.grad(
-                again.sum(), known, retain_graph=True, allow_unused=True, materialize_grads=True
-            )
-            rows, actions = _Motion.apply(again, rows, actions, *slopes, held, self.pull)
+                taken.append(action)
+            rows, actions = torch.stack(passed), torch.stack(taken)
+        if torch.is_grad_enabled():
+            weights = self.learned.values()
+            rows, actions = _Motion.apply(self.pull, rows, actions, held, shifts, *weights)
         moments = self._entries(rows)
         last = state | {key: value[-1] for key, value in moments.items()}
         moments |= {key: state[key].expand(steps + 1, *state[key].shape) for key in self.constants}
@@ -159,65 +155,81 @@ class DifferentiableRollout:
         return entries
 
     def _advance(self, row: Tensor, action: Tensor, *held: Tensor) -> Sequence[Tensor]:
-        """Return the next moment and its observation; what is held are the constants."""
+        """Return the next moment; what is held are the constants."""
         before = dict(zip(self.constants, held, strict=True)) | self._entries(row)
-        reached = self.step({**before, ACTION: action})
-        return self._packed(reached), reached[OBSERVATION].contiguous()
+        return (self._packed(self.step({**before, ACTION: action})),)
+
+    def _drive(self, row: Tensor, shift: Tensor, *held: Tensor) -> Sequence[Tensor]:
+        """Return the next moment and the action before it.
+
+        Args:
+            row: a moment.
+            shift: added to the policy's action.
+            held: the constants, the policy's fixed tensors, its learned ones.
+        """
+        constants, tensors = held[: len(self.constants)], held[len(self.constants) :]
+        named = dict(zip((*self.fixed, *self.learned), tensors, strict=True))
+        seen = self._entries(row)[OBSERVATION].contiguous()
+        action = torch.func.functional_call(self.policy, named, (seen,))
+        action = (action + shift).clamp(-1.0, 1.0)
+        return *self._advance(row, action, *constants), action
 
     def _pull(
         self,
         later: Tensor,
         by_row: Tensor,
         by_action: Tensor,
-        slope: Tensor,
         row: Tensor,
-        action: Tensor,
+        shift: Tensor,
         *held: Tensor,
     ) -> Sequence[Tensor]:
-        """Return the gradient by a moment and by its action.
+        """Return the gradient by a moment, by its shift, and by the learned tensors so far.
 
         Args:
             later: the gradient by the next moment.
             by_row, by_action: what does not come through the next moment.
-            slope: the derivative of the action by the observation.
-            row, action, held: as for :meth:`_advance`.
+            row, shift: as for :meth:`_drive`.
+            held: likewise, and the gradient by the learned tensors from later moments.
         """
+        count = len(self.learned)
+        first = len(held) - 2 * count
         with torch.enable_grad():
-            given = row.detach().requires_grad_(), action.detach().requires_grad_()
-            found = torch.autograd.grad(self._advance(*given, *held)[:1], given, [later])
-        by_action = by_action + found[1]
-        at = sum(self.sizes[: self.moving.index(OBSERVATION)])
-        seen = reverse(slope * by_action).flatten(0, -2)
-        parts = (found[0] + by_row).split([at, len(seen), len(row) - at - len(seen)])
-        return torch.cat([parts[0], parts[1] + seen, parts[2]]), by_action
+            given = [x.detach().requires_grad_() for x in (row, shift, *held[first:][:count])]
+            reached = self._drive(*given[:2], *held[:first], *given[2:])
+            found = torch.autograd.grad(
+                reached, given, [later, by_action], allow_unused=True, materialize_grads=True
+            )
+        sums = (x + y for x, y in zip(held[first + count :], found[2:], strict=True))
+        return found[0] + by_row, found[1], *sums
 
 
 class _Motion(torch.autograd.Function):
-    """The record of a play as a function of its actions, differentiated step by step."""
+    """The record of a play as a function of shifts and learned tensors."""
 
     @staticmethod
     def forward(
         ctx: Any,
-        again: Tensor,
+        pull: Traced,
         rows: Tensor,
         actions: Tensor,
-        slopes: Tensor,
         held: Sequence[Tensor],
-        pull: Traced,
+        shifts: Tensor,
+        *learned: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        ctx.save_for_backward(slopes, rows, actions, *held)
-        ctx.pull = pull
+        ctx.save_for_backward(rows, shifts, *held, *learned)
+        ctx.pull, ctx.learned = pull, len(learned)
         return rows.clone(), actions.clone()
 
     @staticmethod
     def backward(ctx: Any, by_rows: Tensor, by_actions: Tensor) -> tuple[Tensor | None, ...]:
-        slopes, rows, actions, *held = ctx.saved_tensors
-        columns = by_rows.contiguous(), by_actions.contiguous(), slopes, rows, actions
-        later, found = columns[0][-1], torch.empty_like(actions)
-        for step in reversed(range(len(actions))):
+        rows, shifts, *held = ctx.saved_tensors
+        columns = by_rows.contiguous(), by_actions.contiguous(), rows, shifts
+        later, by_shifts = columns[0][-1], torch.empty_like(shifts)
+        sums = [torch.zeros_like(x) for x in held[len(held) - ctx.learned :]]
+        for step in reversed(range(len(shifts))):
             given = (column[step] for column in columns)
-            later, found[step] = ctx.pull(later, *given, *held)
-        return found, None, None, None, None, None
+            later, by_shifts[step], *sums = ctx.pull(later, *given, *held, *sums)
+        return None, None, None, None, by_shifts, *sums
 
 
 def _is_recurrent(piece: Piece) -> bool:

@@ -1,8 +1,8 @@
 """Functions of tensors as loops over rows of numbers, in machine code.
 
-An operation on a tensor costs torch some microseconds, however small the tensor. A step of one
-episode is about 300 operations on one row; as statements on single numbers it takes a few
-microseconds. The statements are not written anywhere: they are recorded from the function itself.
+An operation on a tensor costs torch some microseconds for any size. A step of one episode is about
+300 operations on one row; as statements on single numbers it takes a few microseconds. The
+statements are recorded from the function itself.
 """
 
 from __future__ import annotations
@@ -28,14 +28,13 @@ TensorFunction = Callable[..., Sequence[Tensor]]
 class Rowwise:
     """A function of rows of numbers, computed row by row in machine code.
 
-    If an operation of the function has no counterpart on single numbers, the function itself is
-    called, with tensors.
+    If an operation has no counterpart on single numbers, the function is called with tensors.
 
     Args:
-        function: maps tensors ``[n, width]`` to tensors ``[n, width]``; rows do not mix.
+        function: maps tensors ``[n, width]`` to tensors ``[n, width]``, row by row.
         examples: a row of each argument, ``[1, width]``.
-        what: its name in the line of the log that says that it is not translated.
-        make: makes machine code of its source.
+        what: name in the log if it is not translated.
+        make: compiles its source to machine code.
     Attributes:
         translated: whether it runs as machine code.
     """
@@ -77,7 +76,7 @@ class Rowwise:
 
 
 def translated(function: TensorFunction, examples: Sequence[Tensor]) -> tuple[str, list[Array]]:
-    """Return the source of a function on numbers, and the tables that are its last arguments.
+    """Return the source of a function of numbers, and the tables that are its last arguments.
 
     Raises:
         Untranslatable: naming the operation that has no counterpart on single numbers.

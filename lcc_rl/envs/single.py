@@ -1,4 +1,4 @@
-"""The single-agent view of a string with one automated vehicle, as stock TorchRL scripts expect."""
+"""The single-agent view of a string with one automated vehicle, for stock TorchRL scripts."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from torchrl.envs.transforms import Transform
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import Entry, Key
 
-# Entries of the group that the view shows at the root, without the dimension of one.
+# Entries of the group that the view shows at the root, without the dimension of vehicles.
 GROUP_ENTRIES = ("observation", "reward", "reward_terms")
 
 
 class SingleAgent(Transform):
-    """Presents the one automated vehicle's entries at the root, without the dimension of one.
+    """Shows the entries of the one automated vehicle at the root, without its dimension.
 
     ``("automated", "observation")``, ``[*batch, 1, n]``, becomes ``"observation"``, ``[*batch,
-    n]``; likewise ``"action"``, ``"reward"`` and ``("reward_terms", name)``. The last transform
-    of an environment.
+    n]``; likewise ``"action"``, ``"reward"`` and ``("reward_terms", name)``. It must be the last
+    transform of an environment.
     """
 
     shows = (
@@ -60,7 +60,7 @@ class SingleAgent(Transform):
 
     def _shown(self, specs: Composite, part: str, names: tuple[str, ...]) -> Composite:
         spec = specs[part]
-        if AUTOMATED not in spec.keys():  # noqa: SIM118  a rule drives: there is no action
+        if AUTOMATED not in spec.keys():  # noqa: SIM118  a rule has no action
             return specs
         group = spec[AUTOMATED]
         for name in names:
@@ -90,5 +90,5 @@ def _flat(terms: Composite) -> Composite:
 
 
 def group_key(key: Key) -> Key:
-    """Return the key of the group that the view shows under a key of the root."""
+    """Return the key in the group for a key at the root."""
     return (AUTOMATED, *key) if key[0] in (*GROUP_ENTRIES, "action") else key

@@ -1,7 +1,7 @@
 """One step of an environment as a function of plain mappings of tensors.
 
 The TorchRL environment, the collector, the differentiable rollout and the evaluation all advance
-by :func:`tick` and the pieces' :meth:`~lcc_rl.pieces.base.Piece.derive`: a :class:`Step`.
+by a :class:`Step`: :func:`tick` and the pieces' :meth:`~lcc_rl.pieces.base.Piece.derive`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, FrameSkipTransform, Transform
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.finite import any_lost, require_finite
+from lcc_rl.functional.finite import any_nonfinite, require_finite
 from lcc_rl.pieces.base import (
     ACTION,
     OBSERVATION,
@@ -36,13 +36,13 @@ from lcc_rl.pieces.rewards import RewardTerm, TotalReward
 from lcc_rl.pieces.world import World
 
 DONE, TERMINATED, TRUNCATED = ("done",), ("terminated",), ("truncated",)
-PARTIAL = "_step"  # TorchRL's name of the mask of those that take the step
-# If these entries are finite after a step, all others that matter are.
+PARTIAL = "_step"  # TorchRL's key of the mask of episodes that take the step
+# If these entries are finite after a step, so are all others that matter.
 FINITE_CHECKED = (("vehicles", "gap"), OBSERVATION, REWARD)
 
 
 def tick(seed: Tensor, step: Tensor, horizon: int) -> State:
-    """Return what the clock writes at a step of an episode, before any piece acts."""
+    """Return the entries of the clock at a step of an episode, before any piece acts."""
     truncated = step >= horizon
     terminated = zeros_like(truncated)
     return {SEED: seed, STEP: step, TRUNCATED: truncated, TERMINATED: terminated, DONE: truncated}
@@ -54,7 +54,7 @@ class Step:
     Args:
         pieces: the pieces in the order in which they act.
         horizon: steps per episode.
-        graded: the pieces whose results carry a gradient; None for all.
+        graded: pieces with a gradient; None for all.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Step:
         """Return the entries of the next state.
 
         Args:
-            before: the entries before the step that the pieces read, the action among them.
+            before: the entries before the step that the pieces read, including the action.
         """
         reached = tick(before[SEED], before[STEP] + 1, self.horizon)
         for piece, detached in self.pieces:
@@ -76,7 +76,7 @@ class Step:
         return reached
 
     def begin(self, seeds: Tensor) -> State:
-        """Return the first moment of episodes, as ``env.reset`` draws it.
+        """Return the first state of episodes, as ``env.reset`` draws it.
 
         Args:
             seeds: the seed of each episode, ``[n, 1]``, int64.
@@ -92,12 +92,12 @@ class Step:
 
 
 def written(pieces: Iterable[Piece]) -> set[Key]:
-    """Return the keys that pieces write, without ``"next"``, their constants included."""
+    """Return the keys that pieces write, including constants, without ``"next"``."""
     return {key for piece in pieces for key in piece.entries}
 
 
 def read_before(pieces: Iterable[Piece]) -> set[Key]:
-    """Return the entries of a moment that the next step reads, constants included."""
+    """Return the entries of a state that the next step reads, including constants."""
     found: set[Key] = {SEED, STEP}
     for piece in pieces:
         found |= {key for late, key in piece.needs if not late} | set(piece.constants)
@@ -105,7 +105,7 @@ def read_before(pieces: Iterable[Piece]) -> set[Key]:
 
 
 def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] = ()) -> list[Piece]:
-    """Return the chosen pieces and all that they or the wanted entries depend on, in order."""
+    """Return the chosen pieces and all on which they or the wanted entries depend, in order."""
     kept = list(chosen)
     keys = set(wanted) | {key for piece in kept for _, key in piece.needs}
     grown = True
@@ -117,8 +117,8 @@ def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] =
 
 
 def entries_of(td: TensorDictBase) -> State:
-    """Return the entries of a moment by their full keys."""
-    # Copies: entries that begin as one tensor would cost the compiler a graph of their own.
+    """Return the entries of a state by their full keys."""
+    # Copies: entries that share a tensor would need another compiled graph.
     return {key: value.clone() for key, value in _read(td).items()}
 
 
@@ -137,15 +137,15 @@ def pieces_of(env: TransformedEnv) -> list[Piece]:
 class Pieces(Compose):
     """The pieces of an environment in the order in which they act, applied as one function.
 
-    No piece has an inverse, changes the device or the size of the batch, or looks at what a step
-    leaves behind. TorchRL asks for all this at every step; here only other transforms, which a
-    user may append, are asked. A reward term appended counts in the total reward.
+    No piece has an inverse, changes the device or the batch size, or acts after a step. TorchRL
+    calls all these methods in every step; here they are called for other transforms only, which a
+    user may append. An appended reward term counts in the total reward.
     """
 
-    world: World = World()  # of reward terms that a user appends
+    world: World = World()  # the world of appended reward terms
 
     def append(self, transform: Transform | Callable[[TensorDictBase], TensorDictBase]) -> None:
-        """Append a transform; a reward term goes before the sum of all terms."""
+        """Append a transform; a reward term is inserted before the sum of all terms."""
         places = [i for i, piece in enumerate(self.transforms) if isinstance(piece, TotalReward)]
         if not isinstance(transform, RewardTerm) or not places:
             super().append(transform)
@@ -166,7 +166,7 @@ class Pieces(Compose):
         return next_tensordict
 
     def _run(self, count: int, td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
-        """Apply the first transforms to a step, pieces in one go."""
+        """Apply the first transforms to a step, consecutive pieces as one function."""
         waiting: list[Piece] = []
         for place, transform in enumerate(self.transforms[:count]):
             if isinstance(transform, Piece):
@@ -178,9 +178,9 @@ class Pieces(Compose):
         return _apply(waiting, td, next_td)
 
     def _repeat(self, place: int, td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
-        """Take further steps by the same action, whose rewards add up, until an episode ends.
+        """Repeat the action, adding up rewards, until an episode ends.
 
-        TorchRL's own transform steps from the same TensorDict again; here the state is in it.
+        TorchRL's own transform would step from the same TensorDict again, which holds the state.
         """
         skip: Any = self.transforms[place]
         rewards = skip.parent.reward_keys
@@ -194,16 +194,16 @@ class Pieces(Compose):
         return next_td
 
     def _check_numbers(self, td: TensorDictBase, next_td: TensorDictBase) -> None:
-        """Check that a step was taken by and to numbers.
+        """Check that the entries before and after a step are finite.
 
         Raises:
             Diverged: naming the first entry that is not, its step and its episode.
         """
-        telling = [td.get(ACTION, None), *(next_td.get(key, None) for key in FINITE_CHECKED)]
-        if not any_lost(value for value in telling if value is not None):
+        checked = [td.get(ACTION, None), *(next_td.get(key, None) for key in FINITE_CHECKED)]
+        if not any_nonfinite(value for value in checked if value is not None):
             return
         pieces = [piece for piece in self.transforms if isinstance(piece, Piece)]
-        named: dict[Key, Tensor | None] = {ACTION: telling[0]}
+        named: dict[Key, Tensor | None] = {ACTION: checked[0]}
         named |= {key: next_td.get(key, None) for piece in pieces for key in piece.targets}
         done = td.get(DONE, None)
         running = ones_like(next_td.get(DONE)) if done is None else ~done
@@ -212,7 +212,7 @@ class Pieces(Compose):
         require_finite(reached, running.reshape(1, batch, 1), int(next_td.get(STEP).max()))
 
     def inv(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Apply the inverse of what is not a piece, last first."""
+        """Apply the inverse of transforms that are no pieces, last first."""
         tensordict = tensordict.copy()
         for transform in reversed(self._others()):
             tensordict = transform._inv_call(tensordict)
@@ -242,7 +242,7 @@ class Pieces(Compose):
 
 
 def _read(td: TensorDictBase, place: Key = ()) -> State:
-    """Return the entries of a TensorDict by their full keys, as they are."""
+    """Return the entries of a TensorDict by their full keys, without copies."""
     found: State = {}
     for name, value in td.items():
         if isinstance(value, Tensor):
@@ -253,7 +253,7 @@ def _read(td: TensorDictBase, place: Key = ()) -> State:
 
 
 def _hold(moves: Tensor, before: State, reached: State, keys: Iterable[Key]) -> None:
-    """Put entries back to what they were, or zero, where an episode stands still in this step."""
+    """Restore entries, or set them to zero, where an episode does not take this step."""
     for key in list(keys):
         value = reached[key]
         rows = moves.reshape(*moves.shape, *[1] * (value.ndim - moves.ndim))
@@ -261,7 +261,7 @@ def _hold(moves: Tensor, before: State, reached: State, keys: Iterable[Key]) -> 
 
 
 def _apply(pieces: list[Piece], td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
-    """Apply pieces to two moments; return the second with what they write."""
+    """Apply pieces to two states; return the second one with the written entries."""
     if not pieces:
         return next_td
     before, reached = _read(td), _read(next_td)
@@ -273,7 +273,7 @@ def _apply(pieces: list[Piece], td: TensorDictBase, next_td: TensorDictBase) -> 
             piece.derive(before, reached)
         except KeyError as error:
             raise ConfigError(
-                f"{piece.title} reads {error}, which is not in the state that the step begins at: "
+                f"{piece.title} reads {error}, which is not in the state before the step: "
                 "transforms must keep it"
             ) from error
         if moves is not None and isinstance(piece, StepTransform | RewardPiece):
@@ -292,8 +292,8 @@ def _apply(pieces: list[Piece], td: TensorDictBase, next_td: TensorDictBase) -> 
 def _tensordict(entries_of: dict[str, Any], batch: BatchSize, device: device | None) -> TensorDict:
     """Return nested entries as a TensorDict.
 
-    TensorDict's own check of every shape costs as much as the physics; the shapes were checked
-    when the environment was built (:mod:`lcc_rl.envs.checks`).
+    TensorDict's check of every shape costs as much as the physics. The shapes were checked when the
+    environment was built (:mod:`lcc_rl.envs.checks`).
     """
     made = {
         name: _tensordict(value, batch, device) if isinstance(value, dict) else value

@@ -1,1 +1,1 @@
-"""Evaluation: strategies driven through the same episodes, and what is measured there."""
+"""Evaluation of strategies on the same episodes."""

@@ -1,4 +1,4 @@
-"""Blocks of rows of an evaluation, stored one by one so that it can be resumed."""
+"""Blocks of rows of an evaluation, stored separately so that it can be resumed."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from lcc_rl.version import __version__
 
 BLOCKS = "blocks"
 BLOCK_MARK = "lcc_rl.block"  # in the metadata of a block's files
-Tables = tuple[pd.DataFrame, pd.DataFrame]  # rows, and time series of sample episodes
+Tables = tuple[pd.DataFrame, pd.DataFrame]  # rows, time series of sample episodes
 
 
 def mark_of(strategy: Strategy) -> str:
-    """Return a hash of all that a strategy's rows depend on: settings, weights, version."""
+    """Return a hash of settings, weights and version, on which a strategy's rows depend."""
     digest = hashlib.sha256(f"{__version__} {strategy.name} {strategy.seed} ".encode())
     digest.update(identity(strategy.cfg).encode())
     weights = getattr(strategy.policy, "state_dict", None)
@@ -32,11 +32,11 @@ def mark_of(strategy: Strategy) -> str:
 
 
 class Store:
-    """Keeps the blocks of several strategies in a folder, or a single block in memory.
+    """Stores the blocks of several strategies in a folder, or a single block in memory.
 
     Args:
         folder: folder of the run.
-        strategies: the strategies, which methods name by their place.
+        strategies: the strategies; methods refer to them by index.
         blocks: numbers of the blocks.
     """
 
@@ -46,7 +46,7 @@ class Store:
         self.kept: dict[tuple[int, int], Tables] = {}
 
     def missing(self, strategy: int) -> list[int]:
-        """Return the blocks of a strategy that are still to be played."""
+        """Return the blocks of a strategy that are not played yet."""
         return [block for block in self.blocks if not self._has(strategy, block)]
 
     def _paths(self, strategy: int, block: int) -> tuple[Path, Path]:
@@ -63,7 +63,7 @@ class Store:
         return found.get(BLOCK_MARK) == self.marks[strategy]
 
     def put(self, strategy: int, block: int, tables: Tables) -> None:
-        """Keep a block of a strategy."""
+        """Store a block of a strategy."""
         if len(self.blocks) == 1:
             self.kept[strategy, block] = tables
             return

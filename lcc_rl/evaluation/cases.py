@@ -1,4 +1,4 @@
-"""Evaluation with one row per vehicle, on cases, held-out windows and whole records."""
+"""Evaluation with one row per vehicle: cases, held-out windows and whole records."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CaseSeries = dict[str, Tensor]  # ``[time, runs, vehicles]``
 def evaluate_cases(
     strategy: Strategy, cfg: StudyConfig, inputs: Inputs
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Drive one strategy through every case, the held-out windows and the whole records.
+    """Evaluate one strategy on all cases, held-out windows and whole records.
 
     Returns:
         One row per run and vehicle, and the time series of the cases.
@@ -90,7 +90,7 @@ def of_case(cfg: StudyConfig, case: Case) -> StudyConfig:
 def drive_runs(
     strategy: Strategy, case: Case, inputs: Inputs, seed: int = 0, device: str = "cpu"
 ) -> CaseSeries:
-    """Drive a strategy behind every record of a case, side by side.
+    """Drive a strategy behind all records of a case in parallel.
 
     Returns:
         ``leader`` ``[time + 1, runs, 1]`` and ``speed`` ``[time + 1, runs, N]``; gap, acceleration,
@@ -117,11 +117,11 @@ def drive_runs(
 def measured_series(series: CaseSeries) -> pd.DataFrame:
     """Return one row per run and vehicle.
 
-    Speed errors are e_v(i,0), as in the paper's tables. ``energy_ratio`` is Σ e_v(i,i−1)² over
-    that of the vehicle ahead (string stability: at most 1), missing for the first vehicle and
-    where nothing moves. ``energy_kj_per_km`` is that of the scenario's power over the distance
-    driven, missing for a vehicle at standstill. ``max_gap_error_m`` is the largest |e_x(i,i−1)| of
-    an automated vehicle.
+    Speed errors are e_v(i,0), as in the paper's tables. ``energy_ratio`` is Σ e_v(i,i−1)² divided
+    by that of the vehicle ahead (string stability: at most 1); it is missing for the first vehicle
+    and without motion. ``energy_kj_per_km`` is the energy of the scenario's power divided by the
+    distance, missing at standstill. ``max_gap_error_m`` is the largest |e_x(i,i−1)| of an automated
+    vehicle.
     """
     error, jerk = series["leader_speed_error"].abs(), series["jerk"].abs()
     energy = series["speed_error"].square().sum(0)
@@ -130,7 +130,7 @@ def measured_series(series: CaseSeries) -> pd.DataFrame:
     ratio[..., 1:] = torch.where(ahead > 1e-3, energy[..., 1:] / ahead.clamp(min=1e-3), torch.nan)
     keeps = series["reward"].isfinite().all(0)
     gap_error = series["gap_error"].abs().amax(0)
-    driven = 0.5 * (series["speed"][1:] + series["speed"][:-1]).sum(0)  # in steps' lengths
+    driven = 0.5 * (series["speed"][1:] + series["speed"][:-1]).sum(0)  # in units of a step
     columns = {
         "speed_error_sum": error.sum(0),
         "speed_error_squares": error.square().sum(0),
@@ -156,7 +156,7 @@ def measured_series(series: CaseSeries) -> pd.DataFrame:
 
 
 def trace(series: CaseSeries, time_step: float) -> pd.DataFrame:
-    """Return a row per moment and vehicle of the first run; the leader is vehicle 0."""
+    """Return a row per time and vehicle of the first run; the leader is vehicle 0."""
     leader = series["leader"][1:, 0]
     steps, vehicles = series["jerk"].shape[0], series["jerk"].shape[2]
     columns = {"speed_mps": torch.cat([leader, series["speed"][1:, 0]], dim=-1)}

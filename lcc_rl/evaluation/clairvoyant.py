@@ -1,9 +1,9 @@
-"""Clairvoyant bound: the best drive that the gradient finds when the whole profile is known.
+"""Clairvoyant bound: the best drive that the gradient finds if the whole profile is known.
 
-Every episode is optimised by itself. The objective is the energy of the vehicles and of all drivers
-behind them, less what the last speed stores more than the first: otherwise braking just before the
-end would pay (A2 returns more than twice the kinetic energy). In a task it is divided by the
-distance, at no less flow than that of the drive that a plan begins with.
+Every episode is optimised separately. The objective is the energy of the vehicles and all drivers
+behind them, net of kinetic energy. Otherwise braking just before the end would pay off, because A2
+returns more than twice the kinetic energy. In a task it is divided by the distance, and the flow
+must not be below that of the initial drive.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from lcc_rl.pieces.views import VEHICLES, Views
 
 CONSTRAINED = ("gap", "relative_speed", "time_gap", "speed")
 BOUND_BOTH, BOUND_OWN = "clairvoyant", "clairvoyant own"
-MARGIN = 1.01  # the limits are kept with one per cent to spare
+MARGIN = 1.01  # margin of one per cent on the limits
 LEAST_GAP = 0.5  # [m]
-FAR_GAP = 20.0  # beyond this a limit is not missed by more [m]
-LARGEST_STEP, SMALLEST_STEP = 0.02, 0.001  # of an action per iteration
-FLOW_PRICE = 3.0  # share of the energy that the loss of the whole flow costs
+FAR_GAP = 20.0  # largest excess of a gap that counts [m]
+LARGEST_STEP, SMALLEST_STEP = 0.02, 0.001  # change of an action per iteration
+FLOW_PRICE = 3.0  # cost of losing the whole flow as a multiple of the energy
 
 
 class Planned:
@@ -67,30 +67,31 @@ def clairvoyant(
     hold: int = 1,
     report: Callable[[int, dict[str, float]], None] = lambda iteration, values: None,
 ) -> Strategy:
-    """Return the best strategy found, starting from a learned controller's drive.
+    """Return the best strategy found, starting from the drive of a learned controller.
 
-    The prices of the limits (time-to-collision, time gap and gap; in a task the flow, where the
-    filter keeps the gaps) rise. The problem is not convex: there may be better drives.
+    The prices of the limits (time-to-collision, time gap and gap; in a task the flow, with the
+    gaps kept by the filter) rise. The problem is not convex: there may be better drives.
 
     Args:
-        strategy: the controller to begin with; its policy must be a network of the observation.
-        inputs, drivers, seed: as for :func:`lcc_rl.evaluation.episodes.evaluate`, which must be
-            given the same, and a batch that holds all episodes.
-        iterations: steps along the gradient.
+        strategy: the initial controller; its policy must be a network of the observation.
+        inputs, drivers, seed: as for :func:`lcc_rl.evaluation.episodes.evaluate`, which needs the
+            same values, and a batch with all episodes.
+        iterations: gradient steps.
         compiled: compile the simulator.
         own: minimise the energy of the automated vehicles only.
-        hold: steps for which a shift acts.
-        report: receives the number of the iteration, what is minimised and the price of the limits.
+        hold: number of steps of each shift.
+        report: called with the number of the iteration, the objective and the price of the limits.
 
     Raises:
-        Diverged: if an action, or an entry that is minimised or limited, is not a number.
+        Diverged: if an action or an entry of objective or limits is not finite.
     """
     require(iterations >= 1, f"iterations must be at least 1, got {iterations}")
     env, given = _episodes(strategy, inputs, drivers, seed)
-    source = DifferentiableRollout(env, [(VEHICLES, name) for name in CONSTRAINED], (), compiled)
     policy: Any = strategy.policy
     network, steps = policy.module.requires_grad_(False), env.base_env.horizon
-    # Plans follow the smooth energy; the best one is chosen by the energy that is measured.
+    keys = [(VEHICLES, name) for name in CONSTRAINED]
+    source = DifferentiableRollout(env, network, keys, (), compiled)
+    # Plans minimise the smooth energy; the best one is chosen by the measured energy.
     goal, measured = Goal(strategy.cfg, own), Goal(strategy.cfg, own, exact=True)
     cars = strategy.cfg.scenario.vehicles.count(AUTOMATED)
     held = (math.ceil(steps / hold), env.batch_size[0], cars, 1)
@@ -99,9 +100,9 @@ def clairvoyant(
     for iteration in range(iterations):
         share = iteration / iterations
         every = shifts.repeat_interleave(hold, 0)[:steps]
-        _, record = source.play(source.start(given), network, steps, every)
+        _, record = source.play(source.start(given), steps, every)
         data = source.assemble(record)
-        check_batch(data, who=strategy.title)
+        check_batch(data, label=strategy.title)
         price, missed = goal(data)
         found.take(torch.stack(measured(data)).sum(0), every)
         total = price + min(1.0, 0.1 + 1.8 * share) * missed
@@ -131,19 +132,19 @@ class Best:
 
     @torch.no_grad()
     def take(self, price: Tensor, shifts: Tensor) -> None:
-        """Keep the shifts of the episodes whose price, ``[batch]``, is lower than before."""
+        """Keep the shifts of the episodes with a lower price, ``[batch]``, than before."""
         better = price < self.price
         self.price = torch.where(better, price, self.price)
         self.shifts = torch.where(better.view(-1, 1, 1), shifts, self.shifts)
 
 
 def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float, length: float) -> None:
-    """Take a step, the longer the fewer shifts there are."""
+    """Take a step, which is longer for fewer shifts."""
     (group,) = optimizer.param_groups
     (shifts,) = group["params"]
     optimizer.zero_grad(set_to_none=True)
     price.sum().backward()
-    # Every episode is a problem of its own, of its own scale.
+    # Every episode is a separate problem with its own scale.
     shifts.grad /= shifts.grad.square().sum((0, 2, 3), keepdim=True).sqrt().clamp(min=1e-6)
     fall = 0.5 * (1.0 + math.cos(math.pi * share))
     group["lr"] = length * (SMALLEST_STEP + (LARGEST_STEP - SMALLEST_STEP) * fall)
@@ -159,7 +160,7 @@ def path_energy(
 ) -> Tensor:
     """Return the path energy of all vehicles, or of a string's automated ones, ``[batch]`` [kJ].
 
-    If ``exact``, the energy drawn less what the motion stores, which has jumps.
+    If ``exact``, it is the energy drawn net of kinetic energy, which has jumps.
     """
     now, then = data.get((VEHICLES, "speed")), data.get(("next", VEHICLES, "speed"))
     if string is not None:
@@ -179,28 +180,29 @@ def path_energy(
 
 
 class Goal:
-    """What a plan minimises, and the price of its limits, each ``[batch]`` [kJ].
+    """Objective of a plan and the price of its limits, each ``[batch]`` [kJ].
 
-    In a task: the energy less what the distance is worth, at the price that a metre takes in the
-    first drive, so that less is less energy per distance; the limit is the flow of that drive.
+    In a task the objective is the energy minus a price times the distance. The price is the energy
+    per metre of the first drive, so a smaller value means less energy per distance. The limit is
+    the flow of that drive.
 
     Args:
-        cfg: configuration of the controller to begin with.
+        cfg: configuration of the initial controller.
         own: count the energy of the automated vehicles only.
-        exact: count the energy as it is measured where the plan's is smooth.
+        exact: use the measured energy instead of the smooth one.
     """
 
     def __init__(self, cfg: StudyConfig, own: bool, exact: bool = False) -> None:
         scenario = cfg.scenario
         self.task, self.string = cfg.task is not None, scenario.vehicles
         self.length, self.time_step = scenario.vehicle_length, scenario.time_step
-        whose = self.string if own else None
+        own_string = self.string if own else None
         self.fleet = build_energy(cfg)
-        self.counted = (self.time_step, whose, self.fleet, exact and self.task)
+        self.counted = (self.time_step, own_string, self.fleet, exact and self.task)
         self.first: tuple[Tensor, Tensor] | None = None
 
     def __call__(self, data: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return both for a drive."""
+        """Return objective and price for a drive."""
         energy = path_energy(data, *self.counted)
         if not self.task:
             return energy, misses(data, self.string)
@@ -218,7 +220,7 @@ class Goal:
 
 
 def misses(data: TensorDictBase, string: VehicleString) -> Tensor:
-    """Return the price of the limits missed in each episode, ``[batch]``, zero where kept."""
+    """Return the price of missed limits in each episode, ``[batch]``; zero if they are kept."""
     views = Views(string, AUTOMATED, [f"next.self.{name}" for name in CONSTRAINED])
     gap, relative_speed, time_gap, _ = views(*(data.get(key) for key in views.keys))
     closing = -relative_speed

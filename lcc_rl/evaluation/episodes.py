@@ -1,4 +1,4 @@
-"""Evaluation with one row per episode: every driver behind every profile, in the same noise."""
+"""Evaluation with one row per episode: all pairs of profile and driver with the same noise."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.results.measures import FASTER
 
-# Steps of a strategy from which on compiling saves more than the 3 to 6 s that it takes.
+# Steps of a strategy from which compiling saves more than the 3 to 6 s that it takes.
 COMPILED_STEPS = 20_000_000
 
 
@@ -47,17 +47,17 @@ COMPILED_STEPS = 20_000_000
 class Plan:
     """The episodes of an evaluation in blocks of one size.
 
-    Every profile is paired with every driver, profiles slower than drivers, repeats slowest. A
-    block is the same, bit for bit, whichever shard plays it.
+    Every profile is paired with every driver; repeats vary slowest, drivers fastest. A block is the
+    same, bit for bit, in any shard.
 
     Args:
         profiles: number of profiles.
         population: number of drivers.
-        drivers: number of drivers that are met, spread evenly; None for all.
+        drivers: number of drivers used, spread evenly; None: all.
         batch_size: largest number of episodes of a block.
         repeats: draws of the noise of every pair.
-        shards: number of parts that the blocks are divided into.
-        shard: the part that is played, from 0.
+        shards: number of parts of the blocks.
+        shard: index of the part to play.
 
     Raises:
         ConfigError: if there are more shards than blocks.
@@ -80,22 +80,22 @@ class Plan:
 
     @cached_property
     def chosen(self) -> Tensor:
-        """The ids of the drivers that are met."""
+        """The ids of the drivers used."""
         count = min(self.drivers or self.population, self.population)
         return torch.from_numpy(np.linspace(0, self.population - 1, count).round().astype(np.int64))
 
     def __len__(self) -> int:
-        """Return the number of episodes, those of all shards."""
+        """Return the number of episodes of all shards."""
         return self.profiles * len(self.chosen) * self.repeats
 
     @property
     def blocks(self) -> int:
-        """Number of blocks, those of all shards."""
+        """Number of blocks of all shards."""
         return math.ceil(len(self) / self.batch_size)
 
     @property
     def size(self) -> int:
-        """Episodes of a block; the last one may have less."""
+        """Episodes of a block; the last one may have fewer."""
         return math.ceil(len(self) / self.blocks)
 
     @property
@@ -111,7 +111,7 @@ class Plan:
     def episodes(self, block: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return profile, driver and repeat of each episode of a block, each ``[size]``.
 
-        The last block is filled up with its last episode: one size is compiled once.
+        The last block is padded with its last episode, so that one size is compiled.
         """
         number = torch.arange(self.size).clamp(max=self.count(block) - 1) + block * self.size
         pair, driver = number // len(self.chosen), number % len(self.chosen)
@@ -124,7 +124,7 @@ def pairs(profiles: int, drivers: int, chosen: int | None) -> tuple[Tensor, Tens
     Args:
         profiles: number of profiles.
         drivers: number of drivers.
-        chosen: number of drivers that are met, spread evenly; None for all.
+        chosen: number of drivers used, spread evenly; None: all.
     """
     return Plan(profiles, drivers, chosen, profiles * drivers).episodes(0)[:2]
 
@@ -139,17 +139,17 @@ def plan_of(cfg: StudyConfig, inputs: Inputs) -> Plan:
 class Episodes:
     """Plays the episodes of one strategy, block by block.
 
-    An episode's noise depends on ``seed`` and its profile, driver and repeat only: it is the same
-    for every strategy, and the batch size changes a row by no more than rounding.
+    An episode's noise depends only on ``seed``, profile, driver and repeat. It is the same for all
+    strategies, and the batch size changes rows by rounding only.
 
     Args:
-        strategy: what drives, and its environment's configuration.
+        strategy: the strategy.
         inputs: held-out windows and drivers.
-        plan: which episodes.
+        plan: the episodes.
         seed: seed of the noise.
-        sample_episodes: how many episodes to keep as time series.
-        device: where to compute.
-        compiled: compile the step; None: where the plan, whatever its shard, is long enough.
+        sample_episodes: number of episodes to keep as time series.
+        device: device of the computation.
+        compiled: compile the step; None: if the plan with all shards is long enough.
     """
 
     def __init__(
@@ -211,9 +211,9 @@ class Episodes:
         described[FASTER] = leader_faster(inputs.evaluation, profile, desired, self.warm_up)
         time_step = self.cfg.scenario.time_step
         leader = leader_measures(inputs.evaluation, profile, self.energy, self.warm_up)
-        if self.cfg.scenario.road == RING:  # without a leader
+        if self.cfg.scenario.road == RING:  # it has no leader
             leader[:] = np.nan
-        # Drivers are recorded by sensors, whose noise costs energy in what they drove.
+        # The noise of sensors adds energy to the motion of recorded drivers.
         recorded = RECORDED in self.cfg.evaluation.baselines
         measured = measures(groups, alive, time_step, self.energy, recorded)
         length, free = self.cfg.scenario.vehicle_length, inputs.population.desired_speed[driver]
@@ -237,11 +237,11 @@ def evaluate(
     repeats: int = 1,
     compiled: bool | None = None,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Run every episode of one strategy, all rows in memory; arguments as in :class:`Episodes`.
+    """Run all episodes of one strategy in memory; arguments as for :class:`Episodes`.
 
     Args:
-        drivers: how many of the population, spread evenly; None for all.
-        batch_size: episodes side by side.
+        drivers: number of drivers used, spread evenly; None: all.
+        batch_size: parallel episodes.
         repeats: draws of the noise of every profile and driver.
 
     Returns:
@@ -255,7 +255,7 @@ def evaluate(
 
 
 def any_leader(cfg: StudyConfig) -> StudyConfig:
-    """Return a configuration whose leader plays any record, not the one chosen for training."""
+    """Return a configuration in which the leader may play any record."""
     cfg = deepcopy(cfg)
     leader = cfg.scenario.pieces.get("leader")
     if leader is not None and "profile" in leader.settings:

@@ -1,4 +1,4 @@
-"""Whether a trained policy fits the variant, the observation and the action under study."""
+"""Checks that a trained policy fits the variant, observation and action under study."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.runs import differing, flatten
 
-FIRST_LAYER = "module.0.0.weight"  # of a policy's network
+FIRST_LAYER = "module.0.0.weight"  # first layer of a policy's network
 TRAFFIC_NODES = ("data", "split", "drivers")
 
 
@@ -25,11 +25,11 @@ def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
     """Check that a policy was trained for the variant, observation and action under study.
 
     Args:
-        cfg: configuration under study, whose ``policy`` names it.
+        cfg: configuration under study; its ``policy`` names the policy.
         own: configuration of the policy's training.
 
     Raises:
-        ConfigError: naming what differs.
+        ConfigError: naming the difference.
     """
     path = f"policy={cfg.policy}"
     wanted = (own.task or {}).get("name")
@@ -45,7 +45,7 @@ def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
 
 
 def _check_entries(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
-    """Check that an observation has the entries of the training, before its settings."""
+    """Check that an observation has the entries of the training."""
     scales = (x.observation.settings.get("scales", {}) for x in (own, cfg))
     one, other = ({key for key, _ in flatten(found)} for found in scales)
     parts = (("with", one - other), ("without", other - one))
@@ -58,7 +58,7 @@ def _check_entries(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
 
 
 def _observed(cfg: StudyConfig) -> dict[str, Any]:
-    """Return what makes an observation: its settings, the order of its entries, the memory."""
+    """Return the settings of an observation, the order of its entries and the memory."""
     node = as_plain(cfg.observation)
     order = [key for key, _ in flatten(node) if key.startswith("scales.")]
     memory = cfg.scenario.pieces.get("memory")
@@ -70,7 +70,7 @@ def check_scenario(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
     """Check that a policy was trained in the scenario under study.
 
     Raises:
-        ConfigError: naming both.
+        ConfigError: naming both scenarios.
     """
     if own.scenario.name != cfg.scenario.name:
         raise ConfigError(
@@ -80,15 +80,15 @@ def check_scenario(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
 
 
 def check_action(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
-    """Check that an action has the size and the duration that it had in training.
+    """Check that an action has the size and duration of the training.
 
     Args:
-        path: where the policy comes from, for the message.
+        path: origin of the policy, for the message.
         own: configuration of its training.
         cfg: configuration under study.
 
     Raises:
-        ConfigError: naming what differs.
+        ConfigError: naming the difference.
     """
     one, other = (
         {
@@ -108,12 +108,12 @@ def _check_same(path: str, own: Mapping[str, Any], asked: Mapping[str, Any]) -> 
 
 
 def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
-    """Return a warning where a policy was trained on other data, drivers or split; else nothing.
+    """Return a warning if a policy was trained with other data, drivers or split; else nothing.
 
-    A task chooses its own, and a policy that ships is to be tried on others'.
+    There is no warning for a task, which defines its own, or for a shipped policy.
 
     Args:
-        path: where the policy comes from.
+        path: origin of the policy.
         own: configuration of its training.
         cfg: configuration under study.
     """
@@ -127,25 +127,25 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     others = ", ".join(name + (f" (path={at})" if at else "") for name, at in places.items())
     options = " ".join(f"{name}=…" for name in changed)
     return (
-        f"{path} was trained with other {others}: with {options} as in the config.yaml of its "
-        "training, an evaluation is of the windows that were held out there"
+        f"{path} was trained with other {others}: use {options} as in the config.yaml of its "
+        "training to evaluate on the windows that were held out there"
     )
 
 
 def other_drivers(cfg: StudyConfig) -> str:
-    """Return a sentence where a task has other human drivers than its own; else nothing."""
+    """Return a sentence if a task's human drivers have been replaced; else nothing."""
     if cfg.task is None or HUMAN not in cfg.scenario.vehicles.names:
         return ""
     name = cfg.task["name"]
     try:
         own = load("evaluate", [f"task={name}"])
-    except ConfigError:  # a task that stands in no file
+    except ConfigError:  # a task without a file
         return ""
     if own.drivers == cfg.drivers:
         return ""
     return (
-        f"Human drivers: {origin_of(cfg.drivers)}, in place of those of task={name} "
-        f"({origin_of(own.drivers)}), whose published scores are for others."
+        f"Human drivers: {origin_of(cfg.drivers)} instead of those of task={name} "
+        f"({origin_of(own.drivers)}); published scores do not apply."
     )
 
 
@@ -157,7 +157,7 @@ def classes(cfg: StudyConfig) -> str:
 
 
 def check_width(policy: TensorDictModule, weights: Mapping[str, Any], path: str) -> None:
-    """Check that a trained network observes as many entries as one of this string.
+    """Check that a trained network has as many inputs as a network for this string.
 
     Raises:
         ConfigError: naming both numbers.

@@ -1,8 +1,7 @@
-"""Policies that other libraries trained in an environment of this package.
+"""Policies trained by other libraries in an environment of this package.
 
-A policy is a module of a TensorDict, by its keys; a torch module from observations to actions; or
-a model of stable-baselines3. It is evaluated as it is (:class:`GivenPolicy`), or written as a
-program (:func:`network_of`).
+A policy is a TensorDict module; a torch module from observations to actions; or a model of
+stable-baselines3. It can be evaluated (:class:`GivenPolicy`) or exported (:func:`network_of`).
 """
 
 from __future__ import annotations
@@ -23,20 +22,20 @@ from lcc_rl.pieces.base import ACTION, OBSERVATION, STEP, StepTransform
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import NEXT
 
-INITIAL = "is_init"  # where recurrent modules of TorchRL read that an episode begins
+INITIAL = "is_init"  # key from which recurrent modules of TorchRL read that an episode begins
 
 
 class GivenPolicy(TensorDictModuleBase):
     """A policy from another library that drives every automated vehicle, without exploration.
 
-    The module reads ``"observation"``, ``[rows, n]``, and writes ``"action"``, ``[rows, 1]``, a row
-    per vehicle; or these entries of the group ``"automated"``, ``[*batch, vehicles, …]``. It may
-    read ``"is_init"``, and what it wrote to ``("next", key)`` in the step before; transforms at the
-    head of a sequence, such as ``CatFrames``, work as in an environment.
+    The module reads ``"observation"``, ``[rows, n]``, and writes ``"action"``, ``[rows, 1]``, one
+    row per vehicle; or these entries of the group ``"automated"``, ``[*batch, vehicles, …]``. It
+    may read ``"is_init"`` and entries that it wrote to ``("next", key)`` in the previous step.
+    Transforms at the head of a sequence, such as ``CatFrames``, work as in an environment.
 
     Args:
-        module: a module of a TensorDict.
-        name: what messages call it.
+        module: a TensorDict module.
+        name: its name in messages.
 
     Raises:
         ConfigError: if it reads or writes other entries.
@@ -58,7 +57,7 @@ class GivenPolicy(TensorDictModuleBase):
         require(
             set(reads) <= set(seen) and seen[0] in reads and self.action in writes,
             f"{name} reads {reads} and writes {writes}: expected 'observation' and 'action', maybe "
-            "of the group 'automated', 'is_init', and what it writes to ('next', key)",
+            "of the group 'automated', 'is_init', and entries that it writes to ('next', key)",
         )
         self.kept: dict[Any, Tensor] = {}
 
@@ -86,21 +85,21 @@ class GivenPolicy(TensorDictModuleBase):
         return tensordict.set(ACTION, action)
 
     def tried(self, moment: TensorDictBase) -> None:
-        """Check that it drives at the first moment of an episode.
+        """Check that it returns an action for the first state of an episode.
 
         Raises:
-            ConfigError: saying in one line what went wrong.
+            ConfigError: with the error in one line.
         """
         width = moment.get(OBSERVATION).shape[-1]
         try:
             self(moment)
-        except Exception as error:  # of a module of the user's own
-            words = f"{self.name} is given observations of {width} numbers, and fails"
+        except Exception as error:  # any error of the user's module
+            words = f"{self.name} fails for observations of {width} numbers"
             raise ConfigError(f"{words}: {one_line(str(error))[:300]}") from error
 
 
 def _anew(head: Transform) -> Transform:
-    """Return a transform as at the begin of an episode: CatFrames remembers, the others do not."""
+    """Return a transform in its initial state; only CatFrames has a state."""
     if not isinstance(head, CatFrames):
         return head
     keys = {"in_keys": head.in_keys, "out_keys": head.out_keys}
@@ -113,7 +112,7 @@ def _is_head(part: Any) -> bool:
 
 
 def as_given(policy: Any, name: str) -> GivenPolicy | None:
-    """Return a policy of another library as one that drives here; None if it is none."""
+    """Return a policy of another library as a policy of an evaluation; None if it is none."""
     if isinstance(policy, Controller):
         return None
     if isinstance(policy, TensorDictModuleBase):
@@ -127,11 +126,11 @@ def network_of(policy: Any, normalize: Any = None) -> nn.Module | None:
     """Return a policy as a module from observations ``[rows, n]`` to actions ``[rows, 1]``.
 
     Args:
-        policy: a torch module, which is returned as it is, or a model of stable-baselines3.
-        normalize: its ``VecNormalize``; by default that of the model's environment, if it has one.
+        policy: a torch module, which is returned unchanged, or a model of stable-baselines3.
+        normalize: its ``VecNormalize``; by default that of the model's environment, if any.
 
     Returns:
-        The module; None for anything else, and for a module of a TensorDict.
+        The module; None for TensorDict modules and anything else.
     """
     if hasattr(policy, "get_vec_normalize_env"):
         return Deterministic(policy.policy, normalize or policy.get_vec_normalize_env())
@@ -144,7 +143,7 @@ class Deterministic(nn.Module):
 
     Args:
         policy: ``model.policy``.
-        normalize: ``VecNormalize``, whose statistics are copied, or None.
+        normalize: ``VecNormalize`` or None; its statistics are copied.
     """
 
     mean: Tensor

@@ -17,10 +17,10 @@ KILO = 1e-3
 UNSAFE_TTC = 4.0  # [s] (A10)
 LONG_TIME_GAP = 2.5  # [s] (A13)
 SHORT_TIME_GAP = 1.0  # [s]
-APART = 1.0  # brakings of a vehicle that are closer in time count as one [s]
-CALM = 0.5  # spread of the speeds at which a wave counts as damped [m/s]
-PACE = 1.0  # below it a long time gap is a matter of metres [m/s]
-ACTS = 0.01  # change of a command by which a filter acts [m/s²]
+APART = 1.0  # brakings of a vehicle within this time count as one [s]
+CALM = 0.5  # spread of speeds below which a wave counts as damped [m/s]
+PACE = 1.0  # lower speeds do not count for moving time gaps [m/s]
+ACTS = 0.01  # change of a command above which a filter counts as active [m/s²]
 
 
 def energy_measures(
@@ -31,24 +31,23 @@ def energy_measures(
     energy: Fleet | None = None,
     kind: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Energy of every vehicle (A20), raw, net of what its motion stores, and its distance.
+    """Return energy (A20), gross and net of kinetic energy, and distance of every vehicle.
 
     Args:
         power: power of each step, ``[time, *batch, n, 1]`` [W].
-        speed: speed at every moment, ``[time + 1, *batch, n, 1]`` [m/s].
+        speed: speed at every time, ``[time + 1, *batch, n, 1]`` [m/s].
         alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
         time_step: duration of a step [s].
-        energy: the energy models; None for that of the ALCC paper.
+        energy: the energy models; None: that of the ALCC paper.
         kind: class of every vehicle, ``[*batch, n, 1]``; None: all have the first model.
 
     Returns:
-        ``energy_kj``, ``net_energy_kj`` (a trip that ends slower than it began has used energy
-        that it did not draw), what the speeds driven take without accelerating
-        (``steady_energy_kj``), what a path takes without what the motion stores
-        (``path_energy_kj``; of a model without such a part the net energy), ``distance_m``, its
-        fuel and carbon dioxide (:data:`lcc_rl.energy.BURNT`) where a model burns fuel, and,
-        of models that know them, what accelerating loses (``acceleration_loss_kj``) and the share
-        of time in which the vehicle cannot accelerate as it does (``share_infeasible``), each
+        ``energy_kj``; ``net_energy_kj``, net of the change of kinetic energy; ``steady_energy_kj``,
+        that of the driven speeds without acceleration; ``path_energy_kj``, the steady energy plus
+        the loss by accelerating, or the net energy for a model without these parts;
+        ``distance_m``; fuel and carbon dioxide (:data:`lcc_rl.energy.BURNT`) if a model burns
+        fuel; and, for models that define them, ``acceleration_loss_kj``, the loss by accelerating,
+        and ``share_infeasible``, the share of time with an infeasible acceleration; each
         ``[*batch, n, 1]``.
     """
     energy = as_fleet(energy)
@@ -88,17 +87,17 @@ def averaged_energies(
     energy: Fleet | None = None,
     kind: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Path energies of speeds averaged over :data:`lcc_rl.energy.AVERAGES`, of the whole way.
+    """Return path energies of speeds averaged over :data:`lcc_rl.energy.AVERAGES`.
 
-    Neither noise of a recorded speed nor that of a model counts. The ends, where an average is not
-    whole, count as the rest does.
+    They exclude the noise of recorded speeds and of models. The ends, without a whole average,
+    count like the rest.
 
     Args:
-        speed, alive, time_step, energy, kind: as of :func:`energy_measures`.
+        speed, alive, time_step, energy, kind: as for :func:`energy_measures`.
 
     Returns:
-        By name of :data:`lcc_rl.energy.AVERAGED`, each ``[*batch, n, 1]`` [kJ]; NaN if no average
-        is whole.
+        Energies by name of :data:`lcc_rl.energy.AVERAGED`, each ``[*batch, n, 1]`` [kJ]; NaN if no
+        average is whole.
     """
     energy, found = as_fleet(energy), {}
     way = (0.5 * (speed[:-1] + speed[1:]) * alive).sum(0) * time_step
@@ -107,7 +106,7 @@ def averaged_energies(
         if width >= len(speed):
             found[name] = torch.full_like(way, torch.nan)
             continue
-        # Sums of single precision would lose what differs from one average to the next.
+        # In single precision, sums would lose the difference of consecutive averages.
         sums = torch.cat([torch.zeros_like(speed[:1]), speed]).cumsum(0, dtype=torch.float64)
         mean = ((sums[width:] - sums[:-width]) / width).to(speed)
         power = energy.power(mean[:-1], mean.diff(dim=0) / time_step, kind)
@@ -117,7 +116,7 @@ def averaged_energies(
 
 
 def measured_ttc(ttc: Tensor) -> Tensor:
-    """Return times-to-collision [s] with NaN where the number only says that no gap closes."""
+    """Return times-to-collision [s] with NaN where no gap closes."""
     return torch.where(ttc < NEVER, ttc, torch.nan)
 
 
@@ -135,7 +134,7 @@ class Reductions:
 
     @cached_property
     def steps(self) -> Tensor:
-        """How many steps each episode has."""
+        """Number of steps of each episode."""
         return self.alive.sum(0).squeeze(-2)
 
     def mean(self, entry: Tensor) -> Tensor:
@@ -144,11 +143,11 @@ class Reductions:
         return (entry * self.alive).sum(0).sum(-2) / count
 
     def total(self, entry: Tensor) -> Tensor:
-        """Integral over time, added up over vehicles."""
+        """Integral over time, summed over vehicles."""
         return (entry * self.alive).sum(0).sum(-2) * self.time_step
 
     def begun(self, state: Tensor) -> Tensor:
-        """How often a state of a vehicle begins, :data:`APART` after its last time at the least."""
+        """Number of times that a state of a vehicle begins, at least :data:`APART` apart."""
         state, recent = state & self.alive, torch.zeros_like(state)
         for back in range(1, max(1, round(APART / self.time_step)) + 1):
             recent[back:] |= state[:-back]
@@ -164,14 +163,14 @@ class Reductions:
 
 
 def _turned(over: Reductions, safe: Tensor) -> Tensor:
-    """Whether a safe step is followed by an unsafe one; that after the last step is not known."""
+    """Return whether an unsafe step follows a safe one; False for the last step."""
     turned = torch.zeros_like(safe, dtype=torch.bool)
     turned[:-1] = (safe[:-1] > 0.0) & (safe[1:] <= 0.0) & over.alive[1:]
     return turned
 
 
 # Measures of the automated vehicles of a string by column of episodes.parquet. Each is a function
-# of the entries that it names, see :func:`safety_measures`; where one lacks, so does the column.
+# of the entries that it names, see :func:`safety_measures`. Without an entry there is no column.
 METRICS: dict[str, Callable[..., Tensor]] = {
     "min_gap_m": lambda over, gap: over.lowest(gap),
     "mean_gap_m": lambda over, gap: over.mean(gap),
@@ -212,21 +211,22 @@ def safety_measures(
     time_step: float,
     metrics: Mapping[str, Callable[..., Tensor]] = METRICS,
 ) -> dict[str, Tensor]:
-    """Safety, efficiency and comfort of vehicles of a string.
+    """Return measures of safety, efficiency and comfort of vehicles of a string.
 
     Args:
         series: ``ttc`` [s], ``time_gap`` [s], ``gap`` [m], ``jerk`` [m/s³] after every step,
-            each ``[time, *batch, A, 1]``; ``speed`` [m/s], also before the first one;
-            behind a safety filter, which steps its guarantee covers, ``promised``, which begin
-            ``safe``, and the desired and commanded accelerations ``wanted`` and ``command`` [m/s²].
+            each ``[time, *batch, A, 1]``; ``speed`` [m/s], also before the first step; and with a
+            safety filter ``promised``, 1 for steps that the guarantee covers, ``safe``, 1 for
+            steps that begin safe, ``wanted`` and ``command``, the desired and the commanded
+            acceleration [m/s²].
         alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
         time_step: duration of a step [s].
-        metrics: what is measured, such as :data:`ROAD_METRICS` of all vehicles; by default
-            :data:`METRICS`, of the automated ones.
+        metrics: the measures, such as :data:`ROAD_METRICS` of all vehicles; by default
+            :data:`METRICS` of the automated ones.
 
     Returns:
         Minima and maxima over the vehicles, shares of time and root mean squares averaged over
-        them, each ``[*batch, 1]``; the least time-to-collision is NaN where no gap ever closed.
+        them, each ``[*batch, 1]``; the least time-to-collision is NaN if no gap closed.
     """
     over, found = Reductions(alive, time_step), {}
     for name, metric in metrics.items():
@@ -244,24 +244,24 @@ def string_measures(
     time_step: float,
     leader: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Traffic of a string, front to back.
+    """Return measures of the traffic of a string.
 
     Args:
-        speed: of every vehicle after each step, ``[time, *batch, N, 1]`` [m/s].
-        gap: to the vehicle ahead, likewise [m].
+        speed: speed of every vehicle after each step, ``[time, *batch, N, 1]`` [m/s].
+        gap: gap to the vehicle ahead, likewise [m].
         alive: whether the episode was still running, ``[time, *batch, 1]``.
-        length: of a vehicle; a mean over those of an episode, ``[*batch, 1]`` [m].
+        length: length of a vehicle, or its mean by episode, ``[*batch, 1]`` [m].
         time_step: duration of a step [s].
         leader: speed of the vehicle ahead of the string, ``[time, *batch, 1]`` [m/s].
 
     Returns:
         Each ``[*batch, 1]``: mean speed; standard deviation of a vehicle's speed in time, averaged
-        over vehicles (``speed_std_mps``), and over the vehicles at a time, averaged over the
-        episode and over its last tenth (``speed_spread_mps``, ``final_speed_spread_mps``);
-        vehicles per hour by the mean speed and spacing (``flow_vph``); behind a leader, that
-        deviation in time of the last vehicle over the leader's (``string_ratio``); and, on a ring,
-        how long the deviation over the vehicles takes to stay below 0.5 m/s (``damping_time_s``;
-        NaN: it does not).
+        over vehicles (``speed_std_mps``); standard deviation over the vehicles at a time, averaged
+        over the episode and over its last tenth (``speed_spread_mps``,
+        ``final_speed_spread_mps``); vehicles per hour by mean speed and spacing (``flow_vph``);
+        behind a leader, the deviation in time of the last vehicle divided by the leader's
+        (``string_ratio``); and, on a ring, the time after which the deviation over the vehicles
+        stays below 0.5 m/s (``damping_time_s``; NaN if it does not).
     """
     here, steps = alive.unsqueeze(-2), alive.sum(0).clamp(min=1)
 
@@ -274,7 +274,7 @@ def string_measures(
     def deviation(entry: Tensor) -> Tensor:
         return average((entry - average(entry)).square()).sqrt()
 
-    # Several times as fast as torch's std of a few vehicles.
+    # Several times faster than torch's std for few vehicles.
     spread = (speed - speed.mean(-2, keepdim=True)).square().mean(-2).sqrt()
     late = torch.arange(len(alive), device=alive.device).view(-1, *[1] * (alive.ndim - 1))
     last = alive & (late >= (0.9 * steps).floor())

@@ -1,4 +1,4 @@
-"""Controllers by name: baselines, files, classes and functions as nodes of a configuration."""
+"""Controllers by name: nodes of baselines, files, classes and functions."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from lcc_rl.pieces.controllers import Controller, Law
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.settings import TARGET, find_target, path_of, values
 
-# Cruise controls with tuned constants. Behind the safety filter they have constants of their own.
+# Cruise controls with tuned constants, which differ behind the safety filter.
 TUNED = ("idm_acc", "acc")
-# Baselines that are a controller of conf/ with other settings.
+# Baselines: controllers of conf/ with other settings.
 BASELINES: dict[str, tuple[str, dict[str, Any]]] = {
     # Time gaps above 2.5 s for 2 % of the time, the limit of idm_acc and acc; mpc keeps 1 %.
     "mpc_far": ("mpc", {"longest_gap": -4.0}),
@@ -32,7 +32,7 @@ BASELINES: dict[str, tuple[str, dict[str, Any]]] = {
 GAINS = ("path", "paper_like", "tuned")  # files of conf/gains
 OF_CACC = tuple(f"cacc {name}" for name in GAINS)
 DIRECT = "direct"  # a string without automated vehicles
-PEOPLE = "human"  # automated vehicles driven as the scenario's human drivers drive
+PEOPLE = "human"  # automated vehicles with the scenario's human drivers
 # Controllers that need a policy's action, or the communication of a platoon.
 NEEDY = ("action", "human", "cacc", "deadbeat", "hcfs")
 MODULE = ".py"
@@ -48,7 +48,7 @@ OTHER_WORDS = (
 
 
 def rules() -> tuple[str, ...]:
-    """Return the names of all baselines and of the files of ``controller`` in conf/ and beside."""
+    """Return the names of all baselines and of the files of ``controller``."""
     found = [name for name in choices("controller") if name not in NEEDY]
     return tuple(dict.fromkeys([DIRECT, PEOPLE, "idm", *OF_CACC, *BASELINES, "deadbeat", *found]))
 
@@ -56,93 +56,93 @@ def rules() -> tuple[str, ...]:
 def is_shipped(name: str) -> bool:
     """Whether a name in tables is that of a baseline or a controller of the package.
 
-    Names of variants, such as ``alcc``, stand for learned policies and are reserved.
+    Names of variants, such as ``alcc``, are reserved for learned policies.
     """
     return name.removesuffix(FILTERED) in {DIRECT, PEOPLE, *OF_CACC, *BASELINES, *_files()}
 
 
-def setting_of(who: Any, where: str = "compare") -> str | Node:
-    """Return what a configuration calls a policy or a controller that a program names.
+def setting_of(spec: Any, where: str = "compare") -> str | Node:
+    """Return the value of a policy or controller in a configuration.
 
     Args:
-        who: a name; a path, such as a run's; a node; or a controller as object, class or function.
+        spec: a name; a path, such as a run's; a node; or a controller as object, class or function.
         where: its place in the configuration, for messages.
 
     Raises:
-        ConfigError: if a class or function is not at the top of a module.
+        ConfigError: if a class or function is not at the top level of a module.
     """
-    if isinstance(who, Node):
-        return who
-    if isinstance(who, Controller):
-        who = {TARGET: path_of(type(who)), **values(who)}
-    if isinstance(who, Mapping):
-        return Node.of(who, where)
-    if isinstance(who, PathLike):
-        return fspath(who)
-    return path_of(who) if callable(who) else str(who)
+    if isinstance(spec, Node):
+        return spec
+    if isinstance(spec, Controller):
+        spec = {TARGET: path_of(type(spec)), **values(spec)}
+    if isinstance(spec, Mapping):
+        return Node.of(spec, where)
+    if isinstance(spec, PathLike):
+        return fspath(spec)
+    return path_of(spec) if callable(spec) else str(spec)
 
 
-def is_policy(who: Any) -> TypeGuard[str]:
+def is_policy(spec: Any) -> TypeGuard[str]:
     """Whether a name is that of a trained policy's file or folder."""
-    if not isinstance(who, str) or who.endswith((*YAML, ONNX, MODULE)):
+    if not isinstance(spec, str) or spec.endswith((*YAML, ONNX, MODULE)):
         return False
-    path = Path(who)
+    path = Path(spec)
     return path.exists() or path.parts[:1] == (PRETRAINED,) or path.suffix == ".pt"
 
 
-def controller_of(who: Any, behind: bool = False) -> Node:
+def controller_of(spec: Any, behind: bool = False) -> Node:
     """Return the node of a controller.
 
     Args:
-        who: a baseline; a file of ``controller`` or ``variant`` in conf/ or ``--config-dir``; the
-            dotted path of a class or of a function of named entries; a yaml file that holds a
-            node; an ONNX program (:mod:`lcc_rl.interfaces.onnx_policy`); or a node.
+        spec: a baseline; a file of ``controller`` or ``variant`` in conf/ or ``--config-dir``; the
+            dotted path of a class or of a function of named entries; a yaml file with a node; an
+            ONNX program (:mod:`lcc_rl.interfaces.onnx_policy`); or a node.
         behind: whether it drives behind a filter that keeps a longest time gap, for which tuned
-            ones have constants of their own that count on it.
+            controllers have other constants.
 
     Raises:
         ConfigError: if there is no such controller, or it cannot be built.
     """
-    if isinstance(who, str):
-        plain = who.removesuffix(FILTERED)
-        own = _named(who) if behind or plain not in TUNED else None
+    if isinstance(spec, str):
+        plain = spec.removesuffix(FILTERED)
+        own = _named(spec) if behind or plain not in TUNED else None
         if node := own or _named(plain):
             return node
-        who = plain
-    node = who if isinstance(who, Node) else Node.of(_described(who), f"compare={who}")
+        spec = plain
+    node = spec if isinstance(spec, Node) else Node.of(_described(spec), f"compare={spec}")
     node.made(Controller)
     return node
 
 
-def label_of(who: Any) -> str:
-    """Return what tables call a controller: its name, or that of its file, class or function.
+def label_of(spec: Any) -> str:
+    """Return the name of a controller in tables: its own, or that of its file, class or function.
 
-    A file whose name is one of the package's keeps its ending: ``idm_acc.yaml``.
+    A file with a name of the package keeps its ending: ``idm_acc.yaml``.
     """
-    if isinstance(who, Node):
-        who = str(who.settings.get("law") or who.settings[TARGET])
-    known, plain = {*rules(), *choices("variant")}, who.removesuffix(FILTERED)
+    if isinstance(spec, Node):
+        spec = str(spec.settings.get("law") or spec.settings[TARGET])
+    known, plain = {*rules(), *choices("variant")}, spec.removesuffix(FILTERED)
     file = Path(plain)
     if file.suffix in (*YAML, ONNX):
-        return (file.name if file.stem in known else file.stem) + who[len(plain) :]
-    return who if who in known else str(who).rpartition(".")[2]
+        return (file.name if file.stem in known else file.stem) + spec[len(plain) :]
+    return spec if spec in known else str(spec).rpartition(".")[2]
 
 
-def _named(who: str) -> Node | None:
-    """Return the controller that has a name; None if none has it."""
-    if who in (shipped := _shipped()):
-        return shipped[who]
-    if who in choices("controller"):
-        words = ["variant=idm", f"controller@{AUTO}={who}"]
-    elif who in choices("variant"):
-        words = [f"variant={who}"]
+def _named(spec: str) -> Node | None:
+    """Return the controller with a name; None if there is none."""
+    if spec in (shipped := _shipped()):
+        return shipped[spec]
+    if spec in choices("controller"):
+        words = ["variant=idm", f"controller@{AUTO}={spec}"]
+    elif spec in choices("variant"):
+        words = [f"variant={spec}"]
     else:
         return None
     cfg = load("evaluate", words)
     if cfg.agent is not None:
         raise ConfigError(
-            f"variant {who} is learned: compare its run folder or policy.pt, which "
-            f"lcc-rl train variant={who} makes"
+            f"variant {spec} is learned: compare the run folder or policy.pt of "
+            f"lcc-rl train variant={spec}"
         )
     found: Node = cfg.scenario.controllers[AUTOMATED]
     return found
@@ -157,7 +157,7 @@ def _files() -> frozenset[str]:
 
 @cache
 def _shipped() -> dict[str, Node]:
-    """Compose the controllers and baselines of the package, all at once: that takes a while."""
+    """Compose all controllers and baselines of the package at once, because composing is slow."""
     names = sorted(_files() - {"action", "human", "hcfs"})
     drivers = [f"+controller@scenario.controllers.{name}={name}" for name in names]
     gains = ["+gains=tuned", *(f"+gains@gains.{name}={name}" for name in GAINS)]
@@ -168,20 +168,20 @@ def _shipped() -> dict[str, Node]:
     return found | {f"cacc {x}": found["cacc"].changed(**cfg.gains[x]) for x in GAINS}
 
 
-def _described(who: Any) -> Any:
-    """Return the mapping that describes a controller which has no name."""
-    if isinstance(who, Mapping):
-        return who
-    if who.endswith(ONNX):
-        return {TARGET: ONNX_POLICY, "path": who}
-    if who.endswith(YAML):
-        return parse_yaml(read_text(Path(who)), who)
-    if who.endswith(MODULE):
-        inside = Path(who).stem
-        raise ConfigError(f"{who} is a module: name a class or function in it, {inside}.<Class>")
-    if DOTTED.fullmatch(who) is None:
-        error = unknown_name("strategy", who, [*rules(), *OTHER_WORDS])
-        raise ConfigError(f"{error} {own_file('controller', who)}")
-    if inspect.isclass(find_target(who, f"compare={who}")):
-        return {TARGET: who}
-    return {TARGET: f"{Law.__module__}.{Law.__name__}", "law": who}
+def _described(spec: Any) -> Any:
+    """Return the settings of a controller without a name."""
+    if isinstance(spec, Mapping):
+        return spec
+    if spec.endswith(ONNX):
+        return {TARGET: ONNX_POLICY, "path": spec}
+    if spec.endswith(YAML):
+        return parse_yaml(read_text(Path(spec)), spec)
+    if spec.endswith(MODULE):
+        inside = Path(spec).stem
+        raise ConfigError(f"{spec} is a module: name a class or function in it, {inside}.<Class>")
+    if DOTTED.fullmatch(spec) is None:
+        error = unknown_name("strategy", spec, [*rules(), *OTHER_WORDS])
+        raise ConfigError(f"{error} {own_file('controller', spec)}")
+    if inspect.isclass(find_target(spec, f"compare={spec}")):
+        return {TARGET: spec}
+    return {TARGET: f"{Law.__module__}.{Law.__name__}", "law": spec}

@@ -1,4 +1,4 @@
-"""Plays episodes to their end, without resets, and keeps what an evaluation measures."""
+"""Plays episodes to their end, without resets, and keeps the entries of an evaluation."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.leader import PROFILE, PROFILE_START
 from lcc_rl.pieces.string import COMMAND, WANTED
 
-# Reads and writes a TensorDict; None where a rule drives.
+# Reads and writes a TensorDict; None for a rule.
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Record = dict[Key, Tensor]
-# The next state, the entries to keep, which episodes run, and a sum of all that was written.
+# The next state, the entries to keep, which episodes run, and a sum of all written entries.
 Advanced = tuple[State, list[Tensor], Tensor]
 DRIVER = (HUMAN, "driver")
 
@@ -33,10 +33,10 @@ def play(
     policy: Policy | None,
     given: TensorDictBase,
     keys: Sequence[Key],
-    who: str = "",
+    label: str = "",
 ) -> tuple[Record, Tensor]:
     """Play one batch of episodes to the horizon, see :class:`Player`."""
-    return Player(env, policy, keys, who).play(given)
+    return Player(env, policy, keys, label).play(given)
 
 
 class Player:
@@ -44,11 +44,11 @@ class Player:
 
     Args:
         env: the environment, without the single-agent view.
-        policy: writes the action; None where none is needed.
-        keys: entries to keep; those that the environment lacks are left out.
-        who: name of the strategy, for messages.
-        compiled: compile the step, policy included; where there is no compiler, one line of the
-            log says so and the plain step is used.
+        policy: writes the action; None if none is needed.
+        keys: entries to keep; unknown ones are ignored.
+        label: name of the strategy in messages.
+        compiled: compile the step and the policy; without a compiler the plain step is used, which
+            is logged.
 
     Raises:
         ConfigError: if a controller takes an action and there is no policy.
@@ -59,10 +59,10 @@ class Player:
         env: TransformedEnv,
         policy: Policy | None,
         keys: Sequence[Key],
-        who: str = "",
+        label: str = "",
         compiled: bool = False,
     ) -> None:
-        self.env, self.policy, self.who, self.horizon = env, policy, who, env.base_env.horizon
+        self.env, self.policy, self.label, self.horizon = env, policy, label, env.base_env.horizon
         self.pieces = pieces_of(env)
         _check_driven(policy, self.pieces)
         known = written(self.pieces)
@@ -70,8 +70,7 @@ class Player:
         self.reads = [as_key(key) for key in getattr(policy, "in_keys", [])]
         needed = closure(self.pieces, {*self.kept, *self.reads, TERMINATED})
         self.step = Step(needed, self.horizon)
-        # What the policy and every controller wish is checked, too, whatever a filter makes of it,
-        # and what they remember.
+        # Actions, commands before the safety filter and memories are checked, too.
         wishes = [
             key
             for piece in needed
@@ -83,7 +82,7 @@ class Player:
         self.checked = list(dict.fromkeys([*driven, *wishes, *self.kept]))
         self.compiled = compiled
         self.record: Record = {}
-        self.advance = Compiled(self._advance, "the evaluation", compiled)
+        self.advance = Compiled(self._advance, "the evaluation", compiled, env.device)
 
     @torch.no_grad()
     def play(
@@ -93,7 +92,7 @@ class Player:
 
         Args:
             given: reset options.
-            named: what messages call the episode of a number.
+            named: returns the name of an episode in messages from its index.
 
         Returns:
             The entries after every step, ``[time, *batch, …]``, speeds also before the first one,
@@ -101,8 +100,8 @@ class Player:
             ``[time, batch, 1]``. The next call writes into the same tensors.
 
         Raises:
-            Diverged: if the action, or an entry that is written, is not a number; what the policy
-                and every controller wish and remember counts, not what a filter makes of it.
+            Diverged: if an action, a command, also before the safety filter, a memory or an entry
+                to keep is not finite.
         """
         state, record = self._begin(given), self.record
         running, alive = torch.ones_like(state[TERMINATED]), []
@@ -111,19 +110,19 @@ class Player:
             before, (state, kept, running) = state, self.advance(state, running)
             for key, value in zip(self.checked, kept, strict=True):
                 first = int(key[-1] == "speed")
-                if key not in record:  # written in place: a stack would hold everything twice
+                if key not in record:  # written in place: a stack would need twice the memory
                     record[key] = value.new_empty((self.horizon + first, *value.shape))
                 if first and step == 0:
                     record[key][0] = before[key]
                 record[key][step + first] = value
         after = {key: record[key][-self.horizon :] for key in self.checked}
-        if require_finite(after, torch.stack(alive), who=self.who, named=named):
+        if require_finite(after, torch.stack(alive), label=self.label, named=named):
             for value in after.values():
                 value.nan_to_num_(0.0, 0.0, 0.0)
         return {key: record[key] for key in self.kept}, torch.stack(alive)
 
     def _begin(self, given: TensorDictBase) -> State:
-        """Return the first moment of the episodes."""
+        """Return the first state of the episodes."""
         state = entries_of(self.env.reset(given))
         if self.policy is not None and not self.reads:
             return state  # it may read anything
@@ -139,7 +138,7 @@ class Player:
         return after, [shown[key] for key in self.checked], running & ~reached[TERMINATED]
 
     def _action(self, state: State) -> State:
-        """Return the action of the policy; none where there is no policy."""
+        """Return the action of the policy; none without a policy."""
         if self.policy is None:
             return {}
         seen = TensorDict(batch_size=self.env.batch_size, device=self.env.device)
@@ -152,8 +151,8 @@ class Player:
 def _check_driven(policy: Policy | None, pieces: Sequence[Piece]) -> None:
     if policy is None and any(key == ACTION for piece in pieces for _, key in piece.needs):
         raise ConfigError(
-            "scenario.controllers.automated takes the action of a policy, and there is none: "
-            "choose an agent, or another controller"
+            "scenario.controllers.automated needs the action of a policy, but there is none: "
+            "choose an agent or another controller"
         )
 
 
@@ -165,19 +164,19 @@ def reset_options(
     drivers: int,
     repeat: Tensor | int = 0,
 ) -> TensorDict:
-    """Build what ``env.reset`` needs to play given profiles to given drivers.
+    """Build the reset options for given pairs of profile and driver.
 
     Args:
         env: the environment, ``[batch]``.
         profile: profile of each episode, ``[batch]``.
-        driver: driver that each episode is named after, ``[batch]``.
+        driver: first driver of each episode, ``[batch]``.
         seed: seed of the noise.
-        drivers: how many drivers there are.
-        repeat: which draw of the noise of this profile and driver, ``[batch]``.
+        drivers: number of drivers.
+        repeat: number of the draw of the noise for this pair, ``[batch]``.
     """
     batch = env.batch_size
-    # Every episode gets its own stream. A string begins with the driver it is named after, those
-    # of the next ids follow: every driver is met equally often in every place.
+    # Every episode has its own stream. The drivers of a string have consecutive ids, so every
+    # driver is used equally often in every place.
     number = profile * drivers + driver + repeat * STREAM_INCREMENT
     given = TensorDict(batch_size=batch, device=env.device)
     given.set(SEED, (hash_bits(number + (seed * 0x9E3779B1 & LOW_BITS)) >> 1).unsqueeze(-1))

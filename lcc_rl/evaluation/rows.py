@@ -1,7 +1,7 @@
 """Rows of episodes.parquet from the record of a batch of episodes.
 
-Columns named ``cav_…`` belong to the automated vehicles of the string, ``hdv_…`` to all others;
-energies and distances add up over them.
+Columns ``cav_…`` belong to the automated vehicles of the string, ``hdv_…`` to all others; energies
+and distances are summed over them.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ SUMMED = (
     *AVERAGED,
     *BURNT,
 )
-# Columns of an episode that the steps of a sample episode repeat.
+# Columns of an episode that are repeated in the steps of a sample episode.
 SAMPLED = (
     "strategy",
     "training_seed",
@@ -57,7 +57,8 @@ SAMPLED = (
 ROW_KEYS = [("leader", name) for name in ("speed", "acceleration")]
 ROW_KEYS += [("vehicles", name) for name in ROW_ENTRIES]
 INDEX = (AUTOMATED, "index")
-# Behind a safety filter: for which steps it answers, what it was told and what it commanded.
+# Safety filter: steps covered by the guarantee, steps that begin safe, desired and commanded
+# acceleration.
 FILTER_ENTRIES = tuple((AUTOMATED, name) for name in ("promised", "safe"))
 FILTER_ENTRIES += ((WANTED, AUTOMATED), (COMMAND, AUTOMATED))
 # The record of each group of vehicles, ``[time, batch, n, 1]`` by entry.
@@ -65,9 +66,9 @@ Groups = dict[str, dict[str, Tensor]]
 
 
 def grouped(record: Record, string: VehicleString) -> Groups:
-    """Divide a record into the leader's, that of the automated vehicles and that of all others.
+    """Divide a record into those of the leader, the automated vehicles and all others.
 
-    The automated vehicles have their places in the string, 0 at the front.
+    The record of automated vehicles includes their places in the string, 0 at the front.
     """
     groups: Groups = {"leader": {}, "cav": {}, "hdv": {}}
     own = list(string.places(AUTOMATED))
@@ -97,7 +98,7 @@ def grouped(record: Record, string: VehicleString) -> Groups:
 
 
 def _slice(places: list[int]) -> slice | list[int]:
-    """Return neighbouring places as a slice, which copies nothing."""
+    """Return consecutive places as a slice, which needs no copy."""
     first, end = places[0], places[-1] + 1
     return slice(first, end) if len(places) == end - first else places
 
@@ -109,14 +110,14 @@ def measures(
     energy: Fleet | None = None,
     averaged: bool = True,
 ) -> dict[str, Tensor]:
-    """Return the measures of a batch, each ``[batch, 1]``; energies add up over vehicles (A20).
+    """Return the measures of a batch, each ``[batch, 1]``; energies are sums over vehicles (A20).
 
     Args:
         groups: the record of each group of vehicles.
         alive: whether each step belongs to a running episode, ``[time, batch, 1]``.
         time_step: duration of a step [s].
-        energy: the energy models; None for that of the ALCC paper.
-        averaged: energies of averaged speeds, too.
+        energy: the energy models; None: that of the ALCC paper.
+        averaged: include energies of averaged speeds.
     """
     columns: dict[str, Tensor] = {}
     for group in ("cav", "hdv"):
@@ -147,7 +148,7 @@ def measures(
 def as_frame(columns: dict[str, Tensor], collided: Tensor) -> pd.DataFrame:
     """Return the measures of a batch as one row per episode.
 
-    An episode that a collision ended before what is counted has no measures, NaN.
+    The measures of an episode that ended in a collision before the counted time are NaN.
     """
     frame = pd.DataFrame({key: value.squeeze(-1).cpu().numpy() for key, value in columns.items()})
     if (frame["steps"] == 0).any():
@@ -159,10 +160,10 @@ def as_frame(columns: dict[str, Tensor], collided: Tensor) -> pd.DataFrame:
 def traffic(
     record: Record, alive: Tensor, length: float, time_step: float, free: Tensor, fleet: Fleet
 ) -> dict[str, Tensor]:
-    """Return what the whole string did, each ``[batch, 1]``.
+    """Return measures of the whole string, each ``[batch, 1]``.
 
-    It is :func:`string_measures` and :data:`ROAD_METRICS`; ``free`` is v0 by episode ``[batch]``,
-    and ``length`` that of vehicles without a class [m].
+    These are :func:`string_measures` and :data:`ROAD_METRICS`. ``free`` is v0 by episode
+    ``[batch]``, ``length`` that of vehicles without a class [m].
     """
     steps, leader = len(alive), record.get(("leader", "speed"))
     series = {name: entry for (space, name), entry in record.items() if space == "vehicles"}
@@ -209,7 +210,7 @@ def describe(
 
 
 def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:
-    """Return v0 [m/s] by episode: the strategy's own, or the driver's; NaN of recorded drivers."""
+    """Return v0 [m/s] by episode: the strategy's or the driver's; NaN for recorded drivers."""
     controllers = strategy.cfg.scenario.controllers
     own = controllers.get(AUTOMATED) if strategy.cfg.scenario.vehicles.count(AUTOMATED) else None
     given = None if own is None else own.settings.get("desired_speed")
@@ -224,7 +225,7 @@ def leader_faster(
 ) -> np.ndarray:
     """Return the share of time in which the leader of each episode drives faster than v0 [m/s].
 
-    It is counted from the step ``first`` on.
+    The first step that counts is ``first``.
     """
     shares = np.zeros(len(desired))
     for index in profile.unique().tolist():
@@ -238,7 +239,7 @@ def leader_measures(
 ) -> pd.DataFrame:
     """Return the path energy [kJ] and the mean speed [m/s] of the leader of each episode.
 
-    The leader has the first energy model; it is counted from the step ``first`` on.
+    The leader has the first energy model. The first step that counts is ``first``.
     """
     fleet, found = as_fleet(energy), {}
     for index in profile.unique().tolist():

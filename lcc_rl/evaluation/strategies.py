@@ -34,13 +34,13 @@ from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces import Observation, Piece, RecordedStart
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.results.runs import flatten, told_apart
+from lcc_rl.results.runs import distinguished, flatten
 from lcc_rl.settings import TARGET, path_of
 
 log = logging.getLogger("lcc_rl")
 
 POLICY = "policy.pt"
-# Settings by which trainings do not differ: of other runs, and those on which the seed depends.
+# Settings that do not distinguish trainings: those of other commands, and those of the seed.
 OF_NO_TRAINING = tuple(
     f"{key}." for key in (*NOT_IDENTITY, "seed", "evaluation", "policy", "inputs.policy")
 )
@@ -76,12 +76,12 @@ class Strategy:
 
 
 def deployed(cfg: StudyConfig) -> StudyConfig:
-    """Return a configuration in which the automated vehicles drive as after training."""
+    """Return a configuration with the controller that is used after training."""
     return cfg if cfg.deployed is None else driven_by(cfg, cfg.deployed)
 
 
 def driven_by(cfg: StudyConfig, controller: Node) -> StudyConfig:
-    """Return a configuration in which another controller drives the automated vehicles."""
+    """Return a configuration with another controller of the automated vehicles."""
     cfg = deepcopy(cfg)
     cfg.scenario.controllers[AUTOMATED] = controller
     cfg.deployed = None
@@ -89,9 +89,9 @@ def driven_by(cfg: StudyConfig, controller: Node) -> StudyConfig:
 
 
 def baselines(cfg: StudyConfig, further: Mapping[str, Any] | None = None) -> list[Strategy]:
-    """Build the baselines that an evaluation names, and further controllers by their names."""
+    """Build the baselines of an evaluation, and further controllers by name."""
     named = dict.fromkeys(cfg.evaluation.baselines) | dict(further or {})
-    return [baseline(cfg, name, who) for name, who in named.items() if applies(cfg, name)]
+    return [baseline(cfg, name, spec) for name, spec in named.items() if applies(cfg, name)]
 
 
 def applies(cfg: StudyConfig, name: str) -> bool:
@@ -104,17 +104,17 @@ def applies(cfg: StudyConfig, name: str) -> bool:
     return AUTOMATED in roles and (not name.endswith("oracle") or roles == {AUTOMATED})
 
 
-def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
-    """Build a controller in the scenario under study, with the settings of the variant under study.
+def baseline(cfg: StudyConfig, name: str, spec: Any = None) -> Strategy:
+    """Build a controller in the scenario and with the settings of the variant under study.
 
     Args:
         cfg: the configuration under study.
         name: its name in tables.
-        who: what :func:`lcc_rl.evaluation.named.controller_of` takes; by default the name. It
-            drives behind the safety filter if this or the name ends in ``_filtered``.
+        spec: see :func:`lcc_rl.evaluation.named.controller_of`; by default the name. The
+            controller drives behind the safety filter if this or the name ends in ``_filtered``.
 
     Raises:
-        ConfigError: if the controller is unknown, or needs the safety filter and there is none.
+        ConfigError: if the controller is unknown, or needs a safety filter that does not exist.
     """
     if name == DIRECT:
         return Strategy(name, without_automated(cfg))
@@ -126,11 +126,11 @@ def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
         cfg.scenario.start[AUTOMATED] = start
         return Strategy(name, cfg)
     kept = cfg.scenario.filters.get(AUTOMATED)
-    named = any(str(word).endswith(FILTERED) for word in (name, who))
-    words = f"{name} drives behind the safety filter, and there is none (+filter=cbf adds one)"
+    named = any(str(word).endswith(FILTERED) for word in (name, spec))
+    words = f"{name} needs the safety filter, but there is none (+filter=cbf adds one)"
     require(kept is not None or not named, words)
     held = kept is not None and kept.settings.get("time_gap", True) is not None
-    controller = controller_of(who or name, held)
+    controller = controller_of(spec or name, held)
     if named:
         return Strategy(name, driven_by(cfg, controller))
     if cfg.variant == name and _kind(cfg) is controller.kind:
@@ -139,7 +139,7 @@ def baseline(cfg: StudyConfig, name: str, who: Any = None) -> Strategy:
 
 
 def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[Strategy]:
-    """Build the baselines that a filtered policy is to be seen beside, behind its filter."""
+    """Build the baselines with which a filtered policy is compared, behind its filter."""
     filters = (one.cfg.scenario.filters.get(AUTOMATED) for one in strategies if one.policy)
     own = next((node for node in filters if node is not None), None)
     if own is None:
@@ -158,7 +158,7 @@ def without_filter(cfg: StudyConfig) -> StudyConfig:
 
 
 def by_people(cfg: StudyConfig) -> StudyConfig:
-    """Return a configuration without filter, actuators and sensors: a person's motion has them."""
+    """Return a configuration without filter, actuators and sensors of the automated vehicles."""
     cfg = without_filter(cfg)
     for group in (cfg.scenario.actuators, cfg.scenario.sensors):
         group.pop(AUTOMATED, None)
@@ -166,7 +166,7 @@ def by_people(cfg: StudyConfig) -> StudyConfig:
 
 
 def without_automated(cfg: StudyConfig) -> StudyConfig:
-    """Return a configuration whose string lacks the automated vehicles."""
+    """Return a configuration without automated vehicles."""
     roles = [role for role in cfg.scenario.vehicles.roles if role != AUTOMATED]
     cfg = deepcopy(cfg)
     cfg.scenario.string = " ".join(roles)
@@ -174,15 +174,15 @@ def without_automated(cfg: StudyConfig) -> StudyConfig:
 
 
 def rule(cfg: StudyConfig) -> Strategy:
-    """Return the strategy of a configuration that learns nothing.
+    """Return the strategy of a configuration without an agent.
 
-    Its name is that of the variant, or of the controller's class where that is not the variant's.
+    Its name is that of the variant, or of the controller's class if it is not the variant's.
     """
     if not cfg.scenario.vehicles.count(AUTOMATED):
         return Strategy(DIRECT, cfg)
     try:
         own = _kind(load("evaluate", [f"variant={cfg.variant}"]))
-    except ConfigError:  # a variant of the user's own that only this command line knows
+    except ConfigError:  # a user's variant that only this command line defines
         own = _kind(cfg)
     name = cfg.variant if _kind(cfg) is own else label_of(cfg.scenario.controllers[AUTOMATED])
     return Strategy(name, deployed(cfg))
@@ -201,19 +201,19 @@ def no_policy(cfg: StudyConfig) -> ConfigError:
     """Return the error for a learned variant without a policy."""
     return ConfigError(
         f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
-        f"(lcc-rl train variant={cfg.variant} makes one) or policy=pretrained, or name others "
-        "alone by compare=[human]"
+        f"(of lcc-rl train variant={cfg.variant}) or policy=pretrained, or compare others only: "
+        "compare=[human]"
     )
 
 
 def studied(
     cfg: StudyConfig, policy: TrainedPolicy | None, population: Population
 ) -> list[Strategy]:
-    """Build the strategy under study; of a hybrid, its parents and its oracle, too.
+    """Build the strategy under study; for a hybrid, its parents and its oracle, too.
 
     Args:
         cfg: configuration of the entry point ``evaluate``.
-        policy: the policy read from ``cfg.policy``, where there is one.
+        policy: the policy read from ``cfg.policy``, if there is one.
         population: the human drivers.
 
     Raises:
@@ -235,7 +235,7 @@ def studied(
 
 
 def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
-    """Return the scenario under study with the agent, and where it has none the filter, of own."""
+    """Return the scenario under study with the agent of ``own``, and its filter if it has none."""
     cfg = deepcopy(cfg)
     cfg.agent = own.agent
     seen = own.observation.made(Piece)
@@ -248,7 +248,7 @@ def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
 
 
 def hybrids(strategy: Strategy) -> list[Strategy]:
-    """Build a hybrid strategy, the parents it is composed of, and its oracle."""
+    """Build a hybrid strategy, its parents and its oracle."""
     cfg = strategy.cfg
     parent = driven_by(cfg, cfg.scenario.controllers[AUTOMATED])
     found = [replace(strategy, name=cfg.agent.name, cfg=parent)]
@@ -263,11 +263,11 @@ def hybrids(strategy: Strategy) -> list[Strategy]:
 
 
 def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Population) -> Strategy:
-    """Build a trained strategy to compare with, in the scenario under study.
+    """Build a trained strategy in the scenario under study.
 
     Args:
         cfg: the configuration under study.
-        path: where the policy comes from, for messages.
+        path: origin of the policy, for messages.
         policy: its weights and configuration.
         population: the human drivers.
 
@@ -310,12 +310,12 @@ def with_weights(
 
 
 def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
-    """Return strategies whose names differ wherever their training differs by more than the seed.
+    """Return strategies with names that differ if their trainings differ by more than the seed.
 
-    A variant that several kinds of agents learned gets the agent's name; one whose settings differ
-    otherwise, or that has a seed twice, gets the name of the file or folder of its policy; several
-    seeds of one training keep one name, that of the folder that holds them. Where one folder holds
-    several trainings, these get the settings that differ.
+    If a variant was learned by several kinds of agents, the agent is added to the name. If settings
+    differ otherwise, or a seed occurs twice, the file or folder of the policy is added. Several
+    seeds of one training share a name, that of their folder. If one folder holds several trainings,
+    the settings that differ are added.
     """
     kinds = [one.cfg.agent.name if one.policy else "" for one in strategies]
     found = _where_several(strategies, kinds, kinds)
@@ -336,7 +336,7 @@ def _where_several(
 
 
 def _trainings(strategies: Sequence[Strategy]) -> list[tuple[str, int]]:
-    """Return what sets policies of a name apart: their settings, and which of one seed they are."""
+    """Return settings, and number among equal seeds, by which policies of a name differ."""
     found: list[tuple[str, int]] = []
     of_seed: Counter[Hashable] = Counter()
     for one in strategies:
@@ -349,7 +349,7 @@ def _trainings(strategies: Sequence[Strategy]) -> list[tuple[str, int]]:
 
 
 def _labels(strategies: Sequence[Strategy], marks: Sequence[tuple[str, int]]) -> list[str]:
-    """Return what is added to the name of each policy, the same for the seeds of a training."""
+    """Return the addition to the name of each policy, the same for the seeds of a training."""
     groups = [(one.name, mark) for one, mark in zip(strategies, marks, strict=True)]
     places: dict[tuple[str, tuple[str, int]], str] = {}
     for one, group in zip(strategies, groups, strict=True):
@@ -358,12 +358,12 @@ def _labels(strategies: Sequence[Strategy], marks: Sequence[tuple[str, int]]) ->
     differences: dict[tuple[str, str], str] = {}
     for name in {name for name, _ in groups}:
         texts = list(dict.fromkeys(text for other, (text, _) in places if other == name))
-        words = told_apart([json.loads(text) for text in texts])
+        words = distinguished([json.loads(text) for text in texts])
         differences |= {(name, text): word for text, word in zip(texts, words, strict=True)}
     found = []
     for one, (name, (text, which)) in zip(strategies, groups, strict=True):
         place = places[name, (text, which)]
-        if apart[name, place] > 1:  # one folder holds several trainings, or one of them twice
+        if apart[name, place] > 1:  # one folder holds several trainings, or one twice
             twice = (name, (text, 2)) in places or not differences[name, text]
             place = _place(one, False) if twice else differences[name, text]
         found.append(place)
@@ -371,11 +371,11 @@ def _labels(strategies: Sequence[Strategy], marks: Sequence[tuple[str, int]]) ->
 
 
 def _place(strategy: Strategy, of_sweep: bool) -> str:
-    """Return the name of a policy's file or run, or of the folder that holds its runs."""
-    path = Path(strategy.source).absolute()  # a run beside the command has a folder, too
+    """Return the name of a policy's file or run, or of the folder of its runs."""
+    path = Path(strategy.source).absolute()  # a relative path has a folder, too
     path = path.parent if path.name == POLICY else path
     name = path.parent.name if of_sweep else path.name.removesuffix(".pt")
-    return DATED.sub(r"\1", name)  # of a run's folder the time of day
+    return DATED.sub(r"\1", name)  # of a run's folder, the time of day
 
 
 def check_distinct(strategies: Sequence[Strategy]) -> None:
@@ -388,6 +388,6 @@ def check_distinct(strategies: Sequence[Strategy]) -> None:
     for name, seed in (key for key, count in counts.items() if count > 1):
         which = name if seed is None else f"{name} with training seed {seed}"
         raise ConfigError(
-            f"policy and compare name two policies called {which}: give each a name of its "
-            "own, 'compare={first: …, second: …}'"
+            f"policy and compare name two policies called {which}: give them different "
+            "names, 'compare={first: …, second: …}'"
         )

@@ -1,1 +1,1 @@
-"""Figures and pages, drawn from tables of results."""
+"""Figures and pages from tables of results."""

@@ -1,4 +1,4 @@
-"""Animations of sample episodes: a page that needs no network, an SVG, a GIF or an MP4."""
+"""Animations of sample episodes: an offline page, an SVG, a GIF or an MP4."""
 
 from __future__ import annotations
 
@@ -26,30 +26,31 @@ from lcc_rl.results.motion import MotionSeries, SampleMotion
 
 ANIMATION_FORMATS = (".html", ".svg", ".gif", ".mp4")
 ROLE_COLOURS = {"leader": INK, AUTOMATED: "#0072b2", HUMAN: "#d55e00"}
-ROLE_WORDS = ("human driver", "controlled car")  # a human may drive it, too, as a baseline
-LARGEST_PAGE = 50_000  # moments of vehicles in a page, each a speed and a gap
-FEW_VEHICLES = 6  # vehicles whose lines are all thick
-FRAME_RATE, MOST_FRAMES = 10, 150  # frames per second, and at most
+ROLE_WORDS = ("human driver", "controlled car")  # in baselines, humans may drive it
+LARGEST_PAGE = 50_000  # most samples of a page, each a speed and a gap
+FEW_VEHICLES = 6  # most vehicles for which all lines are thick
+FRAME_RATE, MOST_FRAMES = 10, 150  # frames per second; most frames
 DPI = 80
 
 
 def animate(motions: Mapping[str, SampleMotion], path: str | Path) -> Path:
-    """Write an animation; the ending chooses the form.
+    """Write an animation; the ending selects the format.
 
-    A page (``.html``) plays in any browser, with a slider; a ``.gif`` or ``.mp4`` plays a long
-    episode faster and says so. They show one episode. An ``.svg`` shows rings side by side. Of an
-    open road an ``.svg``, or a ``.gif`` of several, shows space-time diagrams that unroll.
+    A page (``.html``) plays in any browser and has a slider. A ``.gif`` or ``.mp4`` plays long
+    episodes faster and shows the factor. These formats show one episode. An ``.svg`` shows rings
+    side by side. For open roads an ``.svg``, or a ``.gif`` of several episodes, shows space-time
+    diagrams that unroll.
 
     Args:
-        motions: episodes of two moments or more, by what they are for the reader.
-        path: the file; one that exists is replaced.
+        motions: episodes of at least two samples, by title.
+        path: the file; an existing one is replaced.
 
     Returns:
         The path.
 
     Raises:
-        ConfigError: if the ending is another one, the form does not show these episodes, or ffmpeg
-            is needed and missing.
+        ConfigError: if the ending is unknown, the format does not support these episodes, or ffmpeg
+            is missing.
         ResultsError: if the file cannot be written.
     """
     path = Path(path)
@@ -70,7 +71,7 @@ def animate(motions: Mapping[str, SampleMotion], path: str | Path) -> Path:
 
 
 def check_ending(path: Path, episodes: int = 1) -> None:
-    """Check that an animation can be written in the form that its file's ending means."""
+    """Check that an animation can be written in the format of its ending."""
     if path.suffix not in ANIMATION_FORMATS:
         raise unknown_name("ending of an animation", path.suffix, ANIMATION_FORMATS)
     if episodes > 1 and path.suffix not in (".svg", ".gif"):
@@ -80,8 +81,8 @@ def check_ending(path: Path, episodes: int = 1) -> None:
 
 
 def page(motion: SampleMotion, title: str) -> str:
-    """Return the page, all data inside."""
-    # The fewest steps between moments that keep it small.
+    """Return the page with all data."""
+    # Fewest steps between samples within the largest size.
     every = -(-motion.speed.size // LARGEST_PAGE)
     short = motion.at(slice(None, None, every))
     data = {
@@ -97,7 +98,7 @@ def page(motion: SampleMotion, title: str) -> str:
         "colours": ROLE_COLOURS,
         "names": {"leader": "leader", AUTOMATED: ROLE_WORDS[1], HUMAN: ROLE_WORDS[0]},
     }
-    # Within a script no tag may begin.
+    # No tag may begin within a script.
     text = json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
     template = files("lcc_rl.assets").joinpath("animation.html").read_text(encoding="utf-8")
     return template.replace("DATA", text, 1)
@@ -108,7 +109,7 @@ def _numbers(values: MotionSeries) -> list[float]:
 
 
 def frames(motion: SampleMotion, title: str) -> Iterator[Figure]:
-    """Yield the one figure of an animation at every frame, drawn anew each time."""
+    """Yield the figure of an animation for every frame; it is one object."""
     count = min(max(round(FRAME_RATE * float(motion.time[-1] - motion.time[0])), 2), MOST_FRAMES)
     moments = np.linspace(0, len(motion.time) - 1, count).round().astype(int)
     faster = (motion.time[-1] - motion.time[0]) * FRAME_RATE / count
@@ -126,7 +127,7 @@ def frames(motion: SampleMotion, title: str) -> Iterator[Figure]:
     place = _on_road(road, motion)
     place(0)
     figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # found once: what moves needs no other room
+    figure.set_layout_engine("none")  # the layout is fixed
     for moment in moments:
         place(int(moment))
         for cursor in cursors:
@@ -136,7 +137,7 @@ def frames(motion: SampleMotion, title: str) -> Iterator[Figure]:
 
 
 def road_picture(motion: SampleMotion) -> Any:
-    """Return the road at the last moment of a motion, ``[height, width, 3]``, uint8."""
+    """Return a picture of the road at the end of a motion, ``[height, width, 3]``, uint8."""
     figure = new_figure(8.0, 6.4 if motion.circumference else 1.6)
     road = figure.subplots()
     road.set_title(f"{motion.time[-1]:.1f} s", loc="right", fontsize=9)
@@ -151,7 +152,7 @@ def _pixels(figure: Figure) -> Any:
 
 
 def _on_road(road: Axes, motion: SampleMotion) -> Callable[[int], None]:
-    """Draw the cars of a motion; return what places them as they are at a moment."""
+    """Draw the cars of a motion; return a function that places them for a sample."""
     cars = LineCollection([], linewidths=9.0, capstyle="butt")
     road.add_collection(cars)
     cars.set_color([*_hues(motion), *([] if motion.leader is None else [INK])])
@@ -181,7 +182,7 @@ def _lines(
 
 
 def _along(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int) -> None:
-    """Place the cars on an open road, in a view that moves with the leader."""
+    """Place the cars on an open road in a view that moves with the leader."""
     front = float(motion.front[moment])
     fronts, first = [*motion.position[moment], front], motion.lengths[0]
     placed = zip(fronts, np.roll(motion.lengths, -1), strict=True)

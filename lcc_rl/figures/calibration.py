@@ -44,7 +44,7 @@ def calibration_figure(drivers: pd.DataFrame) -> Figure:
         DataError: if the table is empty or lacks a column.
     """
     modes = _modes(drivers)
-    # Parameters held constant in every mode would be empty panels.
+    # Parameters that are constant in every mode would give empty panels.
     shown = {
         name: one
         for name, one in parameters_of(_models(drivers)).items()
@@ -60,7 +60,7 @@ def calibration_figure(drivers: pd.DataFrame) -> Figure:
     for axis, (name, one) in zip(others, shown.items(), strict=False):
         _boxes(axis, {mode: part[one.column] for mode, part in modes.items()})
         axis.set_title(one.label)
-        # The share of drivers whose parameter lies on a bound of the search.
+        # The share of drivers with a parameter on a bound of the search.
         flags = {mode: part[f"{name}_at_bound"].mean() for mode, part in modes.items()}
         texts = [f"{mode} {100 * share:.0f} %" for mode, share in flags.items() if share > 0.0]
         if texts:
@@ -79,7 +79,7 @@ def joint_figure(drivers: pd.DataFrame) -> Figure:
     """Joint distribution of (v0, T) with its marginals (Fig. 5 of the ALCC paper).
 
     Args:
-        drivers: calibrated drivers; local ones are drawn where the table has both modes.
+        drivers: calibrated drivers; local ones if the table has both modes.
 
     Raises:
         DataError: if the table is empty or lacks a column.
@@ -114,27 +114,27 @@ def joint_figure(drivers: pd.DataFrame) -> Figure:
 
 @paper
 def twins_figure(twins: pd.DataFrame) -> Figure:
-    """Calibrated drivers beside the recorded ones whose leaders they follow, a row per mode.
+    """Calibrated and recorded drivers behind the same leaders, a row per mode.
 
     Args:
-        twins: what was measured, see :class:`lcc_rl.drivers.calibrator.Calibration`.
+        twins: measured table, see :class:`lcc_rl.drivers.calibrator.Calibration`.
     """
     modes = list(dict.fromkeys(twins["mode"]))
     figure = new_figure(PAGE_WIDTH, 0.3 + 2.2 * len(modes))
     for mode, row in zip(modes, np.atleast_2d(figure.subplots(len(modes), 3)), strict=True):
         part = twins[twins["mode"] == mode]
-        found = {who: part[part["driver"] == who] for who in dict.fromkeys(part["driver"])}
+        found = {kind: part[part["driver"] == kind] for kind in dict.fromkeys(part["driver"])}
         spectra, share, gaps = row
-        for who, one in found.items():
-            look: dict[str, Any] = {"color": DRIVER_COLOURS[who], "label": who, "linewidth": 1.3}
+        for kind, one in found.items():
+            look: dict[str, Any] = {"color": DRIVER_COLOURS[kind], "label": kind, "linewidth": 1.3}
             density = densities(one).mean()
             spectra.semilogy(density.index, density, **look)
             ordered = np.sort(one["gap_m"])
             gaps.plot(ordered, np.linspace(0.0, 1.0, len(ordered)), **look)
-            if who != RECORDED_DRIVERS:
+            if kind != RECORDED_DRIVERS:
                 near = ratios(one, found[RECORDED_DRIVERS])
                 places = [100.0 * (near[name] - 1.0) for name in RATIOS]
-                share.plot(places, range(len(RATIOS)), "o", color=DRIVER_COLOURS[who], label=who)
+                share.plot(places, range(len(RATIOS)), "o", color=DRIVER_COLOURS[kind], label=kind)
         share.axvline(0.0, color=DRIVER_COLOURS[RECORDED_DRIVERS], linewidth=1.0)
         share.set_yticks(range(len(RATIOS)), list(RATIOS.values()))
         share.set_ylim(len(RATIOS) - 0.5, -0.5)
@@ -169,7 +169,7 @@ def _modes(drivers: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
 
 def _boxes(axis: Axes, values: dict[str, pd.Series]) -> None:
-    """Draw a box per mode, or a line if the parameter was held constant."""
+    """Draw a box per mode, or a line for a constant parameter."""
     for place, (mode, series) in enumerate(values.items()):
         colour = MODE_COLOURS.get(mode, INK)
         numbers = series.to_numpy(float)
@@ -205,7 +205,7 @@ def _boxes(axis: Axes, values: dict[str, pd.Series]) -> None:
 def _scatter(
     axis: Axes, speed: np.ndarray, gap: np.ndarray, bound: np.ndarray, colour: str
 ) -> None:
-    """Draw a dot for every driver, hollow where v0 lies on a bound."""
+    """Draw a dot per driver, hollow if v0 lies on a bound."""
     known = ~bound
     hollow: dict[str, Any] = {"facecolors": "none", "edgecolors": SOFT, "linewidths": 0.8}
     label = f"$v_0$ inside its bounds ({known.sum()})"

@@ -21,9 +21,9 @@ from lcc_rl.io.atomic import atomic_path
 from lcc_rl.results.names import in_words
 
 INK, SOFT = "#222222", "#8a8a8a"
-COLUMN_WIDTH, PAGE_WIDTH = 3.5, 7.2  # widths of one column of a journal, and of two [in]
-LABEL = 28  # signs of a name in one line of a figure
-# Decorates what draws: sizes of print, and letters that stay letters in vector formats.
+COLUMN_WIDTH, PAGE_WIDTH = 3.5, 7.2  # widths of one and two columns of a journal [in]
+LABEL = 28  # most characters of a name in one line
+# Decorator of drawing functions: print sizes, and text as text in vector formats.
 paper = mpl.rc_context(
     {
         "font.size": 8.0,
@@ -40,11 +40,11 @@ paper = mpl.rc_context(
         "lines.linewidth": 1.0,
         "lines.markersize": 4.0,
         "svg.fonttype": "none",
-        "svg.hashsalt": "lcc_rl",  # the same picture gives the same file
+        "svg.hashsalt": "lcc_rl",  # equal pictures give equal files
         "pdf.fonttype": 42,
     }
 )
-# Distinct without colour vision and in grey.
+# Distinguishable without colour vision and in grey.
 COLOURS = {
     "alcc": "#0072b2",
     "reference": "#d55e00",
@@ -55,11 +55,11 @@ COLOURS = {
     "human": "#b0a080",
     "direct": INK,
 }
-OWN_COLOURS = ("#cc79a7", "#882255", "#117733")  # of the user's own; no colour of a baseline
+OWN_COLOURS = ("#cc79a7", "#882255", "#117733")  # of the user's controllers
 
 
 def colour(strategy: str) -> str:
-    """Return the colour that a strategy has in every figure."""
+    """Return the colour of a strategy in all figures."""
     return COLOURS.get(strategy) or OWN_COLOURS[sum(strategy.encode()) % len(OWN_COLOURS)]
 
 
@@ -89,12 +89,12 @@ def grid(axis: Axes, lines: str = "both") -> None:
 
 
 def footnote(figure: Figure, text: str) -> None:
-    """Write how to read a figure below it."""
+    """Write a note below a figure."""
     figure.supxlabel(text, fontsize=7, color=INK)
 
 
 def legend_above(axis: Axes, columns: int = 3) -> Legend:
-    """Put the legend above the frame, where it covers no data."""
+    """Put the legend above the frame."""
     return axis.legend(
         frameon=False,
         ncols=columns,
@@ -105,12 +105,12 @@ def legend_above(axis: Axes, columns: int = 3) -> Legend:
 
 
 def lines_of(name: str) -> str:
-    """Return a strategy's name in words, in two lines at most."""
+    """Return a strategy's name in words, in at most two lines."""
     return fill(in_words(name), LABEL, max_lines=2, placeholder="…")
 
 
 def rows_of(axis: Axes, names: Sequence[str]) -> None:
-    """Label the rows of a chart, the first at the top; without a name no label is drawn."""
+    """Label the rows of a chart, the first at the top; empty names have no label."""
     axis.set_yticks(range(len(names)), [lines_of(name) for name in names])
     axis.set_ylim(len(names) - 0.4, -0.6)
 
@@ -133,7 +133,7 @@ def dots(
         column: name of the column.
         hue: colour of dots and lines.
         upright: draw vertical lines.
-        look: of the dots, for ``Axes.plot``.
+        look: options of the dots, for ``Axes.plot``.
     """
     low, high = (table[f"{column}_{end}"].to_numpy(float) for end in ("low", "high"))
     draw = axis.vlines if upright else axis.hlines
@@ -143,7 +143,7 @@ def dots(
 
 
 def in_file(name: str) -> str:
-    """Return a name as part of a file's: without spaces, or what would lead elsewhere."""
+    """Return a name for use in a file name: without spaces and separators of paths."""
     return re.sub(r"[^\w.+-]", "_", name)
 
 
@@ -154,8 +154,8 @@ def save(figure: Figure, path: str | Path, dpi: int = 200, formats: Iterable[str
     Args:
         figure: the figure.
         path: the file.
-        dpi: pixels per inch of what is drawn as pixels.
-        formats: further formats, each a file beside it (``figure_formats``).
+        dpi: pixels per inch of raster graphics.
+        formats: further formats, each in its own file (``figure_formats``).
 
     Returns:
         The path.
@@ -164,7 +164,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 200, formats: Iterable[str
         ResultsError: if a file cannot be written.
     """
     path = Path(path)
-    logging.getLogger("fontTools").setLevel(logging.WARNING)  # it tells of every letter of a PDF
+    logging.getLogger("fontTools").setLevel(logging.WARNING)  # it logs every glyph of a PDF
     for suffix in dict.fromkeys([path.suffix or ".png", *(f".{kind}" for kind in formats)]):
         with atomic_path(path if suffix == path.suffix else path.with_suffix(suffix)) as temporary:
             figure.savefig(temporary, dpi=dpi, format=suffix[1:])

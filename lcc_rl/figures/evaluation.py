@@ -1,4 +1,4 @@
-"""Figures of evaluations of a controlled car (ALCC Figs. 7, 9 and 10), and all of one folder."""
+"""Figures of evaluations (ALCC Figs. 7, 9 and 10)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.bootstrap import Estimate, share_saved
-from lcc_rl.results.motion import telling
+from lcc_rl.results.motion import most_varied
 from lcc_rl.results.names import in_words, several
 from lcc_rl.results.render import column_cells, signed
 from lcc_rl.results.report import AGAINST, RULE, Report
@@ -60,14 +60,13 @@ def write_figures(
     """Draw the figures of an evaluation into its folder ``figures``.
 
     Args:
-        folder: holds config.yaml, episodes.parquet and steps.parquet.
-        rows: what a row of episodes.parquet is of, ``episodes`` or ``vehicles``.
-        reports: those that the evaluation printed; of a single one, ``overview`` shows the
-            savings.
-        own: strategies that are controllers of the user's own.
+        folder: folder with config.yaml, episodes.parquet and steps.parquet.
+        rows: subject of a row of episodes.parquet, ``episodes`` or ``vehicles``.
+        reports: reports of the evaluation; ``overview`` shows the savings of a single one.
+        own: strategies that are the user's controllers.
 
     Returns:
-        The figures' paths.
+        The paths of the figures.
 
     Raises:
         ResultsError: if a table is missing or a figure cannot be written.
@@ -81,7 +80,7 @@ def write_figures(
         bound = float((cfg.get("deployed") or {}).get("jerk_bound", 30.0))
         found = platoon_figures(steps, bound)
     formats = cfg.get("figure_formats", ())
-    drawn: dict[str, Path] = {}  # files, by names in which no disk tells letters apart
+    drawn: dict[str, Path] = {}  # files by case-folded name, for file systems that ignore case
     for stem, figure in found:
         file = in_file(stem)
         while file.casefold() in drawn:
@@ -98,22 +97,22 @@ def study_figures(
     reports: Sequence[Report] = (),
     own: Collection[str] = (),
 ) -> Iterator[tuple[str, Figure]]:
-    """Yield name and figure of all that an evaluation with a row per episode shows.
+    """Yield name and figure for an evaluation with a row per episode.
 
-    Networks and the user's own controllers have figures of their own; the package's have none.
+    Only networks and the user's controllers get separate figures.
 
     Args:
         episodes: rows of episodes.parquet.
         steps: rows of steps.parquet; it may have none.
         cfg: the evaluation's configuration.
-        reports, own: as in :func:`write_figures`.
+        reports, own: as for :func:`write_figures`.
     """
     means, names = Means.of(episodes).per_km(), list(dict.fromkeys(episodes["strategy"]))
     many = episodes["driver_id"].nunique() > 2
     cars = [name for name in names if name != "direct"]
     seeds = episodes.groupby("strategy")["training_seed"].count()
     shown = [name for name in cars if name != RULE and (seeds[name] or name in own)]
-    # Human drivers, networks, the user's own controllers, the others; last what comes unasked.
+    # Human drivers, networks, the user's controllers, others; filtered strategies last.
     order = sorted(
         names, key=lambda x: (x != "human", not seeds[x], x not in shown, x.endswith(FILTERED))
     )
@@ -127,7 +126,7 @@ def study_figures(
             yield f"episode {name}", sample_episode(steps, name)
         if "direct" in names:
             yield f"human_energy {name}", human_energy_figure(means, name)
-        # Who collides, and so drives less of an episode, saves nothing.
+        # After a collision the rest of an episode is not driven, which is no saving.
         whole = not episodes.loc[episodes["strategy"] == name, "collided"].any()
         for baseline in (*AGAINST, "recorded") if many and whole else ():
             if baseline in names and baseline != name:
@@ -157,15 +156,15 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
 
 @paper
 def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, report: Report) -> Figure:
-    """Speeds of one episode, and what each strategy of a report saves."""
+    """Speeds of one episode, and the saving of each strategy of a report."""
     table = report.short
     lines = max(len(lines_of(str(name)).splitlines()) for name in table["strategy"])
     figure = new_figure(PAGE_WIDTH, max(2.7, 0.9 + 0.13 * lines * len(table)))
     left, right = figure.subplots(1, 2, width_ratios=(4, 5))
     _over_time(left, _one_episode(steps, strategy), "speed")
     style(left, "time [s]", "speed [m/s]")
-    whose = shorten(in_words(strategy), 40, placeholder="…")
-    left.set_title(f"one episode: {whose}", loc="left", pad=16)
+    owner = shorten(in_words(strategy), 40, placeholder="…")
+    left.set_title(f"one episode: {owner}", loc="left", pad=16)
     legend_above(left)
     against = str(report.against)
     what, _, unit = report.label.removesuffix("]").partition(" [")
@@ -187,15 +186,15 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, report:
 
 @paper
 def measures_of(report: Report, seeds: Sequence[Report] = ()) -> Figure:
-    """Every column of a report's short table but zeros: a dot per strategy, grey ones by seed.
+    """All columns of a report's short table except zeros: a dot per strategy, grey ones by seed.
 
     Args:
-        report: of one or several sources, in ``of``.
-        seeds: the report of each training seed alone.
+        report: report of one or several sources, in ``of``.
+        seeds: the report of each training seed.
     """
     table = report.short.assign(of=report.short.get("of", ""))
-    names = table[["of", "who"]].to_numpy()
-    labels = [fill(f"{of}: {who}".removeprefix(": "), 28) for of, who in names]
+    names = table[["of", "driver"]].to_numpy()
+    labels = [fill(f"{of}: {driver}".removeprefix(": "), 28) for of, driver in names]
     places = {tuple(key): place for place, key in enumerate(table[["of", "strategy"]].to_numpy())}
     shown = [one for one in report.shown if is_numeric_dtype(table[one.key])]
     shown = [one for one in shown if table[one.key].any()] or shown
@@ -215,7 +214,7 @@ def measures_of(report: Report, seeds: Sequence[Report] = ()) -> Figure:
 
 
 def _over_time(axis: Axes, rows: pd.DataFrame, entry: str) -> None:
-    """Draw a line per vehicle that has the entry."""
+    """Draw a line per vehicle with the entry."""
     for vehicle, (name, hue) in VEHICLE_STYLES.items():
         column = f"{vehicle}_{entry}"
         if column in rows and rows[column].notna().any():
@@ -223,19 +222,19 @@ def _over_time(axis: Axes, rows: pd.DataFrame, entry: str) -> None:
 
 
 def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
-    """Return the telling episode of a strategy, its columns named for one car and one human."""
-    rows = telling(steps)
+    """Return the episode of :func:`most_varied`, with columns for one car and one human driver."""
+    rows = most_varied(steps)
     rows = rows[rows["strategy"] == strategy]
     if "training_seed" in rows and rows["training_seed"].notna().any():
         rows = rows[rows["training_seed"] == rows["training_seed"].min()]
-    # Of several vehicles the first automated one, and the human after those ahead of it.
+    # Of several vehicles, the first automated one and the human driver behind it.
     rows = rows.rename(columns=lambda name: re.sub(r"^cav1_", "cav_", name))
     behind = 1 + int(rows["cav_place"].iloc[0] if "cav_place" in rows else 0)
     return rows.rename(columns=lambda name: re.sub(f"^hdv{behind}_", "hdv_", name))
 
 
 def human_energy_figure(means: Means, strategy: str) -> Figure:
-    """Human driver's energy behind the controlled car and directly behind the leader (Fig. 9)."""
+    """Energy of human drivers behind the controlled car and directly behind the leader (Fig. 9)."""
     names = {"direct": "directly behind the leader", strategy: f"behind {in_words(strategy)}"}
     return _by_driver(means, "hdv_path_energy_kj", names, "the human driver")
 
@@ -247,17 +246,17 @@ def paired_improvement(means: Means, strategy: str, baseline: str) -> Figure:
 
 
 @paper
-def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> Figure:
-    """Draw the energies of all drivers under a baseline and a strategy, and what each saves.
+def _by_driver(means: Means, column: str, names: dict[str, str], owner: str) -> Figure:
+    """Draw the energies of all drivers with a baseline and a strategy, and their savings.
 
     Args:
-        means: of an evaluation.
+        means: means of an evaluation.
         column: the energy.
         names: labels of the baseline and of the strategy, in this order.
-        whose: energy, for the label of the axis.
+        owner: vehicles with this energy, for the label of the axis.
     """
     baseline, strategy = names
-    # Rounded to joules: bins have a width also where drivers are alike.
+    # Rounded to joules, so that bins have a width if all drivers are equal.
     energy = by_driver(means.drivers, column)[[baseline, strategy]].dropna().round(3)
     figure = new_figure(PAGE_WIDTH, 2.7)
     left, right = figure.subplots(1, 2)
@@ -265,7 +264,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> 
     for (name, label), alpha in zip(names.items(), (0.45, 0.6), strict=True):
         mean = f"{label}, mean of drivers {energy[name].mean():.1f}"
         left.hist(energy[name], bins, color=colour(name), alpha=alpha, label=mean)
-    style(left, f"path energy of {whose}\n[kJ per {means.per}]", "drivers")
+    style(left, f"path energy of {owner}\n[kJ per {means.per}]", "drivers")
     left.xaxis.set_major_locator(MaxNLocator(5))
     left.yaxis.set_major_locator(MaxNLocator(integer=True))
     legend_above(left, 1)
@@ -279,7 +278,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], whose: str) -> 
 
 
 def _sorted_bars(axis: Axes, saving: pd.Series, hue: str) -> None:
-    """Draw one bar per driver, sorted; below zero means worse off."""
+    """Draw one sorted bar per driver; negative values are losses."""
     ordered = 100 * np.sort(saving.to_numpy())
     axis.bar(np.arange(1, len(ordered) + 1), ordered, width=1.0, color=hue, alpha=0.8)
     axis.axhline(0.0, color=INK, lw=0.6)
@@ -287,7 +286,7 @@ def _sorted_bars(axis: Axes, saving: pd.Series, hue: str) -> None:
 
 
 def _mean_line(axis: Axes, found: Estimate, rows: pd.DataFrame) -> None:
-    """Draw the mean saving and its interval, and write both above."""
+    """Draw the mean saving and its interval, and label both."""
     value, low, high = (100 * x for x in (found.value, found.low, found.high))
     text = f"mean {signed(value)} %"
     if np.isfinite(low):

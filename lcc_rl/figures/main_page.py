@@ -1,4 +1,4 @@
-"""The page of the main job: energy saved by strategy, within which limits."""
+"""The page of the main job: energy saved by strategy."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ MAIN_TITLE = "lcc_rl: data → drivers → policies → results"
 LIMIT = "efficiency"
 HELD_TO = (
     f"The networks learn within a limit of long time gaps, agent.limits.{LIMIT}={{limit}} of the "
-    "time; rows with more save by falling back."
+    "time; rows above this limit save by falling behind."
 )
 AS_RECORDED = (
-    "The share of long time gaps of the networks and of the IDM tuned on these data may not exceed "
-    "that of the recorded drivers in training; rows with more save by falling back."
+    "The networks and the IDM tuned on these data are trained with the recorded drivers' share of "
+    "long time gaps as a limit; rows above this limit save by falling behind."
 )
-# Files of figures, in the job's folder and without their ending, and their captions.
+# Files of figures in the job's folder, without ending, and their captions.
 RESULT_FIGURES = {
     "evaluation/figures/overview": "A held-out episode, and the path energy per vehicle and km",
-    "evaluation/figures/learning_curve": "The trainings: what they minimise, and their limit",
+    "evaluation/figures/learning_curve": "The trainings: objective and limit",
 }
 DRIVER_FIGURES = {
     "calibration/calibration": "Calibrated drivers: error and parameters",
@@ -37,10 +37,10 @@ DRIVER_FIGURES = {
 
 
 def held_to(trainings: Iterable[StudyConfig]) -> str:
-    """Return the limit that networks are trained to keep, in words; empty without one.
+    """Return a sentence on the limit of the trainings; empty without one.
 
     Args:
-        trainings: configuration of each.
+        trainings: configurations of the trainings.
     """
     agents = (cfg.agent.settings for cfg in trainings if cfg.agent is not None)
     found = [(agent.get("limits") or {}).get(LIMIT) for agent in agents]
@@ -51,16 +51,16 @@ def held_to(trainings: Iterable[StudyConfig]) -> str:
 
 
 def write_page(folder: str | Path, commands: Sequence[str], report: Report, size: str) -> Path:
-    """Write ``report.html`` of a job: the headline, figures, drivers, and how it was made.
+    """Write ``report.html`` of a job: headline, figures, drivers, commands and versions.
 
     Args:
         folder: the job's folder, with ``evaluation``, ``calibration`` and a folder per training.
-        commands: what was typed.
-        report: of its evaluation.
-        size: how many windows and drivers that is of.
+        commands: the command lines.
+        report: report of its evaluation.
+        size: numbers of windows and drivers as text.
 
     Returns:
-        The page's path.
+        The path of the page.
 
     Raises:
         ResultsError: if the page cannot be written.

@@ -1,4 +1,4 @@
-"""One self-contained HTML page from text, tables and figures, without scripts or network."""
+"""A self-contained HTML page of text, tables and figures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Page:
     """A page of results, without scripts or network.
 
     Args:
-        folder: gets ``report.html``.
+        folder: folder of ``report.html``.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -50,7 +50,7 @@ class Page:
             text: plain paragraphs, separated by blank lines.
             tables: caption and rows, see :func:`lcc_rl.results.render.columns`.
             figures: caption and file.
-            details: titles and long texts, folded away.
+            details: titles and long texts, collapsed.
         """
         shown = [(_line(caption), columns(worded(frame))) for caption, frame in tables]
         drawn = [(_line(caption), _webp(path)) for caption, path in figures]
@@ -59,14 +59,14 @@ class Page:
         self.sections.append(section | {"figures": drawn, "details": details})
 
     def write(self, title: str, commands: Sequence[str] = ()) -> Path:
-        """Add how the results were made, and write ``report.html``.
+        """Add the origin of the results, and write ``report.html``.
 
         Args:
-            title: the page's title.
+            title: title of the page.
             commands: the commands, oldest first.
 
         Returns:
-            The page's path.
+            The path of the page.
 
         Raises:
             ResultsError: if the page cannot be written.

@@ -1,4 +1,4 @@
-"""A platoon over time: its leader's record, speeds, jerks and switching (HCFS Figs. 3–12)."""
+"""Figures of a platoon over time: leader, speeds, jerks and switching (HCFS Figs. 3–12)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def platoon_figures(steps: pd.DataFrame, bound: float) -> Iterator[tuple[str, Fi
 
     Args:
         steps: rows of steps.parquet.
-        bound: of the jerk [m/s³].
+        bound: bound of the jerk [m/s³].
     """
     for case in dict.fromkeys(steps["case"]) if len(steps) else ():
         yield f"{case} velocities", velocities(steps, case)
@@ -45,9 +45,9 @@ def record_figure(record: Profiles, from_s: float, cases: Sequence[Case]) -> Fig
     """Draw the leader's record with the part for training, and the cases' windows (Fig. 3).
 
     Args:
-        record: the record that the training takes a part of, whole.
-        from_s: where that part begins [s].
-        cases: the windows for tests.
+        record: the whole record of the training.
+        from_s: start of the training's part [s].
+        cases: the windows of tests.
     """
     figure = new_figure(PAGE_WIDTH, 3.6)
     grid = figure.subplot_mosaic([["record"] * len(cases), [case.name for case in cases]])
@@ -87,7 +87,7 @@ def _speeds(axis: Axes, profile: Profiles) -> np.ndarray:
 
 
 def _in_record(profile: Profiles) -> str:
-    """Return a profile's record, and where in it the profile begins."""
+    """Return a profile's record and its start in the record."""
     record, _, start = profile.names[0].partition("@")
     name = record.replace("_", " ").upper()
     return name if start == "0s" else f"{name} from {start.removesuffix('s')} s on"
@@ -107,9 +107,9 @@ def velocities(steps: pd.DataFrame, case: str) -> Figure:
 
 @paper
 def jerks(steps: pd.DataFrame, case: str, bound: float) -> Figure:
-    """Jerk of the followers, a panel per strategy, and its bound where they come near it.
+    """Jerk of the followers, a panel per strategy, with the bound where it is near.
 
-    The scale of each panel is that of its data (Figs. 5, 8, 11).
+    Each panel is scaled to its data (Figs. 5, 8, 11).
     """
     title = f"{case}: jerk [m/s³]; scales differ; bound ±{bound:g}, dotted where it is near"
     figure, panels = _panels(steps[steps["case"] == case], title, sharey=False)
@@ -125,7 +125,7 @@ def jerks(steps: pd.DataFrame, case: str, bound: float) -> Figure:
 
 
 def shown(steps: pd.DataFrame) -> list[str]:
-    """Return those of :data:`PANEL_STRATEGIES` that there are; all strategies if there is none."""
+    """Return the strategies of :data:`PANEL_STRATEGIES` in a table; all if there is none."""
     names = list(dict.fromkeys(steps["strategy"]))
     return [name for name in PANEL_STRATEGIES if name in names] or names
 
@@ -133,7 +133,7 @@ def shown(steps: pd.DataFrame) -> list[str]:
 def _panels(
     rows: pd.DataFrame, title: str, sharey: bool = True
 ) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
-    """Return a figure with a panel per strategy, and each panel with its rows."""
+    """Return a figure with a panel per strategy, and the panels with their rows."""
     names = shown(rows)
     figure = new_figure(PAGE_WIDTH, 0.8 + 1.3 * len(names))
     axes = figure.subplots(len(names), 1, sharex=True, sharey=sharey, squeeze=False)[:, 0]
@@ -159,7 +159,7 @@ def _lines(axis: Axes, rows: pd.DataFrame, column: str) -> None:
 
 @paper
 def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
-    """The controller that drives each follower over time, CACC or DDPG (Figs. 6, 9, 12).
+    """Controller in use for each follower over time, CACC or DDPG (Figs. 6, 9, 12).
 
     Args:
         steps: rows of steps.parquet; ``winner`` is 0 for CACC and 1 for DDPG.

@@ -1,4 +1,4 @@
-"""A moving picture of the ring road as an SVG, which any page shows as an image."""
+"""An animated picture of the ring road as an SVG."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from lcc_rl.figures.space_time import SPEED_COLOURS
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.results.motion import MotionSeries, SampleMotion
 
-SPEED_UP, KEY_STEP = 20.0, 1.5  # times as fast as it was driven; between two key frames [s]
-WIDE, HIGH = 330, 380  # of a panel [px]
-RADIUS, ROAD, CAR_SIZE = 118, 24, 12  # of its ring, road and cars [px]
+SPEED_UP, KEY_STEP = 20.0, 1.5  # factor of the speed; time between key frames [s]
+WIDE, HIGH = 330, 380  # size of a panel [px]
+RADIUS, ROAD, CAR_SIZE = 118, 24, 12  # radius of the ring, widths of road and cars [px]
 SVG_FRAME = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {high}" width="{wide}" \
 height="{high}" font-family="system-ui, 'Segoe UI', Roboto, sans-serif" text-anchor="middle">
 <title>{title}</title>
@@ -34,10 +34,10 @@ height="{high}" font-family="system-ui, 'Segoe UI', Roboto, sans-serif" text-anc
 
 
 def ring_picture(motions: Mapping[str, SampleMotion]) -> str:
-    """Return an SVG of rings side by side, in which the cars drive and change their colour.
+    """Return an SVG of rings side by side; cars move and change their colour.
 
     Args:
-        motions: by what stands above each ring; of the same moments.
+        motions: motions with equal times, by title.
 
     Raises:
         ConfigError: if a motion is not of a ring road.
@@ -76,7 +76,7 @@ def _panel(name: str, motion: SampleMotion, place: int, top: float) -> str:
 
 
 def _car(marked: bool, angles: MotionSeries, shares: MotionSeries, long: float, time: str) -> str:
-    """Return a car that turns by the angles [degrees], coloured by shares of the top speed."""
+    """Return a car with angles over time [degrees], coloured by shares of the top speed."""
     hues = ";".join(to_hex(SPEED_COLOURS(share)) for share in shares)
     mark = (
         f'<circle class="mark" cx="{RADIUS}" r="{0.8 * long:.1f}" fill="none" stroke-width="2.5"/>'

@@ -1,4 +1,4 @@
-"""Space–time diagrams: where every vehicle of a string is, coloured by its speed."""
+"""Space-time diagrams: positions of all vehicles of a string, coloured by speed."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from matplotlib.figure import Figure
 from lcc_rl.errors import ResultsError
 from lcc_rl.figures.drawing import COLUMN_WIDTH, PAGE_WIDTH, lines_of, new_figure, paper, unbox
 from lcc_rl.functional.pattern import HUMAN
-from lcc_rl.results.motion import SampleMotion, motion_of, sample_episodes, telling
+from lcc_rl.results.motion import SampleMotion, most_varied, motion_of, sample_episodes
 
-FEWEST = 3  # vehicles; of fewer, speeds over time show all
+FEWEST = 3  # least number of vehicles
 POINT_STEPS = 5  # steps between the points of a line
 MOST_PANELS = 3  # panels
-RIMS = {True: "controlled cars", False: "human drivers"}  # the fewer of both
-# Red stands, blue drives: ends that differ without red and green, and nothing fades into white.
+RIMS = {True: "controlled cars", False: "human drivers"}  # the group with fewer vehicles
+# From red (standing) to blue (driving): distinguishable without colour vision, and never white.
 SPEED_COLOURS = LinearSegmentedColormap.from_list(
     "speed", ["#a50f15", "#f0a202", "#2ca25f", "#08519c"]
 )
@@ -31,38 +31,38 @@ SPEED_COLOURS = LinearSegmentedColormap.from_list(
 def space_time(
     steps: pd.DataFrame, names: Sequence[str], cfg: Mapping[str, Any], every: int = POINT_STEPS
 ) -> Figure | None:
-    """Positions over time of one sample episode, a panel per strategy (the same episode).
+    """Draw positions over time of one sample episode, a panel per strategy.
 
-    Lines of controlled vehicles are framed in black, of people where most are controlled.
+    Lines of controlled vehicles have a black rim, or of human drivers if most are controlled.
 
     Args:
         steps: rows of steps.parquet.
-        names: the strategies to show; the first :data:`MOST_PANELS` that drive the whole string.
+        names: strategies; the first :data:`MOST_PANELS` with the whole string are shown.
         cfg: the evaluation's configuration.
         every: rows between the points of a line.
 
     Returns:
         The figure; None for strings with fewer than :data:`FEWEST` vehicles.
     """
-    found, episode = {}, telling(steps)
+    found, episode = {}, most_varied(steps)
     for name in names:
         try:
             rows = next(iter(sample_episodes(episode, name).values()))
             found[name] = motion_of(rows, cfg["scenario"]).at(slice(None, None, every))
-        except ResultsError:  # the strategy does not drive this episode
+        except ResultsError:  # the strategy lacks this episode
             continue
     most = max((len(motion.roles) for motion in found.values()), default=0)
-    # Strategies that drive all of the string.
+    # Strategies with the whole string.
     whole = {name: m for name, m in found.items() if len(m.roles) == most >= FEWEST}
     return side_by_side(dict([*whole.items()][:MOST_PANELS])) if whole else None
 
 
 @paper
 def side_by_side(motions: Mapping[str, SampleMotion], high: float = 2.6) -> Figure:
-    """Return a diagram of each motion, by what stands above it; ``high`` in inches."""
+    """Return a diagram of each motion, by title; ``high``: height in inches."""
     speeds = np.concatenate([motion.speed.ravel() for motion in motions.values()])
     low, top = float(speeds.min()), float(speeds.max())
-    scale = (low if low > 0.3 * top else 0.0, top)  # if no car nearly stands, colours tell more
+    scale = (low if low > 0.3 * top else 0.0, top)  # a narrower scale if no car nearly stops
     figure = new_figure(COLUMN_WIDTH if len(motions) == 1 else PAGE_WIDTH, high)
     axes = figure.subplots(1, len(motions), sharey=True, squeeze=False)[0]
     for axis, (name, motion) in zip(axes, motions.items(), strict=True):
@@ -78,12 +78,12 @@ def side_by_side(motions: Mapping[str, SampleMotion], high: float = 2.6) -> Figu
 
 
 def _few(motion: SampleMotion) -> bool:
-    """Whether at least half of the vehicles are people's."""
+    """Whether at least half of the vehicles have human drivers."""
     return 2 * motion.roles.count(HUMAN) >= len(motion.roles)
 
 
 def _panel(axis: Axes, motion: SampleMotion, scale: tuple[float, float]) -> LineCollection:
-    """Draw the lines of all vehicles; return them for the scale of colours."""
+    """Draw the lines of all vehicles; return them for the colour bar."""
     around = motion.circumference or np.inf
     shown = motion.position if np.isinf(around) else motion.position % around
     for vehicle, role in enumerate(motion.roles):
@@ -91,7 +91,7 @@ def _panel(axis: Axes, motion: SampleMotion, scale: tuple[float, float]) -> Line
         parts = np.stack([points[:-1], points[1:]], 1)
         whole = np.abs(parts[:, 1, 1] - parts[:, 0, 1]) < 0.5 * around
         framed = (role != HUMAN) == _few(motion)
-        above = 3 if framed else 2  # no other line hides the frame
+        above = 3 if framed else 2  # other lines do not cover the rim
         if framed:
             frame = LineCollection(list(parts[whole]), colors="black", linewidths=2.0, zorder=above)
             axis.add_collection(frame)

@@ -1,4 +1,4 @@
-"""Figures of trainings: what is learned, and limits kept, over the episodes (ALCC Fig. 6)."""
+"""Figures of trainings: objective and limits over episodes (ALCC Fig. 6)."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from lcc_rl.results.names import in_words, several
 
 ROLLING = 10  # iterations of the rolling mean
 BAND_NOTE = (
-    f"band: 95 % interval over seeds;\nof one seed 5th to 95th percentile of {ROLLING} batches"
+    f"band: 95 % interval over seeds;\nfor one seed 5th to 95th percentile of {ROLLING} batches"
 )
 LIMIT_PREFIX = "share_"  # prefix of the columns of limits
-# What a limit's share of the time is spent in.
+# Subjects of the limits' shares of the time.
 LIMIT_LABELS = {
     "safety": "unsafe time-to-collision",
     "efficiency": "long time gap",
@@ -37,7 +37,7 @@ LIMIT_LABELS = {
 
 @paper
 def training_figure(training: pd.DataFrame) -> Figure:
-    """What a training minimises, and how it keeps its limits; without limits the reward.
+    """Draw the objective and the limits of a training; without limits the reward.
 
     Args:
         training: rows of training.parquet of one or more runs, with ``variant``, ``seed`` and
@@ -54,7 +54,7 @@ def training_figure(training: pd.DataFrame) -> Figure:
     legend_above(first, 1)
     for axis, name in zip(others, limits, strict=True):
         draw_curves(axis, training.assign(percent=100.0 * training[name]), "percent")
-        top = 0.0  # after the first fifth, whose batches would set the scale
+        top = 0.0  # without the first fifth, which would set the scale
         for line in axis.lines:
             line.set_label("")
             values = np.asarray(line.get_ydata(), float)
@@ -79,7 +79,7 @@ def training_figure(training: pd.DataFrame) -> Figure:
 
 @paper
 def learning_curve(training: pd.DataFrame) -> Figure:
-    """Episode reward over episodes, see :func:`draw_curves` (Fig. 6).
+    """Draw the episode reward over episodes, see :func:`draw_curves` (Fig. 6).
 
     Args:
         training: rows of training.parquet of one or more runs, with ``variant`` and ``seed``.
@@ -99,12 +99,12 @@ def learning_curve(training: pd.DataFrame) -> Figure:
 def draw_curves(axis: Axes, training: pd.DataFrame, column: str) -> tuple[float, float]:
     """Draw the rolling mean of every variant's column with a band.
 
-    With several seeds the line is the mean and the band its 95 % bootstrap interval, as far as all
-    seeds have trained; with one seed the band spans the 5th to 95th percentile of the window.
+    With several seeds the line is the mean and the band its 95 % bootstrap interval, up to the
+    shortest training. With one seed the band spans the 5th to 95th percentile of the window.
 
     Returns:
-        Limits of the scale: the least value after the first fifth, whose episodes are random, and
-        the largest value; at most and at least 0.
+        Limits of the scale: the least value after the first fifth, which is random, at most 0; and
+        the largest value, at least 0.
     """
     floor = top = 0.0
     for variant, rows in training.groupby("variant", sort=False):

@@ -1,4 +1,4 @@
-"""Space-time diagrams that unroll with the time, side by side, as an SVG or a GIF."""
+"""Space-time diagrams that unroll with time, side by side, as an SVG or a GIF."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.figures.space_time import side_by_side
 from lcc_rl.results.motion import SampleMotion
 
-DPI, HIGH = 160, 3.4  # of the picture [1/inch], [inches]
-POINTS = 400  # of the line of a vehicle, at most
-SECONDS, HELD, FRAMES = 12.0, 3.0, 60  # until all is seen, and how long it stays; frames of a GIF
+DPI, HIGH = 160, 3.4  # resolution [1/inch] and height [inches] of the picture
+POINTS = 400  # most points of a line
+SECONDS, HELD, FRAMES = 12.0, 3.0, 60  # time of unrolling, pause [s]; frames of a GIF
 PAPER, COLOURS = "#ffffff", 255
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom [px]
 
 
 def unroll(motions: Mapping[str, SampleMotion], path: Path, ending: str) -> None:
-    """Write the diagrams of motions, which appear from left to right.
+    """Write diagrams that appear from left to right.
 
     Args:
-        motions: by what stands above each; of the same moments, all of an open road.
+        motions: motions on an open road with equal times, by title.
         path: the file.
         ending: ``.svg`` or ``.gif``.
 
     Raises:
-        ConfigError: if some, but not all, are of a ring.
+        ConfigError: if a motion is on a ring.
     """
     if any(motion.circumference is not None for motion in motions.values()):
         raise ConfigError("a .gif shows one ring; an .svg shows several")
@@ -46,7 +46,7 @@ def unroll(motions: Mapping[str, SampleMotion], path: Path, ending: str) -> None
 
 
 def _picture(motions: Mapping[str, SampleMotion]) -> tuple[Image.Image, list[Box]]:
-    """Return the whole diagram, and where in it the time runs."""
+    """Return the whole diagram and the boxes of its time axes."""
     every = max(len(next(iter(motions.values())).time) // POINTS, 1)
     short = {name: motion.at(slice(None, None, every)) for name, motion in motions.items()}
     figure = side_by_side(short, HIGH)
@@ -63,7 +63,7 @@ def _picture(motions: Mapping[str, SampleMotion]) -> tuple[Image.Image, list[Box
 
 
 def _covered(picture: Image.Image, boxes: list[Box], share: float) -> Image.Image:
-    """Return the picture without what comes after a share of the time."""
+    """Return the picture up to a share of the time."""
     image = picture.convert("RGB")
     for left, top, right, bottom in boxes:
         now = left + share * (right - left)
@@ -72,7 +72,7 @@ def _covered(picture: Image.Image, boxes: list[Box], share: float) -> Image.Imag
 
 
 def _svg(picture: Image.Image, boxes: list[Box], title: str) -> str:
-    """Return the picture under covers that withdraw."""
+    """Return the picture under moving covers."""
     data = BytesIO()
     picture.save(data, "PNG", optimize=True)
     (wide, high), whole = picture.size, SECONDS + HELD

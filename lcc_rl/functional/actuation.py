@@ -15,13 +15,13 @@ from lcc_rl.functional.kinematics import advance_gap, advance_speed
 class Response:
     """How commands become accelerations.
 
-    A command acts after ``late`` steps; from then on the acceleration approaches it by ``share``
-    of what is left in every step (a first-order lag τ, sampled: 1 − e^(−T/τ)).
+    A command acts after ``late`` steps; from then on every step closes ``share`` of the
+    remaining difference (a first-order lag τ, sampled: share = 1 − e^(−T/τ)).
 
     Args:
         late: steps between a command and its first effect.
         share: in (0, 1]; 1 without lag.
-        braking: hardest braking that there is, positive [m/s²].
+        braking: hardest braking possible, positive [m/s²].
         time_step: T [s].
     """
 
@@ -38,10 +38,10 @@ class Response:
 
     @property
     def hold(self) -> float:
-        """Time for which the last acceleration, held, covers what the lag loses [s].
+        """Time for which holding the last acceleration bounds the effect of the lag [s].
 
-        Braking fully from acceleration a reaches, step by step, a speed that lies above that of
-        braking at once by T·(a + braking)·(1 − share + (1 − share)² + …). Holding a for this time,
+        With the lag, full braking from acceleration a reaches a speed that exceeds that without
+        lag by T·(a + braking)·(1 − share + (1 − share)² + …). Holding a for this time,
         then braking fully, bounds the lagged speed from above.
         """
         return self.time_step * (1.0 - self.share) / self.share
@@ -54,10 +54,12 @@ class Response:
 
 @dataclass(frozen=True)
 class PairState:
-    """State of a vehicle and of the one ahead at a moment.
+    """State of a vehicle and of the vehicle ahead.
 
     Args:
-        speed, gap, ahead: of the vehicle [m/s], to and of the one ahead [m, m/s].
+        speed: of the vehicle [m/s].
+        gap: to the vehicle ahead [m].
+        ahead: speed of the vehicle ahead [m/s].
         acceleration: of the step before [m/s²].
     """
 
@@ -67,7 +69,7 @@ class PairState:
     acceleration: Tensor
 
     def after(self, own: Tensor, ahead: Tensor | float, time_step: float) -> PairState:
-        """Return the motion after a step with accelerations of both [m/s²]; none reverses."""
+        """Return the motion after a step with accelerations of both [m/s²]; neither reverses."""
         speed, _ = advance_speed(self.speed, own, time_step)
         reached, _ = advance_speed(self.ahead, torch.as_tensor(ahead), time_step)
         gap = advance_gap(self.gap, self.ahead, self.speed, reached, speed, time_step)
@@ -81,9 +83,9 @@ def predicted(
 
     Args:
         now: the motion, entries of any one shape ``[…, 1]``.
-        pending: commands given and not yet begun, the oldest first, ``[…, late]`` [m/s²].
-        ahead_acceleration: of the vehicle ahead throughout, which stops at standstill [m/s²].
-        response: how the vehicle obeys.
+        pending: commands that do not act yet, oldest first, ``[…, late]`` [m/s²].
+        ahead_acceleration: constant, of the vehicle ahead, which does not reverse [m/s²].
+        response: how commands become accelerations.
 
     Returns:
         The present motion, then one per step.

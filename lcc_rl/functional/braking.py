@@ -3,11 +3,11 @@
 A vehicle is *safe* where full braking keeps ``gap − τ·(v − v_ahead)`` from becoming negative at
 all times to come, while the vehicle ahead brakes as hard as is expected of it until it stands. No
 other behaviour of the vehicle ahead within that bound is worse: its speed and its position are at
-least those of constant braking. Braking fully leads from a safe state to safe states only, so that
-a controller that never leaves them is always able to stay (the backup strategy of control barrier
-functions; the safe distance of Shalev-Shwartz, Shammah and Shashua, "On a formal model of safe and
-scalable self-driving cars", arXiv 1708.06374, without reaction time and for time-to-collision
-instead of contact).
+least those of constant braking. From a safe state, full braking leads to safe states only. A
+controller in a safe state can therefore always stay in safe states: full braking is the backup
+strategy of a control barrier function. The distance is that of Shalev-Shwartz, Shammah and
+Shashua, "On a formal model of safe and scalable self-driving cars", arXiv 1708.06374, without
+reaction time and for time-to-collision instead of contact.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def least_room(speed: Tensor, gap: Tensor, speed_ahead: Tensor, braking: Braking
 
     Args:
         speed: v, any shape [m/s].
-        gap: gap, less what counts as contact [m].
+        gap: gap minus the margin of contact [m].
         speed_ahead: speed of the vehicle ahead [m/s].
         braking: how hard both brake, and τ.
 
@@ -55,7 +55,7 @@ def least_room(speed: Tensor, gap: Tensor, speed_ahead: Tensor, braking: Braking
     room = gap - tau * closing
     standing = speed_ahead / braking.ahead  # when the vehicle ahead stands [s]
     least = torch.minimum(room, _room_at(standing, speed, gap, speed_ahead, braking))
-    if difference > 0.0:  # while both drive, room is convex in time: its least may lie before
+    if difference > 0.0:  # while both drive, room is convex in time: its minimum may be earlier
         when = (closing / difference - tau).clamp(min=0.0)
         before = torch.minimum(least, room - 0.5 * difference * when**2)
         least = torch.where(when < standing, before, least)
@@ -67,7 +67,7 @@ def _room_at(
 ) -> Tensor:
     """Return the least room from the moment on at which the vehicle ahead stands."""
     tau, own = braking.time_to_collision, braking.own
-    # A vehicle that stands earlier sees its gap open again: its room was least before.
+    # If the vehicle stops earlier, its gap grows again: the minimum was before.
     reached = (speed - own * time).clamp(min=0.0)
     moving = torch.minimum(time, speed / own)
     gap = gap + 0.5 * speed_ahead * time - 0.5 * (speed + reached) * moving
@@ -78,12 +78,12 @@ def _room_at(
 def least_room_held(
     motion: PairState, acceleration: Tensor, time: float, braking: Braking
 ) -> Tensor:
-    """Return the least room to come if a vehicle brakes fully after it held an acceleration.
+    """Return the least room to come if a vehicle holds an acceleration, then brakes fully.
 
     The vehicle ahead brakes fully from now on.
 
     Args:
-        motion: the state, its gap less what counts as contact; its acceleration is not used.
+        motion: the state, with the gap minus the margin; its acceleration is not used.
         acceleration: held [m/s²].
         time: for which it is held [s].
         braking: how hard both brake, and τ.
@@ -97,7 +97,8 @@ def least_room_held(
         return reached, gap, (ahead + hard * moment).clamp(min=0.0)
 
     end = torch.full_like(speed, time)
-    # Where room may be least before: closing ends to grow, the vehicle ahead stands, and then.
+    # Room may be least where its slope vanishes or changes, before the vehicle ahead stands, when
+    # it stands, or afterwards.
     slower, slows = (-(acceleration + braking.ahead), -acceleration)
     inner = (
         (speed - ahead) / slower.clamp(min=1e-6) - tau,
@@ -112,13 +113,13 @@ def least_room_held(
 
 
 def least_room_late(motion: PairState, response: Response, braking: Braking) -> Tensor:
-    """Return the least room to come while a vehicle brakes fully that obeys with a lag.
+    """Return a lower bound of the room to come while a vehicle with a lag brakes fully.
 
-    At most that: see :attr:`lcc_rl.functional.actuation.Response.hold`.
+    See :attr:`lcc_rl.functional.actuation.Response.hold`.
 
     Args:
-        motion: the state, its gap less what counts as contact.
-        response: how the vehicle obeys.
+        motion: the state, with the gap minus the margin.
+        response: how commands become accelerations.
         braking: how hard both brake, and τ.
     """
     return least_room_held(motion, motion.acceleration, response.hold, braking)
@@ -127,14 +128,14 @@ def least_room_late(motion: PairState, response: Response, braking: Braking) -> 
 def least_room_to_come(
     now: PairState, pending: Tensor, response: Response, braking: Braking
 ) -> Tensor:
-    """Return the least room to come while commands under way act, then full braking.
+    """Return the least room to come while pending commands act, then full braking.
 
     The vehicle ahead brakes fully from now on.
 
     Args:
-        now: the state, its gap less what counts as contact.
-        pending: commands given and not yet begun, the oldest first, ``[…, late]`` [m/s²].
-        response: how the vehicle obeys.
+        now: the state, with the gap minus the margin.
+        pending: commands that do not act yet, oldest first, ``[…, late]`` [m/s²].
+        response: how commands become accelerations.
         braking: how hard both brake, and τ.
     """
     path = predicted(now, pending, -braking.ahead, response)
@@ -143,22 +144,22 @@ def least_room_to_come(
 
 
 def safe_command(motion: PairState, response: Response, braking: Braking) -> Tensor:
-    """Return the largest command after which a vehicle that obeys with a lag is still safe.
+    """Return the largest command after which a vehicle with a lag is still safe.
 
-    Held for a step and for what the lag costs, the acceleration that it leads to must leave room;
-    full braking does in every safe state. The largest such acceleration is found by bisection,
+    The resulting acceleration must leave room if it is held for a step and for ``response.hold``.
+    Full braking does so in every safe state. The largest such acceleration is found by bisection
     and has the gradient of the implicit function.
 
     Args:
-        motion: the state when the command begins to act, its gap less what counts as contact.
-        response: how the vehicle obeys.
+        motion: the state when the command begins to act, with the gap minus the margin.
+        response: how commands become accelerations.
         braking: how hard both brake, and τ.
 
     Returns:
-        The command, at most that which leads to full acceleration as hard as braking [m/s²].
+        The command; the acceleration that it leads to is at most ``braking.own`` [m/s²].
     """
     time = response.time_step + response.hold
-    # In samples, a vehicle that stops within a step comes a little nearer than its trapezoid.
+    # A vehicle that stops within a step comes nearer than the trapezoidal rule gives.
     now = replace(motion, gap=motion.gap - 0.125 * braking.own * response.time_step**2)
     with torch.no_grad():
         low = torch.full_like(now.speed, -braking.own)
@@ -179,7 +180,7 @@ def safe_command(motion: PairState, response: Response, braking: Braking) -> Ten
 
 
 def _way(speed: Tensor, acceleration: Tensor, time: Tensor) -> Tensor:
-    """Return what a vehicle drives in a time; once it stands, it stays."""
+    """Return the distance that a vehicle drives in a time; it does not reverse."""
     reached = speed + acceleration * time
     stopped = 0.5 * speed**2 / (-acceleration).clamp(min=1e-6)
     return torch.where(reached < 0.0, stopped, 0.5 * (speed + reached) * time)
@@ -191,12 +192,12 @@ def safe_acceleration(
     """Return the largest acceleration of one step after which the vehicle is safe.
 
     The step is the simulator's (A18): the acceleration is held for T, gaps follow the trapezoidal
-    rule. During the step, too, the vehicle ahead brakes as hard as is expected of it. Full braking
-    is safe in every safe state, so that what comes out is at least ``−own`` there.
+    rule. The vehicle ahead brakes as hard as expected during the step, too. In a safe state the
+    result is at least ``−own``, because full braking is safe there.
 
     Args:
         speed: v, any shape [m/s].
-        gap: gap, less what counts as contact [m].
+        gap: gap minus the margin of contact [m].
         speed_ahead: speed of the vehicle ahead [m/s].
         braking: how hard both brake, and τ.
         time_step: T [s].
@@ -210,7 +211,7 @@ def safe_acceleration(
     closing, slope = speed - slowest, tau + 0.5 * time_step
     gap = gap + time_step * (0.5 * (speed_ahead + slowest) - speed)
     room = gap - tau * closing
-    # And once the vehicle ahead stands, likewise: then closing is the speed itself.
+    # Likewise once the vehicle ahead stands: closing is then the speed itself.
     standing = slowest / braking.ahead
     left = speed - braking.own * standing
     gap = gap + standing * (0.5 * slowest - 0.5 * (speed + left))

@@ -19,7 +19,7 @@ from lcc_rl.functional.string import gather
 
 
 class Errors(NamedTuple):
-    """Errors of a vehicle's place in the platoon, each ``[*batch, N, 1]``.
+    """Errors of a vehicle's position and speed in the platoon, each ``[*batch, N, 1]``.
 
     gap: e_x(i,i−1) [m]; speed: e_v(i,i−1) [m/s]; leader_gap: e_x(i,0) [m]; leader_speed:
     e_v(i,0) [m/s].
@@ -70,7 +70,7 @@ def platoon_errors(
 class Chain(NamedTuple):
     """The radio links of a string; other vehicles use their own sensors, which have no delay.
 
-    first: place of the first vehicle of each vehicle's chain of connected vehicles, int64,
+    first: index of the first vehicle of each vehicle's chain of connected vehicles, int64,
     ``[*batch, N]``; hears: whether the vehicle ahead, and so the leader of its chain, sends to it,
     ``[*batch, N, 1]``.
     """
@@ -82,12 +82,12 @@ class Chain(NamedTuple):
 def find_chains(connected: Tensor, leader_sends: bool) -> Chain:
     """Find the chains of connected vehicles, each behind a leader that is not.
 
-    A vehicle hears the connected vehicles ahead of it without a gap in the chain; the vehicle
-    ahead of the first of them is their leader, seen by the first one's sensors.
+    A vehicle receives messages of the connected vehicles directly ahead of it. The vehicle ahead
+    of the first of them is their leader, which the first one measures by its sensors.
 
     Args:
-        connected: whether a vehicle sends and hears, ``[*batch, N]``.
-        leader_sends: the vehicle ahead of the whole string sends, too.
+        connected: whether a vehicle sends and receives, ``[*batch, N]``.
+        leader_sends: whether the vehicle ahead of the whole string sends, too.
     """
     before = torch.nn.functional.pad(connected[..., :-1], (1, 0), value=False)
     goes_on = connected & before
@@ -101,7 +101,7 @@ def find_chains(connected: Tensor, leader_sends: bool) -> Chain:
 class Gains:
     """Gains of the CACC law; k1, k3 [1/s] weigh gap errors, k2, k4 [–] speed errors.
 
-    k1, k2 belong to the predecessor, k3, k4 to the leader.
+    k1 and k2 belong to the predecessor, k3 and k4 to the leader.
     """
 
     k1: float
@@ -113,8 +113,8 @@ class Gains:
         """Check that the closed loop is stable: kx > 0 and T·kx/2 < kv < 2.
 
         kx = k1 + k3 and kv = k2 + k4. By the Jury criterion for
-        e_v' = e_v − kx e_x − kv e_v, e_x' = e_x + T (e_v + e_v')/2, the same for every follower,
-        since what the others do enters only as an input.
+        e_v' = e_v − kx e_x − kv e_v, e_x' = e_x + T (e_v + e_v')/2. This holds for every follower:
+        the other vehicles enter as inputs only.
 
         Raises:
             ConfigError: naming the condition that fails.
@@ -153,9 +153,9 @@ def next_leader_speed(leader: Sequence[Tensor], lookahead: str, time_step: float
     """Predict the leader's speed one step ahead [m/s].
 
     Args:
-        leader: its speed v_0 [m/s], its acceleration a_0 by backward difference [m/s²] and the
-            speed that it will really have [m/s], which only ``"oracle"`` looks at.
-        lookahead: ``"causal"`` for v_0 + a_0 T, ``"hold"`` for v_0, ``"oracle"`` for the truth.
+        leader: its speed v_0 [m/s], its acceleration a_0 by backward difference [m/s²] and its
+            true next speed [m/s], which only ``"oracle"`` reads.
+        lookahead: ``"causal"``: v_0 + a_0 T; ``"hold"``: v_0; ``"oracle"``: the true speed.
         time_step: T [s].
     """
     speed, acceleration, true_next = leader

@@ -16,15 +16,15 @@ from torch import Tensor
 from lcc_rl.errors import require_positive
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 
-Each = Tensor | float  # a number of each driver, or one of all
+Each = Tensor | float  # a number per driver, or one for all
 
 
 class Parameter(NamedTuple):
     """A parameter that a calibration may fit, of one driver model or several.
 
-    column: its name in tables, with the unit; label: its name, symbol and unit for people; bounds:
-    of a calibration, by default; plausible: the range beyond which a table is in other units, or
-    not one of drivers.
+    column: its name in tables, with the unit; label: its name, symbol and unit in figures; bounds:
+    of a calibration, by default; plausible: the range outside which a table is refused, because
+    its units differ or its rows are no drivers.
     """
 
     column: str
@@ -35,7 +35,7 @@ class Parameter(NamedTuple):
 
 _ACCELERATION = (0.05, 20.0)  # plausible [m/s²]
 _RATE = (0.001, 20.0)  # plausible [1/s]
-# The parameters of all models; a model of your own adds those that it alone has.
+# The parameters of all models; your own model adds its own in ``own``.
 PARAMETERS: dict[str, Parameter] = {
     "desired_speed": Parameter(
         "desired_speed_mps", "desired speed $v_0$ [m/s]", (5.0, 40.0), (1.0, 100.0)
@@ -62,7 +62,7 @@ PARAMETERS: dict[str, Parameter] = {
         _ACCELERATION,
     ),
 }
-INDIVIDUAL = ("desired_speed", "time_gap")  # what every driver has of its own, whatever the model
+INDIVIDUAL = ("desired_speed", "time_gap")  # parameters that differ by driver in every model
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +94,7 @@ class DriverConstants(ABC):
     def wish(
         self, speed: Tensor, gap: Tensor, approach_rate: Tensor, desired_speed: Each, time_gap: Each
     ) -> Tensor:
-        """Return the acceleration that the driver wishes [m/s²]; arguments as of a call."""
+        """Return the desired acceleration [m/s²]; arguments as in :meth:`__call__`."""
 
     @abstractmethod
     def steady_gap(self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor) -> Tensor:
@@ -122,8 +122,8 @@ class DriverConstants(ABC):
     ) -> Tensor:
         """Return the gap at which a driver keeps its speed behind an equally fast leader.
 
-        It may diverge as v approaches v0 and is capped at ``2·s0 + cap_time_gap·v``; the papers
-        do not say how a follower starts.
+        It may diverge as v approaches v0 and is capped at ``2·s0 + cap_time_gap·v``. The papers
+        do not define how a follower starts.
 
         Args:
             speed: common speed v [m/s].
@@ -161,7 +161,7 @@ class DriverConstants(ABC):
         return replace(self, **changes)  # type: ignore[arg-type]
 
     def mean(self) -> Self:
-        """Return a copy with the mean in place of what varies by driver."""
+        """Return a copy with the mean of each parameter that varies by driver."""
         varying = {name: x for name, x in vars(self).items() if isinstance(x, Tensor)}
         return self.with_(**{name: float(x.mean()) for name, x in varying.items()})
 
@@ -173,7 +173,7 @@ class Reaction:
     Args:
         delay: age of the speed, gap and relative speed that a driver reacts to [s].
         noise: standard deviation of a noise of the acceleration, see :class:`NoiseStep` [m/s²].
-        gap_noise: the same of the logarithm of the perceived gap.
+        gap_noise: standard deviation of such a noise of the logarithm of the perceived gap.
     """
 
     delay: float = 0.0
@@ -182,22 +182,22 @@ class Reaction:
 
 
 NOISE_TIME = 0.7  # time constant of the noise of the acceleration [s]
-GAP_NOISE_TIME = 2.0  # that of the noise of the perceived gap [s]
+GAP_NOISE_TIME = 2.0  # time constant of the noise of the perceived gap [s]
 
 
 @dataclass(frozen=True)
 class NoiseStep:
     """A step of a smooth noise, exact for any time step.
 
-    The noise is white noise behind two low-passes of one time constant, so that
-    it has a finite jerk, as a pedal has; an Ornstein–Uhlenbeck process has one low-pass only. With
-    z ~ N(0, 1), xₖ = 2ρ xₖ₋₁ − ρ² xₖ₋₂ + c z has the standard deviation 1; neighbours have the
-    correlation ``linked``.
+    The noise is white noise behind two low-pass filters of one time constant. Its jerk is finite,
+    as that of a pedal; an Ornstein–Uhlenbeck process has one low-pass filter only. With
+    z ~ N(0, 1), xₖ = 2ρ xₖ₋₁ − ρ² xₖ₋₂ + c z has the standard deviation 1; successive values have
+    the correlation ``linked``.
 
     Args:
         kept: ρ.
         new: c.
-        linked: correlation of neighbouring values.
+        linked: correlation of successive values.
     """
 
     kept: float
@@ -206,17 +206,17 @@ class NoiseStep:
 
     @classmethod
     def of(cls, time_step: float, time_constant: float = NOISE_TIME) -> Self:
-        """Return the step of a time step and a time constant [s]."""
+        """Return the coefficients for a time step and a time constant [s]."""
         kept = math.exp(-time_step / time_constant)
         new = math.sqrt((1.0 - kept * kept) ** 3 / (1.0 + kept * kept))
         return cls(kept, new, 2.0 * kept / (1.0 + kept * kept))
 
     def start(self, drawn: Tensor, further: Tensor) -> tuple[Tensor, Tensor]:
-        """Return a first value and the one before it, from two independent draws of N(0, 1)."""
+        """Return the first value and its predecessor from two independent draws of N(0, 1)."""
         return drawn, self.linked * drawn + math.sqrt(1.0 - self.linked**2) * further
 
     def next(self, latest: Tensor, before: Tensor, drawn: Tensor) -> Tensor:
-        """Return the value after two others."""
+        """Return the value that follows two others."""
         return 2.0 * self.kept * latest - self.kept**2 * before + self.new * drawn
 
 
@@ -240,10 +240,10 @@ def follow(
         gap: initial gap, ``[*batch]`` [m].
         own: v0 [m/s] and T [s], broadcastable to ``[*batch]``.
         time_step: duration of a step [s].
-        late: steps by which speed, gap and relative speed are old when the driver reacts; until
-            then, they are those of the start.
-        disturbed: makes the command that is executed out of the number of the step and the law's.
-        perceived: makes the gap that the driver sees out of the true one, once a step.
+        late: age in steps of the speed, gap and relative speed that the driver reacts to; in the
+            first steps they are those of the start.
+        disturbed: returns the executed command from the number of the step and the law's command.
+        perceived: returns the gap that the driver sees from the true one, once a step.
 
     Yields:
         Speed, gap and executed acceleration after each step, ``[*batch]``.
@@ -274,12 +274,12 @@ def simulate_follower(
     time_step: float,
     noise: Callable[[int], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the motion of :func:`follow` from the start on; most arguments are described there.
+    """Return the motion of :func:`follow` from the start on.
 
     Args:
-        leader_speed, speed, gap, law, time_step: see there.
+        leader_speed, speed, gap, law, time_step: see :func:`follow`.
         desired_speed, time_gap: v0 [m/s] and T [s], broadcastable to ``[*batch]``.
-        noise: gives the relative error ξ of the executed acceleration at a step (A18), if any.
+        noise: returns the relative error ξ of the executed acceleration at a step (A18).
 
     Returns:
         Speeds and gaps of shape ``[time + 1, *batch]`` and accelerations ``[time, *batch]``.

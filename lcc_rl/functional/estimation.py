@@ -2,11 +2,10 @@
 
 With a, b and s0 known, A3 is linear in q = (v_ref/v0)^δ and quadratic in T. Each step therefore
 allows one recursive update of (q, T) from a single scalar measurement, the follower's
-acceleration by differencing; the running 2×2 covariance is all that is remembered. Because the
-model is exactly quadratic in T, the update can account for the curvature too (a second-order
-filter), without which a wide belief about T is led astray by its first measurements. The
-calibrated population is the prior, which keeps what a drive does not reveal (v0 in congestion)
-plausible.
+acceleration by differencing; its memory is the estimate with its 2×2 covariance. Because the model
+is exactly quadratic in T, the update accounts for the curvature, too (a second-order filter).
+Without it, the first measurements move a wide belief about T too far. The calibrated population
+is the prior. It keeps parameters plausible that a drive does not reveal, such as v0 in congestion.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ def prior(desired_speed: Tensor, time_gap: Tensor, exponent: float = 4.0) -> Bel
         exponent: acceleration exponent δ.
 
     Returns:
-        A belief of shape ``[2]`` and ``[3]``; a single driver gets a small positive variance.
+        A belief of shapes ``[2]`` and ``[3]``; for one driver its variance is small and positive.
     """
     sample = torch.stack([(REFERENCE_SPEED / desired_speed) ** exponent, time_gap])
     centred = sample - sample.mean(1, keepdim=True)
@@ -66,19 +65,19 @@ def predict_and_update(
     time_step: float,
     measurement_error: float,
 ) -> tuple[Tensor, Belief]:
-    """Predict the acceleration of this step, then learn from the one measured (A15).
+    """Predict the acceleration of this step, then update the belief by the measured one (A15).
 
-    The prediction uses the belief from before the measurement. A step in which the follower
-    stands still or its acceleration meets its physical limit contains nothing on (v0, T) and leaves
-    the belief as it was.
+    The prediction uses the belief before the measurement. A step in which the follower stands or
+    its acceleration is at its physical limit carries no information on (v0, T) and leaves the
+    belief unchanged.
 
     Args:
         speed: the follower's speed at the start of the step, shape ``[*, 1]`` [m/s].
         gap: its gap, same shape [m].
         approach_rate: v − v_ahead, same shape [m/s].
         speed_reached: its speed at the end of the step, same shape [m/s].
-        belief: what is believed before the step.
-        constants: the parameters taken as known.
+        belief: the belief before the step.
+        constants: the parameters assumed to be known.
         time_step: duration of the step [s].
         measurement_error: standard deviation of the measured acceleration about the model [m/s²].
 
@@ -92,7 +91,7 @@ def predict_and_update(
 
 
 class _Linear(NamedTuple):
-    """The IDM about a belief: the acceleration it predicts and its slopes by q and T."""
+    """The IDM linearised at a belief: predicted acceleration and its slopes by q and T."""
 
     predicted: Tensor
     slope_q: Tensor
@@ -125,7 +124,7 @@ def _updated(
     slope_q, slope_t = model.slope_q, model.slope_t
     spread_q = variance_q * slope_q + covariance * slope_t
     spread_t = covariance * slope_q + variance_t * slope_t
-    # What the square of T adds to mean and variance of the model; exact for a Gaussian belief.
+    # The term in T² adds this to mean and variance of the model; exact for a Gaussian belief.
     curvature = model.curvature * variance_t
     total = slope_q * spread_q + slope_t * spread_t + 2.0 * curvature.square()
     weight = informative / (total + measurement_error**2)
@@ -134,8 +133,8 @@ def _updated(
     covariance = covariance - spread_q * spread_t * weight
     variance_t = variance_t - spread_t * spread_t * weight
     q, time_gap = q + spread_q * surprise, time_gap + spread_t * surprise
-    # A negative q means nothing (v0 beyond all bounds is q = 0); T follows along the covariance,
-    # else the pair would leave the ridge that the measurements allow.
+    # A negative q has no meaning (q = 0 is an infinite v0). T is corrected along the covariance,
+    # so that the pair stays on the ridge that the measurements allow.
     bounded = q.clamp(min=0.0)
     time_gap = time_gap + covariance / variance_q * (bounded - q)
     estimate = join([bounded, time_gap.clamp(0.05, 10.0)], -1)
@@ -175,7 +174,7 @@ class PopulationMean(torch.nn.Module):
         self.register_buffer("sums", torch.cat([above, torch.zeros(1, 3)]).float())
 
     def forward(self, speed: Tensor, gap: Tensor, approach_rate: Tensor) -> Tensor:
-        """Return the mean acceleration [m/s²]; arguments as of :class:`IDMConstants`."""
+        """Return the mean acceleration [m/s²]; arguments as for :class:`IDMConstants`."""
         known = self.constants
         shift = approach_rate * (0.5 / (known.acceleration * known.deceleration) ** 0.5)
         index = reverse(torch.searchsorted(self.thresholds, reverse(-shift.detach()).contiguous()))

@@ -17,10 +17,11 @@ class GippsConstants(DriverConstants):
     T is the time gap at equilibrium if b̂ = b: the reaction time τ and the paper's further τ/2.
 
     Args:
-        acceleration: largest acceleration a that the driver wishes [m/s²].
-        deceleration: hardest braking b that the driver wishes, positive [m/s²].
+        acceleration: largest desired acceleration a [m/s²].
+        deceleration: hardest desired braking b, positive [m/s²].
         min_gap: gap s0 at standstill [m].
-        leader_deceleration: b̂, what the driver believes of the vehicle ahead, positive [m/s²].
+        leader_deceleration: b̂, braking that the driver expects of the vehicle ahead, positive
+            [m/s²].
     """
 
     acceleration: float = 1.7
@@ -35,22 +36,22 @@ class GippsConstants(DriverConstants):
 
         v_G is the less of v + 2.5 a τ (1 − v/v0) √(0.025 + v/v0), on a free road, and
         −bτ + √(b²τ² + b (2 (s − s0) − vτ) + v_ahead² b/b̂), at which the driver can stop behind
-        the vehicle ahead. With a time step of τ this is the paper's rule; with shorter ones it
-        is renewed within the reaction time.
+        the vehicle ahead. With a time step of τ this is the paper's rule; with shorter steps the
+        speed is updated within the reaction time.
         """
         share, tau = speed / desired_speed, time_gap / 1.5
         free = 2.5 * self.acceleration * (1.0 - share) * (0.025 + share).sqrt()
         brake, ahead = self.deceleration * tau, speed - approach_rate
         room = self.deceleration * (2.0 * (gap - self.min_gap) - speed * tau)
-        believed = self.deceleration / self.leader_deceleration * ahead * ahead
+        expected = self.deceleration / self.leader_deceleration * ahead * ahead
         # Clamped: the gradient of sqrt is infinite at 0.
-        root = (brake * brake + room + believed).clamp(min=1e-12).sqrt()
+        root = (brake * brake + room + expected).clamp(min=1e-12).sqrt()
         return torch.minimum(free, (root - brake - speed) / tau)
 
     def steady_gap(self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor) -> Tensor:
         """Return s0 + vT + v²/2 (1/b − 1/b̂), at least s0.
 
-        Below v0 a driver keeps it behind an equally fast leader; at v0 any larger one, too.
+        Below v0 this is the only equilibrium gap; at v0 every larger gap is one, too.
         """
         trust = 1.0 / self.deceleration - 1.0 / self.leader_deceleration
         more = (speed * time_gap + 0.5 * speed * speed * trust).clamp(min=0.0)

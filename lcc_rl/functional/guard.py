@@ -1,4 +1,4 @@
-"""A check that a function leaves the tensors that it reads as they are."""
+"""A check that a function does not change its inputs in place."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lcc_rl.errors import ConfigError
 def unchanged(
     function: Callable[..., Any], values: Sequence[Tensor], title: str, names: Sequence[str]
 ) -> Any:
-    """Return what a function returns for tensors that it must not change in place.
+    """Return the result of a function that must not change its inputs in place.
 
     Compiled code is not checked: when an environment is built, all its pieces run uncompiled.
 
@@ -31,13 +31,13 @@ def unchanged(
 
 
 def changes(values: Sequence[Tensor]) -> list[int]:
-    """Return how often each tensor was changed in place; torch's inference mode counts nothing."""
+    """Return how often each tensor was changed in place; 0 in torch's inference mode."""
     return [0 if value.is_inference() else value._version for value in values]
 
 
 def changed(title: str, name: str) -> ConfigError:
-    """Return the error for a class that changes what it reads."""
+    """Return the error for a class that changes its inputs."""
     return ConfigError(
         f"{title} changes {name} in place, and so the state of the vehicles; use "
-        "gap.clamp(…) instead of gap.clamp_(…) and the like, or change a clone"
+        "gap.clamp(…) instead of gap.clamp_(…), or change a clone"
     )

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 
-# What the hybrid strategy drives by: the better of its candidates (the paper), the point between
-# them nearest to the rule that earns no less, or the rule and what the first vehicle so adds to it.
+# The command of the hybrid strategy: the better candidate (the paper); the point between both that
+# is nearest to the rule and earns no less; or the rule and the first vehicle's correction of it.
 Choice = Literal["better", "between", "first"]
 
 
@@ -34,17 +34,17 @@ class PlatoonReward:
     """The paper's reward H4–H6: −ω1 |e_v(i,0)|/v_max − ω2 |jerk|/jerk_scale.
 
     Table IV of the paper determines ω1/v_max = 0.369 s/m and ω2 = 0.036 (jerk_scale =
-    2 a_max/T = 30 m/s³). The paper's reward has no spacing; −ω3 (e_x(i,0)/gap_scale)² is an
-    addition, of which only :meth:`one_step` knows.
+    2 a_max/T = 30 m/s³). The paper's reward has no spacing term; −ω3 (e_x(i,0)/gap_scale)² is an
+    addition that only :meth:`one_step` uses.
 
     Args:
         velocity_weight: ω1.
         speed_scale: v_max [m/s].
         jerk_weight: ω2.
         jerk_scale: 2 a_max/T [m/s³].
-        spacing_weight: ω3; 0, the paper's, leaves gaps out.
+        spacing_weight: ω3; 0 as in the paper.
         gap_scale: deviation that costs ω3 [m].
-        spacing_time: how long the speeds that a step leads to are kept until e_x counts [s].
+        spacing_time: time after a step, at the speeds reached, at which e_x counts [s].
     """
 
     velocity_weight: float = 10.0
@@ -56,7 +56,7 @@ class PlatoonReward:
     spacing_time: float = 0.0
 
     def __call__(self, speed_error: Tensor, jerk: Tensor) -> Tensor:
-        """Return the reward of e_v(i,0) [m/s] and jerk [m/s³], of their broadcast shape."""
+        """Return the reward for e_v(i,0) [m/s] and jerk [m/s³], in their broadcast shape."""
         return (
             -self.velocity_weight / self.speed_scale * speed_error.abs()
             - self.jerk_weight / self.jerk_scale * jerk.abs()
@@ -73,9 +73,9 @@ class PlatoonReward:
     ) -> Tensor:
         """Return the reward that an acceleration will earn, ``[*batch, N, 1]`` (H12).
 
-        With a spacing weight also by the place it leads to, e_x(i,0) after the step and after
-        ``spacing_time`` at the speeds reached. One step alone moves a vehicle by a T²/2, so
-        little that its speed would outweigh its place in every step.
+        With a spacing weight, e_x(i,0) after the step and ``spacing_time`` at the speeds reached
+        counts, too. Without that time the speed would outweigh the position in every step,
+        because one step moves a vehicle by a T²/2 only.
 
         Args:
             speed: v_i [m/s].
@@ -83,7 +83,7 @@ class PlatoonReward:
             acceleration: the candidate [m/s²].
             leader_next: the predicted speed of each vehicle's leader [m/s].
             time_step: T [s].
-            place: where the vehicle is, which a spacing weight needs.
+            place: the vehicle's place in its platoon, needed with a spacing weight.
         """
         reached, executed = advance_speed(speed, acceleration, time_step)
         jerk = (executed - last_acceleration) / time_step
@@ -137,35 +137,33 @@ def hybrid_decision(
     """Decide between two candidate accelerations, per follower (H12–H14).
 
     1. Clamp both to the interval of the jerk bound and, from above, to the safe cap.
-    2. The one whose one-step reward is larger wins; the rule wins ties.
-    3. In the frame in which the winner changes, the two are blended half and half.
+    2. The candidate with the larger one-step reward wins; the rule wins ties.
+    3. In the step in which the winner changes, the command is the mean of both.
 
     The theorem H15–H21 assumes that each candidate keeps the jerk bound relative to the
-    acceleration executed last; without step 1 that is not so.
+    acceleration executed last; only step 1 ensures that.
 
-    With ``choice="between"`` the point between the candidates that is nearest to the rule and
-    earns no less than either takes the place of steps 2 and 3: there is no jump, and no step
-    falls short of a candidate, as the blend of step 3 does. With ``"first"`` the first vehicle
-    decides so; the others add its correction, what it adds to its rule, to their own. In the
-    errors between neighbours the correction cancels: they obey the rule's law, whatever the
-    policy does.
+    ``choice="between"`` replaces steps 2 and 3: the command is the point between the candidates
+    that is nearest to the rule and earns no less than either. It does not jump, and no step earns
+    less than a candidate, as the mean of step 3 may. With ``"first"`` the first vehicle decides
+    so. Its correction is the difference from its rule; the other vehicles add it to theirs. It
+    cancels in the errors between neighbours, which follow the rule's law for any policy.
 
     Args:
         rule, learned: the candidates [m/s²]; the rule's may exceed a_max, so that neighbours
             differ by its law there, too.
         speed: v_i [m/s].
         last_acceleration: a_{k−1} as executed [m/s²].
-        last_winner: winner of the frame before; negative or None where there was none.
+        last_winner: winner of the step before; negative or None where there was none.
         leader_next: the predicted speed of each vehicle's leader [m/s].
-        interval: see :func:`jerk_interval`; None leaves the bound out (the literal rule).
-        cap: see :func:`lcc_rl.functional.braking.safe_acceleration`, which may lie below −a_max;
-            None leaves it out. If it or a candidate is not a finite number, the vehicle brakes as
-            hard as it can.
-        reward: the reward to compare by.
+        interval: see :func:`jerk_interval`; None: no bound (the literal rule).
+        cap: see :func:`lcc_rl.functional.braking.safe_acceleration`; it may be below −a_max. None:
+            no cap. If the cap or a candidate is not finite, the vehicle brakes fully.
+        reward: the reward by which candidates are compared.
         time_step: T [s].
         max_acceleration: a_max [m/s²], of both candidates and of the brakes.
-        place: where the vehicle is, which a reward with a spacing weight needs.
-        choice: see above. The winner between the candidates is the nearer one.
+        place: the vehicle's place in its platoon, needed by a reward with a spacing weight.
+        choice: see above. With ``"between"`` and ``"first"`` the winner is the nearer candidate.
     """
     (one, two), clamped, capped = _bounded(
         torch.stack([rule, learned]), interval, cap, max_acceleration
@@ -196,11 +194,11 @@ def hybrid_decision(
 def _nearest(
     rule: Tensor, learned: Tensor, bends: Tensor, earned: Callable[[Tensor], Tensor]
 ) -> Tensor:
-    """Return the least share of the learned candidate that earns no less than either, if mixed in.
+    """Return the least share of the learned candidate in a mix that earns no less than either.
 
     Args:
         rule, learned: the candidates, ``[*batch, N, 1]`` [m/s²].
-        bends: accelerations between which the reward is linear, ``[*batch, N, n]`` [m/s²].
+        bends: accelerations at which the slope of the reward changes, ``[*batch, N, n]`` [m/s²].
         earned: the reward of accelerations, concave.
     """
     span = learned - rule
@@ -223,7 +221,7 @@ def _bounded(
     cap: Tensor | None,
     max_acceleration: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the candidates within jerk bound and safe cap, and whether either cut one (step 1)."""
+    """Return the candidates within jerk bound and cap, and whether each cut one (step 1)."""
     given, free = candidates, candidates.clamp(-max_acceleration, max_acceleration)
     candidates = free
     if interval is not None:
@@ -232,7 +230,7 @@ def _bounded(
     if cap is None:
         return candidates, clamped, torch.zeros_like(clamped)
     bounded = torch.minimum(candidates, cap.clamp(min=-max_acceleration))
-    # If a candidate, or what the cap is computed from, is no number, nothing is known to be safe.
+    # If a candidate or an input of the cap is NaN, no command is known to be safe.
     known = (given.isfinite() & bounded.isfinite() & cap.isfinite()).all(0)
     bounded = torch.where(known, bounded, -max_acceleration)
     return bounded, clamped, (bounded != candidates).any(0)

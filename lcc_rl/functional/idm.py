@@ -18,7 +18,7 @@ class IDMConstants(DriverConstants):
         deceleration: comfortable deceleration b [m/s²].
         min_gap: gap s0 at standstill [m].
         exponent: acceleration exponent δ.
-        gap_floor: gaps below this count as this, so that contact stays finite [m].
+        gap_floor: smaller gaps count as this, so that the result is finite at contact [m].
     """
 
     acceleration: float = 1.0
@@ -53,7 +53,7 @@ class IDMConstants(DriverConstants):
 
 
 def power(base: Tensor, exponent: float) -> Tensor:
-    """Raise to the exponent δ; the usual 4 by squaring, several times faster."""
+    """Raise to the exponent δ; δ = 4 by squaring, which is several times faster."""
     if exponent == 4.0:
         square = base * base
         return square * square

@@ -14,8 +14,8 @@ def advance_speed(speed: Tensor, acceleration: Tensor, time_step: float) -> tupl
         time_step: duration of the step T [s].
 
     Returns:
-        The speed reached [m/s] and the acceleration really executed [m/s²], which differs from
-        the command only where the vehicle came to rest within the step.
+        The speed reached [m/s] and the executed acceleration [m/s²], which differs from the command
+        only where the vehicle stops within the step.
     """
     reached = (speed + acceleration * time_step).clamp(min=0.0)
     return reached, (reached - speed) / time_step

@@ -1,4 +1,4 @@
-"""The driver models by name."""
+"""Driver models by name."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Where the numbers of a batch of strings lie in memory: the episodes side by side.
+"""Memory layout of a batch of strings: the episodes are contiguous.
 
-Entries are ``[*batch, N, w]``. With the batch innermost in memory, some vehicles of a string, one
-component of an entry and sums over vehicles are runs of contiguous numbers, whatever N and w.
+Entries are ``[*batch, N, w]``. With the batch innermost in memory, selected vehicles, one component
+of an entry and sums over vehicles are runs of contiguous numbers for any N and w.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ def join(parts: Sequence[Tensor], dim: int) -> Tensor:
 
     Args:
         parts: entries ``[*batch, N, w]``.
-        dim: −2 for vehicles, −1 for what an entry consists of.
+        dim: −2 for vehicles, −1 for components of the entry.
     """
     return reverse(torch.cat([reverse(part) for part in parts], -1 - dim))
 
 
 def total(entry: Tensor, dim: int) -> Tensor:
-    """Sum over vehicles (−2) or parts (−1), in an order that does not depend on the memory."""
+    """Sum over vehicles (−2) or components (−1), in an order independent of the memory layout."""
     return entry.contiguous().sum(dim, keepdim=True)

@@ -1,4 +1,4 @@
-"""Source as machine code of numba."""
+"""Compiles generated source to machine code by numba."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ log = logging.getLogger("lcc_rl")
 
 @numba.njit
 def pick(condition: Any, one: Any, other: Any) -> Any:
-    """Return one of two numbers; as a function, so that the loop has no branches."""
+    """Return one of two numbers; a function, so that the loop has no branches."""
     return one if condition else other
 
 
@@ -61,7 +61,7 @@ SCOPE = {
 
 @cache
 def compiled(source: str) -> Callable[..., None]:
-    """Return the function ``kernel`` of a source as machine code; equal sources share it."""
+    """Return the function ``kernel`` of a source as machine code, shared by equal sources."""
     return numba.njit(error_model="numpy")(_made(source, "<recorded>", "kernel"))
 
 
@@ -73,9 +73,9 @@ def _made(source: str, file: str, name: str) -> Callable[..., None]:
 
 @cache
 def kept(source: str, fused: bool = False) -> Callable[..., None]:
-    """Return the function ``kernel`` of a source as machine code that is kept for later processes.
+    """Return the function ``kernel`` of a source as machine code that is cached on disk.
 
-    If ``fused``, a product and a sum may be rounded once; nothing else is changed for speed.
+    With ``fused``, a product and a sum may be rounded once; nothing else is relaxed.
 
     numba keeps the machine code beside this file or, where that is read-only, in the user's cache
     folder (``NUMBA_CACHE_DIR``), under a name that contains a hash of the source. If it cannot be
@@ -90,14 +90,14 @@ def kept(source: str, fused: bool = False) -> Callable[..., None]:
     uncached = compile_it()(function)
     try:
         chosen = compile_it(cache=True)(function)
-    except RuntimeError as error:  # there is no place for the code
+    except RuntimeError as error:  # no folder to write the code to
         log.info("compiling a simulation for this run only: %s", error)
         return uncached
     return _Kept((source, fused), chosen, uncached)
 
 
 class _Kept:
-    """Calls machine code that is kept, or, where its file is damaged, code made anew."""
+    """Calls cached machine code; compiles anew if its file is damaged."""
 
     def __init__(self, made_of: tuple[str, bool], chosen: Any, uncached: Any) -> None:
         self.made_of, self.chosen, self.uncached = made_of, chosen, uncached

@@ -19,12 +19,12 @@ from lcc_rl.functional.driver_models import DriverConstants, Each
 class OVMConstants(DriverConstants):
     """The optimal velocity model and its parameters besides v0 and T.
 
-    T is that of :meth:`optimal_speed`.
+    T is defined in :meth:`optimal_speed`.
 
     Args:
         min_gap: gap s0 at which the optimal speed is zero [m].
         sensitivity: κ, how fast the speed adapts to the optimal one [1/s].
-        form: β, at which share of the transition the optimal speed rises most; 0: at s0.
+        form: β, position of the steepest slope: s0 + β A T.
     """
 
     min_gap: float = 2.0
@@ -34,9 +34,9 @@ class OVMConstants(DriverConstants):
     def optimal_speed(self, gap: Tensor, desired_speed: Each, time_gap: Each) -> Tensor:
         """Return V(s) = A (tanh((s − s0)/(A T) − β) + tanh β), A = v0/(1 + tanh β).
 
-        Bando's function by quantities that other models have, too: it is 0 at s0 and v0 far
-        ahead, and its steepest slope is 1/T. Bando's own, 16.8 m/s (tanh(0.086 (Δx − 25 m)) +
-        0.913), has v0 32.1 m/s, T 0.69 s and β 1.54.
+        This is Bando's function in parameters that other models have, too: it is 0 at s0 and v0
+        at large gaps, and its steepest slope is 1/T. Bando's original, 16.8 m/s
+        (tanh(0.086 (Δx − 25 m)) + 0.913), has v0 = 32.1 m/s, T = 0.69 s and β = 1.54.
 
         Args:
             gap: bumper-to-bumper gap s [m].
@@ -72,7 +72,7 @@ class OVMConstants(DriverConstants):
 class FVDMConstants(OVMConstants):
     """The full velocity difference model and its parameters besides v0 and T.
 
-    λ is the same at all gaps; the paper lets it be 0 beyond 100 m.
+    λ is the same at all gaps; in the paper it is 0 beyond 100 m.
 
     Args:
         speed_gain: λ, the weight of the speed difference [1/s].

@@ -25,11 +25,11 @@ class VehicleString:
     """The roles of the vehicles of one lane.
 
     Args:
-        roles: role of every vehicle, front to back; where places are drawn, in any order.
-        drawn: places are drawn anew in every episode; the counts of the roles stay.
-        ring: the first vehicle follows the last.
-        measured: what a vehicle sees of itself and its neighbours is measured from outside, and
-            read by the names of the views.
+        roles: role of every vehicle, front to back; in any order if places are drawn.
+        drawn: whether places are drawn anew in every episode; the counts of the roles are fixed.
+        ring: whether the first vehicle follows the last.
+        measured: whether views of a vehicle are inputs, under their own names, and not computed
+            from the string.
     """
 
     roles: tuple[str, ...] = (AUTOMATED,)
@@ -45,12 +45,12 @@ class VehicleString:
         return self.roles.count(role)
 
     def places(self, role: str) -> tuple[int, ...]:
-        """Return the places of a role, 0 at the front; of a drawn string these mean nothing."""
+        """Return the places of a role, 0 at the front; not meaningful if places are drawn."""
         return tuple(place for place, name in enumerate(self.roles) if name == role)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The roles that occur, in the order of their first vehicles."""
+        """The roles in the string, in the order of their first vehicles."""
         return tuple(dict.fromkeys(self.roles))
 
 

@@ -20,7 +20,7 @@ def motor_power(speed: Tensor, acceleration: Tensor, recuperation: bool = True) 
     Args:
         speed: speed at the start of the step, any shape [m/s].
         acceleration: executed acceleration, same shape [m/s²].
-        recuperation: count negative (braking) power; otherwise it is cut off at zero.
+        recuperation: count negative (braking) power; otherwise negative power is zero.
 
     Returns:
         Power [W], same shape; negative where braking feeds the battery.
@@ -39,12 +39,12 @@ def steady_power(speed: Tensor) -> Tensor:
 
 
 def acceleration_loss(speed: Tensor, acceleration: Tensor) -> Tensor:
-    """Power that accelerating and braking lose for good, the part of A2 with a².
+    """Power that accelerating and braking dissipate, the part of A2 with a².
 
-    Over a trip A2 is a sum of three: the :func:`steady_power` of the speeds driven, what the last
-    speed stores more than the first (the part with a, the derivative of a function of the speed,
-    which braking returns), and this. A controller that follows the same leader over the
-    same distance can only change this one.
+    Over a trip A2 is a sum of three parts: the :func:`steady_power` of the speeds driven; the
+    kinetic energy at the end minus that at the start (the part with a, the derivative of a function
+    of the speed); and this loss. A controller that follows the same leader over the same distance
+    can change the loss only.
 
     Args:
         speed: speed at the start of the step, any shape [m/s].
@@ -58,13 +58,13 @@ def acceleration_loss(speed: Tensor, acceleration: Tensor) -> Tensor:
 
 
 def path_power(speed: Tensor, acceleration: Tensor) -> Tensor:
-    """Power that a path takes: :func:`steady_power` and :func:`acceleration_loss`.
+    """Power of a path: :func:`steady_power` plus :func:`acceleration_loss`.
 
     Args:
         speed: speed at the start of the step, any shape [m/s].
         acceleration: executed acceleration, same shape [m/s²].
 
     Returns:
-        Power [W], same shape: A2 without what the motion stores.
+        Power [W], same shape: A2 without the change of kinetic energy.
     """
     return steady_power(speed) + acceleration_loss(speed, acceleration)

@@ -1,8 +1,8 @@
 """Counter-based random numbers: a draw is a function of (seed, step, stream), not of history.
 
-The same episode therefore meets the same noise whatever its place in the batch, whatever the
-controller and on every device, and nothing but the episode's seed has to be remembered. The
-counter runs through an integer hash (two rounds of xor-shift and multiply on 32 bits), as in
+An episode therefore has the same noise at any place in the batch, with any controller and on any
+device, and its seed is the only state. The counter is hashed by integers (two rounds of xor-shift
+and multiply on 32 bits), as in
 Salmon et al., "Parallel random numbers: as easy as 1, 2, 3" (SC 2011).
 """
 
@@ -20,7 +20,7 @@ STREAM_INCREMENT = 0x85EBCA6B
 
 
 def stream_id(name: str) -> int:
-    """Return the stream that belongs to a name, such as ``"hdv.noise"``."""
+    """Return the stream of a name, such as ``"hdv.noise"``."""
     return zlib.crc32(name.encode())
 
 
@@ -38,25 +38,25 @@ def uniform(seed: Tensor, step: Tensor | int, stream: Tensor | int = 0) -> Tenso
     Args:
         seed: seed of each episode, int64, any shape.
         step: step within the episode, broadcastable to ``seed``.
-        stream: what the draw is for; different streams are independent.
+        stream: purpose of the draw; different streams are independent.
 
     Returns:
         float32 of the broadcast shape.
     """
-    # The mask keeps what counts, within 64 bits.
+    # The mask keeps the low 32 bits, so that the product fits into 64.
     bits = hash_bits(seed + step * STEP_INCREMENT + (stream * STREAM_INCREMENT & LOW_BITS))
     return (bits >> 8).to(torch.float32) * 2.0**-24
 
 
 def normal(seed: Tensor, step: Tensor | int, stream: Tensor | int = 0) -> Tensor:
     """Draw from N(0, 1) by counter; arguments as in :func:`uniform`."""
-    # Amid the cells of the uniform draw; the last one would be rounded to 1, which is infinity.
+    # The middles of the uniform draw's cells. The last would be rounded to 1, which maps to ∞.
     middle = (uniform(seed, step, stream) + 2.0**-25).clamp(max=1.0 - 2.0**-24)
     return torch.special.ndtri(middle)
 
 
 def between(bounds: tuple[float, float], seed: Tensor, stream: Tensor | int) -> Tensor:
-    """Draw evenly between two bounds, once in an episode; float32 of the broadcast shape."""
+    """Draw uniformly between two bounds, once in an episode; float32 of the broadcast shape."""
     return bounds[0] + (bounds[1] - bounds[0]) * uniform(seed, 0, stream)
 
 

@@ -35,7 +35,7 @@ ARITHMETIC = {
     "special_ndtri": "f32(ndtri({0}))",
     "pow": "{0} ** {1}",
     "lerp": "{0} + {2} * ({1} - {0})",
-    # What is not a number stays so, as in torch.
+    # NaN is kept, as in torch.
     "maximum": "pick(({0} > {1}) | ({0} != {0}), {0}, {1})",
     "minimum": "pick(({0} < {1}) | ({0} != {0}), {0}, {1})",
     "bitwise_and": "{0} & {1}",
@@ -57,17 +57,17 @@ COMPARISONS = {
 }
 METHODS = ("addmm", "bitwise_not", "clamp", "index", "searchsorted", "where")  # methods of Recorder
 REDUCTIONS = {"sum": "add", "any": "logical_or", "all": "logical_and"}
-# They move entries, whatever these are, and are applied to the numbers of the variables.
+# These move entries and are applied to the numbers of the variables.
 MOVES = {
     "_unsafe_view", "alias", "cat", "clone", "detach", "expand", "flip", "permute", "repeat",
     "select", "slice", "split", "split_with_sizes", "squeeze", "stack", "t", "transpose", "unbind",
     "unsqueeze", "view",
 }  # fmt: skip
-# They take no more than the shape of what they are given.
+# These read the shape of their argument only.
 SHAPES = {"zeros_like", "ones_like", "full_like", "empty_like", "new_zeros", "new_ones", "new_full"}
 
 
-TAKING = (Tensor.numpy, Tensor.__array__, Tensor.tolist)  # methods that leave tensors
+TAKING = (Tensor.numpy, Tensor.__array__, Tensor.tolist)  # methods that return no tensor
 
 
 class Untranslatable(Exception):
@@ -75,7 +75,7 @@ class Untranslatable(Exception):
 
 
 class TensorsOnly(TorchFunctionMode):
-    """Refuses to take numbers out of tensors, of which a recorder would see constants."""
+    """Refuses to convert tensors to numbers, which a recorder would take for constants."""
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
@@ -88,8 +88,8 @@ class TensorsOnly(TorchFunctionMode):
 class Recorder(TorchDispatchMode):
     """Records operations on tensors as statements on numbers.
 
-    Every entry of a tensor that depends on the inputs is a variable; of such a tensor the numbers
-    of its variables are kept, in a tensor of the same shape. All other tensors are constants.
+    Every entry of a tensor that depends on the inputs is a variable with a number. The numbers are
+    kept in a tensor of the same shape. All other tensors are constants.
 
     Attributes:
         statements: the expression of each variable, and the variables that it reads.
@@ -104,7 +104,7 @@ class Recorder(TorchDispatchMode):
         self.tables: list[Tensor] = []
 
     def add(self, tensor: Tensor, variables: Tensor) -> None:
-        """Say of which variables a tensor consists."""
+        """Record the variables of a tensor."""
         self.variables[id(tensor)] = (tensor, variables)  # kept, so that its id stays its own
 
     def of(self, value: Any) -> Tensor | None:
@@ -123,7 +123,7 @@ class Recorder(TorchDispatchMode):
         return self.known[statement]
 
     def needed(self, results: Iterable[int]) -> list[int]:
-        """Return the variables that some are computed from, these included, in order."""
+        """Return the results and all variables that they depend on, in order."""
         found, left = set[int](), list(results)
         while left:
             if (variable := left.pop()) not in found:
@@ -132,7 +132,7 @@ class Recorder(TorchDispatchMode):
         return sorted(found)
 
     def dependents(self, inputs: Iterable[int]) -> set[int]:
-        """Return the variables that some decide, these included."""
+        """Return the inputs and all variables that depend on them."""
         found = set(inputs)
         for variable, (_, reads) in enumerate(self.statements):
             if not found.isdisjoint(reads):
@@ -179,14 +179,14 @@ class Recorder(TorchDispatchMode):
         return torch.tensor(found, dtype=torch.int64).reshape(parts[0].shape)
 
     def numbers(self, value: Any, dtype: torch.dtype) -> Tensor:
-        """Return the variables of a value as numbers of a type."""
+        """Return the variables of a value, converted to a type."""
         if (kind := NUMBER_TYPES.get(dtype)) is None:
             raise Untranslatable(f"numbers of {dtype}")
         variables = self.of(value)
         if variables is not None:
             same = value.dtype == dtype
             return variables if same else self._stated(f"{kind}({{0}})", [variables])
-        if isinstance(value, int):  # a stream's counter may exceed what torch takes and wraps
+        if isinstance(value, int):  # a stream's counter may exceed int64 and wraps
             value = (value + 2**63) % 2**64 - 2**63
         value = torch.as_tensor(value, dtype=dtype)
         literals = [self.variable(f"{kind}({x!r})", ()) for x in value.flatten().tolist()]
@@ -216,7 +216,7 @@ class Recorder(TorchDispatchMode):
         return reduce(lambda *two: self._stated(formula, two), parts).reshape(result.shape)
 
     def _addmm(self, result: Tensor, bias: Tensor, value: Tensor, weight: Tensor) -> Tensor:
-        """Record a layer of a network: each row is one array of numbers."""
+        """Record a layer of a network; each row is one array."""
         if self.of(bias) is not None or self.of(weight) is not None:
             raise Untranslatable("weights that depend on the inputs")
         tables = f"{self._table(weight.contiguous())}, {self._table(bias)}"
@@ -247,11 +247,11 @@ class Recorder(TorchDispatchMode):
         if variables is None:
             return self._read(result, value, places)
         if any(self.of(place) is not None for place in places):
-            raise Untranslatable("an index that depends on the inputs, into what does, too")
+            raise Untranslatable("indices and values that both depend on the inputs")
         return variables[tuple(slice(None) if x is None else x for x in places)]
 
     def _read(self, result: Tensor, table: Tensor, places: Sequence[Tensor | None]) -> Tensor:
-        """Record reading a constant at places that depend on the inputs."""
+        """Record a read of a constant at indices that depend on the inputs."""
         if any(place is None for place in places):
             raise Untranslatable("an index that is not of the first dimensions")
         inner = table.shape[len(places) :]
@@ -267,13 +267,13 @@ class Recorder(TorchDispatchMode):
         self, result: Tensor, table: Tensor, value: Tensor, right: bool = False, **more: Any
     ) -> Tensor:
         if more or table.ndim != 1 or self.of(table) is not None:
-            raise Untranslatable("a search in what is not one constant list")
+            raise Untranslatable("a search in anything but one constant list")
         side = "right" if right else "left"
         formula = f"i64(np.searchsorted({self._table(table)}, {{0}}, '{side}'))"
         return self._stated(formula, [self.numbers(value, table.dtype)])
 
     def _table(self, table: Tensor) -> str:
-        """Return the name of a table, by which a statement reads it."""
+        """Return the name by which statements read a table."""
         if not any(known is table for known in self.tables):
             self.tables.append(table)
         return f"t{[known is table for known in self.tables].index(True)}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-NEVER = 1e3  # s; stands for "no contact ahead": a number to learn from, not a measured one
+NEVER = 1e3  # "no contact ahead": a finite input for learners, not a measured time [s]
 
 
 def time_to_collision(
@@ -16,11 +16,11 @@ def time_to_collision(
     Args:
         gap: bumper-to-bumper gap [m].
         approach_rate: v − v_ahead, positive when closing [m/s].
-        floor: smallest value returned; a collision has it too [s].
-        ceiling: value where the gap does not close, or closes later than this [s].
+        floor: smallest value returned, also after a collision [s].
+        ceiling: largest value returned, also where the gap does not close [s].
 
     Returns:
-        Time-to-collision [s], finite everywhere so that logs and gradients are too.
+        Time-to-collision [s], always finite and positive, so that its logarithm is finite, too.
     """
     closing = approach_rate > 0.0
     # where() on both sides of the division keeps the gradient free of 0·inf.
@@ -34,11 +34,11 @@ def time_gap(gap: Tensor, speed: Tensor, speed_floor: float = 1.0, ceiling: floa
     Args:
         gap: bumper-to-bumper gap [m].
         speed: speed of the follower [m/s].
-        speed_floor: speeds below this count as this, so that standing in a jam is not punished;
-            0 gives the literal rule, in which the time gap at standstill is infinite [m/s].
+        speed_floor: lower speeds count as this, so that standing in a jam costs nothing. 0 is the
+            literal rule, in which the time gap at standstill is infinite [m/s].
         ceiling: largest value returned [s].
 
     Returns:
-        Time gap [s], finite everywhere.
+        Time gap [s], always finite.
     """
     return (gap / speed.clamp(min=max(speed_floor, 1e-6))).clamp(max=ceiling)

@@ -1,4 +1,4 @@
-"""Measurements with delay and bounded errors, and the states that they allow."""
+"""Measurements with delay and bounded errors, and the states consistent with them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from lcc_rl.functional.actuation import PairState
 from lcc_rl.functional.layout import join
 
-ROUNDING = 0.02  # of the rate of a gap in single precision, and some more [m/s]
+ROUNDING = 0.02  # exceeds the rounding of a gap's rate in single precision [m/s]
 
 
 @dataclass(frozen=True)
@@ -19,11 +19,11 @@ class Sensing:
     """Bounds of measurements.
 
     Args:
-        gap, speed, ahead: largest errors of the gap [m], of the own speed and of that of the
+        gap, speed, ahead: largest errors of the gap [m], the own speed [m/s] and the speed of the
             vehicle ahead [m/s].
-        scale: largest error of both speeds as a share of them.
-        late: age of a measurement that arrives, in steps.
-        longest: steps in a row, at the most, in which none arrives and the last one stays.
+        scale: largest relative error of both speeds.
+        late: age of a measurement when it arrives, in steps.
+        longest: largest number of consecutive steps without a new measurement.
     """
 
     gap: float
@@ -41,7 +41,7 @@ class Sensing:
     def worst(self, measured: PairState) -> PairState:
         """Return the state within the bounds from which braking leaves the least room.
 
-        Room falls with the own speed, and grows with the gap and with the speed ahead.
+        Room decreases with the own speed and increases with the gap and the speed ahead.
         """
         return replace(
             measured,
@@ -53,15 +53,15 @@ class Sensing:
 
 @dataclass(frozen=True)
 class Agreement:
-    """By how much the rate of the measured gap differs from the measured relative speed.
+    """Compares the rate of the measured gap with the measured relative speed.
 
-    A gap is measured by another instrument than speeds are, or replayed from other columns of a
-    record. Where they disagree, each limit uses the worse of both.
+    Gaps and speeds may come from different instruments, or from different columns of a record.
+    Where they disagree, each limit uses the worse of both.
 
     Args:
         sensing: bounds of errors, which explain some of the difference.
         time_step: T [s].
-        settling: time constant with which differences are averaged [s].
+        settling: time constant of the average of differences [s].
     """
 
     sensing: Sensing
@@ -69,10 +69,10 @@ class Agreement:
     settling: float = 0.5
 
     def next(self, kept: Tensor, gap: Tensor, relative: Tensor) -> Tensor:
-        """Return the memory after a measurement, ``[…, 3]``; one of zeros begins anew.
+        """Return the memory after a measurement, ``[…, 3]``; zeros reset it.
 
-        It holds 1, the measured gap plus the way of half a step [m], from which the next gap is
-        predicted by the trapezoidal rule, and the average difference [m/s].
+        It holds 1; the measured gap plus half a step of relative motion, from which the trapezoidal
+        rule predicts the next gap [m]; and the average difference [m/s].
         """
         begun, predicted, average = kept.split(1, -1)
         half = 0.5 * self.time_step * relative
@@ -81,9 +81,9 @@ class Agreement:
         return join([torch.ones_like(gap), gap + half, average], -1)
 
     def difference(self, kept: Tensor, relative: Tensor) -> Tensor:
-        """Return what the gap grows faster than the relative speed says [m/s].
+        """Return the rate of the gap minus the relative speed [m/s].
 
-        Zero where rounding explains it, or the errors that the sensors are known to have.
+        It is zero where rounding or the known errors of the sensors explain the difference.
         """
         sensing, found = self.sensing, kept[..., 2:]
         held = self.time_step * sensing.longest * relative.abs()  # no measurement arrived
@@ -98,12 +98,12 @@ def brought_up(
     ahead_acceleration: Tensor | float,
     time_step: float,
 ) -> PairState:
-    """Return the present motion from a measurement of some steps ago.
+    """Return the present state from a measurement of some steps ago.
 
     Args:
-        measured: the motion then, entries ``[…, 1]``; its acceleration is the present one.
-        age: of the measurement in steps, ``[…, 1]``.
-        past: own accelerations of the last steps, the latest first, ``[…, oldest]`` [m/s²].
+        measured: the measured state, entries ``[…, 1]``; its acceleration is the present one.
+        age: age of the measurement in steps, ``[…, 1]``.
+        past: own accelerations of the last steps, latest first, ``[…, oldest]`` [m/s²].
         ahead_acceleration: of the vehicle ahead since then [m/s²].
         time_step: T [s].
     """

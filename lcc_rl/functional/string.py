@@ -74,7 +74,7 @@ def advance_string(
 
 
 def blocks_of(places: Sequence[int]) -> list[slice]:
-    """Return slices that together select the given places, in order; one where a stride does."""
+    """Return slices that select the given places in order; one slice if a stride suffices."""
     steps = {b - a for a, b in pairwise(places)}
     if len(steps) <= 1 and all(step > 0 for step in steps):
         step = steps.pop() if steps else 1
@@ -89,10 +89,10 @@ def blocks_of(places: Sequence[int]) -> list[slice]:
 
 
 def selector(places: Sequence[int], size: int) -> Callable[[Tensor], Tensor]:
-    """Return a function that picks vehicles of a string, ``[*batch, n, w]`` of ``[*batch, N, w]``.
+    """Return a function that selects vehicles: ``[*batch, n, w]`` of ``[*batch, N, w]``.
 
     Args:
-        places: those picked, in order.
+        places: the selected places, in order.
         size: number N of vehicles.
     """
     blocks = blocks_of(places)
@@ -113,7 +113,7 @@ def _picked(entry: Tensor, blocks: Sequence[slice]) -> Tensor:
 
 
 def gather(entry: Tensor, index: Tensor) -> Tensor:
-    """Return the vehicles of an index that differs by episode.
+    """Select vehicles by an index that differs by episode.
 
     Args:
         entry: ``[*batch, N, w]``.
@@ -132,7 +132,7 @@ def sum_ranges(entry: Tensor, first: Tensor, last: Tensor) -> Tensor:
     Args:
         entry: ``[*batch, N, 1]``.
         first: first vehicle of each range, int64, ``[*batch, n]``.
-        last: the vehicle after its last one, likewise.
+        last: the vehicle after the last one of each range, int64, ``[*batch, n]``.
 
     Returns:
         The sums, ``[*batch, n, 1]``.

@@ -1,4 +1,4 @@
-"""Policies and rules that drive vehicles of another simulator by their measurements."""
+"""Policies and rules for vehicles of another simulator."""
 
 from __future__ import annotations
 
@@ -34,39 +34,38 @@ from lcc_rl.pieces import CBFFilter, Controller
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.world import World
 
-# Own motion, that of the vehicle ahead and of the one behind.
+# Motion of the vehicle, of the vehicle ahead and of the vehicle behind.
 MEASURED = (
     *("self.speed", "self.gap", "self.acceleration", "ahead.speed", "ahead.acceleration"),
     *("behind.speed", "behind.gap", "behind.acceleration", BEHIND_PRESENT),
 )
 KNOWN = set(MEASURED)
-WIDEST = 200  # numbers remembered in machine code
+WIDEST = 200  # largest memory in machine code
 
 
 class Driver:
-    """Computes the accelerations of any number of cars, and keeps the memory of each.
+    """Computes the accelerations of any number of cars and stores their memories.
 
     Args:
         name: a run, a run folder, a policy file, ``pretrained/<name>``, or a controller by name
-            (``"idm_acc"``), as object, class, function, file or node, as :func:`lcc_rl.compare`
-            takes it. A rule whose name ends in ``_filtered`` drives behind the safety filter.
+            (``"idm_acc"``), as object, class, function, file or node, see :func:`lcc_rl.compare`.
+            Append ``_filtered`` to the name of a rule to put it behind the safety filter.
         time_step: duration of a step of the simulator [s]; a policy needs that of its training.
         trust: modules outside this package that a policy may name.
-        safety: the safety filter behind which it drives; None: a policy's own, and for rules whose
-            name ends in ``_filtered`` that of ``+filter=cbf``.
-        seed: seed of the drivers' noise; each new car draws by the next one, and keeps it if it
-            leaves and returns.
-        drivers: of the rules that drive as people do, such as ``"human"``, with their reaction: a
-            table of ``lcc-rl calibrate`` or one of :mod:`lcc_rl.drivers.population`; None: the
-            shipped ones.
+        safety: the safety filter; None: that of the policy's training, or that of ``+filter=cbf``
+            for rules with ``_filtered``.
+        seed: seed of the drivers' noise; each new car has the next seed, also if it leaves and
+            returns.
+        drivers: population of rules with human drivers, such as ``"human"``: a table of ``lcc-rl
+            calibrate`` or a population of :mod:`lcc_rl.drivers.population`; None: the shipped one.
 
     Attributes:
-        names: what :meth:`step` reads, SI units: ``"self.gap"`` …
+        names: the inputs of :meth:`step`, in SI units: ``"self.gap"`` …
         cars: the cars of the last step.
 
     Raises:
-        LccError: if the policy or rule is unknown, was trained with another step, reads what is
-            not measured, or returns another shape than a row per vehicle.
+        LccError: if the policy or rule is unknown, was trained with another step, reads an entry
+            that is not measured, or does not return a row per vehicle.
 
     Examples:
         >>> driver = Driver("idm_acc", time_step=0.1)
@@ -87,31 +86,31 @@ class Driver:
     ) -> None:
         usable = isinstance(time_step, (int, float)) and 0.0 < time_step < math.inf
         require(usable, f"time_step must be a positive number of seconds, got {time_step!r}")
-        who = setting_of(name)
-        self.name = who if isinstance(who, str) else label_of(who)
+        spec = setting_of(name)
+        self.name = spec if isinstance(spec, str) else label_of(spec)
         self.time_step, self.seed = time_step, seed
-        if is_policy(who):
-            require(drivers is None, f"drivers are of rules; {self.name} is a policy")
-            self.program = program(who, trust, safety=safety)
+        if is_policy(spec):
+            require(drivers is None, f"drivers needs a rule; {self.name} is a policy")
+            self.program = program(spec, trust, safety=safety)
             trained = self.program.controller.time_step
             if abs(trained - time_step) > 1e-9:
                 raise ConfigError(
-                    f"{who} was trained with steps of {trained!r} s, the simulation has "
+                    f"{spec} was trained with steps of {trained!r} s, the simulation has "
                     f"{time_step!r} s (in SUMO, --step-length {trained:g} sets it)"
                 )
         else:
             own = bootstrap(drivers) if isinstance(drivers, (str, Path)) else drivers
-            self.program = self._rule(who, safety, measuring(time_step, True, own))
+            self.program = self._rule(spec, safety, measuring(time_step, True, own))
         self.names = self.program.names
         self.behind = {x for x in self.names if x.startswith("behind.")} - {BEHIND_PRESENT}
         self._check()
         self.reset()
 
-    def _rule(self, who: Any, safety: CBFFilter | None, world: World) -> DrivingProgram:
-        if safety is None and isinstance(who, str) and who.endswith(FILTERED):
+    def _rule(self, spec: Any, safety: CBFFilter | None, world: World) -> DrivingProgram:
+        if safety is None and isinstance(spec, str) and spec.endswith(FILTERED):
             filters = load("evaluate", ["variant=idm", "+filter=cbf"]).scenario.filters
             safety = filters[AUTOMATED].made(CBFFilter)
-        node = controller_of(who, safety is not None and safety.time_gap is not None)
+        node = controller_of(spec, safety is not None and safety.time_gap is not None)
         return driving([node.made(Controller)], safety, world)
 
     def _check(self) -> None:
@@ -124,41 +123,41 @@ class Driver:
         self.program.step(*self._examples(BATCH), apply=check_step)  # type: ignore[misc]
 
     def _examples(self, count: int) -> list[Tensor]:
-        """Return measurements, and the memory of cars that begin, if there is one."""
+        """Return measurements, and the memory of new cars, if there is one."""
         state, seeds = torch.ones(count, len(self.names)), torch.zeros(count, 1).long()
         return [state, self.program.begin(state.double(), seeds)] if self.program.width else [state]
 
     def reset(self, cars: Sequence[Hashable] | None = None) -> None:
-        """Let cars begin anew: what they remember begins with their next measurement.
+        """Reset the memories of cars, which start with their next measurement.
 
         Args:
-            cars: which cars of the last step; None: all, and their seeds.
+            cars: cars of the last step; None: all cars, and their seeds.
         """
         if cars is None:
             self.cars: Sequence[Any] = ()
             self.memory = np.zeros((0, self.program.width))
-            self.numbers: dict[Hashable, int] = {}  # of all cars, in their order
+            self.numbers: dict[Hashable, int] = {}  # seeds of all cars, in order of appearance
             return
         stay = [place for place, car in enumerate(self.cars) if car not in cars]
         self.cars, self.memory = [self.cars[place] for place in stay], self.memory[stay]
 
     def step(self, measured: Mapping[str, Any], cars: Sequence[Hashable] | None = None) -> Any:
-        """Return the acceleration of each car for the step that begins [m/s²].
+        """Return the acceleration of each car for the next step [m/s²].
 
         Args:
-            measured: numbers of one car by name, or of several cars as arrays of one length. A car
-                has no vehicle behind if none of its entries is given, or where
-                ``"behind.present"`` is 0.
-            cars: ids of the cars, in the order of the arrays; by default 0, 1, 2 … A car that the
-                last step did not have begins anew, one that is no longer there is forgotten. So
-                does one that measured what is no number, for which it brakes, behind a filter.
+            measured: numbers of one car by name, or arrays of one length for several cars. A car
+                has no vehicle behind if none of its entries is given, or if ``"behind.present"``
+                is 0.
+            cars: ids of the cars, in the order of the arrays; by default 0, 1, 2 … The memory of a
+                car starts anew if it was not in the last step, or if it measured a NaN, for which
+                it brakes behind a filter. Cars that are not in this step are forgotten.
 
         Returns:
-            A number where numbers are given, else an array, ``[cars]``.
+            A number for numbers, else an array, ``[cars]``.
 
         Raises:
             ConfigError: if a measurement is missing or unknown, or sizes differ.
-            Diverged: if a command is no number; nothing is remembered of the step then.
+            Diverged: if a command is not finite; memories are then unchanged.
         """
         state, alone = self._state(measured)
         self._admit(range(len(state)) if cars is None else list(cars), state)
@@ -175,7 +174,7 @@ class Driver:
         return float(command[0, 0]) if alone else command[:, 0]
 
     def _admit(self, cars: Sequence[Hashable], state: Array) -> None:
-        """Take the cars of a step: bring what they remember into their order."""
+        """Sort the memories by the cars of a step."""
         if cars == self.cars:
             return
         words = f"cars must be {len(state)} different ids, as many as measured, got {cars}"
@@ -194,7 +193,7 @@ class Driver:
         self.cars = cars
 
     def _state(self, measured: Mapping[str, Any]) -> tuple[Array, bool]:
-        """Return what the program reads, ``[cars, names]``, and whether numbers were given."""
+        """Return the inputs of the program, ``[cars, names]``, and whether numbers were given."""
         words = f"measured must name measurements, such as self.gap, got {type(measured).__name__}"
         require(isinstance(measured, Mapping), words)
         if unknown := measured.keys() - KNOWN:
@@ -216,23 +215,23 @@ class Driver:
         return state, not shape
 
     def _completed(self, measured: Mapping[str, Any]) -> dict[str, Any]:
-        """Return measurements with those of a vehicle behind, also where there is none.
+        """Return measurements completed by those of a vehicle behind.
 
-        A policy that observes whether there is one is given zeros then; any other a vehicle at the
-        own speed and gap.
+        Without a vehicle behind they are zero for a policy that observes its presence. Else a
+        vehicle at the own speed and gap is assumed.
         """
         found, absent = dict(measured), measured.keys().isdisjoint(self.behind)
         present = found.setdefault(BEHIND_PRESENT, float(not absent))
         for name in () if np.all(present) else self.behind:
             entry = name.partition(".")[2]
             zero = BEHIND_PRESENT in self.names or entry == "acceleration"
-            nobody = 0.0 if zero else measured[f"self.{entry}"]
-            found[name] = nobody if absent else np.where(present, found[name], nobody)
+            default = 0.0 if zero else measured[f"self.{entry}"]
+            found[name] = default if absent else np.where(present, found[name], default)
         return found
 
     @cached_property
     def _rows(self) -> Rowwise:
-        """The program by rows, once it is needed."""
+        """The program by rows, compiled on demand."""
         make = partial(kept, fused=True) if self.program.width <= WIDEST else _by_tensors
         return Rowwise(self.program.step, self._examples(1), self.name, make)
 

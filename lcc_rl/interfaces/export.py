@@ -1,8 +1,8 @@
-"""Export of trained policies as ONNX, PyTorch's ``.pt2`` or a page in which they drive.
+"""Export of trained policies as ONNX, PyTorch's ``.pt2`` or a page of the ring road.
 
-An exported program takes the measurements of one vehicle in SI units and returns its acceleration;
-it contains the scales of the observation, the network and the safety filter, if there is one. The
-program of a policy that remembers takes and returns its memory, too.
+An exported program maps the measurements of a vehicle in SI units to its acceleration. It contains
+the scales of the observation, the network and the safety filter, if there is one. The program of a
+policy with a memory also reads and returns the memory.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ def export(
     overrides: Sequence[str] = (),
     normalize: Any = None,
 ) -> Path:
-    """Write a trained policy, with its safety filter, for use elsewhere.
+    """Write a trained policy, with its safety filter, for other software.
 
-    The ending chooses the form. ONNX (``.onnx``) and PyTorch's exported program (``.pt2``) take
-    ``state``, ``[batch, inputs]`` in SI units, and return ``acceleration``, ``[batch, 1]`` [m/s²],
-    of a policy that remembers also ``memory`` and ``next_memory`` (zeros at first);
-    names, units and meanings of the inputs are in the file's metadata under ``lcc_rl`` as JSON. A
-    page (``.html``) shows the ring road with the policy in any browser, see
+    The ending selects the format. ONNX (``.onnx``) and PyTorch's exported program (``.pt2``) read
+    ``state``, ``[batch, inputs]`` in SI units, and return ``acceleration``, ``[batch, 1]`` [m/s²].
+    A policy with a memory also has the input ``memory`` (zeros at first) and the output
+    ``next_memory``. Names, units and meanings of the inputs are in the file's metadata under
+    ``lcc_rl`` as JSON. A page (``.html``) shows the ring road with the policy in any browser, see
     :func:`lcc_rl.interfaces.ring_page.ring_page`.
 
     Args:
@@ -55,15 +55,15 @@ def export(
             ``[batch, 1]``.
         path: the file to write.
         trust: modules outside this package that the policy may name.
-        variant, overrides: of the environment in which a model or module was trained; of a page
+        variant, overrides: environment in which a model or module was trained; for a page the
             overrides are settings of its ring.
-        normalize: ``VecNormalize`` of a model; by default that of its own environment.
+        normalize: ``VecNormalize`` of a model; by default that of its environment.
 
     Returns:
-        The file's path.
+        The path of the file.
 
     Raises:
-        ConfigError: if the ending is another one, an extra is missing, or the policy cannot be
+        ConfigError: if the ending is unknown, an extra is missing, or the policy cannot be
             exported.
         ResultsError: if the policy cannot be read, or the file exists or cannot be written.
 
@@ -96,7 +96,7 @@ def export(
 
 
 def _program(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> tuple[Any, str]:
-    """Return the exported program, and what is to know about it as JSON."""
+    """Return the exported program and its description as JSON."""
     module = program(policy, trust, cfg)
     inputs = [described_input(name)._asdict() for name in module.names]
     about: dict[str, Any] = {
@@ -125,15 +125,15 @@ def _as_onnx(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> byte
     count = len(exported.graph_signature.user_inputs)
     try:
         import onnx
-        import onnxscript  # noqa: F401 - what torch exports with
+        import onnxscript  # noqa: F401 - torch needs it
     except ImportError as error:
         raise ConfigError(
             f"{error.name} is not installed: {how_to_install('interfaces')}; or write a .pt2"
         ) from error
     registry = logging.getLogger("torch.onnx._internal.exporter._registration")
-    registry.setLevel(logging.ERROR)  # that torchvision, of no use here, is missing
+    registry.setLevel(logging.ERROR)  # warnings about the missing torchvision
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # of torch, about itself
+        warnings.simplefilter("ignore", FutureWarning)  # raised by torch about itself
         made = torch.onnx.export(
             exported,
             (),
@@ -154,8 +154,8 @@ EXPORTERS = {".onnx": _as_onnx, ".pt2": _as_pt2}
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Export the policy named on the command line."""
-    parser = Arguments(description="Export a policy for use elsewhere.")
+    """Export the policy of a command line."""
+    parser = Arguments(description="Export a policy for other software.")
     parser.add_argument("policy", help="run folder, policy.pt or pretrained/<name>")
     parser.add_argument("path", help="file to write: a program (.onnx, .pt2) or a page (.html)")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
@@ -167,5 +167,5 @@ def main(words: Sequence[str] | None = None) -> int:
         return 0
     for item in map(described_input, program(options.policy, options.trust).names):
         print(f"  {item.name} [{item.unit}]: {item.meaning}")
-    print(f"{path}: from these, in this order, the acceleration [m/s²]")
+    print(f"{path}: maps these inputs, in this order, to the acceleration [m/s²]")
     return 0

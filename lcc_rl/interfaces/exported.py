@@ -1,8 +1,7 @@
-"""Policies and rules as programs of plain tensors: from what a vehicle measures to accelerations.
+"""Policies and rules as programs of tensors, from measurements to accelerations.
 
-A program consists of pieces of the environment in their order: what a policy remembers and
-observes, the controller, the safety filter. :mod:`.export` writes it to files, :mod:`.driver` runs
-it.
+A program consists of pieces of the environment in their order: memory and observation of a policy,
+controller, safety filter. :mod:`.export` writes it to files, :mod:`.driver` runs it.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ from lcc_rl.pieces.world import World
 from lcc_rl.results.policies import load_policy
 from lcc_rl.settings import Positive, values
 
-# Entries computed inside from other measurements: v_ahead − v.
+# Entries that are computed from other measurements: v_ahead − v.
 DERIVED_INPUTS = {
     "self.relative_speed": ("ahead.speed", "self.speed"),
     "behind.relative_speed": ("self.speed", "behind.speed"),
@@ -67,8 +66,8 @@ class Input(NamedTuple):
 class NetworkController(Controller):
     """Commands the action of a network, in [−1, 1], times the largest acceleration."""
 
-    network: InstanceOf[nn.Module]  # from the scaled observation to actions
-    max_acceleration: Positive  # of action 1, in both directions [m/s²]
+    network: InstanceOf[nn.Module]  # maps the scaled observation to actions
+    max_acceleration: Positive  # acceleration of action 1, in both directions [m/s²]
 
     reads = (next_key(OBSERVATION),)
 
@@ -83,10 +82,10 @@ class NetworkController(Controller):
 
 
 class DrivingProgram(nn.Module):
-    """From measurements ``[batch, inputs]`` to accelerations ``[batch, 1]`` [m/s²].
+    """Maps measurements ``[batch, inputs]`` to accelerations ``[batch, 1]`` [m/s²].
 
-    A program that remembers takes and returns its memory, ``[batch, width]``, too. Where its first
-    number is zero, a vehicle begins anew.
+    A program with a memory also reads and returns the memory, ``[batch, width]``. If its first
+    number is zero, the vehicle starts anew.
 
     Args:
         pieces: a policy's memory and observation, the controller, the safety filter, in this order
@@ -94,9 +93,9 @@ class DrivingProgram(nn.Module):
 
     Attributes:
         names: the inputs, such as ``"self.gap"``.
-        inputs: the inputs that each entry is made of.
-        kept: the entries that are remembered: their shapes and types.
-        width: how many numbers the memory has, 0 if there is none.
+        inputs: the inputs of each entry.
+        kept: shapes and types of the remembered entries.
+        width: size of the memory, 0 if there is none.
     """
 
     def __init__(self, pieces: Sequence[Piece]) -> None:
@@ -120,13 +119,13 @@ class DrivingProgram(nn.Module):
         self.names = list(dict.fromkeys(name for names in self.inputs.values() for name in names))
 
     def _inputs(self, name: str) -> tuple[str, ...]:
-        """Return the inputs that an entry is made of; several numbers are an input each."""
+        """Return the inputs of an entry, one per number."""
         columns = [] if self.observation is None else self.observation.columns()
         several = tuple(column for column, *_ in columns if column.startswith(f"{name}."))
         return several or DERIVED_INPUTS.get(name, (name,))
 
     def forward(self, state: Tensor, memory: Tensor | None = None) -> Any:
-        """Return the accelerations to command and, if there is one, the memory after the step."""
+        """Return the commanded accelerations and, if there is one, the memory after the step."""
         if memory is None:
             return self.step(state)[0]
         begun = memory[:, :1]
@@ -134,8 +133,8 @@ class DrivingProgram(nn.Module):
         return self.step(state, torch.where(begun > 0.0, memory, self.begin(state, seeds)))
 
     def begin(self, state: Tensor, seeds: Tensor) -> Tensor:
-        """Return the memories of vehicles that begin now, from seeds ``[batch, 1]``, int64."""
-        start = TensorDict()  # without batch dimensions, whose number an export would take as fixed
+        """Return the initial memories of vehicles from seeds ``[batch, 1]``, int64."""
+        start = TensorDict()  # no batch dimensions: an export would fix their number
         clock: State = {SEED: seeds, STEP: torch.zeros_like(seeds)}
         for key, value in {**self.measured(state), **clock}.items():
             start.set(key, value)
@@ -147,7 +146,7 @@ class DrivingProgram(nn.Module):
     def step(
         self, state: Tensor, memory: Tensor | None = None, apply: Any = None
     ) -> tuple[Tensor, ...]:
-        """Return the accelerations and, if there is a memory, that after the step.
+        """Return the accelerations and, if there is one, the memory after the step.
 
         ``apply(piece, before, reached)`` applies each piece, by default ``piece.derive``.
         """
@@ -170,14 +169,14 @@ class DrivingProgram(nn.Module):
         return torch.cat(rows, 1)
 
     def measured(self, state: Tensor) -> State:
-        """Return the entries that are measured, ``[batch, 1, width]``."""
+        """Return the measured entries, ``[batch, 1, width]``."""
         columns = dict(zip(self.names, state.unsqueeze(1).split(1, -1), strict=True))
         found = {}
         for key, names in self.inputs.items():
             value = torch.cat([columns[name] for name in names], -1)
             if names == DERIVED_INPUTS.get(".".join(key)):
                 value = columns[names[0]] - columns[names[1]]
-                if key[0] == BEHIND and BEHIND_PRESENT in columns:  # zero where there is none
+                if key[0] == BEHIND and BEHIND_PRESENT in columns:  # zero without a vehicle behind
                     value = value * columns[BEHIND_PRESENT]
             found[key] = value
         return found
@@ -186,19 +185,19 @@ class DrivingProgram(nn.Module):
 def described_input(name: str) -> Input:
     """Return name, unit and meaning of a measurement such as ``"ahead.speed"``."""
     view, entry = name.split(".")[:2]
-    whose = {"self": "own", "ahead": "of the vehicle ahead", "behind": "of the vehicle behind"}
+    owners = {"self": "own", "ahead": "of the vehicle ahead", "behind": "of the vehicle behind"}
     known = declared(Piece)
     for key in ((VEHICLES, entry), (view, entry), (ROLE, entry)):
         if key in known:
-            return Input(name, known[key].unit, f"{known[key].meaning} ({whose.get(view, view)})")
-    return Input(name, "–", f"{entry} ({whose.get(view, view)})")
+            return Input(name, known[key].unit, f"{known[key].meaning} ({owners.get(view, view)})")
+    return Input(name, "–", f"{entry} ({owners.get(view, view)})")
 
 
 def measuring(time_step: float, behind: bool = True, population: Population | None = None) -> World:
-    """Return the world of a vehicle that measures its neighbours, by steps of so many seconds.
+    """Return the world of a vehicle that measures its neighbours.
 
-    Without ``behind``, there is not always a vehicle behind. Human drivers are of the population,
-    by default the shipped one.
+    Without ``behind`` there is not always a vehicle behind. Human drivers are drawn from the
+    population, by default the shipped one.
     """
     string = VehicleString((AUTOMATED, HUMAN)[: 1 + behind], ring=True, measured=True)
     return World(string, time_step, population=population or bootstrap())
@@ -217,10 +216,10 @@ def program(
             :func:`lcc_rl.evaluation.foreign.network_of`.
         trust: modules outside this package that the policy may name.
         cfg: the configuration in which a network was trained.
-        safety: the filter behind which it drives; None: its own.
+        safety: the safety filter; None: its own.
 
     Raises:
-        ConfigError: if no network drives, its filter knows the faults of a scenario, or its
+        ConfigError: if no network drives, its filter depends on delays of a scenario, or its
             vehicles have a class with limits.
         ResultsError: if the policy cannot be read.
     """
@@ -237,14 +236,14 @@ def program(
     for name, node in scenario.fleet.items():
         if node is not None and AUTOMATED in node.settings["roles"]:
             raise ConfigError(
-                f"{policy}: it drives vehicles of the class {name} (scenario.fleet), whose limits "
-                "only an environment knows: it cannot drive in SUMO or a file"
+                f"{policy}: it drives vehicles of the class {name} (scenario.fleet) with limits "
+                "that only an environment has: it cannot drive in SUMO or be exported"
             )
     safety = safety or next((p for p in pieces if isinstance(p, CBFFilter)), None)
     if safety is not None and any(vars(safety).get("remembers", {}).values()):
         raise ConfigError(
-            f"{policy}: its filter remembers commands under way or earlier measurements, which "
-            "nothing outside an environment knows: it needs one without delays, lag and drop-outs"
+            f"{policy}: its filter needs pending commands or earlier measurements, which exist "
+            "only in an environment: use a filter without delays, lag and drop-outs"
         )
     if isinstance(policy, nn.Module):
         network = policy
@@ -262,9 +261,9 @@ def program(
 
 
 def driving(pieces: Sequence[Piece], safety: CBFFilter | None, world: World) -> DrivingProgram:
-    """Return the program of pieces and a filter, which acts from the start, in a world.
+    """Return the program of pieces and a filter in a world; the filter acts from the start.
 
-    See :class:`DrivingProgram` and :func:`measuring`; all are bound here.
+    All are bound here, see :class:`DrivingProgram` and :func:`measuring`.
     """
     if safety is not None:
         world = replace(world, filtered=[AUTOMATED])

@@ -18,7 +18,7 @@ from lcc_rl.results.motion import SampleMotion
 
 
 class Film:
-    """The moments of the present episode in one place of a batch.
+    """Records the states of the present episode in one place of a batch.
 
     Args:
         episodes: the batch.
@@ -33,7 +33,7 @@ class Film:
         self.moments: list[tuple[Any, Any, Any]] = []
 
     def expose(self, begins: bool) -> None:
-        """Keep the present moment; of an episode that begins, it is the first."""
+        """Record the present state; ``begins``: it is the first of an episode."""
         if begins:
             self.moments.clear()
         speed, gap = (self._look("vehicles", name) for name in ("speed", "gap"))
@@ -41,7 +41,7 @@ class Film:
         self.moments.append((speed, gap, ahead))
 
     def picture(self) -> Any:
-        """Return the present moment, ``[height, width, 3]``, uint8."""
+        """Return a picture of the present state, ``[height, width, 3]``, uint8."""
         require(bool(self.moments), "call reset before render")
         speed, gap, ahead = map(np.asarray, zip(*self.moments, strict=True))
         string, length = self.motion.string, np.array(self.motion.vehicle_length)

@@ -1,7 +1,8 @@
 """Gymnasium environments of strings with one automated vehicle.
 
-``gymnasium.make("lcc_rl/alcc-v0")``, ``gymnasium.make_vec("lcc_rl/alcc-v0", 64)``: importing this
-module registers them, also by the name ``"lcc_rl.interfaces.gym:lcc_rl/alcc-v0"``.
+Importing this module registers them: ``gymnasium.make("lcc_rl/alcc-v0")``,
+``gymnasium.make_vec("lcc_rl/alcc-v0", 64)``. The name ``"lcc_rl.interfaces.gym:lcc_rl/alcc-v0"``
+imports it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from lcc_rl.errors import ConfigError, require, unknown_name
 
 GYM_VARIANTS = ("alcc", "reference", "own_energy")
 TERMS_INFO, MASK_OPTION = "reward_terms", "reset_mask"
-LARGEST_SCALED = 1e6  # beyond every speed [m/s], gap [m] and time [s] of a string, scaled
+LARGEST_SCALED = 1e6  # exceeds all scaled speeds [m/s], gaps [m] and times [s]
 MODES = ["rgb_array"]
 FIRST_EPISODE = np.zeros(1, np.int64)  # the place of the only episode
 
@@ -44,7 +45,7 @@ def register() -> None:
 def _episodes(
     variant: str, count: int, overrides: Sequence[str], held_out: bool, render_mode: Any
 ) -> ArrayEpisodes:
-    """Build episodes side by side; arguments as of the environments.
+    """Build parallel episodes; arguments as for the environments.
 
     Raises:
         ConfigError: naming the setting at fault.
@@ -62,7 +63,7 @@ def _episodes(
 
 
 def _seeds(seed: Any, count: int) -> list[int | None]:
-    """Return the seed of each place, from a number, None or a list of these.
+    """Return the seed of each place from a number, None or a list of these.
 
     Raises:
         ConfigError: naming a seed and its range, or the number of places.
@@ -79,10 +80,10 @@ def _seeds(seed: Any, count: int) -> list[int | None]:
 
 
 def _options(options: Any) -> dict[str, Any]:
-    """Return reset options as a dictionary of the caller's own.
+    """Return a copy of reset options as a dictionary.
 
     Raises:
-        ConfigError: if they are none.
+        ConfigError: if they are no dictionary.
     """
     if not isinstance(options, Mapping | None):
         raise ConfigError(f"options must be a dictionary of reset options, got {options!r}")
@@ -98,19 +99,19 @@ def _spaces(episodes: ArrayEpisodes) -> tuple[Box, Box]:
 class CarFollowing(gymnasium.Env[Array, Array]):
     """One episode of a string with one automated vehicle.
 
-    Observation: the entries of ``observation.scales``, scaled, float32. Action: acceleration as a
-    share of 3 m/s². ``terminated`` after a collision, ``truncated`` at the horizon; ``info`` has
-    the terms of the reward by name.
+    The observation is the scaled entries of ``observation.scales``, float32, the action an
+    acceleration as a share of 3 m/s². An episode is ``terminated`` by a collision and ``truncated``
+    at the horizon. ``info`` holds the reward terms by name.
 
     Args:
         variant: ``"alcc"``, ``"reference"`` or ``"own_energy"``.
         overrides: further settings, as on the command line: ``["scenario.horizon=100"]``.
-        held_out: play the evaluation's leaders instead of the training's.
-        render_mode: ``"rgb_array"``: :meth:`render` draws the road; None: nothing is drawn.
+        held_out: play the leaders of the evaluation, not of the training.
+        render_mode: ``"rgb_array"``: :meth:`render` draws the road; None: no rendering.
 
     Raises:
-        ConfigError: if an override is unknown, there is not just one automated vehicle, or the
-            ``render_mode`` is another.
+        ConfigError: if an override or the ``render_mode`` is unknown, or there is not exactly one
+            automated vehicle.
     """
 
     metadata: dict[str, Any] = {"render_modes": MODES, "render_fps": 10}  # noqa: RUF012
@@ -130,14 +131,14 @@ class CarFollowing(gymnasium.Env[Array, Array]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Begin an episode; with a seed, the same series of episodes as ever with it.
+        """Begin an episode; equal seeds give equal series of episodes.
 
         Args:
-            seed: of the series; None: the next episode of the series.
+            seed: seed of the series; None: the next episode of the series.
             options: see :meth:`lcc_rl.envs.arrays.ArrayEpisodes.reset`.
 
         Raises:
-            ConfigError: naming the seed or the option and its range; nothing changes then.
+            ConfigError: naming the seed or the option and its range; the state is then unchanged.
         """
         seed = checked_seed(seed)
         observation = self.episodes.reset(FIRST_EPISODE, [seed], _options(options))[0]
@@ -156,32 +157,32 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         return self.episodes.observation[0], reward, bool(terminated), bool(truncated), info
 
     def render(self) -> Any:
-        """Return the road at the present moment, ``[height, width, 3]``, uint8."""
+        """Return a picture of the road, ``[height, width, 3]``, uint8."""
         films = self.episodes.films
         return films[0].picture() if films else None
 
 
 class CarFollowingVector(VectorEnv[Array, Array, Array]):
-    """Episodes side by side in one batch.
+    """Parallel episodes in one batch.
 
-    Every place plays what a :class:`CarFollowing` of its seed plays. Where an episode ends in
-    the mode ``"SameStep"``, ``info["final_obs"]`` holds the last observations where
-    ``info["_final_obs"]`` is true, and ``info["final_info"]`` the terms of the last rewards.
+    Every place plays the episodes of a :class:`CarFollowing` with its seed. In the mode
+    ``"SameStep"``, ``info["final_obs"]`` holds the last observations of ended episodes, where
+    ``info["_final_obs"]`` is true, and ``info["final_info"]`` the terms of their last rewards.
 
     Args:
-        num_envs: episodes side by side.
+        num_envs: number of parallel episodes.
         variant, overrides, held_out, render_mode: see :class:`CarFollowing`.
         max_episode_steps: None; ``scenario.horizon`` is the number of steps.
-        autoreset_mode: when an episode that has ended begins anew, as Gymnasium names it:
-            ``"SameStep"``; ``"NextStep"``: in the next step, whose action and reward do not count;
+        autoreset_mode: when a new episode begins after one has ended, as in Gymnasium:
+            ``"SameStep"``; ``"NextStep"``: in the next step, which ignores action and reward;
             ``"Disabled"``: by ``reset`` with the option ``"reset_mask"``.
 
     Raises:
-        ConfigError: as of :class:`CarFollowing`, if ``max_episode_steps`` is given, or the mode is
-            unknown.
+        ConfigError: as for :class:`CarFollowing`, or if ``max_episode_steps`` is given or the mode
+            is unknown.
     """
 
-    metadata: dict[str, Any] = CarFollowing.metadata  # and the mode, of each vector
+    metadata: dict[str, Any] = CarFollowing.metadata  # and the mode of each vector
 
     def __init__(
         self,
@@ -210,7 +211,7 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.num_envs = num_envs
         self.running = np.zeros(num_envs, np.bool_)
-        self.ended = self.running.copy()  # those that begin anew in the next step
+        self.ended = self.running.copy()  # places with a new episode in the next step
 
     def reset(
         self,
@@ -221,14 +222,14 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
         """Begin episodes.
 
         Args:
-            seed: of the first place, one more for each further one; or the seed of each place,
-                None where its series is to go on.
-            options: see :meth:`lcc_rl.envs.arrays.ArrayEpisodes.reset`; besides, ``"reset_mask"``
-                says where episodes begin, by default everywhere.
+            seed: seed of the first place, increasing by one per place; or a seed per place, None to
+                continue its series.
+            options: see :meth:`lcc_rl.envs.arrays.ArrayEpisodes.reset`; the option ``"reset_mask"``
+                selects the places in which episodes begin, by default all.
 
         Raises:
-            ConfigError: if seeds or mask do not fit the number of places, and as of
-                :meth:`CarFollowing.reset`; nothing changes then.
+            ConfigError: if seeds or mask do not fit the number of places, and as for
+                :meth:`CarFollowing.reset`; the state is then unchanged.
         """
         options, count = _options(options), self.num_envs
         mask = np.asarray(options.pop(MASK_OPTION, [True] * count), np.object_)
@@ -269,7 +270,7 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
         return observation, results[:, 0], ends[:, 0], ends[:, 1], info
 
     def render(self) -> tuple[Any, ...] | None:
-        """Return the road of every place, ``[height, width, 3]``, uint8."""
+        """Return a picture of the road of every place, ``[height, width, 3]``, uint8."""
         return tuple(film.picture() for film in self.episodes.films) or None
 
 

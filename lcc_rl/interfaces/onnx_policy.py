@@ -1,13 +1,13 @@
-"""A policy as an ONNX program that anybody can write: it runs in onnxruntime and nowhere else.
+"""A policy as an ONNX program of any origin, which runs in onnxruntime.
 
 A program has the input ``state``, ``[batch, inputs]``, and the output ``acceleration``,
-``[batch, 1]`` [m/s²], in single precision for any batch. Its metadata hold under ``lcc_rl`` a JSON
-text with name and unit of every input, in order (:data:`INPUT_UNITS`), and the output's unit::
+``[batch, 1]`` [m/s²], in single precision for any batch. Its metadata contain under ``lcc_rl`` a
+JSON text with name and unit of every input, in order (:data:`INPUT_UNITS`), and the output's unit::
 
     {"inputs": [{"name": "self.gap", "unit": "m"}], "output": "acceleration [m/s²]"}
 
-A program that remembers has a further input ``memory`` and output ``next_memory``, ``[batch, n]``:
-zeros at first, then what it returned in the step before.
+A program with a memory has a further input ``memory`` and output ``next_memory``, ``[batch, n]``:
+zeros at first, then the output of the previous step.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from lcc_rl.settings import Positive, Settings, parse
 ABOUT = "lcc_rl"  # key of the metadata
 STATE_INPUT, MEMORY_INPUT = TAKES = ("state", "memory")
 MAKES = ("acceleration", "next_memory")
-# What a program may read, and its unit: entries of a vehicle and of its neighbours.
+# Possible inputs with their units: entries of a vehicle and of its neighbours.
 INPUT_UNITS = {
     f"{view}.{key[1]}": entry.unit
     for view in (SELF, AHEAD, BEHIND)
@@ -51,7 +51,7 @@ class ProgramInput(Settings):
         if self.name not in INPUT_UNITS:
             raise ValueError(
                 f"{self.name!r} is not measured: expected self, ahead or behind and an entry of "
-                "a vehicle, such as ahead.speed; what a program remembers is its input memory"
+                "a vehicle, such as ahead.speed; the memory of a program is its input memory"
             )
         if self.unit != INPUT_UNITS[self.name]:
             raise ValueError(f"{self.name} is in {INPUT_UNITS[self.name]}, got {self.unit!r}")
@@ -65,18 +65,18 @@ class ProgramFacts(Settings):
 
 
 class Program:
-    """An ONNX program in onnxruntime, on the processor.
+    """An ONNX program in onnxruntime on the CPU.
 
     Args:
-        path: its file, which must hold its weights itself.
+        path: its file, which must contain its weights.
 
     Attributes:
-        names: what it reads, in order.
-        memory: how many numbers it remembers.
+        names: its inputs, in order.
+        memory: size of its memory.
 
     Raises:
         ConfigError: if onnxruntime is not installed.
-        ResultsError: if the file cannot be read or is no program as described above.
+        ResultsError: if the file cannot be read or is not such a program.
     """
 
     def __init__(self, path: str) -> None:
@@ -92,7 +92,7 @@ class Program:
         options = ort.SessionOptions()
         options.intra_op_num_threads, options.log_severity_level = torch.get_num_threads(), 4
         try:
-            # From memory: a program can then name no other files for its weights.
+            # From memory, so that a program cannot name other files for its weights.
             content = Path(path).read_bytes()
             self.session = ort.InferenceSession(content, options, ["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's errors have no common class
@@ -160,14 +160,14 @@ def _facts(text: str, path: str) -> ProgramFacts:
 
 
 def _line(error: Exception) -> str:
-    """Return an error of another library as one line that is not too long."""
+    """Return an error of another library as one line of limited length."""
     return one_line(str(error))[:300]
 
 
 class OnnxPolicy(Controller):
-    """A controller that is an ONNX program; its metadata name its inputs, see the module.
+    """An ONNX program as a controller; its metadata name its inputs, see the module.
 
-    A program that remembers keeps its memory in ``(role, "program")``, ``[*batch, n, width]``. It
+    The memory of a program is kept in ``(role, "program")``, ``[*batch, n, width]``. The controller
     passes no gradient.
     """
 
@@ -175,18 +175,18 @@ class OnnxPolicy(Controller):
     max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
 
     def validate(self) -> None:
-        """Read the program, so that a wrong one is refused before anything starts."""
+        """Read the program, so that an invalid one is refused at once."""
         self.program = Program(self.path)
 
     def setup(self, world: World) -> None:
-        """Read what the program reads, and its memory."""
+        """Read the program's inputs and memory."""
         width = self.program.memory
         memory = [Entry("role.program", "–", "memory of the program", width)] * bool(width)
         self.declare(world, self.program.names, remembers=memory)
 
     @torch.compiler.disable
     def command(self, *entries: Tensor) -> tuple[Tensor, ...]:
-        """Return the commands, and the memory where there is one."""
+        """Return the commands, and the memory if there is one."""
         count, rows = len(self.program.names), entries[0].shape[:-1]
         given = [torch.cat(entries[:count], -1), *entries[count:]]
         found = self.program(*(value.reshape(rows.numel(), -1) for value in given))

@@ -1,8 +1,8 @@
-"""A ring road as a page in which a policy drives, in any browser.
+"""A page of the ring road with a policy, for any browser.
 
 The page needs no server and no other file. It computes the equations of this package with the
-ring, drivers and cars of the policy's training, or else of ``task=ring-22``, the weights of the
-policy and the package's random numbers: a seed means the same drive in both.
+weights of the policy and the ring, drivers and cars of its training, or else of ``task=ring-22``.
+It has the package's random numbers, so equal seeds give equal drives in both.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ OF_RING = (*NOT_ON_PAGE, "circumference", "string", "vehicle_length", "initial_s
 OF_DRIVERS = ("drivers", "controllers.human")
 DRAWS = ("noise", "wiener", "acceleration_noise", "acceleration_noise.before", "driver")
 RING_RULES = ("follower_stopper", "pi_saturation")
-# What the page computes.
+# Layers that the page can compute.
 LAYERS, VIEWS = (nn.Linear, nn.ReLU, nn.Tanh), ("self", "ahead", "behind", "memory")
 
 
 def ring_page(policy: str | Path, trust: Sequence[str] = (), overrides: Sequence[str] = ()) -> str:
-    """Return the page, all data inside.
+    """Return the page with all data.
 
     Args:
         policy: a run folder, a policy file, or ``pretrained/<name>``.
@@ -60,24 +60,24 @@ def ring_page(policy: str | Path, trust: Sequence[str] = (), overrides: Sequence
     data = page_data(policy, trust, overrides)
     text = json.dumps(data, ensure_ascii=False, separators=(",", ":"))
     template = files("lcc_rl.assets").joinpath("ring.html").read_text(encoding="utf-8")
-    # Within a script no tag may begin.
+    # No tag may begin within a script.
     return template.replace("DATA", text.replace("<", "\\u003c"), 1)
 
 
 def page_data(policy: Any, trust: Sequence[str], overrides: Sequence[str]) -> dict[str, Any]:
-    """Return all numbers of the page; arguments as of :func:`ring_page`."""
+    """Return all numbers of the page; arguments as for :func:`ring_page`."""
     cfg = ring_of(policy, trust, overrides)
     scenario, vehicles, energy = cfg.scenario, cfg.scenario.vehicles, build_energy(cfg).models
     car = energy[0] if len(energy) == 1 and isinstance(energy[0], CirclesFuel) else None
     strange = [f"role {name}" for name in vehicles.names if name not in (HUMAN, AUTOMATED)]
     strange += [f"scenario.{x}" for x in NOT_ON_PAGE if getattr(scenario, x)]
     if car is None or car.truck or car.grade:
-        strange.append("energy (it takes one car on a level road: energy=compact)")
+        strange.append("energy (only one car on a level road: energy=compact)")
     human = None if strange else _human(cfg)
     if human is None and not strange:
-        strange.append("drivers (it takes IDM drivers who share a, b and s0, without gap_noise)")
+        strange.append("drivers (only IDM drivers that share a, b and s0, without gap_noise)")
     if strange or car is None:
-        raise ConfigError(f"{policy}: a page of the ring cannot carry {', '.join(strange)}")
+        raise ConfigError(f"{policy}: a page of the ring does not support {', '.join(strange)}")
     rules = {name: Driver(name, scenario.time_step).program.controller for name in RING_RULES}
     count, some = len(vehicles), vehicles.count(AUTOMATED)
     spread = [k * count // some for k in range(some)]
@@ -103,7 +103,7 @@ def page_data(policy: Any, trust: Sequence[str], overrides: Sequence[str]) -> di
 
 
 def ring_of(policy: str | Path, trust: Sequence[str], overrides: Sequence[str]) -> StudyConfig:
-    """Return the ring of a policy's training, or else that of the task, with the overrides."""
+    """Return the ring of a policy's training, or else of the task, with overrides."""
     cfg: StudyConfig = load("evaluate", [*RING_TASK, *overrides])
     own, given = load_policy(policy, trust=trust)[1], [key_of(item) for item in overrides]
     if own.scenario.road != RING:
@@ -121,7 +121,7 @@ def ring_of(policy: str | Path, trust: Sequence[str], overrides: Sequence[str]) 
 
 
 def _human(cfg: StudyConfig) -> dict[str, Any] | None:
-    """Return what drives the human drivers; None of those whom the page cannot compute."""
+    """Return the settings of human drivers; None if the page cannot compute them."""
     inputs = load_inputs(cfg)
     pieces = pieces_of(build_env(cfg, inputs.evaluation, inputs.population, nominal=True))
     people = [piece for piece in pieces if isinstance(piece, Drivers)]
@@ -150,7 +150,7 @@ def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict
     strange += ["stacked memory"] if any(x.stacked for x in memory) else []
     strange += ["late filter"] if program.safety is not None and program.safety.late else []
     if strange:
-        raise ConfigError(f"{policy}: the page cannot compute its {', '.join(strange)}")
+        raise ConfigError(f"{policy}: the page does not support its {', '.join(strange)}")
     return {
         "layers": [_layer(layer) for layer in layers],
         "columns": columns,

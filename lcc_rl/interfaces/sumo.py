@@ -1,4 +1,4 @@
-"""Vehicles of a SUMO simulation, driven by a policy or a rule of this package.
+"""Policies and rules of this package in a SUMO simulation.
 
 ::
 
@@ -21,17 +21,17 @@ from lcc_rl.interfaces.driver import MEASURED, Driver
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.controllers import Population
 
-UNCHECKED, RELEASED = 0, -1.0  # SUMO's speed mode without checks, and the speed that releases
+UNCHECKED, RELEASED = 0, -1.0  # SUMO's speed mode without checks; speed that releases a vehicle
 
 
 def load_sumo() -> Any:
-    """Return the module ``libsumo``, imported without its line about pyarrow's version.
+    """Return the module ``libsumo``, imported without its message on pyarrow's version.
 
     Raises:
         ConfigError: if it is not installed.
     """
     try:
-        # Only meanwhile: in the environment it would also replace SUMO's module traci.
+        # Only during the import: otherwise it would replace SUMO's module traci, too.
         with patch.dict(os.environ, {"LIBSUMO_AS_TRACI": "quiet"}):
             import libsumo
     except ImportError as error:
@@ -40,21 +40,21 @@ def load_sumo() -> Any:
 
 
 class Bridge:
-    """Lets a policy or a rule drive vehicles of the SUMO simulation that runs in libsumo.
+    """Drives vehicles of the SUMO simulation in libsumo by a policy or a rule.
 
-    The commands are executed exactly: SUMO's checks of speeds, right of way and traffic lights are
-    off for the driven vehicles (speed mode 0). SUMO's own model drives a vehicle that sees none
-    ahead within ``sight``; its memory then begins anew. If none is behind and the policy does
-    not observe that, a vehicle at the own speed and gap is assumed. SUMO changes lanes.
+    Commands are executed exactly: SUMO's checks of speeds, right of way and traffic lights are off
+    for these vehicles (speed mode 0). Without a vehicle ahead within ``sight``, SUMO's own model
+    drives, and the memory starts anew. Without a vehicle behind, one at the own speed and gap is
+    assumed, unless the policy observes its presence. SUMO changes lanes.
 
     Args:
-        driver: a policy or a rule, as :class:`lcc_rl.interfaces.driver.Driver` takes it.
+        driver: a policy or a rule, see :class:`lcc_rl.interfaces.driver.Driver`.
         vehicles: ids of the driven vehicles, which may enter later, or a predicate on ids.
-        sight: distance at which a vehicle ahead is seen, bumper to bumper [m].
+        sight: largest gap to a vehicle ahead that is measured, bumper to bumper [m].
         trust, safety, seed, drivers: see :class:`lcc_rl.interfaces.driver.Driver`.
 
     Raises:
-        LccError: if libsumo is missing or runs no simulation, or the driver cannot drive there.
+        LccError: if libsumo is missing or runs no simulation, or the driver cannot be used.
     """
 
     def __init__(
@@ -75,19 +75,19 @@ class Bridge:
         names = {vehicles} if isinstance(vehicles, str) else vehicles
         self.chosen = names if callable(names) else set(names).__contains__
         self.sight = sight
-        self.modes: dict[str, int] = {}  # of those commanded, their speed modes before
+        self.modes: dict[str, int] = {}  # original speed modes of commanded vehicles
 
     def command(self, execute: bool = True) -> dict[str, float]:
-        """Set the speeds that the driven vehicles have after SUMO's next step.
+        """Set the speeds of the driven vehicles after SUMO's next step.
 
         Args:
-            execute: False to update memories only, while SUMO's own model drives.
+            execute: False: update memories only, while SUMO's own model drives.
 
         Returns:
-            The accelerations commanded, by vehicle [m/s²].
+            The commanded accelerations by vehicle [m/s²].
 
         Raises:
-            Diverged: if a command is no number; SUMO would drive with its own model instead.
+            Diverged: if a command is not finite; SUMO would then use its own model.
         """
         cars = self.sumo.vehicle
         present = cars.getIDList()
@@ -125,10 +125,10 @@ class Bridge:
             self.sumo.vehicle.setSpeed(car, RELEASED)
 
     def _measured(self, car: str) -> tuple[float, ...] | None:
-        """Return what :data:`MEASURED` names of a vehicle; None if it sees no vehicle ahead."""
+        """Return the entries :data:`MEASURED` of a vehicle; None without a vehicle ahead."""
         cars = self.sumo.vehicle
         ahead, free = cars.getLeader(car, self.sight) or ("", 0.0)
-        gap = free + cars.getMinGap(car)  # SUMO's gaps are without the least one desired
+        gap = free + cars.getMinGap(car)  # SUMO's gaps exclude the minimum gap
         if not ahead or gap > self.sight:
             return None
         own = (cars.getSpeed(car), gap, cars.getAcceleration(car))

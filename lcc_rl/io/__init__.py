@@ -1,1 +1,1 @@
-"""Reading and writing of result files."""
+"""Reading and writing of files."""

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ from pathlib import Path
 
 from lcc_rl.errors import ResultsError
 
-# Of a run; other folders in it are runs of their own.
+# Folders of a run; other folders in it are separate runs.
 SUBFOLDERS = ("figures", "policies", "blocks")
 
 
 def new_file(path: str | Path, option: str, own: Callable[[Path], bool] | None = None) -> Path:
-    """Return the path of a file to write: the one door of commands that are given its name.
+    """Return the checked path of a file that a command is to write.
 
     Args:
-        path: what was given.
-        option: the option that gave it, for the message.
-        own: whether a regular file that is there is this command's, to be replaced.
+        path: the given path.
+        option: its option, for the message.
+        own: whether an existing regular file belongs to this command and is replaced.
 
     Raises:
-        ResultsError: if something else is there.
+        ResultsError: if another file exists.
     """
     path = _spelled(path)
     if os.path.lexists(path) and not (
         own and not path.is_symlink() and path.is_file() and own(path)
     ):
-        raise ResultsError(f"{path} is already there; choose another {option}, or remove it")
+        raise ResultsError(f"{path} exists already; choose another {option}, or remove it")
     return path
 
 
 def own_folder(path: str | Path, option: str, own: Callable[[set[str]], bool]) -> Path:
-    """Return the path of a folder to write into, the one door as above.
+    """Return the checked path of a folder that a command is to write into.
 
     Args:
-        path: what was given.
-        option: the option that gave it, for the message.
-        own: whether the names in it, none of them hidden, are those of this command.
+        path: the given path.
+        option: its option, for the message.
+        own: whether the names in it, without hidden ones, belong to this command.
 
     Raises:
-        ResultsError: if it holds something else, or is no folder.
+        ResultsError: if it contains other files, or is no folder.
     """
     path = _spelled(path)
     if os.path.lexists(path):
@@ -67,17 +67,16 @@ def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` that replaces it only when the block succeeds.
 
     Args:
-        path: the final path; its folder is made where it does not exist.
-        durable: flush to disk, so that the file survives a power cut.
+        path: the final path; its folder is created if necessary.
+        durable: flush to disk, so that the file survives a power failure.
 
     Raises:
-        ResultsError: if ``path`` is there and no regular file, such as a folder or a device.
-        ResultsError: if it cannot be written (disk full, folder read-only …); a former
-            file at ``path`` is kept and the temporary one removed.
+        ResultsError: if ``path`` exists and is no regular file, or cannot be written (disk full,
+            folder read-only …); an existing file is kept and the temporary one removed.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
-        raise ResultsError(f"{path}: is no regular file; choose another place to write")
+        raise ResultsError(f"{path}: is no regular file; choose another path")
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -96,7 +95,7 @@ def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Flush a rename in a folder to disk, where the system supports it."""
+    """Flush a rename in a folder to disk, if the system supports it."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -108,7 +107,7 @@ def _sync_folder(folder: Path) -> None:
 def remove_leftovers(folder: Path) -> None:
     """Remove temporary files of killed writers from a run's folder and its own subfolders.
 
-    Call it only while no writer is active.
+    It must not be called while a writer is active.
     """
     for place in (folder, *(folder / name for name in SUBFOLDERS)):
         for path in place.glob(".*.tmp"):

@@ -21,10 +21,10 @@ from lcc_rl.io.atomic import atomic_path
 from lcc_rl.version import __version__
 
 SCHEMA_VERSION = "1"
-PROCESSOR = "lcc_rl.processor"  # in a table's metadata
-# The rows of a table, read; or, of many rows, files that are read when asked.
+PROCESSOR = "lcc_rl.processor"  # key in a table's metadata
+# The rows of a table, or, for many rows, a dataset that is read on demand.
 Rows: TypeAlias = pd.DataFrame | ds.Dataset
-FEW = 200_000  # rows that are read at once without a thought
+FEW = 200_000  # most rows that are read at once
 TEXT = pa.dictionary(pa.int32(), pa.string())
 
 
@@ -38,14 +38,14 @@ def write_parquet(
     The processor is recorded because trainings differ between processors as between seeds.
 
     Args:
-        frame: the table; its index is not kept. Or its parts, at least one, all of the same
-            columns: each becomes a row group, and one at a time is held in memory.
+        frame: the table, without its index; or at least one part with equal columns, each of
+            which becomes a row group, so that one part at a time is in memory.
         path: destination.
         metadata: further entries, such as a config hash.
 
     Raises:
-        ResultsError: if the file cannot be written, or a number is infinite; it names column and
-            row. NaN is a missing value and is written as null.
+        ResultsError: if the file cannot be written, or naming column and row of an infinite
+            number. NaN is written as null.
     """
     own = {
         "lcc_rl.schema": SCHEMA_VERSION,
@@ -68,7 +68,7 @@ def write_parquet(
 
 
 def _finite(frame: pd.DataFrame, path: str | Path) -> pa.Table:
-    """Return a data frame as a table whose numbers are finite."""
+    """Return a data frame as a table after a check for infinite numbers."""
     table = pa.Table.from_pandas(frame, preserve_index=False)
     for name, column in zip(table.column_names, table.columns, strict=True):
         if pa.types.is_floating(column.type) and pc.any(pc.is_inf(column)).as_py():
@@ -97,19 +97,19 @@ def read_parquet(path: str | Path) -> pd.DataFrame:
     table = read_table(path)
     try:
         frame: pd.DataFrame = table.to_pandas()
-    except Exception as error:  # whatever pandas' own entry of the metadata says
+    except Exception as error:  # pandas' own metadata may be damaged
         raise _no_frame(path, error) from error
     return frame
 
 
 def read_table(path: str | Path, encoded: Sequence[str] = ()) -> pa.Table:
-    """Read a table, of which some columns of text are dictionary-encoded.
+    """Read a table with dictionary encoding of some columns of text.
 
     Raises:
         ResultsError: if it is missing or damaged.
     """
 
-    def read(place: Path) -> pa.Table:  # pq.read_table takes a third longer for a small file
+    def read(place: Path) -> pa.Table:  # pq.read_table takes a third longer for small files
         how = {"page_checksum_verification": True, "read_dictionary": list(encoded)}
         with pq.ParquetFile(place, **how) as file:
             return file.read()
@@ -118,7 +118,7 @@ def read_table(path: str | Path, encoded: Sequence[str] = ()) -> pa.Table:
 
 
 def as_rows(path: Path) -> Rows:
-    """Return a table: read where it has :data:`FEW` rows at most, else as a dataset.
+    """Return a table with at most :data:`FEW` rows, else a dataset.
 
     Raises:
         ResultsError: if it is missing, damaged or of a newer schema.
@@ -128,11 +128,11 @@ def as_rows(path: Path) -> Rows:
 
 
 def as_dataset(tables: Mapping[Path, Mapping[str, Any]], schema: pa.Schema) -> ds.Dataset:
-    """Return tables as one dataset of pyarrow, whose rows are read when asked.
+    """Return tables as one dataset of pyarrow, which is read on demand.
 
     Args:
-        tables: of each file the columns that are constant in it, the same of all files.
-        schema: columns of the files, see :func:`schema_of`; one that a file lacks is null there.
+        tables: constant columns of each file; all files have the same ones.
+        schema: columns of the files, see :func:`schema_of`; missing ones are null.
     """
     constant = pa.Table.from_pylist([dict(columns) for columns in tables.values()]).schema
     for field in _texts_encoded(constant):
@@ -150,13 +150,13 @@ def as_dataset(tables: Mapping[Path, Mapping[str, Any]], schema: pa.Schema) -> d
 
 
 def schema_of(path: str | Path, needed: Iterable[str] = ()) -> pa.Schema:
-    """Return the columns of a table of the present schema version, or of other origin.
+    """Return the columns of a table of the present schema version or of other origin.
 
     Text is dictionary-encoded.
 
     Raises:
-        ResultsError: if it is missing, damaged, of another schema version, no data frame, or
-            without a column that is needed.
+        ResultsError: if it is missing, damaged, of another schema version, no data frame, or lacks
+            a needed column.
     """
     found: pa.Schema = _read(path, pq.read_schema)
     version = _decoded((found.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()))
@@ -168,7 +168,7 @@ def schema_of(path: str | Path, needed: Iterable[str] = ()) -> pa.Schema:
         raise _no_frame(path, error) from error
     for name in needed:
         if name not in found.names:
-            raise ResultsError(f"{path}: not what a run writes: it has no column {name}")
+            raise ResultsError(f"{path}: not written by a run: it has no column {name}")
     return _texts_encoded(found.remove_metadata())
 
 
@@ -176,7 +176,7 @@ def unified(schema: pa.Schema, other: pa.Schema, path: Path) -> pa.Schema:
     """Return the columns of two schemas.
 
     Raises:
-        ResultsError: if a column has another type in the other one, which is that of ``path``.
+        ResultsError: if the type of a column differs; ``path`` is the file of ``other``.
     """
     try:
         return pa.unify_schemas([schema, other], promote_options="permissive")
@@ -198,7 +198,7 @@ def _is_text(kind: pa.DataType) -> bool:
 
 
 def _constants(columns: Mapping[str, Any]) -> ds.Expression:
-    """Return constant columns as the expression that a dataset's file has them by."""
+    """Return constant columns as the partition expression of a file."""
     found = ds.scalar(True)
     for name, value in columns.items():
         same = ds.field(name).is_null() if value is None else ds.field(name) == value
@@ -210,7 +210,7 @@ def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:
     """Read a parquet file, or raise a ResultsError of one line."""
     path = Path(path)
     try:
-        if not path.is_file():  # a pipe would be waited for
+        if not path.is_file():  # reading a pipe would block
             raise ResultsError(f"{path}: no such file")
         return reader(path)
     except (pa.ArrowException, OSError) as error:

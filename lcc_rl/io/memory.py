@@ -1,4 +1,4 @@
-"""Memory that is free on this machine, and refusal of what needs more before it is allocated."""
+"""Free memory of this machine, and a check before allocations."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ if TYPE_CHECKING:
     import torch
 
 PROCESS, MEMINFO, GROUPS = Path("/proc/self/cgroup"), Path("/proc/meminfo"), Path("/sys/fs/cgroup")
-# Of a control group: files of its limit and its use, and the line of memory.stat on file pages.
+# Files of a control group's limit and use, and the line of memory.stat on file pages.
 VERSION_1 = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 VERSION_2 = ("memory.max", "memory.current", "inactive_file")
 SIZE_UNITS = ("B", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB")
 
 
 def require_memory(needs: Mapping[str, float], device: torch.device | str = "cpu") -> None:
-    """Check that what is about to be allocated fits into the memory that is free.
+    """Check that planned allocations fit into the free memory.
 
     Args:
-        needs: bytes by the option, as it was given, that they are due to.
-        device: where the tensors will live.
+        needs: memory by option, as given [bytes].
+        device: device of the tensors.
 
     Raises:
-        ConfigError: naming the option that needs most, how much, and how much is free.
+        ConfigError: naming the option that needs most, its need and the free memory.
     """
     free, total = available(device), sum(needs.values())
     if free is None or total <= free:
@@ -43,13 +43,13 @@ def require_memory(needs: Mapping[str, float], device: torch.device | str = "cpu
 
 
 def torch_device(name: torch.device | str) -> torch.device:
-    """Return a device by its name, or raise a ConfigError where this machine has none such."""
-    import torch  # here: reading a table needs no torch
+    """Return a device by its name; raise a ConfigError if this machine does not have it."""
+    import torch  # here, because reading a table needs no torch
 
     try:
         device = torch.device(name)
         torch.empty(0, device=device)
-    # Which error torch raises depends on how it was built.
+    # The type of error depends on the build of torch.
     except (RuntimeError, AssertionError, TypeError) as error:
         reason = str(error).strip().partition("\n")[0]
         raise ConfigError(f"device {str(name)!r} is not available: {reason}") from error
@@ -57,10 +57,10 @@ def torch_device(name: torch.device | str) -> torch.device:
 
 
 def available(device: torch.device | str = "cpu") -> int | None:
-    """Return the bytes that can be allocated on a device; None if it is not known.
+    """Return the free memory of a device [bytes]; None if it is unknown.
 
-    On the CPU the least of what the system calls available and what the process's control groups
-    leave (Linux); the physical memory where the system says no more (macOS).
+    On the CPU it is the least of the system's available memory and the free memory of the process's
+    control groups (Linux), or the physical memory (macOS).
     """
     if str(device).startswith("cuda"):
         import torch
@@ -70,7 +70,7 @@ def available(device: torch.device | str = "cpu") -> int | None:
 
 
 def amount(size: float) -> str:
-    """Return a number of bytes with its unit, e.g. ``"1.9 TiB"``."""
+    """Return a size in bytes with its unit, e.g. ``"1.9 TiB"``."""
     place = 0
     while size >= 1000 and place < len(SIZE_UNITS) - 1:
         size, place = size / 1024, place + 1
@@ -82,12 +82,12 @@ def _of_system() -> Iterator[int]:
         _, _, after = MEMINFO.read_text("utf-8").partition("MemAvailable:")
         yield int(after.split()[0]) * 1024
         return
-    with suppress(OSError, ValueError, AttributeError):  # no such name, or no such system
+    with suppress(OSError, ValueError, AttributeError):  # not supported by the system
         yield os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def _of_groups() -> Iterator[int]:
-    """Yield what each control group above this process leaves, of version 1 and 2."""
+    """Yield the free memory of each control group of this process, version 1 and 2."""
     with suppress(OSError):
         for line in PROCESS.read_text("utf-8").splitlines():
             _, controllers, path = line.split(":", 2)
@@ -99,7 +99,7 @@ def _of_groups() -> Iterator[int]:
 
 
 def _left(folder: Path, limit: str, used: str, reclaimable: str) -> Iterator[int]:
-    """Yield what one group leaves; files that it holds in memory are given up first."""
+    """Yield the free memory of a group, including reclaimable file pages."""
     # ValueError: "max", no limit.
     with suppress(OSError, ValueError):
         most, now = (int((folder / name).read_text("utf-8")) for name in (limit, used))

@@ -1,4 +1,4 @@
-"""Reads small text files that may be foreign: YAML and JSON."""
+"""Reader of small, possibly foreign text files: YAML and JSON."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import yaml
 
 from lcc_rl.errors import ResultsError
 
-LARGEST_FILE = 2**20  # bytes; a configuration has some thousands
-NESTED = 2000  # signs that may nest, at most, for the C loader
-# The C loader is five times as fast as Python's.
+LARGEST_FILE = 2**20  # bytes; a configuration has thousands
+NESTED = 2000  # most characters that open a nested level, for the C loader
+# The C loader is five times faster than Python's.
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -20,7 +20,7 @@ def read_text(path: Path) -> str:
     """Read a small text file.
 
     Raises:
-        ResultsError: if it is missing, no regular file (a pipe would be waited for), too large or
+        ResultsError: if it is missing, no regular file (reading a pipe would block), too large or
             not text.
     """
     try:
@@ -32,7 +32,7 @@ def read_text(path: Path) -> str:
     except (OSError, ValueError) as error:
         raise ResultsError(f"{path}: cannot be read: {error}") from error
     if len(content) > LARGEST_FILE:
-        raise ResultsError(f"{path}: larger than {LARGEST_FILE} bytes, which no such file is")
+        raise ResultsError(f"{path}: larger than {LARGEST_FILE} bytes, the limit of such files")
     return text
 
 
@@ -40,9 +40,9 @@ def parse_yaml(text: str, where: str) -> dict[str, Any]:
     """Parse stored settings as plain containers.
 
     Raises:
-        ResultsError: naming what was wrong and where it comes from.
+        ResultsError: naming the error and the origin.
     """
-    # The C loader would end the process at deep nesting, which no settings have.
+    # The C loader would crash at deep nesting, which settings never have.
     loader = LOADER if sum(map(text.count, "[{-")) < NESTED else yaml.SafeLoader
     try:
         content = yaml.load(text, Loader=loader)  # safe: plain values only

@@ -14,12 +14,12 @@ from torch import Tensor
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.atomic import atomic_path
 
-# Of what is stored here: weights, sums in double precision, counters, flags.
+# Types of stored tensors: weights, sums in double precision, counters, flags.
 TENSOR_TYPES = (torch.float32, torch.float64, torch.int64, torch.bool)
 
 
 def write_torch(content: Any, path: str | Path) -> None:
-    """Write tensors atomically, in a form that loads with ``weights_only=True``.
+    """Write tensors atomically in a format that loads with ``weights_only=True``.
 
     Raises:
         ResultsError: if the file cannot be written.
@@ -28,7 +28,7 @@ def write_torch(content: Any, path: str | Path) -> None:
         try:
             torch.save(content, file)
         except RuntimeError as error:
-            # Torch hides what went wrong with the file behind a fault of its own.
+            # Torch hides the file's error behind its own.
             if isinstance(error.__context__, OSError):
                 raise error.__context__ from None
             raise
@@ -38,40 +38,40 @@ def read_torch(path: str | Path) -> Any:
     """Read tensors without running code in the file.
 
     Raises:
-        ResultsError: if the file is missing, damaged or holds anything but tensors and plain
-            containers.
+        ResultsError: if the file is missing, damaged, or holds other objects than tensors and
+            plain containers.
     """
     path = Path(path)
     if not path.is_file():
         raise ResultsError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
     try:
-        with zipfile.ZipFile(path) as archive:  # torch does not compare the checksums
+        with zipfile.ZipFile(path) as archive:  # torch does not check the checksums
             damaged = archive.testzip()
             packed = any(item.compress_type for item in archive.infolist())
-        if packed or damaged is not None:  # torch packs nothing; unpacked it may be any size
+        if packed or damaged is not None:  # torch does not compress
             raise zipfile.BadZipFile(damaged)
         return torch.load(path, weights_only=True, map_location="cpu")
     except PermissionError as error:
         raise ResultsError(f"{path}: cannot be read: {error.strerror}") from error
     except Exception as error:  # torch raises many kinds for damaged or malicious files
         raise ResultsError(
-            f"{path}: not a readable weights file: damaged, or made by something else"
+            f"{path}: not a readable weights file: damaged or of another kind"
         ) from error
 
 
 def check_like(found: Any, wanted: Any, name: str) -> None:
-    """Check that a state may replace another one: the same entries, types and sizes, all numbers.
+    """Check that a state may replace another one: equal entries, types and sizes, finite numbers.
 
-    What the other one does not have yet, as an optimizer before its first step or a list that is
-    empty, may be any numbers.
+    Entries that the other one does not have yet, such as those of an optimizer before its first
+    step or of an empty list, may be any numbers.
 
     Args:
         found: nested containers of tensors.
-        wanted: the other one.
-        name: of the state, for messages.
+        wanted: the other state.
+        name: name of the state, for messages.
 
     Raises:
-        ValueError: naming the first entry at fault.
+        ValueError: naming the first wrong entry.
     """
     if isinstance(wanted, Mapping):
         if not isinstance(found, Mapping) or set(wanted) - set(found):
@@ -96,6 +96,6 @@ def check_like(found: Any, wanted: Any, name: str) -> None:
         if found.dtype not in TENSOR_TYPES:
             raise ValueError(f"{name} is of type {found.dtype}")
         if not bool(torch.isfinite(found).all()):
-            raise ValueError(f"{name} holds values that are no numbers")
+            raise ValueError(f"{name} holds values that are not finite")
     elif isinstance(found, float) and not math.isfinite(found):
         raise ValueError(f"{name} is {found}")

@@ -1,6 +1,6 @@
 """Pieces: everything that an environment is made of, one TensorDict transform each."""
 
-# ruff: noqa: F401  what other rooms and users import from here
+# ruff: noqa: F401  imported from here by other packages and users
 
 from lcc_rl.functional.pattern import VehicleString, parse_string
 from lcc_rl.pieces.actuation import Actuation

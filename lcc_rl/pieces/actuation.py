@@ -15,20 +15,18 @@ HARDEST = 1e3  # above any braking that is commanded [m/s²]
 
 
 class Actuation(RoleTransform):
-    """Makes accelerations of commands: after a delay, with a first-order lag, within the brakes.
+    """Turns commands into accelerations, with a delay, a first-order lag and limited brakes.
 
-    It keeps the last acceleration and the commands that do not act yet, the oldest first; zeros at
-    the start.
+    It keeps the last acceleration and the commands that do not act yet, oldest first; zeros at the
+    start.
     """
 
     delay: NonNegative = 0.0  # between a command and its first effect, a number of steps [s]
     lag: NonNegative = 0.0  # time constant with which the acceleration follows the command [s]
-    braking: Positive | None = None  # hardest braking that there is; None: as commanded [m/s²]
+    braking: Positive | None = None  # hardest braking possible; None: no limit [m/s²]
 
-    obeyed = Entry("obeyed.role", "m/s²", "acceleration that engine and brakes make of the command")
-    kept = Entry(
-        "role.actuation", "m/s²", "that of the last step, and commands that do not act yet"
-    )
+    obeyed = Entry("obeyed.role", "m/s²", "acceleration of engine and brakes for the command")
+    kept = Entry("role.actuation", "m/s²", "last acceleration, then commands that do not act yet")
 
     def setup(self, world: World) -> None:
         """Read the commands of the role."""
@@ -37,17 +35,17 @@ class Actuation(RoleTransform):
         self.declare(world, reads, [self.obeyed, self.kept.wide(1 + self.response.late)])
 
     def response_in(self, world: World, role: str, hardest: float) -> Response:
-        """Return how the role's vehicles obey commands that brake no harder than that [m/s²].
+        """Return the response of the role's vehicles; ``hardest``: of the commands [m/s²].
 
         Raises:
-            ConfigError: if the delay is no number of steps, or too long.
+            ConfigError: if the delay is no multiple of the time step, or too long.
         """
         late = world.late(self.delay, f"scenario.actuators.{role}.delay")
         braking = min(self.braking or hardest, hardest)
         return Response.of(late, self.lag, braking, world.time_step)
 
     def compute(self, command: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the accelerations, and what is kept."""
+        """Return the accelerations and the memory."""
         line = join([kept[..., 1:], command], -1)
         acceleration = self.response.next(kept[..., :1], line[..., :1])
         return acceleration, join([acceleration, line[..., 1:]], -1)

@@ -7,9 +7,9 @@ call, on a stored rollout and in a replay buffer. Two kinds exist:
 * a :class:`StepTransform` reads two: keys under ``"next"`` belong to the state after the step, all
   others to the state before it, so that it applies unchanged to any stored transition.
 
-A piece is made of its settings (:mod:`lcc_rl.settings`). ``bind`` puts a copy of it into a world
-and calls ``setup``, which declares what the piece reads and writes: what its class names in
-``reads`` and ``writes``, unless that depends on settings.
+A piece is constructed from its settings (:mod:`lcc_rl.settings`). ``bind`` returns a copy of it for
+a world and calls ``setup``, which declares the entries that the piece reads and writes: ``reads``
+and ``writes`` of its class, unless they depend on settings.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.views import EPISODE, NEXT, VEHICLES, Key, Views, as_key
 from lcc_rl.pieces.world import Part, World
 
-# The entries of one moment by their full keys.
+# The entries of one state by their full keys.
 State = dict[Key, Tensor]
 
-# Written by the clock: the seed from which everything random in an episode follows, and its step.
+# Written by the clock: the episode's seed, which determines all its random numbers, and its step.
 SEED = (EPISODE, "seed")
 STEP = (EPISODE, "step")
-# What learners read and write, and are rewarded by.
+# Read and written by learners, and their reward.
 OBSERVATION, ACTION, REWARD = ((AUTOMATED, x) for x in ("observation", "action", "reward"))
 # Parts of declared keys that stand for the role of a piece, and for its name.
 ROLE, TERM = "role", "name"
@@ -51,9 +51,9 @@ class Entry:
 
     Args:
         key: its key; a part ``role`` stands for the role of the piece, ``name`` for its name.
-        unit: of its numbers; "–" for none.
-        meaning: what it holds, for docs/entries.md.
-        width: how many numbers a row has; a tuple for several dimensions.
+        unit: unit of its numbers; "–" for none.
+        meaning: description for docs/entries.md.
+        width: numbers per row; a tuple for several dimensions.
         whole: whether it holds whole numbers, int64.
         option: whether a caller may set it, a whole constant, through ``env.reset``.
     """
@@ -71,7 +71,7 @@ class Entry:
         return replace(self, key=tuple(held.get(part) or part for part in as_key(self.key)))
 
     def wide(self, width: int | tuple[int, ...]) -> Entry:
-        """Return the entry with a width that depends on settings."""
+        """Return the entry with another width."""
         return replace(self, width=width)
 
 
@@ -114,25 +114,25 @@ def require_option(key: Key, values: Tensor, count: Tensor | int) -> None:
 class Piece(Part, TensorDictModuleBase, Transform):
     """Base of all pieces; see the module's description."""
 
-    # Whose vehicles have a row each in what the piece writes: a role, "vehicles" for all of them,
-    # "episode" where an entry belongs to the episode.
+    # Rows of the written entries: one per vehicle of a role, one per vehicle ("vehicles"), or one
+    # per episode ("episode").
     role = AUTOMATED
-    # What compute is given, in order: names of views, and keys as tuples.
+    # Arguments of compute, in order: names of views, and keys as tuples.
     reads: ClassVar[Sequence[NestedKey]] = ()
-    # What compute returns, in order; a plain key holds one number per row.
+    # Results of compute, in order; a plain key holds one number per row.
     writes: ClassVar[Sequence[Entry | NestedKey]] = ()
     keeps: ClassVar[Sequence[Entry]] = ()  # constants of an episode, which begin sets at reset
-    measures: ClassVar[bool] = False  # what sensors measure is read as they measure it
-    # Maps what is read to what is written; a pure function of tensors.
+    measures: ClassVar[bool] = False  # whether measured values are read where the role has sensors
+    # Maps the entries read to the entries written; a pure function of tensors.
     compute: ClassVar[Callable[..., Any]]
 
     @property
     def title(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return type(self).__name__
 
     def __post_init__(self) -> None:
-        # A transform, which reads and writes nothing before it is put into a world.
+        # As a transform it reads and writes nothing before it is bound.
         Transform.__init__(self, in_keys=[], out_keys=[])
 
     def __getattr__(self, name: str) -> Any:
@@ -142,10 +142,10 @@ class Piece(Part, TensorDictModuleBase, Transform):
         return super().__getattr__(name)
 
     def setup(self, world: World) -> None:
-        """Derive from a world what depends on it; one that overrides this calls :meth:`declare`.
+        """Derive everything that depends on a world; an override calls :meth:`declare`.
 
         Args:
-            world: what the pieces of the environment share.
+            world: see :class:`lcc_rl.pieces.world.World`.
         """
         self.declare(world)
 
@@ -156,12 +156,12 @@ class Piece(Part, TensorDictModuleBase, Transform):
         writes: Sequence[Entry | NestedKey] | None = None,
         keeps: Sequence[Entry] | None = None,
     ) -> None:
-        """Set what the piece reads and writes; by default what its class names.
+        """Set the entries that the piece reads and writes; by default those of its class.
 
         Args:
-            world: what the pieces of the environment share.
-            reads: what :meth:`compute` is given, in order.
-            writes: what :meth:`compute` returns, in order, without ``"next"``.
+            world: see :class:`lcc_rl.pieces.world.World`.
+            reads: arguments of :meth:`compute`, in order.
+            writes: results of :meth:`compute`, in order, without ``"next"``.
             keeps: constants of an episode.
         """
         string = self.string = world.string
@@ -170,7 +170,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
             names = world.sensed(self.role, names) if self.measures else names
             reads = Views(string, self.role, names)
         self.views = reads
-        # As plain tuples: TorchRL's properties convert at every access.
+        # Plain tuples, because TorchRL's properties convert at every access.
         self.needs = [self.read_at(key) for key in reads.keys]
         self.read_names = [".".join(key) for key in reads.keys]
         count = len(string) if self.role == VEHICLES else string.count(self.role)
@@ -183,11 +183,11 @@ class Piece(Part, TensorDictModuleBase, Transform):
         self.out_keys = [self.written_at(key) for key in self.targets]
         self.event_shape = self.shape_of(self.targets[0]) if self.targets else (*self.rows, 1)
 
-    read_at = staticmethod(lambda key: (True, key))  # whether of the moment reached, and its key
-    written_at = staticmethod(root_key)  # where a TensorDict of a step has what is written
+    read_at = staticmethod(lambda key: (True, key))  # (whether it is of the next state, key)
+    written_at = staticmethod(root_key)  # key of a written entry in a step's TensorDict
 
     def _declared(self, entries: Sequence[Entry | NestedKey]) -> list[Key]:
-        """Take entries of the piece; return their keys."""
+        """Store entries of the piece; return their keys."""
         own = [x.of(self.role, self.name) if isinstance(x, Entry) else Entry(x) for x in entries]
         self.entries |= {as_key(entry.key): entry for entry in own}
         return [as_key(entry.key) for entry in own]
@@ -209,12 +209,12 @@ class Piece(Part, TensorDictModuleBase, Transform):
         return found
 
     def derive(self, before: State, reached: State, detached: bool = False) -> None:
-        """Compute the entries written from plain mappings of entries.
+        """Compute the written entries from plain mappings of entries.
 
         Args:
             before: entries of the state before the step; a feature ignores them.
-            reached: entries of the state after it, to which those written are added.
-            detached: cut the gradient of what is written.
+            reached: entries of the state after the step, to which the written ones are added.
+            detached: cut the gradient of the written entries.
         """
         values = self._entries(before, reached)
         if detached:
@@ -222,10 +222,10 @@ class Piece(Part, TensorDictModuleBase, Transform):
         self._write(self.computed(values), reached)
 
     def computed(self, entries: Sequence[Tensor]) -> Any:
-        """Return what :meth:`compute` returns; a ConfigError if it changes an entry in place.
+        """Return the results of :meth:`compute`; a ConfigError if it changes an entry in place.
 
         Args:
-            entries: those read, in the order of ``in_keys``.
+            entries: the entries read, in the order of ``in_keys``.
         """
         return unchanged(self._seen, entries, self.title, self.read_names)
 
@@ -241,7 +241,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
             raise ValueError(f"it returned {len(values)} instead of {len(self.targets)} entries")
         reached.update(zip(self.targets, values, strict=True))
 
-    @dispatch(auto_batch_size=False)  # entries of vehicles have one dimension more
+    @dispatch(auto_batch_size=False)  # entries of vehicles have a further dimension
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the piece to any TensorDict that holds its ``in_keys``."""
         reads = self.in_keys if self.needs else ()  # an unbound piece raises here
@@ -252,8 +252,8 @@ class Piece(Part, TensorDictModuleBase, Transform):
         return tensordict
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        # TorchRL's own version insists on finding the out_keys literally in the specs, which
-        # keys under "next" never are. TransformedEnv passes a copy; one per piece would be slow.
+        # TorchRL's own version requires the out_keys in the specs, where keys under "next" are
+        # missing. TransformedEnv passes a copy; one per piece would be slow.
         for part, transform in (
             ("full_observation_spec", self.transform_observation_spec),
             ("full_reward_spec", self.transform_reward_spec),
@@ -282,7 +282,7 @@ def add_specs(piece: Piece, spec: Composite, keys: Sequence[Key] | None = None) 
 
 
 class Feature(Piece):
-    """A piece that reads one moment, at reset as well as after every step."""
+    """A piece that reads one state, at reset and after every step."""
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
@@ -293,10 +293,22 @@ class Feature(Piece):
         return self.forward(tensordict_reset)
 
 
+class AfterStep(Feature):
+    """A feature that writes nothing at reset, and what it writes is no observation."""
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return tensordict_reset
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        return observation_spec
+
+
 class StepTransform(Piece):
     """A piece that reads the states before and after a step."""
 
-    compute: ClassVar[Callable[..., Any]] = staticmethod(lambda: ())  # of one that only keeps
+    compute: ClassVar[Callable[..., Any]] = staticmethod(lambda: ())  # of a piece of constants
 
     read_at = staticmethod(lambda key: (key[0] == NEXT, root_key(key)))
     written_at = staticmethod(next_key)
@@ -305,8 +317,8 @@ class StepTransform(Piece):
         """Set the written entries and the constants at reset; zeros unless overridden.
 
         Args:
-            given: what the caller passed to ``env.reset``: the reset options may be in it.
-            start: the first moment of the episodes, written by the pieces before this one.
+            given: TensorDict passed to ``env.reset``, which may contain reset options.
+            start: first state of the episodes, with the entries of the pieces before this one.
         """
         for key, (shape, dtype) in self.layouts(start.batch_size, self.targets).items():
             start.set(key, torch.zeros(shape, dtype=dtype, device=start.device))
@@ -328,13 +340,13 @@ class StepTransform(Piece):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         self.begin(tensordict, tensordict_reset)
-        for key in (*self.targets, *self.constants):  # as a step lays them out
+        for key in (*self.targets, *self.constants):  # in the memory layout of a step
             tensordict_reset.set(key, batch_innermost(tensordict_reset.get(key)))
         return tensordict_reset
 
 
 class RoleTransform(StepTransform):
-    """A step transform of the vehicles of one role, which is its name in an environment."""
+    """A step transform of the vehicles of one role; its name in an environment is the role."""
 
     name = AUTOMATED
 

@@ -1,4 +1,4 @@
-"""Drivers of a population of one or several models, each by its own."""
+"""Drivers of a population with one or several models."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lcc_rl.pieces.world import World
 
 
 class CalibratedDrivers(Drivers):
-    """Drivers of the population, each by the model and parameters that were calibrated."""
+    """Drivers of the population; each follows its calibrated model and parameters."""
 
     tells_gap = True
     further = ("driver",)
@@ -30,7 +30,7 @@ class CalibratedDrivers(Drivers):
         self.models = [name for name in LAWS if name in models]
         self.register_buffer("kinds", torch.tensor([self.models.index(name) for name in models]))
         for name, values in population.parameters().items():
-            # What a driver's model lacks is computed, too, and must have a gradient.
+            # Parameters that a driver's model lacks are computed, too, and need a finite gradient.
             otherwise = [getattr(LAWS[model], name, 1.0) for model in self.models]
             self.register_buffer(f"own_{name}", values.float().nan_to_num(nan=otherwise[0]))
 
@@ -41,7 +41,7 @@ class CalibratedDrivers(Drivers):
         return super().described(world, where)
 
     def acceleration(self, speed: Tensor, *more: Tensor) -> Tensor:
-        """Return what the drivers wish, each by its own model."""
+        """Return the desired acceleration of each driver by its model."""
         gap, relative_speed, desired_speed, time_gap, driver = more
         motion = (speed, gap, -relative_speed, desired_speed, time_gap)
         return self._each(driver, lambda law: law(*motion))
@@ -49,7 +49,7 @@ class CalibratedDrivers(Drivers):
     def equilibrium_gap(
         self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor, driver: Tensor
     ) -> Tensor:
-        """Return the gap at which drivers follow steadily, each by its own model."""
+        """Return the equilibrium gap of each driver by its model."""
         steady = (speed, desired_speed, time_gap, LONGEST_TIME_GAP)
         return self._each(driver, lambda law: law.equilibrium_gap(*steady))
 

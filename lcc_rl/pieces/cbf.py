@@ -30,76 +30,82 @@ from lcc_rl.settings import NonNegative, Positive
 ROUNDING = 5e-3  # of gaps [m] and accelerations [m/s²] in single precision
 FILTER_READS = ("self.speed", "self.gap", "ahead.speed", "ahead.acceleration")
 REMEMBERS = 3  # numbers in the filter's memory of gaps
-SLOWEST = 1.0  # slower speeds count as this, as in the time gap: the limit has a slope [m/s]
+SLOWEST = 1.0  # slower speeds count as this, which gives the limit a slope [m/s]
 
 
 class CBFFilter(RoleTransform):
-    """Changes a command as little as needed for the vehicle to stay between its limits.
+    """Changes a command as little as needed to keep the vehicle within its limits.
 
-    Two functions of the state are to stay positive: ``gap − margin − τ·(v − v_ahead)``, which
-    keeps time-to-collision above τ, and ``longest(v) − gap``, which keeps the time gap below
-    ``time_gap``. Each may fall at most at its rate times its value per second, which bounds the
-    acceleration from above and from below; within the bounds the controller decides. If they
-    contradict each other, safety wins. This is the quadratic programme of Ames, Grizzle and
+    Two functions of the state are kept positive: ``gap − margin − τ·(v − v_ahead)``, which keeps
+    time-to-collision above τ, and ``longest(v) − gap``, which keeps the time gap below
+    ``time_gap``. Each may fall per second by at most its rate times its value. This bounds the
+    acceleration from above and from below; within the bounds the command is unchanged. If the
+    bounds conflict, safety has priority. This is the quadratic program of Ames, Grizzle and
     Tabuada ("Control barrier function based quadratic programs with application to adaptive
     cruise control", CDC 2014), whose solution for one number is a clamp. The vehicle ahead is
     expected to keep its last measured acceleration.
 
-    Comfort rests on that expectation, safety does not: a third bound keeps the vehicle where full
-    braking maintains the first limit even if the vehicle ahead brakes by ``braking_ahead`` until
-    it stands (:mod:`lcc_rl.functional.braking`). A vehicle that starts there has no TTC below τ at
-    any sample as long as the vehicle ahead brakes no harder; which steps that covers, the
-    :class:`CBFGuarantee` of :meth:`watch` writes. If a measurement or the command is no number, the
+    These bounds depend on that expectation. A third bound does not: full braking must still keep
+    the first limit if the vehicle ahead brakes by ``braking_ahead`` until it stands
+    (:mod:`lcc_rl.functional.braking`). A vehicle that starts in such a state has no TTC below τ at
+    any sample as long as the vehicle ahead brakes no harder. The :class:`CBFGuarantee` of
+    :meth:`watch` writes which steps that covers. If a measurement or the command is NaN, the
     filter brakes fully.
 
-    It trusts gaps. Where the measured gap grows at another rate than the measured relative speed
-    says (:class:`lcc_rl.functional.sensing.Agreement`), limits of nearness count with the lower
-    speed ahead, those of distance with the higher. While the gap is below ``margin`` and does not
-    grow, the vehicle does not accelerate.
+    Gaps are trusted more than speeds. Where the rate of the measured gap differs from the measured
+    relative speed (:class:`lcc_rl.functional.sensing.Agreement`), the limits of short gaps use the
+    lower speed ahead, those of long gaps the higher one. While the gap is below ``margin`` and does
+    not grow, the vehicle does not accelerate.
 
-    With a ``shortest_time_gap``, ``gap − shortest_time_gap·v`` is kept positive, too, by the same
-    expectation as comfort: as far as the vehicle ahead keeps its acceleration and braking suffices.
+    With ``shortest_time_gap``, ``gap − shortest_time_gap·v`` is kept positive, too, as long as the
+    vehicle ahead keeps its acceleration and braking suffices.
 
-    With a ``longest_gap``, ``longest_gap − gap − h·(v_ahead − v)`` is kept positive, likewise, with
-    ``h = √(2·longest_gap / max_acceleration)``: the gap that the present speeds lead to within h.
-    Where it is, half of the acceleration suffices to keep it, so that the other half can answer a
-    vehicle ahead that accelerates. Limits of nearness win.
+    With ``longest_gap``, ``longest_gap − gap − h·(v_ahead − v)`` is kept positive, likewise, with
+    ``h = √(2·longest_gap / max_acceleration)``; the last two terms are the gap after h at the
+    present speeds. Half of the acceleration suffices to keep this limit; the other half is left for
+    a vehicle ahead that accelerates. Limits of short gaps have priority.
 
-    Behind a leader at standstill both limits are about the same number, gap / speed, so that a
-    vehicle from farther away violates one of them. With a ``full_speed``, ``longest(v)`` is
-    ``time_gap·v`` from there on and falls with the square of the speed below: the vehicle is near
-    before its leader stands, at a cost of energy.
+    Behind a leader at standstill both limits are about gap / speed, so a vehicle that approaches
+    from far away must violate one of them. With ``full_speed``, ``longest(v)`` is ``time_gap·v``
+    above this speed and falls with the square of the speed below: the vehicle closes up before
+    its leader stands, which costs energy.
 
-    A ``robust`` filter reckons with the scenario's actuators and sensors (:class:`Actuation`,
-    :class:`Sensors`). It starts from the worst state within the errors of the measurement, moves it
-    on to the present with the accelerations driven since, then to the moment at which the command
-    begins to act with the commands under way, while the vehicle ahead brakes as hard as is reckoned
-    with; and full braking is reached with the lag
-    (:func:`lcc_rl.functional.braking.safe_command`). Comfort is that of the state expected.
+    A ``robust`` filter uses the scenario's actuators and sensors (:class:`Actuation`,
+    :class:`Sensors`):
 
-    It reads ``("wanted", role)``, which the controller of a filtered role writes. Differentiable.
+    1. It takes the worst state within the errors of the measurement.
+    2. It predicts the present from it with the accelerations driven since.
+    3. It predicts the moment at which the command acts, with the pending commands and a vehicle
+       ahead that brakes by ``braking_ahead``.
+    4. Full braking is reached with the lag (:func:`lcc_rl.functional.braking.safe_command`).
+
+    The other bounds use the expected state. The filter reads ``("wanted", role)``, which the
+    controller of a filtered role writes. It is differentiable.
     """
 
     max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
-    # Reckon with the actuators and sensors of the scenario; false: as if both were exact.
+    # Use the actuators and sensors of the scenario; false: assume that both are exact.
     robust: bool = True
     time_to_collision: Positive = 4.0  # shortest allowed [s]
     rate: Positive = 3.0  # how fast that limit may be approached [1/s]
     margin: Positive = 0.2  # gap that counts as contact [m]
-    braking_ahead: Positive = 2.6  # hardest braking of the vehicle ahead reckoned with [m/s²]
+    braking_ahead: Positive = 2.6  # hardest braking assumed of the vehicle ahead [m/s²]
     time_gap: Positive | None = 2.45  # longest allowed; None: no limit [s]
     shortest_time_gap: Positive | None = None  # shortest allowed; None: no limit [s]
     longest_gap: Positive | None = None  # longest allowed; None: no limit [m]
     # How fast the limits of the time gap and the longest gap may be approached [1/s].
     time_gap_rate: Positive = 0.2
-    # Speed below which the longest time gap falls in proportion; 0: it does not [m/s].
+    # Speed below which the longest time gap falls in proportion to the speed; 0: never [m/s].
     full_speed: NonNegative = 0.0
-    least_gap: NonNegative = 2.0  # gap that the limit of the time gap always allows [m]
-    from_s: NonNegative = 0.0  # moment of the episode from which on it acts, see Handover [s]
+    least_gap: NonNegative = 2.0  # gap that the limit of the time gap allows at any speed [m]
+    from_s: NonNegative = 0.0  # time of the episode from which it acts, see Handover [s]
 
     measures = True
     agreed = Entry(
-        "role.agreement", "–, m, m/s", "1, the gap last measured, what it grows too fast", REMEMBERS
+        "role.agreement",
+        "–, m, m/s",
+        "1, last measured gap, its rate minus the relative speed",
+        REMEMBERS,
     )
     writes = (COMMANDED, agreed)
 
@@ -113,12 +119,12 @@ class CBFFilter(RoleTransform):
         self.time_step = world.time_step
         actuation = world.actuators.get(self.role, Actuation())
         sensors = world.sensors.get(self.role, Sensors())
-        self.answers = self.robust or self.role not in {*world.actuators, *world.sensors}
+        self.guaranteed = self.robust or self.role not in {*world.actuators, *world.sensors}
         if not self.robust:
             actuation, sensors = Actuation(), Sensors()
         self.response = actuation.response_in(world, self.role, self.max_acceleration)
         self.sensing = sensors.sensing_in(world, self.role)
-        # What is kept of commands under way, and since the measurement, where there is anything.
+        # The memories of pending commands and of measurements, where there are any.
         self.late = self.response.late > 0 or self.response.share < 1.0
         self.remembers = {ACTUATION: self.late, SENSORS: self.sensing.oldest > 0}
         self.memories = [f"{self.role}.{name}" for name, needed in self.remembers.items() if needed]
@@ -130,11 +136,11 @@ class CBFFilter(RoleTransform):
         self.limits = Braking(self.response.braking, self.braking_ahead, self.time_to_collision)
 
     def watch(self) -> CBFGuarantee:
-        """Return the piece that records the steps for which the filter promises its limit."""
+        """Return the piece that records the steps which the filter's guarantee covers."""
         return CBFGuarantee(safety=self).bind(World(self.string), self.role)
 
     def compute(self, wanted: Tensor, *state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the commands that the vehicles obey, and what is remembered of gaps."""
+        """Return the filtered commands and the memory of gaps."""
         if not self.from_step:
             return self.filtered(wanted, *state)
         *state, step = state  # type: ignore[assignment]
@@ -149,7 +155,7 @@ class CBFFilter(RoleTransform):
     def _when_it_acts(
         self, motion: PairState, acceleration: Tensor | float, actuation: Tensor, sensors: Tensor
     ) -> PairState:
-        """Return the motion when the command begins to act, from one as old as the measurement."""
+        """Return the state when the command begins to act from the measured state."""
         past = frames_of(sensors, "self.acceleration")[..., : self.sensing.oldest]
         now = brought_up(motion, sensors[..., :1], past, acceleration, self.time_step)
         return predicted(now, actuation[..., 1:], acceleration, self.response)[-1]
@@ -164,18 +170,18 @@ class CBFFilter(RoleTransform):
         agreed: Tensor,
         *memories: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Return the commands that the vehicles obey, ``[*batch, n, 1]`` [m/s²], and a memory.
+        """Return the filtered commands, ``[*batch, n, 1]`` [m/s²], and the memory of gaps.
 
         Args:
-            wanted: commands [m/s²].
-            speed, gap, ahead, ahead_acceleration: the state measured [m/s, m, m/s, m/s²].
-            agreed: the memory of the step before, ``[*batch, n, 3]``; zeros begin anew.
+            wanted: desired commands [m/s²].
+            speed, gap, ahead, ahead_acceleration: measured state [m/s, m, m/s, m/s²].
+            agreed: memory of the step before, ``[*batch, n, 3]``; zeros reset it.
             *memories: the entries that :attr:`memories` names.
         """
-        # Any of them that is no number, or infinite, shows in the sum.
+        # A NaN or an infinity in any of them makes the sum non-finite.
         known = (wanted + speed + gap + ahead + ahead_acceleration).isfinite()
         kept, relative = self.kept(memories, wanted), ahead - speed
-        with torch.no_grad():  # what is measured agrees in a simulator: there is no slope
+        with torch.no_grad():  # no slope: simulated measurements agree
             agreed = self.agreement.next(agreed, gap, relative)
             agreed = batch_innermost(torch.where(known, agreed, 0.0))
             differs = self.agreement.difference(agreed, relative)
@@ -191,7 +197,7 @@ class CBFFilter(RoleTransform):
         return torch.where(known, command, -self.max_acceleration), agreed
 
     def _safe(self, worst: PairState) -> Tensor:
-        """Return the largest command that leaves the vehicle where braking suffices."""
+        """Return the largest command after which full braking suffices."""
         if self.late:
             return safe_command(worst, self.response, self.limits)
         state = (worst.speed, worst.gap, worst.ahead)
@@ -205,9 +211,9 @@ class CBFFilter(RoleTransform):
         doubt: Tensor,
         safe: Tensor,
     ) -> Tensor:
-        """Return the command nearest to what is wanted within all bounds, not clamped.
+        """Return the command within all bounds that is nearest to the desired one, not clamped.
 
-        The vehicle ahead may be faster by ``doubt`` than ``now`` says.
+        The vehicle ahead may be faster than in ``now`` by ``doubt``.
         """
         speed, gap, closing = now.speed, now.gap, now.speed - now.ahead
         opening = doubt - closing
@@ -234,7 +240,7 @@ class CBFFilter(RoleTransform):
         return command
 
     def _allowed(self, speed: Tensor, time_gap: float) -> tuple[Tensor, Tensor]:
-        """Return the longest gap at a speed, and how it grows with the speed."""
+        """Return the longest gap at a speed and its derivative by the speed."""
         moving = speed.clamp(min=SLOWEST)
         share = (moving / max(self.full_speed, SLOWEST)).clamp(max=1.0)
         slope = time_gap * torch.where(share < 1.0, 2.0 * share, share)
@@ -242,12 +248,12 @@ class CBFFilter(RoleTransform):
 
 
 class Corrected(RoleTransform):
-    """By how much the command differs from a policy's action: zero where the filter is inactive."""
+    """Writes the command minus a policy's action: zero where the filter is inactive."""
 
     max_acceleration: Positive = MAX_ACCELERATION  # acceleration of action 1 [m/s²]
 
     writes = (
-        Entry("role.correction", "m/s²", "what the safety filter added to a policy's command"),
+        Entry("role.correction", "m/s²", "change of a policy's command by the safety filter"),
     )
 
     def setup(self, world: World) -> None:
@@ -255,39 +261,39 @@ class Corrected(RoleTransform):
         self.declare(world, (f"{self.role}.action", f"next.command.{self.role}"))
 
     def compute(self, action: Tensor, command: Tensor) -> Tensor:
-        """Return what the filter added."""
+        """Return the correction."""
         return command - self.max_acceleration * action
 
 
 class CBFGuarantee(RoleTransform):
     """Writes which steps a filter's guarantee covers, ``(role, "promised")``, ``[*batch, n, 1]``.
 
-    1 where the vehicle was safe when the step began and the vehicle ahead braked no harder than
-    is reckoned with, in the step and since the oldest measurement that may be in use:
-    time-to-collision at its end is then above the filter's limit; else 0. Before the filter acts
-    (``from_s``) it promises nothing.
+    It is 1 where the vehicle was safe when the step began and the vehicle ahead braked no harder
+    than ``braking_ahead``, in the step and since the oldest measurement in use. Time-to-collision
+    at the end of the step is then above the filter's limit. Elsewhere, and before the filter acts
+    (``from_s``), it is 0.
 
     ``(role, "safe")``, likewise, is 1 where the vehicle was safe when the step began, by its true
-    state and the actuators that the scenario declares. A step that turns unsafe though it is
-    promised shows that actuators or sensors are not as declared.
+    state and the declared actuators. A covered step that ends unsafe shows that actuators or
+    sensors differ from the declared ones.
     """
 
     safety: InstanceOf[CBFFilter]  # the filter, bound
 
     writes = (
         Entry("role.promised", "–", "1 if the guarantee of the safety filter covers the step"),
-        Entry("role.safe", "–", "1 where full braking keeps the limit when the step begins"),
+        Entry("role.safe", "–", "1 if full braking keeps the limit from the start of the step"),
     )
 
     def setup(self, world: World) -> None:
-        """Read the true state, and what bounds the commands of the role."""
+        """Read the true state and the filter's memories."""
         seen = ["self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration"]
         self.declare(world, [*seen, *self.safety.memories, "episode.step"])
 
     def compute(
         self, speed: Tensor, gap: Tensor, ahead: Tensor, acceleration: Tensor, *more: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return 1 for the steps that are covered, and for those that begin safe."""
+        """Return 1 for covered steps, and 1 for steps that begin safe."""
         safety, (*memories, step) = self.safety, more
         actuation, sensors = safety.kept(memories, speed)
         now = PairState(speed, gap - safety.margin, ahead, actuation[..., :1])

@@ -1,4 +1,4 @@
-"""Vehicles that talk to each other: what they hear, and the controllers that use it (HCFS)."""
+"""Vehicle-to-vehicle communication and the controllers that use it (HCFS)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from lcc_rl.pieces.views import LEADER, VEHICLES
 from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import NonNegative, Number, Positive
 
-# How the leader's next speed is predicted: by v0 + a0 T, by v0, or known, as an upper bound only.
+# Prediction of the leader's next speed: v0 + a0 T, v0, or the true one, as an upper bound only.
 Lookahead = Literal["causal", "hold", "oracle"]
 PLATOON_ERRORS = ("gap_error", "speed_error", "leader_gap_error", "leader_speed_error")
 
@@ -33,14 +33,14 @@ PLATOON_ERRORS = ("gap_error", "speed_error", "leader_gap_error", "leader_speed_
 class Communication(Feature):
     """Writes the errors that vehicles receive from their platoon by radio (HCFS H1–H2).
 
-    A connected vehicle hears the connected vehicles ahead of it without a gap in the chain. The
-    vehicle ahead of the first of them is the chain's leader; if it is not connected, the first
-    one sees it by its own sensors, without delay. The errors of a vehicle that is not connected
-    refer to the vehicle ahead.
+    A connected vehicle receives messages of the connected vehicles directly ahead of it. The
+    vehicle ahead of the first of them is the chain's leader. If it is not connected, the first
+    vehicle measures it by its own sensors, without delay. The errors of a vehicle that is not
+    connected refer to the vehicle ahead.
     """
 
-    connected: tuple[str, ...] = (AUTOMATED,)  # send and hear
-    leader_sends: bool = True  # the vehicle ahead of the whole string sends, too
+    connected: tuple[str, ...] = (AUTOMATED,)  # roles that send and receive
+    leader_sends: bool = True  # whether the vehicle ahead of the string sends, too
     headway: NonNegative = 5.0  # h, the gap to be kept [m]
     delay: NonNegative = 0.005  # of messages; it acts on the positions received [s]
 
@@ -79,7 +79,7 @@ class Communication(Feature):
     def compute(
         self, speed: Tensor, gap: Tensor, acceleration: Tensor, *more: Tensor
     ) -> tuple[Tensor, ...]:
-        """Return what the vehicles know, in the order of ``writes``."""
+        """Return the errors and received values, in the order of ``writes``."""
         leader, leading = (None, None) if self.string.ring else more[:2]
         indices = more[0 if self.string.ring else 2 :]
         ahead, accelerating = entries_ahead(leader, speed), entries_ahead(leading, acceleration)
@@ -111,8 +111,8 @@ class CACC(Controller):
     k2: Number = 0.12  # gain of e_v(i,i−1)
     k3: Number = 1.4  # gain of e_x(i,0) [1/s]
     k4: Number = 1.3  # gain of e_v(i,0)
-    # H11 as printed, where v_i + … is the acceleration. v_i feeds back positively: unstable unless
-    # k2 + k4 > 1 + T (k1 + k3)/2, and then the first vehicle of a chain settles v_0/(k1 + k3) too
+    # H11 as printed, where v_i + … is the acceleration. Its feedback of v_i is positive: unstable
+    # unless k2 + k4 > 1 + T (k1 + k3)/2, and then a chain's first vehicle settles v_0/(k1 + k3) too
     # close to its leader. Stability is not checked.
     literal: bool = False
 
@@ -128,23 +128,23 @@ class CACC(Controller):
     def command(self, *read: Tensor) -> Tensor:
         """Return the commands."""
         errors, speed = Errors(*read[: len(PLATOON_ERRORS)]), read[len(PLATOON_ERRORS) :]
-        # Within the limits of every controller, which a hybrid leaves out.
+        # A hybrid controller uses the command without these limits.
         return cacc_acceleration(errors, self.gains, self.time_step, *speed)
 
 
 class DeadBeat(Controller):
     """Dead-beat control: (v̂0 − v)/T, within ±max_acceleration, v̂0 the leader's predicted speed.
 
-    With ``lookahead="oracle"`` it knows the leader's next speed and bounds what any controller
-    can reach; ``"causal"`` takes v0 + a0 T, ``"hold"`` v0. It keeps no gap: errors of the past
-    stay, so it is a baseline, not a controller to drive with.
+    With ``lookahead="oracle"`` it reads the leader's true next speed and is an upper bound for all
+    controllers; ``"causal"`` uses v0 + a0 T, ``"hold"`` v0. It does not control the gap, so past
+    errors remain: it is a baseline only.
     """
 
     max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
     lookahead: Lookahead = "causal"
 
     def setup(self, world: World) -> None:
-        """Read what the look-ahead needs."""
+        """Read the entries that the look-ahead needs."""
         self.declare(world, ["self.speed", *leader_names(self.lookahead)])
         check_leader(self.lookahead, self)
 
@@ -155,13 +155,13 @@ class DeadBeat(Controller):
 
 
 def leader_names(lookahead: str) -> list[str]:
-    """Return what a controller reads of its leader to predict its next speed."""
+    """Return the entries from which a controller predicts its leader's next speed."""
     true_next = "leader.next_speed" if lookahead == "oracle" else "self.leader_speed"
     return ["self.leader_speed", "self.leader_acceleration", true_next]
 
 
 def check_leader(lookahead: str, controller: Controller) -> None:
-    """Check that an oracle's leader is the recorded one, of which alone it knows the future."""
+    """Check that an oracle's leader is the recorded one: only its next speed is known."""
     if lookahead == "oracle":
         check_platoon(
             controller, "lookahead=oracle", "knows the recorded leader only", "causal or hold"
@@ -173,12 +173,12 @@ def check_platoon(controller: Controller, option: str, fact: str, remedy: str) -
 
     Args:
         controller: the controller.
-        option: its option that needs this, and the value.
-        fact: what the option does or needs.
+        option: the option that needs this, with its value.
+        fact: effect or need of the option, as a predicate.
         remedy: values that can be used instead.
 
     Raises:
-        ConfigError: if the string has other vehicles, too.
+        ConfigError: if the string has vehicles of other roles.
     """
     names = controller.string.names
     if names != (controller.role,):

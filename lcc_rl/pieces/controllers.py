@@ -1,7 +1,7 @@
-"""Controllers: what the vehicles of a role wish to do, one acceleration each.
+"""Controllers: the commanded acceleration of each vehicle of a role.
 
-A controller of your own is a class with its settings (:mod:`lcc_rl.settings`), the names of what
-it reads (:mod:`lcc_rl.pieces.views`) and its law::
+Your own controller is a class with its settings (:mod:`lcc_rl.settings`), the names of the entries
+that it reads (:mod:`lcc_rl.pieces.views`) and its law::
 
     class KeepDistance(Controller):
         distance: Positive = 20.0    # gap to be kept [m]
@@ -31,7 +31,7 @@ from lcc_rl.pieces.views import AHEAD, BEHIND, SELF
 from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import Number, Positive, find_target
 
-# The names of the random streams: an episode's seed means the same episode under either.
+# Names of the random streams; a seed gives the same episode under either name.
 STREAMS = {AUTOMATED: "cav", HUMAN: "hdv"}
 
 
@@ -59,16 +59,16 @@ class Population(Protocol):
 class Controller(RoleTransform):
     """Base of all controllers: writes ``("command", role)``, ``[*batch, n, 1]`` [m/s²].
 
-    Where the role has a safety filter, it writes ``("wanted", role)``, which this reads.
+    Where the role has a safety filter, it writes ``("wanted", role)``, which the filter reads.
 
-    The role that it drives is its name in an environment. Commands to automated vehicles are held
-    within ±3 m/s², or, of whatever role, within the controller's setting ``max_acceleration``.
+    Its name in an environment is the role. Commands are clamped to ± the controller's setting
+    ``max_acceleration``; without this setting, those of automated vehicles to ±3 m/s².
     """
 
-    # What it remembers, 0 at first: entries, or names of entries (role, name) of one number.
+    # Entries of its memory, 0 at first, or names of entries (role, name) with one number.
     remembers: ClassVar[Sequence[str | Entry]] = ()
-    # Maps what is read and remembered, one row per vehicle of the role, to the commands
-    # [*batch, n, 1], or to a tuple of them, what is remembered next and what else is written.
+    # Maps the entries read and the memory, one row per vehicle of the role, to the commands
+    # [*batch, n, 1], or to a tuple of the commands, the next memory and further entries.
     command: ClassVar[Callable[..., Any]]
 
     measures = True
@@ -87,19 +87,19 @@ class Controller(RoleTransform):
         keeps: Sequence[Entry] | None = None,
         remembers: Sequence[str | Entry] | None = None,
     ) -> None:
-        """Set what is read and written, where it depends on settings.
+        """Set the entries read and written, by default those of the class.
 
         Args:
-            world: what the pieces of the environment share.
-            reads: names of what :meth:`command` is given before what it remembers.
-            writes: entries of what it returns after the command and what it remembers.
-            keeps: see :meth:`lcc_rl.pieces.base.StepTransform.declare`.
-            remembers: what it remembers; by default what the class does.
+            world: see :class:`lcc_rl.pieces.world.World`.
+            reads: names of the arguments of :meth:`command` before the memory.
+            writes: entries that :meth:`command` returns after the command and the memory.
+            keeps: see :meth:`lcc_rl.pieces.base.Piece.declare`.
+            remembers: entries of the memory.
         """
         self.time_step = world.time_step
         otherwise = MAX_ACCELERATION if self.role == AUTOMATED else None
         largest = getattr(self, "max_acceleration", otherwise)
-        # Of the commands [m/s²]; None where they are executed as they are.
+        # Limits of the commands [m/s²]; None: not clamped.
         self.limits: tuple[float, float] | None = None if largest is None else (-largest, largest)
         memory = self.remembers if remembers is None else remembers
         own = [Entry((ROLE, x)) if isinstance(x, str) else x for x in memory]
@@ -110,7 +110,7 @@ class Controller(RoleTransform):
         super().declare(world, self.names, [order, *own, *more], keeps)
 
     def compute(self, *entries: Tensor) -> Any:
-        """Return what :meth:`command` returns, its commands within the limits."""
+        """Return the results of :meth:`command` with clamped commands."""
         found = self.command(*entries)
         if self.limits is None:
             return found
@@ -123,8 +123,8 @@ class Controller(RoleTransform):
 class Action(Controller):
     """The action of a policy, in [−1, 1], times the largest acceleration.
 
-    Reads ``(role, "action")``, ``[*batch, n, 1]``; like every piece that reads this entry, it
-    sees actions beyond the range as its ends (:mod:`lcc_rl.pieces.views`).
+    It reads ``(role, "action")``, ``[*batch, n, 1]``, clamped to this range as for every piece
+    (:mod:`lcc_rl.pieces.views`).
     """
 
     max_acceleration: Positive = MAX_ACCELERATION  # of action 1, in both directions [m/s²]
@@ -134,7 +134,7 @@ class Action(Controller):
     def setup(self, world: World) -> None:
         """Read the role's action."""
         self.declare(world, [f"{self.name}.action"])
-        self.limits = None  # within ±1 the action is read
+        self.limits = None  # the action is clamped when it is read
 
     def command(self, action: Tensor) -> Tensor:
         """Return the commands."""
@@ -142,7 +142,7 @@ class Action(Controller):
 
 
 class ConstantAcceleration(Controller):
-    """The same acceleration always; behind a safety filter, the filter alone drives."""
+    """A constant acceleration, the input of a safety filter that drives alone."""
 
     acceleration: Number = 0.0  # [m/s²]
 
@@ -156,19 +156,19 @@ class ConstantAcceleration(Controller):
 class Law(Controller):
     """The acceleration that a plain function of named entries returns.
 
-    The function's parameters without a default name what it reads: ``gap`` is the vehicle's own
-    (``self.gap``), ``ahead_speed`` and ``behind_gap`` are of its neighbours.
+    The function's parameters without a default name the entries that it reads: ``gap`` is the
+    vehicle's own (``self.gap``), ``ahead_speed`` and ``behind_gap`` belong to its neighbours.
     """
 
     law: str  # dotted path of the function, as in my_pieces.keep_distance
 
     @property
     def title(self) -> str:
-        """The function."""
+        """The path of the function."""
         return self.law
 
     def setup(self, world: World) -> None:
-        """Find the function, and read what its parameters name."""
+        """Find the function and the entries that its parameters name."""
         self.function = find_target(self.law, "law")
         parameters = inspect.signature(self.function).parameters.values()
         names = [one.name for one in parameters if one.default is one.empty]
@@ -180,6 +180,6 @@ class Law(Controller):
 
 
 def _entry(parameter: str) -> str:
-    """Return the entry that a parameter's name means: ``ahead_speed`` is ``ahead.speed``."""
+    """Return the entry of a parameter's name: ``ahead_speed`` is ``ahead.speed``."""
     space, _, entry = parameter.partition("_")
     return f"{space}.{entry}" if space in (AHEAD, BEHIND) else f"{SELF}.{parameter}"

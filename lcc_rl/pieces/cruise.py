@@ -1,4 +1,4 @@
-"""Adaptive cruise control by rules with constants: what a learned controller has to beat."""
+"""Adaptive cruise control by rules with constants, the baselines of learned controllers."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from lcc_rl.settings import Positive, defaults
 
 
 class Cruise(Controller):
-    """A rule of own speed, gap and relative speed, held within the largest acceleration.
+    """A rule of own speed, gap and relative speed, clamped to the largest acceleration.
 
-    The settings of a class besides that are the constants of its law, in this order.
+    The other settings of a class are the constants of its law, in this order.
     """
 
     max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
@@ -38,7 +38,7 @@ class Cruise(Controller):
             speed: own speed v [m/s].
             gap: bumper-to-bumper gap [m].
             relative_speed: v_ahead − v [m/s].
-            *constants: those of :meth:`constants_of_rule`.
+            *constants: see :meth:`constants_of_rule`.
         """
 
     def command(self, speed: Tensor, gap: Tensor, relative_speed: Tensor) -> Tensor:
@@ -67,7 +67,7 @@ class IDMACC(Cruise):
 class LinearACC(Cruise):
     """Cruise control with a constant time gap.
 
-    k_d (gap − s0 − T v) + k_v (v_ahead − v), or k_v (v_d − v) where that is less: the usual form,
+    The lesser of k_d (gap − s0 − T v) + k_v (v_ahead − v) and k_v (v_d − v). The form is common,
     e.g. Milanés and Shladover, "Modeling cooperative and autonomous adaptive cruise control
     dynamic responses using experimental data", Transportation Research C 48 (2014).
     """

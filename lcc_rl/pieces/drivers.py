@@ -40,32 +40,33 @@ LONGEST_TIME_GAP = 1000.0  # time gap up to which an equilibrium gap is written 
 
 
 class Drivers(Controller):
-    """Base of human drivers: each has its own (v0, T), noise and a reaction delay.
+    """Base of human drivers: individual (v0, T), noise and a reaction delay.
 
     Every vehicle draws a driver by the episode's seed, unless ``(role, "driver")`` is given to
-    ``env.reset``. The equilibrium gap is written for other models than the IDM behind a leader,
-    the past motion with a delay, and the latest values of the noise where there is one.
+    ``env.reset``. Further entries are written where they are needed: the equilibrium gap, unless
+    the drivers are IDM drivers or on a ring; the past motion with a delay; the latest values of
+    a noise.
     """
 
     # Largest relative error ξ of the executed acceleration a·(1 + ξ), drawn anew each step from
     # U(0, noise) (A18).
     noise: Share = 0.05
     wiener: NonNegative = 0.0  # standard deviation of a random walk of the speed [m/s per √s]
-    # Factors of it and of every driver's T in an episode of training; evaluation takes 1.
+    # Ranges of a factor on wiener and on every driver's T in training; 1 in evaluation.
     wiener_range: Factors = (1.0, 1.0)
     time_gap_range: Factors = (1.0, 1.0)
-    # Steps by which speed, gap and relative speed are old when the driver reacts; until then,
-    # those at the start of the episode. None: the reaction delay of the population.
+    # Age in steps of the speed, gap and relative speed that the driver reacts to; in the first
+    # steps they are those of the start. None: the reaction delay of the population.
     delay: Delay | None = None
-    # Steps from which and to which every episode of training draws its delay; evaluation takes
-    # delay, as does a training without a range.
+    # Range in steps from which every training episode draws its delay. Evaluation uses delay, as
+    # does training without a range.
     delay_range: Annotated[tuple[Delay, Delay], Increasing] | None = None
     # Standard deviation of a smooth noise of the acceleration, see
-    # lcc_rl.functional.driver_models.NoiseStep [m/s²]; None: of the population.
+    # lcc_rl.functional.driver_models.NoiseStep [m/s²]; None: that of the population.
     acceleration_noise: NonNegative | None = None
-    # That from which and to which every episode of training draws its noise, likewise [m/s²].
+    # Range from which every training episode draws acceleration_noise, likewise [m/s²].
     acceleration_noise_range: Annotated[tuple[NonNegative, NonNegative], Increasing] | None = None
-    # Standard deviation of a smooth noise of ln of the perceived gap; None: of the population.
+    # Standard deviation of a smooth noise of ln(perceived gap); None: that of the population.
     gap_noise: NonNegative | None = None
 
     LATER = ("delay_range", "acceleration_noise_range", "gap_noise")
@@ -82,7 +83,7 @@ class Drivers(Controller):
         "role.motion_history", "m/s, m, m/s", "past (speed, gap, relative speed), latest first"
     )
     latest = Entry("role.acceleration_noise", "m/s²", "noise of the acceleration, latest first", 2)
-    gap_latest = Entry("role.gap_noise", "–", "noise of ln of the seen gap, latest first", 2)
+    gap_latest = Entry("role.gap_noise", "–", "noise of ln(perceived gap), latest first", 2)
     law: ClassVar[type[DriverConstants]] = IDMConstants
     tells_gap: ClassVar[bool] = False  # whether the equilibrium gap is written
     further: ClassVar[tuple[str, ...]] = ()  # entries of the role that acceleration reads, too
@@ -91,7 +92,7 @@ class Drivers(Controller):
     index: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
-        """Take the drivers, and choose what is read and written by the settings."""
+        """Read the drivers, and choose the entries by the settings."""
         role, self.fleet = self.name, world.energy
         speeds, time_gaps, self.drivers = self.described(world, f"scenario.controllers.{role}")
         reaction = self.reaction(world)
@@ -99,7 +100,7 @@ class Drivers(Controller):
         what = "the reaction delay of drivers"
         late = world.late(reaction.delay, what) if late is None else late
         noise = reaction.noise if spread is None else spread
-        # The least and the largest of an episode; drivers remember as far back as the largest.
+        # Range of the delay; the memory of drivers covers the largest one.
         ranges = self.delay_range, self.acceleration_noise_range
         delays, noises = (None, None) if world.nominal else ranges
         self.soonest, self.late = delays or (late, late)
@@ -114,7 +115,7 @@ class Drivers(Controller):
         names = [*MOTION_READS, f"{role}.desired_speed", f"{role}.desired_time_gap", "episode.seed"]
         names += ["episode.step", *(f"{role}.{name}" for name in self.further)]
         self.declare(world, names, keeps=self.known[: 3 + self.starts], remembers=memory)
-        self.limits = None  # drives as a person, in automated vehicles, too
+        self.limits = None  # no clamp at ±3 m/s² in automated vehicles
         walk = self.wiener / world.time_step**0.5
         self.spreads = tuple(walk * factor for factor in world.deviations(self.wiener_range))
         self.time_gap_factors = world.deviations(self.time_gap_range)
@@ -130,16 +131,16 @@ class Drivers(Controller):
         self.register_buffer("index", torch.arange(*self.rows).unsqueeze(-1))
 
     def described(self, world: World, where: str) -> tuple[Tensor, Tensor, DriverConstants]:
-        """Return v0 [m/s] and T [s] of the drivers, ``[drivers]``, and what they share.
+        """Return v0 [m/s] and T [s] of the drivers, ``[drivers]``, and their shared parameters.
 
         Raises:
-            ConfigError: if there are none, or they are of other models.
+            ConfigError: if there are no drivers, or their model differs.
         """
         population = world.given("population", where)
         return population.desired_speed, population.time_gap, population.constants
 
     def reaction(self, world: World) -> Reaction:
-        """Return the reaction of the population's drivers; none where it says nothing."""
+        """Return the reaction of the population's drivers; no reaction if it has none."""
         return getattr(world.population, "reaction", Reaction())
 
     def command(
@@ -153,7 +154,7 @@ class Drivers(Controller):
         step: Tensor,
         *more: Tensor,
     ) -> Any:
-        """Return the commands, then the history and the noise where they are kept."""
+        """Return the commands, then the history and the noise if they are kept."""
         motion = (speed, gap, relative_speed)
         kept: list[Tensor] = []
         noise = sight = None
@@ -168,7 +169,7 @@ class Drivers(Controller):
         if self.late:
             *more, history = more  # type: ignore[assignment]
             now = join(motion, -1)
-            # Before the first step nothing else was ever seen.
+            # In the first step the whole history is the present.
             past = torch.where(step == 0, now.repeat(*[1] * (now.ndim - 1), self.late), history)
             seen = join([now, past], -1)
             motion = self._then(seen, seed).split(1, -1)
@@ -189,7 +190,7 @@ class Drivers(Controller):
         return (command, *kept) if kept else command
 
     def _then(self, seen: Tensor, seed: Tensor) -> Tensor:
-        """Return what the drivers react to, of the motion seen from the present back."""
+        """Return the motion that the drivers react to from the motion seen, latest first."""
         if self.soonest == self.late:
             return seen[..., -3:]
         span = self.late - self.soonest + 1
@@ -207,7 +208,7 @@ class Drivers(Controller):
         noise_step: NoiseStep,
         streams: Sequence[int],
     ) -> Tensor:
-        """Return the latest two values of a noise from those before."""
+        """Return the latest two values of a noise from the previous two."""
         drawn, further = (spread * normal(seed, step, stream + self.index) for stream in streams)
         first = join(noise_step.start(drawn, further), -1)
         latest, last = before.split(1, -1)
@@ -223,13 +224,13 @@ class Drivers(Controller):
         time_gap: Tensor,
         *more: Tensor,
     ) -> Tensor:
-        """Return what the drivers wish without noise [m/s²], all ``[*batch, n, 1]``."""
+        """Return the desired acceleration without noise [m/s²], all ``[*batch, n, 1]``."""
         return self.drivers(speed, gap, -relative_speed, desired_speed, time_gap)
 
     def equilibrium_gap(
         self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor, driver: Tensor
     ) -> Tensor:
-        """Return the gap at which drivers follow steadily [m], all ``[*batch, n, 1]``."""
+        """Return the equilibrium gap [m], all ``[*batch, n, 1]``."""
         return self.drivers.equilibrium_gap(speed, desired_speed, time_gap, LONGEST_TIME_GAP)
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
@@ -264,18 +265,18 @@ def _made(value: Any) -> Any:
 
 
 class DriverModel(Drivers):
-    """Drivers of one model: those of the population, or one and the same in all vehicles.
+    """Drivers of one model: those of the population, or the same driver in all vehicles.
 
-    They execute what they wish with a relative error (A18).
+    They execute the desired acceleration with a relative error (A18).
 
-    A model of your own overrides :meth:`acceleration`, or sets ``law`` to a
+    Your own model overrides :meth:`acceleration`, or sets ``law`` to a
     :class:`lcc_rl.functional.driver_models.DriverConstants` and ``tells_gap``.
     """
 
-    # v0 of every vehicle; None: of the population [m/s]. Needs time_gap, too.
+    # v0 of every vehicle; None: that of the population [m/s]. Needs time_gap, too.
     desired_speed: Positive | None = None
     time_gap: Positive | None = None  # T of every vehicle, likewise [s]; needs desired_speed, too
-    # Those besides v0 and T, the law's constants; None: of the population.
+    # The law's constants besides v0 and T; None: those of the population.
     parameters: Annotated[InstanceOf[DriverConstants] | None, BeforeValidator(_made)] = None
 
     def validate(self) -> None:
@@ -287,7 +288,7 @@ class DriverModel(Drivers):
         return super().reaction(world) if self.desired_speed is None else Reaction()
 
     def described(self, world: World, where: str) -> tuple[Tensor, Tensor, DriverConstants]:
-        """Return the drivers, see :class:`Drivers`; refuse those calibrated by other models."""
+        """Return the drivers, see :class:`Drivers`; drivers of other models are refused."""
         one = self.desired_speed is not None
         if one:
             own = torch.tensor([[float(x)] for x in (self.desired_speed, self.time_gap)])  # type: ignore[arg-type]
@@ -322,7 +323,7 @@ class IDM(DriverModel):
 class OVM(DriverModel):
     """Drivers of the optimal velocity model, see :class:`lcc_rl.functional.ovm.OVMConstants`.
 
-    It does not regard the speed difference, and may collide.
+    The model ignores the speed difference and may collide.
     """
 
     law = OVMConstants

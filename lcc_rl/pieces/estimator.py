@@ -1,4 +1,4 @@
-"""The estimator: what an automated vehicle believes of the human drivers behind it."""
+"""The estimator of the human drivers behind an automated vehicle."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class DriverEstimator(StepTransform):
 
     During the first ``learning_time`` the prediction is the mean over the calibrated drivers;
     afterwards it is the IDM with the (v0, T) fitted to this episode so far. Only speeds and gaps
-    up to now are used; a driver's acceleration is the difference of its speeds.
-    The belief is that of :mod:`lcc_rl.functional.estimation`.
+    up to now are used; a driver's acceleration is the difference of its speeds. See
+    :mod:`lcc_rl.functional.estimation`.
     """
 
     learning_time: NonNegative | None = 5.0  # until the fit is trusted; None: never [s]
     measurement_error: Positive = 0.05  # standard deviation of the acceleration [m/s²]
-    role: str = HUMAN  # whose acceleration is predicted
+    role: str = HUMAN  # role of the predicted drivers
 
     writes = (
         Entry("role.predicted_acceleration", "m/s²", "acceleration of the last step as predicted"),
@@ -39,7 +39,7 @@ class DriverEstimator(StepTransform):
     prior_covariance: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
-        """Take what the drivers of the population have in common; what they share, as its mean."""
+        """Read the population: mean of parameters that differ by driver, and the prior."""
         role, time_step = self.role, world.time_step
         population = world.given("population", self.title)
         belief = (f"{role}.estimate", f"{role}.covariance")

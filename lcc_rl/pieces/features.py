@@ -1,4 +1,4 @@
-"""Features of vehicles: time-to-collision, time gap and power, and the class that it depends on."""
+"""Features of vehicles: time-to-collision, time gap, vehicle class and power."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lcc_rl.settings import NonNegative, Positive
 class TimeToCollision(Feature):
     """Writes the time-to-collision of every vehicle, ``("vehicles", "ttc")`` [s] (A10)."""
 
-    floor: Positive = 0.01  # smallest value, which a collision has too [s]
+    floor: Positive = 0.01  # smallest value, also after a collision [s]
 
     role = VEHICLES
     reads = ("vehicles.gap", "vehicles.relative_speed")
@@ -54,8 +54,8 @@ CLASS = (VEHICLES, "energy_class")
 class EnergyClasses(StepTransform):
     """Draws the class of every vehicle at reset, ``("vehicles", "energy_class")``, int64.
 
-    By the episode's seed, so that all strategies meet the same vehicles; numbers are those of
-    the fleet's models.
+    The draw depends on the episode's seed, so all strategies have the same vehicles. The numbers
+    are those of the fleet's models.
     """
 
     role = VEHICLES
@@ -64,7 +64,7 @@ class EnergyClasses(StepTransform):
     )
 
     def setup(self, world: World) -> None:
-        """Take the classes and their shares from the world."""
+        """Read the classes and their shares."""
         self.declare(world)
         self.energy = world.given("energy", self.title)
         self.stream = stream_id("vehicles.energy_class")
@@ -94,23 +94,23 @@ def speed_limits(start: TensorDictBase, fleet: Any) -> Tensor | None:
 def first_speeds(leader: Tensor, count: int, limits: Tensor | None) -> Tensor:
     """Return the speed at which each vehicle starts, ``[*batch, N, 1]`` [m/s].
 
-    It is the leader's, ``[*batch, 1]``, or the lowest limit of the vehicle and those ahead of it.
+    It is the leader's, ``[*batch, 1]``, or the lowest limit of the vehicle and the vehicles ahead.
     """
     speed = leader.unsqueeze(-2).expand(*leader.shape[:-1], count, 1)
     return speed if limits is None else torch.minimum(speed, limits.cummin(-2).values)
 
 
 def of_role(entry: Tensor, start: TensorDictBase, string: VehicleString, role: str) -> Tensor:
-    """Return the rows of a role at reset, ``[*batch, n, 1]``, of ``[*batch, N, 1]``."""
+    """Return the rows of a role at reset, ``[*batch, n, 1]``, from ``[*batch, N, 1]``."""
     if string.drawn:
         return gather(entry, start.get((role, "index")))
     return entry[..., list(string.places(role)), :]
 
 
 def _drawn(draw: Tensor, shares: Sequence[float]) -> Tensor:
-    """Return the number of the class that each draw from [0, 1) means; int64, same shape."""
+    """Return the number of the class for each draw from [0, 1); int64, same shape."""
     bounds = torch.tensor(shares, device=draw.device).cumsum(0)[:-1]
-    # A class without a share is never met, also where rounding leaves a crumb at the end.
+    # A class with share 0 is never drawn, also if rounding leaves a remainder at the end.
     last = max(number for number, share in enumerate(shares) if share > 0.0)
     return torch.bucketize(draw, bounds, right=True).clamp(max=last)
 
@@ -118,14 +118,14 @@ def _drawn(draw: Tensor, shares: Sequence[float]) -> Tensor:
 class MotorPower(StepTransform):
     """Writes the power of the step just taken [W], from the speed at its start (A2 by default).
 
-    From a predicted acceleration it computes what an automated vehicle believes of a human driver
-    (A16).
+    From a predicted acceleration it computes the power that an automated vehicle estimates for a
+    human driver (A16).
     """
 
-    vehicles: str = VEHICLES  # whose power: "vehicles" for all of them, or a role
-    # Entry of theirs that holds the acceleration, or "predicted_acceleration".
+    vehicles: str = VEHICLES  # "vehicles" for all of them, or a role
+    # Their entry with the acceleration, or "predicted_acceleration".
     acceleration: str = "acceleration"
-    power: str = "power"  # entry of theirs that is written
+    power: str = "power"  # their entry that is written
     recuperation: bool = True  # braking feeds the battery
 
     kinds = (
@@ -134,14 +134,14 @@ class MotorPower(StepTransform):
     )
 
     def setup(self, world: World) -> None:
-        """Read the motion of those vehicles, and the class of each where there are several."""
+        """Read the motion of the vehicles, and their classes if there are several."""
         self.energy = world.given("energy", self.title)
-        everybody, self.role = self.vehicles == VEHICLES, self.vehicles
-        space = VEHICLES if everybody else SELF
+        every, self.role = self.vehicles == VEHICLES, self.vehicles
+        space = VEHICLES if every else SELF
         names = [f"{space}.speed", f"{NEXT}.{self.vehicles}.{self.acceleration}"]
         if len(self.energy.models) > 1:
             names.append(f"{space}.{CLASS[-1]}")
-        written = self.kinds[0] if everybody else self.kinds[1]
+        written = self.kinds[0] if every else self.kinds[1]
         self.declare(world, names, [replace(written, key=(self.vehicles, self.power))])
 
     def compute(self, *motion: Tensor) -> Tensor:

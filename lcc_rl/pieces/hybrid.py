@@ -41,40 +41,40 @@ COUNTERS = SWITCHES, CLAMPS, CAPS = tuple(
     ("hybrid", name) for name in ("switches", "clamps", "cap_interventions")
 )
 HYBRID_READS = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
-SPARE = 2.0  # beyond the gap that the cap needs, for what vehicles deviate from it [m]
+SPARE = 2.0  # headway beyond the gap that the cap needs, for deviations [m]
 
 
 class HCFS(Controller):
-    """The hybrid car-following strategy: a rule or the action, the better of both each step.
+    """The hybrid car-following strategy: the better of a rule and an action in each step.
 
-    Composes two candidates by H12–H14, see :func:`lcc_rl.functional.hcfs.hybrid_decision`: the
-    command of a rule and the action of a policy.
+    The two candidates are the command of a rule and the action of a policy (H12–H14), see
+    :func:`lcc_rl.functional.hcfs.hybrid_decision`.
     """
 
-    rule: InstanceOf[Controller]  # whose command is one candidate
+    rule: InstanceOf[Controller]  # its command is one candidate
     max_acceleration: Positive = MAX_ACCELERATION  # acceleration of action 1 [m/s²]
     jerk_bound: Positive = 30.0  # J; the paper's 2 a_max/T = 30 never binds [m/s³]
     lookahead: Lookahead = "causal"
     clamp: bool = True  # hold the candidates within the jerk bound; false: the literal rule
-    # Hold the result below what braking allows; false is the literal rule, which in long runs
-    # drives through the vehicle ahead: the paper's reward has no spacing term. It brakes fully
-    # where a measurement, the action or the rule's command is no finite number.
+    # Keep the result below the safe cap; full braking if a measurement, the action or the rule's
+    # command is not finite. false: the literal rule, which collides in long runs, because the
+    # paper's reward has no spacing term.
     safe_cap: bool = True
     # The better candidate (the paper); the point between both that is nearest to the rule and earns
-    # no less than either; or, for a string that is one platoon, what that of the first vehicle
-    # adds to its rule, added to every vehicle's rule.
+    # no less than either; or, for a string that is one platoon, every vehicle's rule plus the
+    # first vehicle's correction of its rule.
     choice: Choice = "better"
     braking: Positive = 3.0  # b of the safe cap [m/s²]
-    margin: NonNegative = 0.5  # gap that it keeps at standstill [m]
-    # Settings of the compared lcc_rl.functional.hcfs.PlatoonReward; with spacing_weight 0,
-    # the paper's rule, gap_scale and spacing_time have no effect.
+    margin: NonNegative = 0.5  # gap that the cap keeps at standstill [m]
+    # Settings of lcc_rl.functional.hcfs.PlatoonReward, by which candidates are compared. With
+    # spacing_weight 0, as in the paper, gap_scale and spacing_time have no effect.
     velocity_weight: NonNegative = PlatoonReward.velocity_weight
     speed_scale: Positive = PlatoonReward.speed_scale  # [m/s]
     jerk_weight: NonNegative = PlatoonReward.jerk_weight
     jerk_scale: Positive = PlatoonReward.jerk_scale  # [m/s³]
     spacing_weight: NonNegative = PlatoonReward.spacing_weight
     gap_scale: Positive = PlatoonReward.gap_scale  # [m]
-    spacing_time: NonNegative = PlatoonReward.spacing_time  # e_x counts so long after the step [s]
+    spacing_time: NonNegative = PlatoonReward.spacing_time  # time until e_x counts [s]
 
     reads = (f"{AUTOMATED}.action",)
     remembers = (
@@ -85,14 +85,14 @@ class HCFS(Controller):
     )
 
     def validate(self) -> None:
-        if self.braking > self.max_acceleration:  # more than vehicles can brake is no safe cap
+        if self.braking > self.max_acceleration:  # harder braking than possible is not safe
             raise ValueError(
                 f"braking must be at most max_acceleration={self.max_acceleration}, "
                 f"got {self.braking}"
             )
 
     def setup(self, world: World) -> None:
-        """Read what both candidates and the decision need."""
+        """Read the entries of both candidates and of the decision."""
         self.rule = rule = self.rule.bind(world, self.name)
         reads = [f"{self.name}.action", *(f"self.{name}" for name in HYBRID_READS)]
         self.declare(world, [*reads, *leader_names(self.lookahead), *rule.names])
@@ -120,7 +120,7 @@ class HCFS(Controller):
         last_winner: Tensor,
         rule: Tensor,
     ) -> Decision:
-        """Return the decision and what led to it."""
+        """Return the decision."""
         speed, last, gap, speed_error, leader_gap = own
         interval = jerk_interval(last, self.jerk_bound, self.time_step, self.max_acceleration)
         ahead, time_step = speed + speed_error, self.time_step
@@ -149,9 +149,9 @@ class HCFS(Controller):
 def check_spacing(pieces: Sequence[Piece], profiles: Any) -> None:
     """Check that a platoon keeps the gap that the safe cap of its hybrid controller needs.
 
-    At a speed v shared with the vehicle ahead the cap lets a vehicle be T·v + margin behind it, by
-    the position received, which is delay·v behind the true one. A constant headway below that
-    would set the controller and its cap against each other for ever.
+    At a speed v shared with the vehicle ahead the cap needs a received gap of T·v + margin; the
+    received position is delay·v behind the true one. With a shorter constant headway the
+    controller and its cap would permanently conflict.
 
     Args:
         pieces: the pieces of an environment.

@@ -1,4 +1,4 @@
-"""Knowledge beyond the present moment: a vehicle's own memory, and a preview of the leader."""
+"""Observations beyond the present state: a vehicle's memory and a preview of the leader."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from lcc_rl.pieces.views import EPISODE, NEXT, Views
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative
 
-Seconds = Annotated[float, Field(ge=0.0, le=3600.0)]  # what is remembered or known ahead
+Seconds = Annotated[float, Field(ge=0.0, le=3600.0)]  # ages of memories, horizons of previews
 Times = Annotated[tuple[Seconds, ...], Field(min_length=1)]
 
 
 class LeaderPreview(Feature):
-    """The leader's speed some seconds ahead, as a message from further down the road would give.
+    """The leader's future speed, as a message from further down the road would contain it.
 
     Writes ``("preview", "speed")`` [m/s], ``[*batch, 1, horizons]``: one row for all vehicles.
-    Beyond the end of a record its last speed stands; a window cut from a longer record continues
-    in it. Reading the record makes this an upper bound: no real message knows this much.
+    Beyond the end of a record it is the last speed; a window of a longer record continues in the
+    record. The preview is an upper bound, because it is read from the record.
     """
 
     horizons: Times = (1.0, 2.0, 3.0, 4.0, 5.0)  # how far ahead [s]
     noise: NonNegative = 0.0  # standard deviation of an error drawn anew for each speed [m/s]
-    delay: Seconds = 0.0  # age of the message: the speed of that long before is given instead [s]
+    delay: Seconds = 0.0  # age of the message, by which the horizons are shorter [s]
 
     role = EPISODE
     reads = (PROFILE, PROFILE_START, SEED, STEP)
@@ -45,7 +45,7 @@ class LeaderPreview(Feature):
     columns: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
-        """Take the leader's records."""
+        """Read the leader's records."""
         profiles = world.profiles
         self.declare(world, writes=[self.known.wide((1, len(self.horizons)))])
         self.stream = stream_id("preview.noise")
@@ -70,15 +70,15 @@ class LeaderPreview(Feature):
 
 
 class ObservationMemory(StepTransform):
-    """What each automated vehicle measured during the last seconds.
+    """Measurements of each automated vehicle during the last seconds.
 
-    Writes ``("memory", "entries")``, ``[*batch, A, sources × seconds]``, sources slowest: for each
-    source and each number in ``seconds`` its exponential average with that time constant
-    (``filtered``), or its value of that long ago (``stacked``, which also writes the
-    ``("memory", "history")`` that it needs). Before the episode began nothing had changed.
+    Writes ``("memory", "entries")``, ``[*batch, A, sources × seconds]``, ordered by source: for
+    each source and each number in ``seconds`` the exponential average with this time constant
+    (``filtered``), or the value of this age (``stacked``, which also writes ``("memory",
+    "history")``). Values before the episode are those of its start.
     """
 
-    # What is remembered, views one number wide, dotted: "self.gap".
+    # Remembered entries: dotted names of views with one number, "self.gap".
     sources: Annotated[tuple[str, ...], Field(min_length=1)] = ("ahead.speed",)
     seconds: Times = (0.5, 1.0, 2.0, 5.0)  # time constants or ages, at least a step [s]
     kind: Literal["filtered", "stacked"] = "filtered"
@@ -90,7 +90,7 @@ class ObservationMemory(StepTransform):
     places: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
-        """Find what is measured, and how much of it is kept."""
+        """Find the sources and the length of the history."""
         time_step = world.time_step
         if min(self.seconds) < time_step:
             raise ConfigError(
@@ -106,14 +106,14 @@ class ObservationMemory(StepTransform):
         writes += [self.history.wide(self.counted * self.depth)] * self.stacked
         reached = [f"{NEXT}.{source}" for source in self.sources]
         self.declare(world, [str(kept.key), *reached], writes)
-        # The same entries at reset, where there is no step before.
+        # The same entries at reset, which has no previous step.
         self.first = Views(world.string, AUTOMATED, world.sensed(AUTOMATED, self.sources))
         shares = 1.0 - torch.exp(-time_step / torch.tensor(list(self.seconds)))
         self.register_buffer("shares", shares.repeat(self.counted))
         self.register_buffer("places", torch.tensor(ages))
 
     def compute(self, kept: Tensor, *measured: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        """Return the entries, and the history where it is kept."""
+        """Return the entries, and the history if it is kept."""
         now = torch.cat(measured, -1)
         if not self.stacked:
             return torch.lerp(kept, now.repeat_interleave(self.repeat, -1), self.shares)

@@ -25,28 +25,27 @@ LEADER_SPEED, LEADER_ACCELERATION, NEXT_SPEED = (
 class NGSIMLeader(StepTransform):
     """Plays back a window of a speed record ahead of the string (PV in ALCC, leader in HCFS).
 
-    The record is random by the episode's seed, or given to ``env.reset`` as ``("leader",
-    "profile")`` and ``("leader", "start")``, one per episode: an id, or a list paired with
-    drivers.
+    The record and its first sample are drawn by the episode's seed, or given to ``env.reset`` as
+    ``("leader", "profile")`` and ``("leader", "start")``, one number per episode.
 
-    A perturbed leader drives max(0, (1 + p c) v + p A sin(2π t/τ + φ)): every episode has its own
-    c ~ U(−0.2, 0.2), A ~ U(0, 1) m/s, τ ~ U(4, 20) s and φ, all by its seed.
+    A perturbed leader drives max(0, (1 + p c) v + p A sin(2π t/τ + φ)). Every episode draws
+    c ~ U(−0.2, 0.2), A ~ U(0, 1) m/s, τ ~ U(4, 20) s and φ by its seed.
     """
 
     start: Literal["random", "first"] = "random"  # sample of the record at which a window begins
-    profile: int | None = None  # the record to play in every episode; None: draws one for each
-    perturbation: NonNegative = 0.0  # p; evaluation takes 0, the record as it is
+    profile: int | None = None  # the record of every episode; None: one is drawn per episode
+    perturbation: NonNegative = 0.0  # p; 0 in evaluation
     foresight: bool = False  # write the next speed, too
 
     role = EPISODE
     keeps = (
         Entry(PROFILE, "–", "id of the speed record that the leader plays", option=True),
-        Entry(PROFILE_START, "–", "sample of it at which the episode begins", option=True),
+        Entry(PROFILE_START, "–", "sample of the record at which the episode begins", option=True),
     )
     writes = (
         Entry(LEADER_SPEED, "m/s", "speed of the leader"),
-        Entry(LEADER_ACCELERATION, "m/s²", "backward difference of its speed"),
-        Entry(NEXT_SPEED, "m/s", "its speed one step ahead, for oracles"),
+        Entry(LEADER_ACCELERATION, "m/s²", "backward difference of the leader's speed"),
+        Entry(NEXT_SPEED, "m/s", "speed of the leader one step ahead, for oracles"),
     )
     speeds: ClassVar[Tensor]
     offsets: ClassVar[Tensor]
@@ -55,7 +54,7 @@ class NGSIMLeader(StepTransform):
     shares: ClassVar[Tensor | None]
 
     def setup(self, world: World) -> None:
-        """Take the records that are as long as the horizon, drawn by weights if they have any.
+        """Select the records that are as long as the horizon, and their weights if they have any.
 
         Raises:
             DataError: if no record is as long as the horizon.
@@ -75,7 +74,7 @@ class NGSIMLeader(StepTransform):
         self.register_buffer("offsets", profiles.offsets)
         self.register_buffer("lengths", profiles.lengths)
         self.register_buffer("starts", profiles.lengths - world.horizon)
-        shares = None  # cumulative, of the draws that each record and those before it take
+        shares = None  # cumulative shares of the draws
         if profiles.weights is not None:
             shares = profiles.weights.cumsum(0) / profiles.weights.sum()
         self.register_buffer("shares", shares)
@@ -91,7 +90,7 @@ class NGSIMLeader(StepTransform):
         return (*motion, self.speed_at(profile, first, step + 1, seed))
 
     def speed_at(self, profile: Tensor, first: Tensor, step: Tensor, seed: Tensor) -> Tensor:
-        """Return the speed at a step of the episode; a record that is over keeps its last."""
+        """Return the speed at a step of the episode; after the end of a record, its last speed."""
         sample = first + step
         if self.foresight:
             sample = torch.minimum(sample, self.lengths[profile] - 1)
@@ -121,10 +120,10 @@ class NGSIMLeader(StepTransform):
             return choose(seed, len(self.offsets), self.profile_stream)
         place = uniform(seed, 0, self.profile_stream).double()
         drawn = torch.searchsorted(self.shares, place, right=True)
-        return drawn.clamp(max=len(self.offsets) - 1)  # the last share may round to below 1
+        return drawn.clamp(max=len(self.offsets) - 1)  # rounding may leave the last share below 1
 
     def _window(self, given: TensorDictBase, seed: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the record and its first sample, as given or else drawn."""
+        """Return the record and its first sample, given or drawn."""
         profile, first = given.get(PROFILE, None), given.get(PROFILE_START, None)
         if profile is None and self.profile is not None:
             profile = torch.full_like(seed, self.profile)

@@ -1,4 +1,4 @@
-"""A model predictive controller: plans some seconds ahead and drives the first of it."""
+"""A model predictive controller: plans some seconds and executes the first step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.world import MAX_ACCELERATION, World
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
-LONGEST_GAP = 200.0  # gaps beyond it are planned for as this one [m]
+LONGEST_GAP = 200.0  # longer gaps count as this one [m]
 Array = np.ndarray
 MOST_STEPS = 200  # of a plan
 
@@ -26,30 +26,29 @@ MOST_STEPS = 200  # of a plan
 class MPCSettings(Settings):
     """Horizon, prediction, limits and prices of :class:`MPC`."""
 
-    horizon: Positive = 5.0  # how far ahead is planned [s]
-    step: Positive = 0.25  # of the plan; the horizon is a multiple of it [s]
-    # Time constant with which the acceleration of the vehicle ahead is expected to decay; 0: it
-    # keeps its speed [s].
+    horizon: Positive = 5.0  # length of the plan [s]
+    step: Positive = 0.25  # step of the plan; the horizon is a multiple of it [s]
+    # Time constant with which the acceleration of the vehicle ahead is assumed to decay; 0: its
+    # speed is constant [s].
     acceleration_time: NonNegative = 1.5
-    margin: NonNegative = 1.0  # gap at standstill that is kept [m]
-    least_time_gap: NonNegative = 0.5  # that is kept beyond it [s]
-    # The gap that is not exceeded is this time gap times the speed [s] plus longest_gap, which may
-    # be negative [m]; more where the vehicle ahead is so slow that it would be less than the gap
-    # to be kept.
+    margin: NonNegative = 1.0  # shortest gap at standstill [m]
+    least_time_gap: NonNegative = 0.5  # shortest time gap beyond margin [s]
+    # The largest gap is longest_time_gap [s] times the speed plus longest_gap [m], which may be
+    # negative. It is raised to the shortest gap where it would be less.
     longest_time_gap: Positive = 2.8
     longest_gap: Number = -8.5
-    least_ttc: NonNegative = 4.1  # time-to-collision that is kept [s]
-    steady_price: NonNegative = 1.0  # of what the planned speeds take without accelerating
-    jerk_price: NonNegative = 0.1  # of the squared change of the acceleration per second [s²]
+    least_ttc: NonNegative = 4.1  # shortest time-to-collision [s]
+    steady_price: NonNegative = 1.0  # price of the steady power at the planned speeds
+    jerk_price: NonNegative = 0.1  # price of the squared jerk [s²]
     # Prices of the squared distance by which the gap is too short, too long, or too short for the
     # time-to-collision [1/(m²s⁴)].
     near_price: Positive = 3.0
     far_price: Positive = 0.1
     ttc_price: Positive = 30.0
     max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
-    # Absolute and relative, at which the solver stops.
+    # Absolute and relative tolerance of the solver.
     tolerance: Annotated[float, Field(ge=1e-10, le=0.1)] = 1e-4
-    iterations: Annotated[int, Field(ge=1, le=1_000_000)] = 4000  # after which it gives up
+    iterations: Annotated[int, Field(ge=1, le=1_000_000)] = 4000  # most iterations of the solver
 
     def validate(self) -> None:
         if self.longest_time_gap <= self.least_time_gap:
@@ -63,19 +62,17 @@ class MPCSettings(Settings):
 
 
 class MPC(MPCSettings, Controller):
-    """Plans accelerations by a quadratic program every step and commands the first one.
+    """Plans accelerations by a quadratic program in every step and commands the first one.
 
-    Little energy within limits of the gap and of the time-to-collision, see
-    :class:`FollowingProgram`; solved by OSQP (Stellato et al. 2020) from
-    the same start every time, so that the command depends on what is read alone. Where OSQP finds
-    no solution it brakes fully, and ``(role, "unsolved")``, ``[*batch, n, 1]``, is 1. It passes no
-    gradient and is not compiled; rows that are alike are solved once.
+    The plan minimises energy within limits of the gap and the time-to-collision, see
+    :class:`FollowingProgram`. OSQP (Stellato et al. 2020) starts from the same point every time, so
+    the command depends on its inputs only. Without a solution the vehicle brakes fully, and
+    ``(role, "unsolved")``, ``[*batch, n, 1]``, is 1. The controller passes no gradient and is not
+    compiled; equal rows are solved once.
     """
 
     reads = ("self.speed", "self.gap", "self.acceleration", "ahead.speed", "ahead.acceleration")
-    writes = (
-        Entry("role.unsolved", "–", "1 where the plan of MPC had no solution, and it brakes"),
-    )
+    writes = (Entry("role.unsolved", "–", "1 where MPC found no solution and brakes fully"),)
 
     def setup(self, world: World) -> None:
         """Set up the solver."""
@@ -86,17 +83,17 @@ class MPC(MPCSettings, Controller):
 
     @staticmethod
     def check_installed() -> None:
-        """Refuse to drive without OSQP.
+        """Check that OSQP is installed.
 
         Raises:
-            ConfigError: saying how to install it.
+            ConfigError: if it is not; the message contains the command to install it.
         """
         if find_spec("osqp") is None:
             raise ConfigError(f"controller=mpc needs osqp: {how_to_install('mpc')}")
 
     @torch.compiler.disable
     def command(self, *entries: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the commands, and where there was no solution."""
+        """Return the commands, and 1 where there was no solution."""
         speed = entries[0]
         rows = torch.stack([x.detach().expand_as(speed).flatten() for x in entries], -1)
         first, unsolved = self.solver(rows.double().cpu().numpy())
@@ -105,10 +102,10 @@ class MPC(MPCSettings, Controller):
 
 
 class Solver:
-    """Solves the program of many moments one after the other with one factorisation.
+    """Solves the programs of many states one after the other with one factorisation.
 
     Args:
-        settings: of the controller.
+        settings: settings of the controller.
     """
 
     def __init__(self, settings: MPCSettings) -> None:
@@ -120,13 +117,13 @@ class Solver:
         return Solver, (self.settings,)  # OSQP's own object cannot be copied
 
     def __call__(self, rows: Array) -> tuple[Array, Array]:
-        """Return the first accelerations and where there was no solution, ``[rows]``.
+        """Return the first accelerations, and 1 where there was no solution, ``[rows]``.
 
         Args:
             rows: speed, gap, acceleration, speed and acceleration ahead, ``[rows, 5]``.
         """
-        alike, place = np.unique(rows, axis=0, return_inverse=True)
-        first, unsolved = self._each(alike)
+        distinct, place = np.unique(rows, axis=0, return_inverse=True)
+        first, unsolved = self._each(distinct)
         return first[place.ravel()], unsolved[place.ravel()]
 
     def _each(self, rows: Array) -> tuple[Array, Array]:
@@ -159,7 +156,7 @@ def _set_up(program: FollowingProgram) -> Any:
         vectors.lower[0],
         vectors.upper[0],
         verbose=False,
-        warm_starting=False,  # a result must not depend on what was solved before
+        warm_starting=False,  # a result must not depend on earlier programs
         adaptive_rho=0,
         eps_abs=settings.tolerance,
         eps_rel=settings.tolerance,
@@ -171,7 +168,7 @@ def _set_up(program: FollowingProgram) -> Any:
 
 @dataclass(frozen=True)
 class Vectors:
-    """The parts of the program that depend on the moment, one row per vehicle.
+    """The parts of the program that depend on the state, one row per vehicle.
 
     Args:
         linear: q, ``[rows, 4 N]``.
@@ -186,13 +183,13 @@ class Vectors:
 class FollowingProgram:
     """min ½ xᵀPx + qᵀx, l ≤ Ax ≤ u; x: N accelerations and N slacks of each of three limits.
 
-    The plan's speeds and gaps are linear in its accelerations, so that P and A depend on settings
-    only. Minimised is what accelerating loses (the part of A2 with a²) and ``steady_price`` times
-    the slope of the steady power at the present speed, over the loss of 1 m/s² at that speed. The
-    limits of the gap and of the time-to-collision are soft: there is always a solution.
+    The plan's speeds and gaps are linear in its accelerations, so P and A depend on settings only.
+    The objective is the loss by acceleration (the part of A2 with a²) plus ``steady_price`` times
+    the steady power, linearised at the present speed; both in units of the loss of 1 m/s² at this
+    speed. The limits of gap and time-to-collision are soft, so a solution always exists.
 
     Args:
-        settings: of the controller.
+        settings: settings of the controller.
 
     Attributes:
         quadratic: P, ``[4 N, 4 N]``.
@@ -204,8 +201,8 @@ class FollowingProgram:
         h, n = settings.step, self.steps
         self.times = h * np.arange(1, n + 1)
         sums = np.tril(np.ones((n, n)))
-        self.speeds = h * sums  # of the plan, by its accelerations
-        # Trapezoids, as the vehicles move (A18).
+        self.speeds = h * sums  # speeds of the plan by its accelerations
+        # The trapezoidal rule of the simulator (A18).
         self.ways = h * sums @ (self.speeds - 0.5 * h * np.eye(n))
         changes = (np.eye(n) - np.eye(n, k=-1)) / h
         own = np.eye(n) + settings.jerk_price * changes.T @ changes
@@ -232,17 +229,17 @@ class FollowingProgram:
     def vectors(
         self, speed: Array, gap: Array, acceleration: Array, ahead: Array, ahead_change: Array
     ) -> Vectors:
-        """Return what depends on the moment.
+        """Return the vectors of a state.
 
         Args:
             speed, gap, acceleration: of the vehicle, ``[rows]`` [m/s], [m], [m/s²].
-            ahead, ahead_change: speed and acceleration of the one ahead, ``[rows]`` [m/s], [m/s²].
+            ahead, ahead_change: those of the vehicle ahead, ``[rows]`` [m/s], [m/s²].
         """
         s, n = self.settings, self.steps
         speed = speed[:, None]
         lead, way = self.predicted(ahead[:, None], ahead_change[:, None])
         free = gap[:, None] + way - speed * self.times  # gaps without accelerating
-        # Following steadily, the limits leave a gap at any speed.
+        # At equilibrium the limits leave a gap at any speed.
         narrowest = s.margin - (s.longest_time_gap - s.least_time_gap) * lead
         upper = [
             free - s.margin - s.least_time_gap * speed,
@@ -268,6 +265,6 @@ class FollowingProgram:
 
 
 def _steady_slope(speed: Array) -> Array:
-    """Return dP/dv of the steady power over the loss of 1 m/s² at a speed, from A2."""
+    """Return dP/dv of the steady power divided by the loss of 1 m/s² at a speed (A2)."""
     (_, _, p02), (p10, _, p12), (p20, _, _), (p30, _, _) = POWER_COEFFICIENTS
     return (p10 + speed * (2.0 * p20 + speed * 3.0 * p30)) / (p02 + p12 * speed)

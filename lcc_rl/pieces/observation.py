@@ -1,4 +1,4 @@
-"""What a policy observes: entries of the string as each automated vehicle sees them."""
+"""Observation of a policy: entries of the string in the views of each automated vehicle."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ Width = Annotated[int, Field(ge=1, le=10_000)]  # entries of one view
 class Observation(Feature):
     """Gathers entries, each times a fixed constant, into ``("automated", "observation")``.
 
-    Writes ``[*batch, A, entries]``, one row per automated vehicle. If a vehicle may have
-    fewer than ``visible`` vehicles behind, or with ``presence``, their entries are zero and one
-    more entry per vehicle behind says whether it is there (1 or 0). HCFS observes the state H3, see
+    Writes ``[*batch, A, entries]``, one row per automated vehicle. If a vehicle may have fewer than
+    ``visible`` vehicles behind, or with ``presence``, one more entry per vehicle behind is 1 if it
+    exists and else 0, as its entries are. HCFS observes the state H3, see
     ``conf/observation/platoon.yaml``.
     """
 
     # Constant of each entry, nested by view (lcc_rl.pieces.views), in the order of the
     # observation, e.g. {"self": {"speed": 0.1}, "ahead": {"speed": 0.1}}.
     scales: Mapping[str, Mapping[str, Number]]
-    visible: Width = 1  # how many vehicles behind are seen, the nearest first
-    # Width of the views whose entries are wider than one number, or a list of that length, e.g.
-    # the horizons of a preview.
+    visible: Width = 1  # number of vehicles behind that are observed, nearest first
+    # Number of columns of views with several, or a list of that length, such as the horizons of a
+    # preview.
     widths: Mapping[str, Width | Sequence[float]] | None = None
-    # Dotted names of what entries are seen as differences from, e.g. {"preview": "ahead.speed"}, or
-    # one for each of as many equal parts; None: as they are. A difference does not hide what
-    # matters in large numbers.
+    # Dotted name of the entry subtracted from a view's entries, e.g. {"preview": "ahead.speed"}, or
+    # one per equal part; None: no difference. A difference keeps small changes of large numbers
+    # visible.
     relative_to: Mapping[str, str | Sequence[str] | None] | None = None
-    presence: bool = False  # tell which vehicles behind are there, even where all always are
-    raw: bool = False  # take every entry times 1, in SI units, whatever its scale
+    presence: bool = False  # write which vehicles behind exist, even if all always do
+    raw: bool = False  # entries in SI units, without their scale
 
     LATER = ("presence",)
     measures = True
@@ -57,7 +57,7 @@ class Observation(Feature):
         return {(view, name): x for view, own in self.scales.items() for name, x in own.items()}
 
     def tells_presence(self, string: VehicleString) -> bool:
-        """Whether entries say which vehicles behind are there."""
+        """Whether entries show which vehicles behind exist."""
         everywhere = Views(string, AUTOMATED, [], self.visible).sees_all_behind()
         return BEHIND in self.scales and (self.presence or not everywhere)
 
@@ -82,7 +82,7 @@ class Observation(Feature):
         views = Views(string, AUTOMATED, known, visible)
         self.declare(world, views, [self.gathered.wide(len(values))])
         firsts = [sum(counts[:place]) for place in range(len(counts))]
-        # The (first) column of each entry that is seen as it is.
+        # The (first) column of each entry without a difference.
         each = zip(seen, firsts, bases, strict=True)
         self.layout = {".".join(key): first for key, first, base in each if not base}
         self.seen, self.names = [".".join(key) for key in seen], [".".join(key) for key in names]
@@ -95,16 +95,16 @@ class Observation(Feature):
         """Return the column of an entry, e.g. ``"self.gap"``.
 
         Raises:
-            ConfigError: if it is not observed, or as a difference only.
+            ConfigError: if it is not observed, or only as a difference.
         """
         if name not in self.layout:
             raise ConfigError(f"a rule needs {name}, which observation.scales does not name")
         return self.layout[name]
 
     def columns(self) -> list[list[str]]:
-        """Return the names of what each column holds, and of what it is a difference from, if any.
+        """Return for each column the name of its entry, and that of the subtracted entry if any.
 
-        A view with several columns ends with the column's number: ``"memory.entries.0"``.
+        The name of a view with several columns ends with a number: ``"memory.entries.0"``.
         """
         found = []
         for name, bases, repeat in zip(self.seen, self.bases, self.repeats, strict=True):
@@ -122,7 +122,7 @@ class Observation(Feature):
                 base = torch.cat([values[i] for i in bases], -1)
                 seen[place] = seen[place] - base.repeat_interleave(repeat, -1)
         vehicles = max(entry.shape[-2] for entry in seen)
-        # What all see alike, such as a preview of the leader, has one row for all.
+        # An entry that is the same for all, such as a preview of the leader, has one row.
         rows = [
             entry if entry.shape[-2] == vehicles else entry.expand(*entry.shape[:-2], vehicles, -1)
             for entry in seen
@@ -135,7 +135,7 @@ def _bases(
     flat: Mapping[tuple[str, str], float],
     counts: Sequence[int],
 ) -> list[list[tuple[str, ...]]]:
-    """Return what is subtracted from each entry, in equal parts; nothing from most."""
+    """Return the entries to subtract from each entry, by equal parts; mostly none."""
     for view in relative_to:
         if view == BEHIND or view not in {name for name, _ in flat}:
             where = f"observation.relative_to.{view}"

@@ -14,7 +14,7 @@ from lcc_rl.settings import Positive, Share
 class RangeReward(RewardTerm):
     """−1 where an entry of the automated vehicle leaves its range, else 0."""
 
-    entry: str = "gap"  # of the vehicle: gap [m], time_gap [s], speed [m/s] …
+    entry: str = "gap"  # the vehicle's gap [m], time_gap [s], speed [m/s] …
     least: Positive | None = None  # in the entry's unit; None for no bound
     largest: Positive | None = None
 
@@ -43,10 +43,10 @@ class RangeReward(RewardTerm):
 
 
 class SmoothRange(RangeReward):
-    """Minus the share by which an entry leaves its range, smooth, from a little inside it."""
+    """Minus the share by which an entry leaves its range, smooth; begins inside the range."""
 
-    margin: Share = 0.05  # share of a bound by which the price begins before it
-    width: Positive = 0.05  # share of a bound over which the price bends
+    margin: Share = 0.05  # distance from a bound at which the price begins, as a share of it
+    width: Positive = 0.05  # range over which the price bends, as a share of a bound
 
     def reward(self, entry: Tensor) -> Tensor:
         """Return the unweighted term."""

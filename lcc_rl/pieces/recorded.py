@@ -1,4 +1,4 @@
-"""The driver that was recorded behind the leader, as a controller and as a start."""
+"""The recorded driver behind the leader, as a controller and as a start."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def _followers(world: World, where: str) -> Tensor:
 class RecordedDriver(Controller):
     """Drives as the recorded driver behind the leader; for the first place of a string.
 
-    The speeds are those of the record, where gaps are the integral of the relative speed. Those of
-    two instruments differ by up to 1 %, which would take the car tens of metres from its recorded
-    place: it is led back at the rate of what it is off.
+    The speeds are those of the record. Gaps are the integral of the relative speed. Speeds of two
+    instruments differ by up to 1 %, which would move the car tens of metres from its recorded
+    place. The gap error is therefore corrected with the time constant ``led_back``.
     """
 
-    led_back: Positive = 10.0  # time in which it is [s]
+    led_back: Positive = 10.0  # time constant of the correction of the gap [s]
 
     reads = ("self.speed", "self.gap", "leader.profile", "leader.start", "episode.step")
 
@@ -47,7 +47,7 @@ class RecordedDriver(Controller):
     offsets: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
-        """Take the records."""
+        """Read the records."""
         found = _followers(world, f"scenario.controllers.{self.name}")
         self.register_buffer("records", found)
         self.register_buffer("offsets", world.profiles.offsets)
@@ -65,10 +65,10 @@ class RecordedDriver(Controller):
 
 
 class RecordedStart(Part):
-    """The speed and gap of the driver who was recorded behind the leader at that moment."""
+    """The speed and gap of the recorded driver behind the leader at the start of the episode."""
 
     def setup(self, world: World) -> None:
-        """Take the records."""
+        """Read the records."""
         self.followers = _followers(world, f"scenario.start.{self.name}")
         self.offsets = world.profiles.offsets
 

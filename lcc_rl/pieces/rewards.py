@@ -1,7 +1,7 @@
-"""Rewards: named, weighted terms per automated vehicle, each logged by itself, and their sum.
+"""Rewards: named, weighted terms per automated vehicle, each logged separately, and their sum.
 
-A term of your own is a class with its settings (:mod:`lcc_rl.settings`), what it reads
-(:mod:`lcc_rl.pieces.views`) and its formula::
+Your own term is a class with its settings (:mod:`lcc_rl.settings`), the names of the entries that
+it reads (:mod:`lcc_rl.pieces.views`) and its formula::
 
     class Comfort(RewardTerm):
         limit: Positive = 2.0    # jerk below notice [m/s³]
@@ -18,7 +18,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
@@ -27,26 +26,26 @@ from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.functional.layout import total
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.safety import time_to_collision
-from lcc_rl.pieces.base import REWARD, Entry, RewardPiece, add_specs
+from lcc_rl.pieces.base import REWARD, AfterStep, Entry, RewardPiece, add_specs
 from lcc_rl.pieces.sections import Sections
 from lcc_rl.pieces.views import VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
 
 TERMS = (AUTOMATED, "reward_terms")
-TOUCH = 1e-6  # [m]; room that is left within the margin: none, but not a collision
+TOUCH = 1e-6  # gap that counts within the margin: positive, so no collision [m]
 
 
 class RewardTerm(RewardPiece):
     """Base of all terms: writes ``("automated", "reward_terms", name)``, ``[*batch, A, 1]``.
 
-    The name is the key under ``reward.terms``; by default from that of the class.
+    The name is the key under ``reward.terms``; by default it follows from that of the class.
     """
 
-    weight: NonNegative = 1.0  # factor of the term; 0 takes it out
+    weight: NonNegative = 1.0  # factor of the term; 0 removes it
 
     writes = (Entry("automated.reward_terms.name", "–", "weighted term of the reward"),)
-    # Maps what is read, one row per automated vehicle, to the unweighted term, [*batch, A, 1].
+    # Maps the entries read, one row per automated vehicle, to the unweighted term, [*batch, A, 1].
     reward: ClassVar[Callable[..., Tensor]]
 
     def __init_subclass__(cls, **more: Any) -> None:
@@ -61,14 +60,14 @@ class RewardTerm(RewardPiece):
 class SafetyReward(RewardTerm):
     """R_safe = log(TTC / threshold) where TTC is below the threshold, else 0 (A10–A11).
 
-    The time is that until the gap has shrunk to the ``margin``; within it, 0 while the gap closes.
-    The literal rule, margin 0, says nothing against creeping up to a standing leader until the
-    bumpers touch: slowly enough, TTC stays large. A gap that does not close costs nothing, as in
-    A10, unless it is a collision.
+    TTC is the time until the gap equals ``margin``; within the margin it is 0 while the gap closes.
+    The literal rule, margin 0, does not penalise creeping up to a standing leader until the bumpers
+    touch, because TTC stays large at low speed. A gap that does not close costs nothing, as in A10,
+    unless it is a collision.
     """
 
-    threshold: Positive = 4.0  # time-to-collision that is safe enough [s]
-    floor: Positive = 0.01  # time-to-collision below which the term no longer falls [s]
+    threshold: Positive = 4.0  # time-to-collision above which the term is 0 [s]
+    floor: Positive = 0.01  # time-to-collision below which the term is constant [s]
     margin: NonNegative = 1.0  # gap that counts as contact [m]
 
     reads = ("self.gap", "self.relative_speed")
@@ -100,13 +99,13 @@ class EnergyReward(RewardTerm):
     """R = −P/scale · T: energy of the step just taken (A14 for the CAV, A16 for the HDV)."""
 
     scale: Positive = 20000.0  # power that costs 1 per second [W]
-    # Whose energy: of the vehicles behind, those back to the next automated one.
+    # Vehicle whose energy counts; of those behind, all back to the next automated one.
     of: Literal["self", "behind", "string"] = "self"
     # "human.predicted_power": as the automated vehicle estimates it (A16).
     power: str = "vehicles.power"
 
     def setup(self, world: World) -> None:
-        """Choose what is read by whose energy counts."""
+        """Choose the entries for ``of``."""
         space, _, entry = self.power.partition(".")
         own = f"self.{entry}" if space == VEHICLES else self.power
         self.sections = Sections(world.string, space)
@@ -124,15 +123,15 @@ class EnergyReward(RewardTerm):
 
 
 class CollisionPenalty(RewardTerm):
-    """Minus the weight in the step that ends in a collision, so that a crash never pays.
+    """Minus the weight in the step that ends in a collision, so that a collision never pays off.
 
-    Every other term is at most 0 and ends with the episode; without this one an agent with a long
-    horizon learns that crashing early is cheap. It is paid by the automated vehicle that hit the
-    one ahead.
+    All other terms are at most 0 and end with the episode. Without this term an agent with a long
+    horizon learns to collide early. It is the term of the automated vehicle that hit the vehicle
+    ahead.
     """
 
     weight: NonNegative = 100.0  # must exceed the worst discounted return that remains
-    behind: bool = True  # also paid for collisions behind, back to the next automated vehicle
+    behind: bool = True  # count collisions behind, back to the next automated vehicle, too
 
     def setup(self, world: World) -> None:
         """Find which vehicles are behind."""
@@ -174,11 +173,11 @@ class JerkReward(RewardTerm):
 
 
 class SpacingReward(RewardTerm):
-    """−(e_x(i,0)/gap_scale)²: the place behind the leader, which the HCFS paper's reward lacks.
+    """−(e_x(i,0)/gap_scale)²: the position behind the leader; not in the reward of the HCFS paper.
 
-    e_x(i,0) is the sum of the gap errors up to the leader: where it is zero for all vehicles of a
-    platoon, all gaps equal the headway. The gap to the vehicle ahead alone would teach a vehicle
-    to repeat what that one does, and errors to grow along the platoon.
+    e_x(i,0) is the sum of the gap errors up to the leader. If it is zero for all vehicles of a
+    platoon, all gaps equal the headway. With the gap to the vehicle ahead instead, vehicles learn
+    to repeat its motion, and errors grow along the platoon.
     """
 
     weight: NonNegative = 0.02  # ω3
@@ -191,10 +190,10 @@ class SpacingReward(RewardTerm):
         return -(gap_error / self.gap_scale).square()
 
 
-class TotalReward(RewardPiece):
+class TotalReward(AfterStep, RewardPiece):
     """Writes ``("automated", "reward")``: the sum of all terms (A17, A19), ``[*batch, A, 1]``.
 
-    It is the only entry of the environment's reward spec, and exists after a step, not at reset.
+    It is the only entry of the environment's reward spec. It exists after a step, not at reset.
     """
 
     terms: Sequence[str]  # their names
@@ -210,14 +209,6 @@ class TotalReward(RewardPiece):
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the sum."""
         return torch.stack(entries).sum(0)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return tensordict_reset
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return observation_spec
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         return add_specs(self, reward_spec)

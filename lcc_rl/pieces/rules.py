@@ -22,10 +22,10 @@ ThreeTimes = tuple[NonNegative, NonNegative, NonNegative]
 
 
 class Averaging(Controller):
-    """Base of rules that know the mean of the vehicle's own speed during the last seconds.
+    """Base of rules that use the mean of the vehicle's own speed during the last seconds.
 
-    It is kept in ``(role, "speed_history")``, ``[*batch, n, samples]`` [m/s]; before the window
-    is full, the mean is that since the episode began.
+    The speeds are kept in ``(role, "speed_history")``, ``[*batch, n, samples]`` [m/s]. Until the
+    window is full, the mean is that since the start of the episode.
     """
 
     window: Window = 60.0  # length of the mean [s]
@@ -36,11 +36,11 @@ class Averaging(Controller):
 
     @property
     def averages(self) -> bool:
-        """Whether the mean is kept."""
+        """Whether the speeds are kept."""
         return True
 
     def setup(self, world: World) -> None:
-        """Read what the rule reads, and the history where it is kept."""
+        """Read the entries of the rule, and the history if it is kept."""
         self.samples = max(world.steps(self.window, "window"), 1) if self.averages else 0
         memory = [self.history.wide(self.samples), *self.remembers] if self.averages else []
         reads = [*self.reads, *["episode.step"] * self.averages]
@@ -48,7 +48,7 @@ class Averaging(Controller):
         self.limits = (-self.max_deceleration, self.max_acceleration)
 
     def mean(self, speed: Tensor, step: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the mean [m/s], ``[*batch, n, 1]``, and the history with the present in it."""
+        """Return the mean [m/s], ``[*batch, n, 1]``, and the history with the present speed."""
         past = join([speed, history[..., :-1]], -1)
         return total(past, -1) / (step + 1).clamp(max=self.samples), past
 
@@ -61,7 +61,7 @@ class FollowerStopper(Averaging):
     """FollowerStopper in its time-headway form (Stern et al. 2018, arXiv 1705.01693).
 
     Three gaps Δx_k = max(Δx⁰_k, h_k v) + Δv₋²/(2 d_k), Δv₋ = min(v_ahead − v, 0), bound regions of
-    the gap: below Δx₁ stop, then rise to ṽ = min(max(v_ahead, 0), v_d) at Δx₂, then to v_d at Δx₃.
+    the gap. v_cmd is 0 below Δx₁, rises to min(max(v_ahead, 0), v_d) at Δx₂ and to v_d at Δx₃.
     The command is (v_cmd − v)/T within the limits. The desired speed v_d is fixed, or the mean of
     the vehicle's own speed during the last ``window`` seconds, kept in ``(role,
     "speed_history")``, ``[*batch, n, samples]`` [m/s].
@@ -80,11 +80,11 @@ class FollowerStopper(Averaging):
 
     @property
     def averages(self) -> bool:
-        """Whether the mean is kept, which is of use without a desired speed."""
+        """Whether the speeds are kept: if there is no desired speed."""
         return self.desired_speed is None
 
     def command(self, speed: Tensor, gap: Tensor, ahead: Tensor, *kept: Tensor) -> Any:
-        """Return the commands, and the history where it is kept."""
+        """Return the commands, and the history if it is kept."""
         if self.desired_speed is not None:
             desired = torch.full_like(speed, self.desired_speed)
             return self.towards(self.wanted(speed, gap, ahead, desired), speed)
@@ -111,19 +111,19 @@ class FollowerStopper(Averaging):
 class PISaturation(Averaging):
     """PI with saturation (Stern et al. 2018, arXiv 1705.01693).
 
-    Drives at the mean of its own speed v_d, a little faster where the gap is large, and like the
-    vehicle ahead where it is small: v_target = v_d + c·min(max((Δx − g_l)/(g_u − g_l), 0), 1);
-    Δx_s = max(2 s·(v − v_ahead), 4 m); α = min(max((Δx − Δx_s)/γ, 0), 1), β = 1 − α/2; the command
-    becomes β(α v_target + (1 − α) v_ahead) + (1 − β) times the command before, which is kept in
+    The vehicle drives at the mean v_d of its own speed, faster if the gap is large, and at the
+    speed ahead if it is small: v_target = v_d + c·min(max((Δx − g_l)/(g_u − g_l), 0), 1);
+    Δx_s = max(2 s·(v − v_ahead), 4 m); α = min(max((Δx − Δx_s)/γ, 0), 1), β = 1 − α/2. The speed
+    command is β(α v_target + (1 − α) v_ahead) + (1 − β) times the last one, which is kept in
     ``(role, "commanded_speed")``, ``[*batch, n, 1]`` [m/s].
     """
 
     window: Window = 38.0  # length of the mean [s]
-    gaps: Pair = (7.0, 30.0)  # g_l and g_u, between which catching up sets in [m]
+    gaps: Pair = (7.0, 30.0)  # g_l and g_u, between which the target rises [m]
     catch_up: NonNegative = 1.0  # c, by how much the target may exceed the mean [m/s]
-    least_gap: NonNegative = 4.0  # least Δx_s, below which it drives like the vehicle ahead [m]
-    closing_time: Positive = 2.0  # how long closing in may take [s]
-    transition: Positive = 2.0  # γ, range of gaps over which it changes from one to the other [m]
+    least_gap: NonNegative = 4.0  # least Δx_s; at Δx_s the target is the speed ahead [m]
+    closing_time: Positive = 2.0  # factor of the closing speed in Δx_s [s]
+    transition: Positive = 2.0  # γ, range of gaps over which the target changes [m]
 
     reads = ("self.speed", "self.gap", "ahead.speed")
     remembers = (
@@ -162,17 +162,17 @@ class PISaturation(Averaging):
 
 
 class Handover(Controller):
-    """Lets one controller drive until a moment of the episode, and another one from then on.
+    """Executes one controller until a time of the episode, and another one from then on.
 
-    Both compute from the start, so that one which remembers is ready when its turn comes.
+    Both compute from the start, so the memory of the second one is up to date at the handover.
     """
 
     before: InstanceOf[Controller]  # drives first, for example a human driver
     after: InstanceOf[Controller]  # drives from then on
-    from_s: NonNegative  # that moment [s]
+    from_s: NonNegative  # time of the handover [s]
 
     def setup(self, world: World) -> None:
-        """Read and write what both do."""
+        """Read and write the entries of both."""
         both = [inner.bind(world, self.name) for inner in (self.before, self.after)]
         self.before, self.after = both
         self.declare(
@@ -181,11 +181,11 @@ class Handover(Controller):
             [inner.entries[key] for inner in both for key in inner.targets[1:]],
             [inner.entries[key] for inner in both for key in inner.constants],
         )
-        self.limits = None  # each has its own
+        self.limits = None  # each has its own limits
         self.from_step = world.steps(self.from_s, "from_s")
 
     def command(self, step: Tensor, *entries: Tensor) -> Any:
-        """Return the commands of the one that drives, and what both write besides."""
+        """Return the commands of the active controller and the further entries of both."""
         place = len(self.before.names)
         first = self.before.compute(*entries[:place])
         second = self.after.compute(*entries[place:])

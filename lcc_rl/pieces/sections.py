@@ -1,4 +1,4 @@
-"""Sections of a string: each automated vehicle and those behind it, back to the next one."""
+"""Sections of a string: an automated vehicle and those behind it, back to the next one."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from lcc_rl.pieces.views import VEHICLES
 class Sections:
     """Sums an entry over the vehicles behind each automated one, back to the next automated one.
 
-    On a ring road the section of the last automated vehicle goes on at the front.
+    On a ring road the section of the last automated vehicle continues at the front.
 
     Args:
         string: the string of vehicles.
-        of: whose entry: ``"vehicles"`` for all, or the one role that has it.
+        of: ``"vehicles"`` if all have the entry, or the one role that has it.
 
     Attributes:
-        keys: entries that :meth:`sum` needs besides the one summed; none where places are fixed.
+        keys: further entries that :meth:`sum` needs; none if places are fixed.
     """
 
     def __init__(self, string: VehicleString, of: str) -> None:
@@ -34,11 +34,11 @@ class Sections:
         ends = [*own[1:], len(string)]
         self.first = [self._rank(place + 1) for place in own]
         self.last = [self._rank(place) for place in ends] if own else []
-        # On a ring: what is ahead of the first automated vehicle is behind the last one.
+        # On a ring, vehicles ahead of the first automated vehicle are behind the last one.
         self.wrapped = self._rank(own[0]) if own and string.ring else 0
 
     def _rank(self, place: int) -> int:
-        """Return how many of those counted are ahead of a place."""
+        """Return how many vehicles with the entry are ahead of a place."""
         roles = self.string.roles[:place]
         return place if self.of == VEHICLES else roles.count(self.of)
 

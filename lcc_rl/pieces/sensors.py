@@ -1,4 +1,4 @@
-"""Sensors between the true state and what the vehicles of a role know of it."""
+"""Sensors: delayed measurements of the true state with bounded errors."""
 
 from __future__ import annotations
 
@@ -18,33 +18,32 @@ from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Share
 
 SENSORS = "sensors"
-# What is measured, the columns of a frame of the memory.
+# Measured entries, the columns of a frame of the memory.
 TRUE_STATE = ("self.gap", "self.speed", "ahead.speed", "ahead.acceleration", "self.acceleration")
 
 
 class Sensors(RoleTransform):
-    """Measures gap and speeds for a role: late, with bounded errors, and with drop-outs.
+    """Measures gap and speeds for a role, with delay, bounded errors and drop-outs.
 
-    Controllers, safety filter, observation and memory of the role read what is measured here in
-    the place of ``self.gap``, ``self.speed``, ``self.relative_speed``, ``ahead.speed`` and
-    ``ahead.acceleration``; limits, rewards and energy are those of the true state. The own
-    acceleration is known, as are vehicles behind and what comes by radio. Errors are drawn evenly
-    within their bounds by the episode's seed: for each measurement, or every ``error_time``, and
-    linear in time between.
+    Controllers, safety filter, observation and memory of the role read the measurements instead of
+    ``self.gap``, ``self.speed``, ``self.relative_speed``, ``ahead.speed`` and
+    ``ahead.acceleration``. Limits, rewards and energy use the true state. The own acceleration,
+    vehicles behind and messages are exact. Errors are drawn uniformly within their bounds by the
+    episode's seed, for each measurement or every ``error_time`` with linear interpolation.
 
-    It keeps the age of the measurement in steps, then what :data:`TRUE_STATE` names, at present and
-    in the steps before. Before the episode began, speeds were what they are at its start.
+    The memory holds the age of the measurement in steps, then the entries of :data:`TRUE_STATE` at
+    present and in the steps before. Speeds before the episode are those of its start.
     """
 
-    gap_error: NonNegative = 0.0  # largest, of the gap [m]
-    speed_error: NonNegative = 0.0  # largest, of the own speed [m/s]
-    ahead_error: NonNegative = 0.0  # largest, of the speed of the vehicle ahead [m/s]
-    # Largest, of both speeds as a share of them: each is wrong by one factor for a whole episode.
+    gap_error: NonNegative = 0.0  # largest error of the gap [m]
+    speed_error: NonNegative = 0.0  # largest error of the own speed [m/s]
+    ahead_error: NonNegative = 0.0  # largest error of the speed of the vehicle ahead [m/s]
+    # Largest relative error of both speeds; each has one factor for a whole episode.
     scale_error: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
-    error_time: NonNegative = 0.0  # in which errors change, a number of steps; 0: a step [s]
-    delay: NonNegative = 0.0  # age of a measurement that arrives, a number of steps [s]
-    dropouts: Share = 0.0  # chance that a measurement does not arrive: the last one stays
-    longest_dropout: NonNegative = 0.0  # in a row, a number of steps [s]
+    error_time: NonNegative = 0.0  # interval of drawn errors, multiple of a step; 0: a step [s]
+    delay: NonNegative = 0.0  # age of an arriving measurement, multiple of a step [s]
+    dropouts: Share = 0.0  # probability that a measurement is missing; the last one is kept
+    longest_dropout: NonNegative = 0.0  # longest drop-out, multiple of a step [s]
 
     LATER = ("scale_error",)
     measured = (
@@ -52,7 +51,7 @@ class Sensors(RoleTransform):
         Entry("role.sensed_speed", "m/s", "own speed as measured"),
         Entry("role.sensed_relative_speed", "m/s", "speed ahead minus own speed, as measured"),
         Entry("role.sensed_ahead_speed", "m/s", "speed of the vehicle ahead as measured"),
-        Entry("role.sensed_ahead_acceleration", "m/s²", "its acceleration as measured"),
+        Entry("role.sensed_ahead_acceleration", "m/s²", "acceleration ahead as measured"),
     )
     kept = Entry("role.sensors", "–", "age of the measurement [steps], and true states to measure")
     index: ClassVar[Tensor]
@@ -62,7 +61,7 @@ class Sensors(RoleTransform):
             raise ValueError("dropouts and longest_dropout belong together: give both or none")
 
     def setup(self, world: World) -> None:
-        """Read the true state as the role sees it."""
+        """Read the true state in the views of the role."""
         role, self.time_step = self.name, world.time_step
         self.sensing = self.sensing_in(world, role)
         self.apart = max(1, world.steps(self.error_time, f"scenario.sensors.{role}.error_time"))
@@ -70,7 +69,7 @@ class Sensors(RoleTransform):
         seen = [f"{role}.{SENSORS}", *(f"next.{name}" for name in TRUE_STATE), *drawn]
         width = 1 + len(TRUE_STATE) * (self.sensing.oldest + 1)
         self.declare(world, seen, [*self.measured, self.kept.wide(width)])
-        # The same entries at reset, where there is no step before.
+        # The same entries at reset, which has no previous step.
         self.first = Views(world.string, role, [*TRUE_STATE, "episode.seed", "episode.step"])
         self.streams = [stream_id(f"{role}.sensors.{name}") for name in ("gap", "speed", "ahead")]
         self.scales = [stream_id(f"{role}.sensors.{name}_scale") for name in ("speed", "ahead")]
@@ -78,10 +77,10 @@ class Sensors(RoleTransform):
         self.register_buffer("index", torch.arange(*self.rows).unsqueeze(-1))
 
     def sensing_in(self, world: World, role: str) -> Sensing:
-        """Return the bounds of what the role measures.
+        """Return the bounds of the role's measurements.
 
         Raises:
-            ConfigError: if a duration is no number of steps, or too long.
+            ConfigError: if a duration is no multiple of the time step, or too long.
         """
         late, longest = (
             world.late(getattr(self, name), f"scenario.sensors.{role}.{name}")
@@ -91,7 +90,7 @@ class Sensors(RoleTransform):
         return Sensing(*errors, late, longest)
 
     def compute(self, memory: Tensor, *seen: Tensor) -> tuple[Tensor, ...]:
-        """Return what is measured, and what is kept."""
+        """Return the measurements and the memory."""
         *now, seed, step = seen
         frames = join([*now, memory[..., 1 : -len(TRUE_STATE)]], -1)
         dropped = memory[..., :1] - self.sensing.late
@@ -102,7 +101,7 @@ class Sensors(RoleTransform):
     def _measured(
         self, frames: Tensor, age: Tensor, seed: Tensor, step: Tensor
     ) -> tuple[Tensor, ...]:
-        """Return what is measured of frames, the latest first, and what is kept."""
+        """Return the measurements from frames, latest first, and the memory."""
         number = age.long()
         columns = len(TRUE_STATE) * number + torch.arange(len(TRUE_STATE), device=frames.device)
         chosen = reverse(reverse(frames).gather(0, reverse(columns)))
@@ -122,7 +121,7 @@ class Sensors(RoleTransform):
         return gap + gap_error, speed, ahead - speed, ahead, acceleration, kept
 
     def _error(self, seed: Tensor, step: Tensor, stream: int) -> Tensor:
-        """Return the error of measurements of that step as a share of its bound, in [−1, 1]."""
+        """Return the error of a step's measurements as a share of its bound, in [−1, 1]."""
         place = step / self.apart
         first = place.floor()
         start, end = (uniform(seed, first.long() + k, stream + self.index) for k in (0, 1))

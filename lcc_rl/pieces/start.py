@@ -1,4 +1,4 @@
-"""How the vehicles of a role start: their speeds and gaps at reset."""
+"""Starts: speeds and gaps of a role's vehicles at reset."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ def draw_uniform(start: TensorDictBase, stream: int, like: Tensor) -> Tensor:
 class TimeGapStart(Part):
     """A gap that grows with the speed: standstill gap + time gap · speed, at the leader's speed."""
 
-    standstill_gap: Positive = 2.0  # gap when standing [m]
-    time_gap: NonNegative = 1.5  # further time gap; the ALCC paper is silent on it [s]
-    # The gap is that times a factor drawn evenly from this range by the episode's seed, so that
-    # training meets what good driving never does; evaluation takes 1.
+    standstill_gap: Positive = 2.0  # gap at standstill [m]
+    time_gap: NonNegative = 1.5  # time gap beyond it; not given in the ALCC paper [s]
+    # Range of a factor on the gap, drawn uniformly by the episode's seed; 1 in evaluation. Training
+    # thus includes gaps that good driving never reaches.
     gap_range: Factors = (0.1, 1.5)
 
     name = AUTOMATED
 
     def setup(self, world: World) -> None:
-        """Choose the range, and the random numbers of the role."""
+        """Choose the range and the random stream of the role."""
         self.stream = stream_id(f"{stream_name(self.name)}.gap_factor")
         self.lowest, self.highest = world.deviations(self.gap_range)
 
@@ -49,14 +49,14 @@ class TimeGapStart(Part):
 class EquilibriumStart(Part):
     """The gap at which the role's own drivers neither brake nor accelerate, at the leader's speed.
 
-    By the parameters that the drivers of the population share.
+    It is computed with the parameters that the drivers of the population share.
     """
 
-    # Bounds the gap, see DriverConstants.equilibrium_gap [s].
+    # Time gap of the cap, see DriverConstants.equilibrium_gap [s].
     cap_time_gap: Positive = 3.0
 
     def setup(self, world: World) -> None:
-        """Take what the drivers share."""
+        """Read the shared parameters."""
         self.drivers = world.population.constants.mean()
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
@@ -78,18 +78,18 @@ class EquilibriumStart(Part):
 
 
 class HeadwayStart(Part):
-    """A fixed gap at the leader's speed, in training with deviations from both (HCFS)."""
+    """A fixed gap at the leader's speed, with deviations from both in training (HCFS)."""
 
-    headway: Positive = 5.0  # h, the gap at equilibrium; the paper is silent on it [m]
-    gap_spread: NonNegative = 2.0  # largest deviation of a gap from it; evaluation takes 0 [m]
-    speed_spread: NonNegative = 1.0  # … and of a speed from the leader's [m/s]
+    headway: Positive = 5.0  # h, the gap at equilibrium; not given in the paper [m]
+    gap_spread: NonNegative = 2.0  # largest deviation of a gap; 0 in evaluation [m]
+    speed_spread: NonNegative = 1.0  # largest deviation of a speed; 0 in evaluation [m/s]
 
     def validate(self) -> None:
         if self.gap_spread >= self.headway:
             raise ValueError(f"gap_spread={self.gap_spread} must be below headway={self.headway}")
 
     def setup(self, world: World) -> None:
-        """Take no deviations in an evaluation."""
+        """Choose the deviations; 0 in an evaluation."""
         spreads = (self.gap_spread, self.speed_spread)
         self.gaps, self.speeds = (0.0, 0.0) if world.nominal else spreads
 

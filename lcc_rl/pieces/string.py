@@ -1,4 +1,4 @@
-"""The string of vehicles: where the roles drive, how vehicles start, and how all of them move."""
+"""The string of vehicles: places of the roles, starts and motion."""
 
 from __future__ import annotations
 
@@ -31,8 +31,9 @@ WISHED = Entry("wanted.role", "m/s²", "acceleration commanded before the safety
 class RolePlaces(StepTransform):
     """Writes which vehicles have which role, ``(role, "index")``, ``[*batch, n]``, int64.
 
-    If the places of a string are drawn, they are written for every role, anew in every episode by
-    its seed; else for the automated vehicles alone. The places are constant within an episode.
+    If the places of a string are drawn, they are written for every role and drawn by the seed of
+    each episode; else they are written for the automated vehicles. They are constant within an
+    episode.
     """
 
     role = EPISODE
@@ -40,7 +41,7 @@ class RolePlaces(StepTransform):
     index: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
-        """Choose the roles whose places are written."""
+        """Choose the roles with written places."""
         string = world.string
         roles = string.names if string.drawn else tuple({AUTOMATED} & set(string.names))
         keeps = [self.placed.of(role).wide(string.count(role)) for role in roles]
@@ -64,30 +65,30 @@ class RolePlaces(StepTransform):
 
 
 class Start(Protocol):
-    """How the vehicles of one role start."""
+    """Start of the vehicles of one role."""
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed [m/s] and gap [m] of every vehicle of the role, ``[*batch, n, 1]``.
 
         Args:
-            start: the first moment of the episodes.
+            start: the first state of the episodes.
             role: the role.
             speed: the leader's speed, ``[*batch, n, 1]`` [m/s].
         """
 
 
 class StringMotion(StepTransform):
-    """Moves all vehicles by their commands (A18): the one place with physics.
+    """Moves all vehicles by their commands (A18); no other piece contains physics.
 
-    Commands are held within what the vehicles of a class can do, see
+    Commands are clamped to the abilities of the vehicle's class, see
     :class:`lcc_rl.energy.VehicleClass`.
     """
 
     start: Mapping[str, Any] = field(default_factory=dict)  # by role: a :class:`Start`
     circumference: Positive | None = None  # of a ring road [m]
-    circumference_range: Factors = (1.0, 1.0)  # factor of it in training; evaluation takes 1
-    vehicle_length: Positive = 5.0  # of vehicles without a class, on a ring for the gaps [m]
-    # Speed of all vehicles at the start on a ring road, where there is no leader [m/s].
+    circumference_range: Factors = (1.0, 1.0)  # factor on it in training; 1 in evaluation
+    vehicle_length: Positive = 5.0  # of vehicles without a class, for the gaps on a ring [m]
+    # Speed of all vehicles at the start on a ring road, which has no leader [m/s].
     initial_speed: Speed = 0.0
 
     role = VEHICLES
@@ -124,14 +125,14 @@ class StringMotion(StepTransform):
         self.ring_gaps = self._ring_gaps(world) if string.ring else None
         missing = [role for role in string.names if role not in self.start]
         if missing and not string.ring:
-            raise ConfigError(f"scenario.start lacks {', '.join(missing)}: how do they start?")
+            raise ConfigError(f"scenario.start has no entry for {', '.join(missing)}")
         order = [place for role in string.names for place in string.places(role)]
         self.arrange = selector([order.index(place) for place in range(len(order))], len(order))
 
     def _ring_gaps(self, world: World) -> tuple[float, float]:
         """Return the least and the largest gap at which vehicles spread evenly over a ring [m].
 
-        They are those without classes, whose lengths :meth:`begin` regards.
+        Vehicles have no classes here; :meth:`begin` uses the lengths of classes.
         """
         if self.circumference is None:
             raise ConfigError("scenario.road=ring needs scenario.circumference [m]")
@@ -149,7 +150,7 @@ class StringMotion(StepTransform):
         return least, largest
 
     def compute(self, speed: Tensor, gap: Tensor, acceleration: Tensor, *more: Tensor) -> Any:
-        """Return the motion after the step, and the commands that led there."""
+        """Return the motion after the step and the executed commands."""
         leader, reached = (None, None) if self.string.ring else more[:2]
         parts = more[0 if self.string.ring else 2 :]
         roles = len(self.string.names)
@@ -161,7 +162,7 @@ class StringMotion(StepTransform):
         return (*motion, command)
 
     def _assemble(self, parts: tuple[Tensor, ...], indices: tuple[Tensor, ...]) -> Tensor:
-        """Return one entry of every vehicle, front to back, from that of every role."""
+        """Return an entry of all vehicles, front to back, from those of the roles."""
         joined = parts[0] if len(parts) == 1 else join(parts, -2)
         if indices:
             order = join(indices, -1).unsqueeze(-1)

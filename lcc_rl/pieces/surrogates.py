@@ -1,9 +1,8 @@
 """Smooth surrogates of reward terms with thresholds, which have a gradient; for training only.
 
-The literal terms have no slope where it matters: an indicator has none at all, a penalty that
-begins at a threshold has none before it. Each surrogate has a ``threshold`` of its own, to be
-set a little on the safe side of the term's, and a ``width`` over which it bends. ``missed`` marks
-the steps that violate the term's limit.
+The literal terms lack a useful slope: an indicator has none, and a penalty that begins at a
+threshold has none before it. Each surrogate has its own ``threshold``, on the safe side of the
+term's, and a ``width`` over which it bends. ``missed`` marks the steps that violate the limit.
 """
 
 from __future__ import annotations
@@ -23,29 +22,29 @@ from lcc_rl.settings import NonNegative, Positive
 
 
 def excess(value: Tensor, width: float) -> Tensor:
-    """Return max(0, value), bent: quadratic up to about ``width``, then straight; same shape.
+    """Return a smooth max(0, value): quadratic up to about ``width``, then linear; same shape.
 
-    Nothing of it reaches below zero: a tail, however small, is paid in every step of every
-    episode and would outweigh what it stands for.
+    It is exactly zero below zero. A smooth tail would add a small cost to every step, which sums
+    to more than the cost of real violations.
     """
     above = value.clamp(min=0.0)
     return width * ((1.0 + (above / width).square()).sqrt() - 1.0)
 
 
 class SmoothSafety(RewardTerm):
-    """−max(0, log(threshold / TTC)), smooth in gap and approach rate (stands in for A10–A11).
+    """−max(0, log(threshold / TTC)), smooth in gap and approach rate (surrogate of A10–A11).
 
-    Unlike the literal term it has a slope beyond the threshold, at contact and behind it, all of
-    which lead back to safety.
+    Unlike the literal term it has a slope towards safety beyond the threshold, at contact and at
+    negative gaps.
     """
 
     weight: NonNegative = 0.5  # price of log(threshold / TTC)
-    threshold: Positive = 4.2  # time-to-collision that is safe enough; the term's is 4 [s]
+    threshold: Positive = 4.2  # time-to-collision above which the term is 0; 4 in A11 [s]
     width: Positive = 0.1  # range over which the logarithm bends
     margin: NonNegative = 1.0  # gap that counts as contact, as for the term [m]
     gap_width: Positive = 0.2  # range of gaps over which contact bends [m]
     rate_width: Positive = 0.1  # range of approach rates over which closing begins [m/s]
-    limit: Positive = 4.0  # time-to-collision below which a limit is missed [s]
+    limit: Positive = 4.0  # time-to-collision below which the limit is missed [s]
 
     reads = ("self.gap", "self.relative_speed")
 
@@ -61,20 +60,20 @@ class SmoothSafety(RewardTerm):
 
 
 class SmoothEfficiency(RewardTerm):
-    """−max(0, log(TG / threshold)), smooth (stands in for A12–A13)."""
+    """−max(0, log(TG / threshold)), smooth (surrogate of A12–A13)."""
 
     weight: NonNegative = 2.0  # price of log(TG / threshold)
-    threshold: Positive = 2.3  # time gap that is too long; the term's is 2.5 [s]
+    threshold: Positive = 2.3  # time gap below which the term is 0; 2.5 in A13 [s]
     width: Positive = 0.05  # range over which the logarithm bends
     speed_floor: Positive = 1.0  # speeds below this count as this [m/s]
-    limit: Positive = 2.5  # time gap above which a limit is missed, if faster than the floor [s]
+    limit: Positive = 2.5  # time gap above which the limit is missed at speeds above the floor [s]
 
     reads = ("self.gap", "self.speed")
 
     def reward(self, gap: Tensor, speed: Tensor) -> Tensor:
         """Return the unweighted term."""
         longest = self.threshold * speed.clamp(min=self.speed_floor)
-        # Behind contact nothing is too long.
+        # Negative gaps are never too long.
         return -excess((gap / longest).clamp(min=1e-3).log(), self.width)
 
     def missed(self, gap: Tensor, speed: Tensor) -> Tensor:
@@ -83,10 +82,10 @@ class SmoothEfficiency(RewardTerm):
 
 
 class Smoothness(RewardTerm):
-    """Minus the square of the jerk: draws a policy that still learns away from limit cycles.
+    """Minus the square of the jerk: moves a policy in training away from limit cycles.
 
-    With a high gain on the gap a controlled car oscillates, and gradients through an oscillating
-    car are long and carry little information.
+    With a high gain on the gap a controlled car oscillates. Gradients through an oscillating car
+    are large and carry little information.
     """
 
     weight: NonNegative = 0.001  # price of 1 (m/s³)²
@@ -102,7 +101,7 @@ class SpeedSpread(RewardTerm):
     """Minus the standard deviation of the speeds of all vehicles, a measure of waves."""
 
     weight: NonNegative = 0.2  # price of 1 m/s in a step
-    floor: Positive = 0.05  # spread of no wave, where the slope ends [m/s]
+    floor: Positive = 0.05  # lower bound of the spread, which keeps its slope finite [m/s]
 
     reads = ("vehicles.speed",)
 
@@ -113,10 +112,10 @@ class SpeedSpread(RewardTerm):
 
 
 class Correction(RewardTerm):
-    """Minus the square of the safety filter's change of the command: draws a policy to its limits.
+    """Minus the square of the safety filter's correction: moves a policy into the filter's limits.
 
-    When the filter overrides the policy, no gradient reaches it, so a policy that starts by
-    braking never learns. Only of use with a filter that writes the correction.
+    When the filter overrides the policy, no gradient reaches it, and a policy that brakes at first
+    never learns. The term needs a filter that writes the correction.
     """
 
     weight: NonNegative = 0.1  # price of 1 (m/s²)²
@@ -129,15 +128,15 @@ class Correction(RewardTerm):
 
 
 class ExcessSpacing(RewardTerm):
-    """Minus the share by which a vehicle takes more of the lane than a human driver at its speed.
+    """Minus the share by which a vehicle needs more of the lane than a human driver at its speed.
 
-    The flow of a lane is speed over mean spacing, so a lane with a share p of such vehicles loses
-    about p times this share. Its limit holds on average: what is taken in a wave may be given
-    back after it.
+    The flow of a lane is speed divided by mean spacing, so a lane with a share p of such vehicles
+    loses about p times this share of its flow. Its limit is one of the average: longer gaps in a
+    wave may be compensated later.
     """
 
     standstill_gap: Positive = 2.0  # of the human driver [m]
-    time_gap: Positive = 1.05  # of the human driver, that of a stationary gap [s]
+    time_gap: Positive = 1.05  # of the human driver at equilibrium [s]
     vehicle_length: Positive = 5.0  # [m]
 
     reads = ("self.gap", "self.speed")
@@ -147,28 +146,28 @@ class ExcessSpacing(RewardTerm):
         return -self.missed(gap, speed)
 
     def missed(self, gap: Tensor, speed: Tensor) -> Tensor:
-        """Return that share, negative for a vehicle closer than a human, ``[*batch, A, 1]``."""
+        """Return the share, ``[*batch, A, 1]``; negative for gaps shorter than a human driver's."""
         own = self.standstill_gap + self.time_gap * speed
         return (gap - own) / (own + self.vehicle_length)
 
 
 class PathEnergy(RewardTerm):
-    """−P/scale · T of the path energy: energy without the kinetic energy that is stored.
+    """−P/scale · T of the path energy: energy net of kinetic energy.
 
-    Of A2's three parts (:func:`lcc_rl.functional.power.acceleration_loss`) the steady power of the
-    speeds driven and what accelerating loses; of another model what is drawn less what the
-    kinetic energy is worth (:meth:`lcc_rl.energy.EnergyModel.path_power`). A vehicle that ends
-    slower than it began gains nothing by it.
+    With A2 these are the steady power and the loss by acceleration
+    (:func:`lcc_rl.functional.power.acceleration_loss`); with another model the power drawn minus
+    the change of kinetic energy (:meth:`lcc_rl.energy.EnergyModel.path_power`). A lower final speed
+    does not lower it.
     """
 
     scale: Positive = 20000.0  # power that costs 1 per second [W]
     of: Literal["self", "behind"] = "self"  # behind: all back to the next automated vehicle
-    # Energy that a metre driven is worth: at what a metre takes, the objective is energy per
-    # distance, and falling behind gains nothing [J/m].
+    # Energy credited per metre. If it is the energy that a metre takes, the objective is energy per
+    # distance, and falling behind does not lower it [J/m].
     distance_price: NonNegative = 0.0
 
     def setup(self, world: World) -> None:
-        """Choose what is read by whose energy counts, and by which models."""
+        """Choose the entries for ``of``, and the energy models."""
         self.sections = Sections(world.string, VEHICLES)
         self.energy = world.given("energy", self.title)
         self.mixed, behind = len(self.energy.models) > 1, self.of == "behind"
@@ -189,5 +188,5 @@ class PathEnergy(RewardTerm):
 
 
 def _log_softplus(value: Tensor) -> Tensor:
-    """log(log(1 + eˣ)), which is x far below zero, where softplus itself is rounded to zero."""
+    """log(log(1 + eˣ)); it is x far below zero, where softplus is rounded to zero."""
     return softplus(value.clamp(min=-15.0)).log() + (value + 15.0).clamp(max=0.0)

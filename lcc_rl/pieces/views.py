@@ -1,19 +1,19 @@
-"""Views: how a vehicle of some role sees the string, by names such as ``"ahead.speed"``.
+"""Views: entries of the string from a vehicle of a role, by names such as ``"ahead.speed"``.
 
 ======================  ====================================================================
 ``self.x``              entry x of the vehicle itself
-``ahead.x``             of the vehicle ahead: of the string, or the leader
-``behind.x``            of the vehicle behind; zeros where there is none
-``behind.present``      1 where there is a vehicle behind, else 0
-``leader.x``            of the leader, ahead of the whole string
-``episode.x``           of the episode: its seed, its step
-``role.action``         the action, held within [−1, 1]
-any other ``name.x``    the entry as it is, ``[*batch, n, w]``: one row per vehicle of the role
+``ahead.x``             entry x of the vehicle ahead, in the string or the leader
+``behind.x``            entry x of the vehicle behind; zeros if there is none
+``behind.present``      1 if there is a vehicle behind, else 0
+``leader.x``            entry x of the leader, ahead of the whole string
+``episode.x``           entry of the episode: seed or step
+``role.action``         the action, clamped to [−1, 1]
+any other ``name.x``    the entry itself, ``[*batch, n, w]``: one row per vehicle of the role
 ======================  ====================================================================
 
-A name that begins with ``next.`` means the state after the step. Every name gives
-``[*batch, n, w]``, one row per vehicle of the role (or 1 if all of them see the same). A tuple is
-no name but the key of an entry, which is given as it is.
+A name that begins with ``next.`` refers to the state after the step. Every view is
+``[*batch, n, w]``, one row per vehicle of the role, or one row if it is the same for all. A tuple
+is the key of an entry, which is not changed.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ class Views:
 
     Args:
         string: the string of vehicles.
-        role: whose view.
-        names: what is seen: dotted names, and keys as tuples.
-        behind: how many vehicles behind are seen, the nearest first.
+        role: role of the vehicles.
+        names: dotted names, and keys as tuples.
+        behind: number of vehicles behind in each view ``behind.x``, nearest first.
 
     Attributes:
-        keys: the entries to read, in the order in which :meth:`__call__` takes them.
+        keys: the entries to read, in the order of the arguments of :meth:`__call__`.
 
     Raises:
         ConfigError: if a name has no namespace.
@@ -72,30 +72,30 @@ class Views:
         for name in names:
             if not isinstance(name, (str, tuple)):
                 raise ConfigError(f"reads must hold names such as self.gap, got {name!r}")
-        # Only roles have places; what all vehicles see alike needs none.
+        # Only roles have places; entries that are the same for all vehicles need none.
         self.drawn = string.drawn and role in string.names
         self.places, self.role = string.places(role), role
         self.select = selector(self.places, len(string))
         self.keys: list[Key] = []
-        # Everything that depends on the string alone is settled here, not at every step.
+        # Everything that depends on the string only is resolved here, not in every step.
         self.plan = [self._resolver(name) for name in names]
 
     def __call__(self, *entries: Tensor) -> list[Tensor]:
-        """Return what is seen, one tensor per name."""
+        """Return the views, one tensor per name."""
         return [resolve(entries) for resolve in self.plan]
 
     def of(self, moment: TensorDictBase) -> list[Tensor]:
-        """Return what is seen of a moment."""
+        """Return the views of a state."""
         return self(*(moment.get(key) for key in self.keys))
 
     def _place(self, key: Key) -> int:
-        """Return the place of an entry among those read."""
+        """Return the index of an entry among those read."""
         if key not in self.keys:
             self.keys.append(key)
         return self.keys.index(key)
 
     def _resolver(self, given: NestedKey) -> Resolver:
-        """Return the function from the entries read to what a name or a key means."""
+        """Return the function from the entries read to the view of a name or a key."""
         name = as_key(given)
         if not isinstance(given, str):
             return partial(_as_it_is, self._place(name))
@@ -108,7 +108,7 @@ class Views:
         if space in (SELF, AHEAD):
             return self._at((*prefix, VEHICLES, entry), -1 if space == AHEAD else 0)
         if space == BEHIND:
-            # Any entry of the vehicles tells the shape of the batch.
+            # Any entry of the vehicles has the shape of the batch.
             present = entry == PRESENT
             key = (*prefix, VEHICLES, "speed" if present else entry)
             distances = range(1, self.behind + 1)
@@ -118,7 +118,7 @@ class Views:
         return partial(_row if space in (LEADER, EPISODE) else _as_it_is, self._place(name))
 
     def _at(self, key: Key, distance: int, present: bool = False) -> Resolver:
-        """Return what finds an entry of the vehicles so far behind (−1: ahead of) the role's."""
+        """Return a function to the entry of the vehicles at a distance behind (−1: ahead)."""
         size = len(self.string)
         places = [place + distance for place in self.places]
         if self.string.ring:
@@ -141,12 +141,12 @@ class Views:
         present: bool,
         entries: Sequence[Tensor],
     ) -> Tensor:
-        """Return an entry at a distance that some vehicles, or some episodes, do not have."""
+        """Return an entry at a distance where not every vehicle or episode has a vehicle."""
         entry = torch.ones_like(entries[own]) if present else entries[own]
         if distance < 0:
             entry = entries_ahead(entries[lead] if lead >= 0 else None, entry)
         elif distance > 0:
-            # The first vehicles come round to the end on a ring; elsewhere there is none.
+            # On a ring the first vehicles follow the last; elsewhere there are none.
             wrapped = entry[..., :distance, :]
             end = wrapped if self.string.ring else torch.zeros_like(wrapped)
             entry = join([entry[..., distance:, :], end], -2)[..., : len(self.string), :]
@@ -155,7 +155,7 @@ class Views:
         return self.select(entry)
 
     def sees_all_behind(self) -> bool:
-        """Whether every vehicle of the role always has as many vehicles behind as it sees."""
+        """Whether every vehicle of the role always has as many vehicles behind as its views."""
         if self.string.ring:
             return len(self.string) > self.behind
         if self.drawn:

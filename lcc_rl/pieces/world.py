@@ -1,4 +1,4 @@
-"""What the pieces of an environment share, and how a piece is put into it."""
+"""Properties of an environment that its pieces share, and the binding of pieces to it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.settings import Settings, values
 
 MAX_ACCELERATION = 3.0  # of vehicles by default, in both directions [m/s²]
-MOST_LATE = 1000  # steps that a sensor, an actuator or a driver may be late; each is kept
-# Views that a role with sensors has from them, and the entries of the role that hold them.
+MOST_LATE = 1000  # longest delay of sensors, actuators and drivers in steps, all of which are kept
+# Views that sensors measure, and the entries of the role with their measurements.
 SENSED = {
     "self.gap": "sensed_gap",
     "self.speed": "sensed_speed",
@@ -26,7 +26,7 @@ SENSED = {
 
 @dataclass(frozen=True)
 class World:
-    """What the pieces of an environment share; by default one automated vehicle at 10 Hz.
+    """Properties that all pieces share; by default one automated vehicle at 10 Hz.
 
     Args:
         string: the string of vehicles.
@@ -35,10 +35,10 @@ class World:
         profiles: speed profiles of the leader.
         population: the human drivers.
         energy: the classes of the vehicles, :class:`lcc_rl.energy.Fleet`.
-        nominal: leaders and starts as in an evaluation, without the deviations of training.
-        actuators: settings of the :class:`lcc_rl.pieces.Actuation` of roles that have one.
-        sensors: settings of the :class:`lcc_rl.pieces.Sensors` of roles that have some.
-        filtered: roles whose commands a safety filter changes.
+        nominal: whether leaders and starts are as in an evaluation, without training's deviations.
+        actuators: settings of :class:`lcc_rl.pieces.Actuation` by role.
+        sensors: settings of :class:`lcc_rl.pieces.Sensors` by role.
+        filtered: roles with a safety filter.
     """
 
     string: VehicleString = field(default_factory=VehicleString)
@@ -63,14 +63,14 @@ class World:
         return found
 
     def deviations(self, factors: tuple[float, float]) -> tuple[float, float]:
-        """Return the range of a factor from which episodes draw: 1 in an evaluation."""
+        """Return the range from which episodes draw a factor: 1 to 1 in an evaluation."""
         return (1.0, 1.0) if self.nominal else factors
 
     def steps(self, seconds: float, what: str) -> int:
         """Return a duration in steps.
 
         Raises:
-            ConfigError: if it is no number of steps.
+            ConfigError: if it is no multiple of the time step.
         """
         count = seconds / self.time_step
         require(
@@ -83,14 +83,14 @@ class World:
         """Return a delay in steps.
 
         Raises:
-            ConfigError: if it is no number of steps, or above :data:`MOST_LATE`.
+            ConfigError: if it is no multiple of the time step, or above :data:`MOST_LATE` steps.
         """
         most = MOST_LATE * self.time_step
         require(seconds < 1.001 * most, f"{what} must be at most {most:g} s, got {seconds:g} s")
         return self.steps(seconds, what)
 
     def sensed(self, role: str, names: Sequence[NestedKey]) -> list[NestedKey]:
-        """Return names of views of a role, those that its sensors measure as measured."""
+        """Return names of views of a role, with its measurements where it has sensors."""
         if role not in self.sensors:
             return list(names)
         return [_sensed(role, name) if isinstance(name, str) else name for name in names]
@@ -105,14 +105,14 @@ def _sensed(role: str, name: str) -> str:
 class Part(Settings):
     """Settings of a part of an environment, bound to a world."""
 
-    name: ClassVar[str] = ""  # by default; that of a part in an environment is its own
+    name: ClassVar[str] = ""  # default; a part in an environment has its own name
 
     def bind(self, world: World | None = None, name: str | None = None) -> Self:
-        """Return the part with what depends on a world.
+        """Return a copy that is bound to a world.
 
         Args:
-            world: what the pieces of the environment share.
-            name: the role that it drives, or its key in the configuration.
+            world: see :class:`World`.
+            name: its role, or its key in the configuration.
         """
         bound = type(self)(**values(self))
         bound.name = name or self.name  # type: ignore[misc]
@@ -120,8 +120,8 @@ class Part(Settings):
         return bound
 
     def setup(self, world: World) -> None:
-        """Derive from a world what depends on it.
+        """Derive everything that depends on a world.
 
         Args:
-            world: what the pieces of the environment share.
+            world: see :class:`World`.
         """

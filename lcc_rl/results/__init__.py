@@ -1,4 +1,4 @@
-"""Results of runs: windows, intervals and tables from parquet files."""
+"""Results of runs: windows, intervals and tables."""
 
 from lcc_rl.results.loading import load
 

@@ -1,4 +1,4 @@
-"""Rows of ``lcc-rl score``: one for each task and source of leaders, and tables of them."""
+"""Rows of ``lcc-rl score``, one per task and source of leaders, and their tables."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ def row_of(
     """Return the row of a strategy on a task behind the leaders of a source.
 
     Args:
-        table: of :func:`lcc_rl.results.report.summary`.
+        table: result of :func:`lcc_rl.results.report.summary`.
         task: the task.
         source: name of the leaders.
         strategy: the strategy.
-        drivers: number of drivers that it met.
+        drivers: number of drivers of the evaluation.
 
     Returns:
-        Plain values, numbers that do not exist as None: ``limits`` contains bound and value of
-        each, ``measures`` all measures; ``windows`` and ``drives`` count what the interval is over.
+        Plain values, None for missing numbers. ``limits`` holds bound and value of each limit,
+        ``measures`` all measures, ``windows`` and ``drives`` the counts of the interval.
     """
     by_name = table.set_index("strategy")
     found = by_name.loc[strategy]
@@ -67,11 +67,11 @@ def row_of(
 
 
 def _number(value: Any) -> float | None:
-    """Return a number with seven digits, all that single precision holds; None of NaN."""
+    """Return a number with seven digits, the accuracy of single precision; None for NaN."""
     return float(f"{value:.7g}") if np.isfinite(value) else None
 
 
-def score_table(who: str, rows: Sequence[BoardRow]) -> Table:
+def score_table(name: str, rows: Sequence[BoardRow]) -> Table:
     """Return rows as a table for the terminal, within 80 characters."""
     lines: list[dict[str, str]] = []
     for row in rows:
@@ -81,11 +81,11 @@ def score_table(who: str, rows: Sequence[BoardRow]) -> Table:
             lines[-1] |= {"where": row["task"], "score": unit_of(row), "saved": against}
         lines.append({"where": f"  {row['source']}", **_cells(row)})
     caption = (
-        "saved, distance, flow: against the baseline; 95 % interval over drives; over "
-        "windows where there are fewer than five drives, too narrow if one drive has several; "
+        "saved, distance, flow: against the baseline; 95 % interval over drives, or over "
+        "windows for fewer than five drives, too narrow if one drive has several; "
         "score.json has every limit and value."
     )
-    return render.as_rich(pd.DataFrame(lines), BOARD_COLUMNS, in_words(who), caption)
+    return render.as_rich(pd.DataFrame(lines), BOARD_COLUMNS, in_words(name), caption)
 
 
 def unit_of(row: BoardRow) -> str:
@@ -113,19 +113,19 @@ def leaderboard(documents: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a Markdown table for each task: policies and savings by source.
 
     Args:
-        documents: contents of the files of ``lcc-rl score``, by their names.
+        documents: contents of the files of ``lcc-rl score``, by name.
 
     Raises:
-        ConfigError: if two rows of one task and source are not comparable, or have one name.
+        ConfigError: if two rows of one task and source are not comparable or share a name.
     """
     check_alike(documents)
-    every = [{**row, "who": one["name"]} for one in documents.values() for row in one["results"]]
+    every = [{**row, "by": one["name"]} for one in documents.values() for row in one["results"]]
     parts = []
     for task in dict.fromkeys(row["task"] for row in every):
         rows = [row for row in every if row["task"] == task]
         sources = list(dict.fromkeys(row["source"] for row in rows))
         lines = [
-            [f"{row['source']}, {_sample(row)}", f"`{row['who']}`", *_markdown(row)]
+            [f"{row['source']}, {_sample(row)}", f"`{row['by']}`", *_markdown(row)]
             for row in sorted(rows, key=lambda x: sources.index(x["source"]))
         ]
         lines = [HEAD, ["---"] * len(HEAD), *lines]
@@ -135,10 +135,10 @@ def leaderboard(documents: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def check_alike(documents: Mapping[str, Mapping[str, Any]]) -> None:
-    """Check that the rows of a task and source share data, settings and limits, not a name.
+    """Check that rows of a task and source share data, settings and limits, and no name.
 
     Raises:
-        ConfigError: naming the file, the row, and what differs, or contradicts itself.
+        ConfigError: naming the file, the row and the difference or contradiction.
     """
     first: dict[tuple[str, str], BoardRow] = {}
     files: dict[tuple[str, str, str], str] = {}
@@ -164,10 +164,10 @@ def check_alike(documents: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def check_row(row: BoardRow, where: str) -> None:
-    """Check that what a row says agrees with its own numbers; ``where`` names it.
+    """Check that a row is consistent; ``where`` names it.
 
     Raises:
-        ConfigError: saying what does not.
+        ConfigError: naming the contradiction.
     """
     numbers = [row.get("score"), *(row[key] for key in SAVED_SHARE)]
     numbers += [limit[key] for limit in row["limits"].values() for key in ("bound", "value")]
@@ -191,9 +191,9 @@ def _sample(row: BoardRow) -> str:
 
 
 def _markdown(row: BoardRow) -> list[str]:
-    """Return saving, flow, and the limits that are not kept.
+    """Return saving, flow and broken limits.
 
-    A saving is bold where all limits are kept, and a flow where much of it is lost.
+    The saving is bold if all limits are kept, the flow if much of it is lost.
     """
     cells = _cells(row)
     share = f"**{cells['saved']}**" if row["kept"] else cells["saved"]
@@ -203,7 +203,7 @@ def _markdown(row: BoardRow) -> list[str]:
 
 
 def broken(row: BoardRow) -> list[str]:
-    """Return the limits that are not kept, by their first words, and the number of collisions."""
+    """Return the broken limits by their first words, and the number of collisions."""
     found = [f"{row['collisions']} coll."] if row["collisions"] else []
     for name, limit in row["limits"].items():
         measure = measures.limit_measures()[name]

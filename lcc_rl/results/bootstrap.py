@@ -14,10 +14,10 @@ from lcc_rl.arrays import Floats
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
-LEAST_DRIVES = 5  # fewer tell too little of how drives differ
+LEAST_DRIVES = 5  # least number of drives that are resampled
 STUDENT = (12.706, 4.303, 3.182)  # 97.5 % quantiles of Student's t by degrees of freedom, from 1
-RESAMPLING_SEED = 0  # of the resampling: the same rows give the same interval
-WITHOUT_WINDOWS = -1  # stream of seeds that are resampled without windows
+RESAMPLING_SEED = 0  # equal rows give equal intervals
+WITHOUT_WINDOWS = -1  # stream for seeds that are resampled without windows
 
 Side = Mapping[str, Floats]  # columns of one side of a comparison, each ``[..., windows, seeds]``
 
@@ -26,7 +26,7 @@ Side = Mapping[str, Floats]  # columns of one side of a comparison, each ``[...,
 class Estimate:
     """A value with the bounds of its 95 % interval; NaN bounds if nothing can be resampled.
 
-    Two drives or more that are too few to be resampled also have a t-interval ``over_drives``.
+    Two to four drives also give a t-interval, ``over_drives``.
     """
 
     value: float
@@ -53,25 +53,24 @@ def estimate(
     """Return a statistic of means with its interval.
 
     The interval is that of a clustered bootstrap: held-out windows and training seeds are
-    resampled crosswise (the pigeonhole bootstrap, Owen 2007). All sides meet the same windows;
-    the seeds of two trainings are independent. From n windows or seeds n − 1 are drawn, which
-    makes the variance of a mean unbiased (Rao and Wu 1988). In synthetic data with 20 windows, 95 %
-    intervals of eight seeds contain the truth in 90 to 97 % of cases, of four in 80 to 91 %, of two
-    in 61 to 84 %: with few seeds that differ much, the interval is too narrow.
+    resampled independently (the pigeonhole bootstrap, Owen 2007). All sides share the windows; the
+    seeds of two trainings are independent. From n windows or seeds n − 1 are drawn, which makes the
+    variance of a mean unbiased (Rao and Wu 1988). In synthetic data with 20 windows, 95 % intervals
+    contain the true value in 90 to 97 % of cases with eight seeds, 80 to 91 % with four and 61 to
+    84 % with two: with few seeds that differ much, the interval is too narrow.
 
     Args:
-        statistic: function of one mapping per side, which holds the mean of each column,
-            ``[...]``, or its resampled means, ``[..., RESAMPLES]``.
-        sides: columns of each side, in the same windows; one seed if nothing was trained.
-        drives: what each window is cut from; whole drives are resampled if there are at least
-            five, because windows of one drive are alike.
-        paired: seed by seed, all sides come from the same training.
-        alone: resample seeds only, and n of n.
+        statistic: function of one mapping per side with the mean of each column, ``[...]``, or its
+            resampled means, ``[..., RESAMPLES]``.
+        sides: columns of each side for the same windows; one seed without training.
+        drives: drive of each window. If there are at least five, whole drives are resampled,
+            because windows of one drive are similar.
+        paired: whether equal seeds of all sides belong to one training.
+        alone: resample seeds only, n of n.
 
     Returns:
-        The statistic; without an interval if it is NaN, if there is one window and one seed of
-        each side, or if no resample has a value. If a side has one seed, the interval does not
-        cover what another seed would change.
+        The statistic. It has no interval if it is NaN, if each side has one window and one seed, or
+        if no resample has a value. With one seed, the interval excludes the variation of seeds.
     """
     value = float(statistic(*({key: x.mean((-2, -1)) for key, x in one.items()} for one in sides)))
     if not np.isfinite(value) or max(n for one in sides for n in _sizes(one)) < 2:
@@ -88,7 +87,7 @@ def estimate(
     if not len(found):
         return Estimate(value)
     low, high = bounds(found)
-    # Of two windows one is drawn, and the share of both may lie outside those of either.
+    # Of two windows one is drawn, and the value of both may lie outside the values of each.
     ends = min(float(low), value), max(float(high), value)
     return Estimate(value, *ends, _over_drives(statistic, sides, drives or (), value))
 
@@ -98,7 +97,7 @@ def _over_drives(
 ) -> tuple[float, float] | None:
     """Return the t-interval of a statistic over two to four drives.
 
-    Its standard error is that of the jackknife: each drive is left out once.
+    Its standard error is that of the jackknife, which leaves out each drive once.
     """
     names = list(dict.fromkeys(drives))
     if not 2 <= len(names) < LEAST_DRIVES:
@@ -108,8 +107,8 @@ def _over_drives(
         kept = np.array([drive != name for drive in drives])
         means = ({key: x[..., kept, :].mean((-2, -1)) for key, x in one.items()} for one in sides)
         left.append(float(statistic(*means)))
-    beside = STUDENT[len(names) - 2] * float(np.std(left)) * (len(names) - 1) ** 0.5
-    return value - beside, value + beside
+    half_width = STUDENT[len(names) - 2] * float(np.std(left)) * (len(names) - 1) ** 0.5
+    return value - half_width, value + half_width
 
 
 def _sizes(side: Side) -> tuple[int, ...]:
@@ -117,13 +116,13 @@ def _sizes(side: Side) -> tuple[int, ...]:
 
 
 def resampled(table: Floats, stream: int, drives: Sequence[object] | None = None) -> Floats:
-    """Return the resampled means of ``[..., windows, seeds]``; a stream draws its own seeds."""
+    """Return the resampled means of ``[..., windows, seeds]``; ``stream`` draws the seeds."""
     drawn = drawn_windows(table.shape[-2], drives) @ table
     return np.asarray((drawn * resample_weights(table.shape[-1], stream)).sum(-1))
 
 
 def drawn_windows(count: int, drives: Sequence[object] | None = None) -> Floats:
-    """Return the weights of windows in every resample, ``[RESAMPLES, count]``; of whole drives."""
+    """Return the weights of windows in every resample, ``[RESAMPLES, count]``."""
     if drives is None or len(set(drives)) < LEAST_DRIVES:
         return resample_weights(count, 0)
     names = {name: code for code, name in enumerate(dict.fromkeys(drives))}
@@ -131,7 +130,7 @@ def drawn_windows(count: int, drives: Sequence[object] | None = None) -> Floats:
     return np.asarray(drawn / drawn.sum(1, keepdims=True))
 
 
-@lru_cache(maxsize=8)  # a table asks for the same ones again and again
+@lru_cache(maxsize=8)  # tables repeat the same calls
 def resample_weights(count: int, stream: int) -> Floats:
     """Return the weights of ``count`` units in every resample, ``[RESAMPLES, count]``."""
     if stream == WITHOUT_WINDOWS:
@@ -174,7 +173,7 @@ def band(curves: Floats) -> Floats:
 
 
 def share_saved(value: Any, baseline: Any) -> Any:
-    """Return the saved share of a baseline's energy, also if that is negative (recuperation)."""
+    """Return the saved share of a baseline's energy, which may be negative (recuperation)."""
     return (baseline - value) / abs(baseline)
 
 
@@ -185,18 +184,18 @@ def saving(
     drives: Sequence[object] | None = None,
     ways: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> Estimate:
-    """Return the share saved by the mean against that of a baseline, see :func:`estimate`.
+    """Return the share of a baseline's mean energy that is saved, see :func:`estimate`.
 
     Args:
         values: mean energy over all drivers, ``[windows, seeds]``.
         baseline: that of the baseline in the same windows, ``[windows, its seeds]``.
-        paired, drives: as of :func:`estimate`.
-        ways: the distances of both sides, as the energies: what is saved is then energy per
-            distance, ratios of totals, in which energy and distance are resampled together.
+        paired, drives: as for :func:`estimate`.
+        ways: distances of both sides, shaped as the energies. The saving is then one of energy per
+            distance, a ratio of totals; energy and distance are resampled together.
 
     Returns:
-        The share; without an interval if resampled baselines are of both signs: then no share of
-        them means anything. The share of a baseline of zero is NaN.
+        The share; without an interval if resampled baselines have both signs. It is NaN for a
+        baseline of zero.
     """
     sides = [np.asarray(side, dtype=np.float64) for side in (values, baseline)]
     driven = [np.asarray(side, dtype=np.float64) for side in ways or map(np.ones_like, sides)]

@@ -1,8 +1,8 @@
-"""Controllers compared as fronts: energy over what saving it costs, at equal cost.
+"""Comparison of controllers by fronts: energy at equal cost.
 
-A controller that drives nearer saves less energy, and misses the limit of the time gap less or
-takes less of the flow. Two controllers are compared as curves over several limits or time gaps,
-read where both cost as much.
+A controller with shorter gaps saves less energy, but violates the limit of the time gap less or
+loses less flow. Two controllers are therefore compared as curves over several limits or time gaps,
+at equal cost.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lcc_rl.results.windows import DISTANCE, DRIVE
 
 FRONT_KINDS = ["variant", "policy"]
 ENERGY, LONG_SHARE = PATH, LONG_GAPS
-# Of a fleet.
+# Columns of a fleet.
 NET = "total_net_energy_kj"
 FLEET = NET, DISTANCE, FLOW
 # Means of columns of one kind of controller, each ``[limits]``, or ``[RESAMPLES, limits]``.
@@ -33,13 +33,13 @@ def front(windows: pd.DataFrame, kind: Sequence[str], columns: Sequence[str]) ->
     """Return columns of one kind of controller by limit, window and seed.
 
     Args:
-        windows: columns :data:`FRONT_KINDS`, ``limit`` (or what else is varied along a front),
+        windows: columns :data:`FRONT_KINDS`, ``limit`` (or another variable along a front),
             ``training_seed``, ``profile_id`` and ``columns``; a row per training and window.
         kind: variant and policy.
-        columns: which.
+        columns: columns to return.
 
     Raises:
-        ResultsError: if it is missing, or lacks a window or seed at one of its limits.
+        ResultsError: if the kind is missing, or lacks a window or seed at one of its limits.
     """
     name = " ".join(kind)
     rows = windows[(windows[FRONT_KINDS] == list(kind)).all(axis=1)]
@@ -65,12 +65,12 @@ def compare_fronts(
 ) -> Estimate:
     """Return a measure of two kinds of controllers with its interval.
 
-    Resampled as in :func:`lcc_rl.results.bootstrap.estimate`.
+    It is resampled as in :func:`lcc_rl.results.bootstrap.estimate`.
 
     Args:
         windows, columns: see :func:`front`.
         one, other: variant and policy of each.
-        measure: of the means by limit of both.
+        measure: function of the means by limit of both.
     """
     fronts = [front(windows, kind, columns) for kind in (one, other)]
     drives = windows.groupby("profile_id")[DRIVE].first().tolist() if DRIVE in windows else None
@@ -82,10 +82,10 @@ def compare_fronts(
 
 
 def energy_at(energy: Floats, share: Floats, at: Any, most: float | None = None) -> Floats:
-    """Return the energy of a front, ``[..., limits]`` each, at a share of ``at``.
+    """Return the energy of a front, ``[..., limits]`` each, at the share ``at``.
 
-    It is linear between the limits and NaN if no share is as small; if all are smaller, it is
-    ``most``, by default the energy of the largest share.
+    It is interpolated linearly between the limits, and NaN if all shares are larger. If all are
+    smaller, it is ``most``, by default the energy of the largest share.
     """
 
     def read(at: float, share: Floats, energy: Floats) -> float:
@@ -100,7 +100,7 @@ def saving_at(
 ) -> Estimate:
     """Return the share of energy that one kind of controller saves against another.
 
-    Both spend at most the share ``at`` of the time beyond the limit; see :func:`compare_fronts`.
+    Both violate the limit for at most the share ``at`` of the time; see :func:`compare_fronts`.
     """
 
     def measure(*curves: Curve) -> Any:
@@ -125,7 +125,7 @@ def flow_gained(point: Curve, baseline: Curve) -> Any:
 
 
 def saved_at_flow(point: Curve, rule: Curve) -> Any:
-    """Return the share of the energy per distance that a fleet saves against a front, at its flow.
+    """Return the share of energy per distance that a fleet saves against a front at equal flow.
 
     NaN if the front does not reach that flow.
     """

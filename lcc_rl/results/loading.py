@@ -29,11 +29,11 @@ from lcc_rl.io.files import (
     texts_of,
     unified,
 )
-from lcc_rl.results.runs import CONFIG, FINAL, PARTS, flat_settings, told_apart
+from lcc_rl.results.runs import CONFIG, FINAL, PARTS, distinguished, flat_settings
 
 log = logging.getLogger("lcc_rl")
 
-# The tables of a run, and columns without which a file of this name is not one.
+# The tables of a run and their required columns.
 TABLES = {
     "episodes": ("strategy",),
     "training": ("iteration",),
@@ -41,9 +41,9 @@ TABLES = {
     "steps": ("strategy", "time_s"),
     "drivers": ("desired_speed_mps", "time_gap_s"),
 }
-ALWAYS = ("variant", "seed")  # settings that are columns also where all runs agree
+ALWAYS = ("variant", "seed")  # settings that are columns even if all runs agree
 SHARD, SHARDS = "evaluation.shard", "evaluation.shards"
-# Integers of pandas that may be missing.
+# Nullable integers of pandas.
 NULLABLE = {pa.int64(): pd.Int64Dtype(), pa.int32(): pd.Int32Dtype()}
 # Settings in which the parts and the seeds of one study differ.
 SHARED = tuple(f"{key}." for key in (*NOT_IDENTITY, "seed", SHARD))
@@ -53,11 +53,11 @@ Runs = dict[Path, dict[str, Any]]  # the settings of each run by its table
 
 
 class Damaged(dict[str, str]):
-    """Reasons why runs are left out, by run.
+    """Reasons for leaving out runs, by run.
 
     Args:
         root: the folder above the runs.
-        strict: raise the first reason instead.
+        strict: raise the first reason.
     """
 
     def __init__(self, root: Path, strict: bool) -> None:
@@ -66,7 +66,7 @@ class Damaged(dict[str, str]):
 
     @contextmanager
     def noting(self, folder: Path) -> Iterator[None]:
-        """Note what is raised while files of a run are read."""
+        """Note errors that are raised while files of a run are read."""
         try:
             yield
         except ResultsError as error:
@@ -114,26 +114,25 @@ def load(
     """Read one table of every run below a folder.
 
     A damaged run is left out with a warning; ``frame.attrs["damaged"]`` holds the reasons by run,
-    and ``frame.attrs["missing"]`` the missing shards of an evaluation. Of a finished job of
-    ``lcc-rl run`` the rows of episodes are those of its evaluation, in which those of its
-    trainings are.
+    and ``frame.attrs["missing"]`` the missing shards of an evaluation. The episodes of a finished
+    job of ``lcc-rl run`` are those of its evaluation, which includes its trainings.
 
     Args:
         root: a run folder, or any folder above runs.
         table: ``"episodes"``, ``"training"``, ``"timing"``, ``"steps"`` or ``"drivers"``.
-        settings: which settings become columns, by their dotted keys (``"seed"``,
-            ``"agent.gamma"``) or patterns of them (``"reward.*"``, ``"*"``); by default
-            ``"variant"``, ``"seed"`` and those in which the runs differ.
-        strict: raise for a damaged run, or a missing shard, instead.
-        lazy: return a pyarrow dataset, which reads rows when they are needed, for tables that do
-            not fit into memory.
+        settings: settings that become columns, by dotted keys (``"seed"``, ``"agent.gamma"``) or
+            patterns (``"reward.*"``, ``"*"``); by default ``"variant"``, ``"seed"`` and those in
+            which the runs differ.
+        strict: raise for a damaged run or a missing shard.
+        lazy: return a pyarrow dataset, which reads rows on demand, for tables that do not fit into
+            memory.
 
     Returns:
-        The rows of all runs, in the order of their folders, with the column ``run`` and the
-        chosen settings. Text is categorical.
+        The rows of all runs, sorted by folder, with the column ``run`` and the chosen settings.
+        Text is categorical.
 
     Raises:
-        ConfigError: if the table, or a setting, is unknown.
+        ConfigError: if the table or a setting is unknown.
         ResultsError: if no such table below ``root`` can be read.
     """
     if table not in TABLES:
@@ -166,11 +165,11 @@ def load(
 def load_sweep(root: str | Path) -> pd.DataFrame:
     """Read the rows of all runs below a folder as those of one evaluation.
 
-    A strategy is named by the settings in which the runs differ (:func:`told_apart`); the seeds of
-    a training share a name. A strategy whose rows are the same in all runs stands once.
+    Strategies are named by the settings in which the runs differ (:func:`distinguished`); the seeds
+    of a training share a name. A strategy with the same rows in all runs occurs once.
 
     Raises:
-        ConfigError: if the runs meet different leaders, or one training is there twice.
+        ConfigError: if the runs have different leaders, or a training occurs twice.
         ResultsError: as :func:`load`.
     """
     root = Path(root)
@@ -178,7 +177,7 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
     names = list(rows["run"].unique())
     stored = [flat_settings(root / name / CONFIG) for name in names]
     settings = [{k: x for k, x in one.items() if not f"{k}.".startswith(SHARED)} for one in stored]
-    labels = dict(zip(names, told_apart(settings), strict=True))
+    labels = dict(zip(names, distinguished(settings), strict=True))
     rows = rows.assign(run=rows["run"].astype(str), strategy=rows["strategy"].astype(str))
     for strategy, part in rows.groupby("strategy"):
         first, *others = (one.drop(columns="run") for _, one in part.groupby("run"))
@@ -196,21 +195,21 @@ def _check_one_study(root: Path, rows: pd.DataFrame) -> None:
         leaders = rows.groupby("profile_id")["leader_speed_mps"].nunique()
         require(
             leaders.max() == 1,
-            f"{root}: its runs meet different leaders (profile_id {leaders.idxmax()}); "
+            f"{root}: its runs have different leaders (profile_id {leaders.idxmax()}); "
             f"lcc_rl.results.load({str(root)!r}) reads them",
         )
     twice = rows[rows.duplicated([key for key in EPISODE if key in rows])]
     which = [f"{strategy}, seed {seed}" for strategy, seed in twice[TRAINING].to_numpy()[:1]]
-    require(not which, f"{root}: it holds one training twice: {''.join(which)}")
+    require(not which, f"{root}: it contains a training twice: {''.join(which)}")
 
 
 def _files(root: Path, name: str, damaged: Damaged) -> list[Path]:
-    """Return the files of a name in run folders at or below a folder, sorted."""
+    """Return the files with a name in run folders at or below a folder, sorted."""
     found = []
     for place, folders, files in os.walk(root, onerror=damaged.unlisted):
         own = SUBFOLDERS if CONFIG in files else ()
         if PARTS in folders and Path(place, FINAL, name).is_file():
-            folders[:] = [FINAL]  # what its trainings evaluated is evaluated there again
+            folders[:] = [FINAL]  # it includes the evaluations of its trainings
         folders[:] = [x for x in folders if not x.startswith(".") and x not in own]
         if name in files:
             found.append(Path(place, name))
@@ -218,7 +217,7 @@ def _files(root: Path, name: str, damaged: Damaged) -> list[Path]:
 
 
 def _surveyed(root: Path, table: str, damaged: Damaged) -> tuple[Runs, pa.Schema]:
-    """Return the settings of all runs whose tables can be read as one, and its columns."""
+    """Return the settings of all runs with readable tables, and their common columns."""
     runs, schemas = {}, {}
     for path in _files(root, f"{table}.parquet", damaged):
         with damaged.noting(path.parent):
@@ -226,7 +225,7 @@ def _surveyed(root: Path, table: str, damaged: Damaged) -> tuple[Runs, pa.Schema
             own = flat_settings(config) if config.exists() else {}
             runs[path] = {"run": str(path.parent.relative_to(root)), **own}
             schemas[path] = schema
-    # Columns are as most tables have them, whichever comes first.
+    # Columns are those of most tables.
     common, whole, kept = Counter(map(str, schemas.values())), pa.schema([]), []
     for path in sorted(runs, key=lambda path: -common[str(schemas[path])]):
         with damaged.noting(path.parent):
@@ -238,11 +237,11 @@ def _surveyed(root: Path, table: str, damaged: Damaged) -> tuple[Runs, pa.Schema
 
 
 def _chosen(runs: Runs, names: Sequence[str] | None, columns: Sequence[str]) -> Runs:
-    """Return the settings that become columns beside those of the table."""
+    """Return the settings that become columns."""
     every = dict.fromkeys(key for settings in runs.values() for key in settings)
     for name in names or ():
         if not any(fnmatchcase(key, name) for key in every):
-            near = get_close_matches(name, every, cutoff=0.4)  # there are some hundreds
+            near = get_close_matches(name, every, cutoff=0.4)  # there are hundreds
             raise unknown_name("setting of these runs", name, near)
     first = next(iter(runs.values()))
 
@@ -264,7 +263,7 @@ def _chosen(runs: Runs, names: Sequence[str] | None, columns: Sequence[str]) -> 
 
 
 def _of_one_type(values: Sequence[Any]) -> list[Any]:
-    """Return the values of a setting, as text where they are of several types."""
+    """Return the values of a setting, as text if they have several types."""
     kinds = {type(value) for value in values} - {type(None)}
     if (kinds <= {int, float} and kinds) or len(kinds) == 1:
         return list(values)
@@ -272,7 +271,7 @@ def _of_one_type(values: Sequence[Any]) -> list[Any]:
 
 
 def _frame(parts: Mapping[Path, pa.Table], constants: Runs) -> pd.DataFrame:
-    """Return tables, and what is constant in each, as one data frame."""
+    """Return tables with their constant columns as one data frame."""
     table = pa.concat_tables(parts.values(), promote_options="permissive")
     counts = [len(part) for part in parts.values()]
     integers = {
@@ -285,13 +284,13 @@ def _frame(parts: Mapping[Path, pa.Table], constants: Runs) -> pd.DataFrame:
         values = pd.Series([constants[path][key] for path in parts])
         values = values if is_numeric_dtype(values) else values.astype("category")
         columns[key] = values.repeat(counts).array
-    # Without the metadata of pandas, which may differ from table to table.
+    # Without the metadata of pandas, which may differ between tables.
     frame = table.to_pandas(split_blocks=True, self_destruct=True, ignore_metadata=True)
     return pd.concat([frame.assign(**integers), pd.DataFrame(columns, copy=False)], axis=1)
 
 
 def missing_shards(runs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a line for every evaluation, among runs' settings, that lacks some of its shards."""
+    """Return a line for every evaluation with missing shards."""
     parts: dict[str, set[int]] = {}
     for settings in (x for x in runs if (x.get(SHARDS) or 1) > 1):
         others = {key: value for key, value in settings.items() if key not in (SHARD, "run")}

@@ -1,6 +1,6 @@
-"""Measures of evaluations: what every table, limit and score calls them, and how they are shown.
+"""Measures of evaluations with their names in tables, limits and scores.
 
-A further measure is a function in :mod:`lcc_rl.evaluation.metrics` and a line here.
+A new measure is a function in :mod:`lcc_rl.evaluation.metrics` and a line here.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from lcc_rl.energy import AVERAGED, AVERAGES
 from lcc_rl.results.windows import DAMPING, DISTANCE, WAYS, episode_mean, how
 
 PATH = "total_path_energy_kj"
-PATH_PER_KM = "path_energy_kj_per_km"  # and vehicle; falling behind does not lower it
+PATH_PER_KM = "path_energy_kj_per_km"  # per vehicle and km; falling behind does not lower it
 FASTER, BROKEN = "share_leader_faster", "share_promise_broken"
 REACH = ("cav_share_infeasible", "hdv_share_infeasible")
 FLOW = "flow_vph"
 TTC, LONG_GAPS = "share_ttc_unsafe", "share_time_gap_long_moving"
-SHORT_NAMES = {TTC: "unsafe_ttc_pct", LONG_GAPS: "long_time_gap_pct"}  # of columns of short tables
+SHORT_NAMES = {TTC: "unsafe_ttc_pct", LONG_GAPS: "long_time_gap_pct"}  # columns of short tables
 BARE, TURNED = "share_ttc_unpromised", "share_turned_unsafe"
 SPEED_STD, FINAL_SPREAD = "speed_std_mps", "final_speed_spread_mps"
 AT_LEAST, SHARE, PERCENT = "≥", "share_", "{:.2%}"
@@ -39,16 +39,15 @@ class Measure:
     """A measure of a strategy.
 
     Args:
-        key: its name in files; the column of episodes.parquet, if ``of`` names no other.
-        label: its row in tables of every measure, with the unit; without one it is in files only.
+        key: its name in files; also the column of episodes.parquet, unless ``of`` is given.
+        label: its row in full tables, with the unit; without a label it is in files only.
         form: format of its number.
-        limit: heading of a limit that a task may set, with ``≤ {:g}`` or ``≥ {:g}`` in place of the
-            bound.
-        short: its heading in short tables, where a share is in per cent; without one it is in full
-            tables only.
+        limit: heading of a limit in a task, with ``≤ {:g}`` or ``≥ {:g}`` for the bound.
+        short: its heading in short tables, with shares in per cent; without it the measure is in
+            full tables only.
         of: the column of episodes.parquet.
         per: a column; the measure is then the ratio of both totals.
-        factor: what a ratio is multiplied by.
+        factor: factor on a ratio.
         score: its name as a task's score.
     """
 
@@ -64,7 +63,7 @@ class Measure:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns that it is made of."""
+        """The columns from which it is computed."""
         return tuple(filter(None, (self.of or self.key, self.per)))
 
     @property
@@ -75,11 +74,11 @@ class Measure:
 
     @property
     def scale(self) -> float:
-        """What its limits and short columns multiply it by: shares are in per cent."""
+        """Factor in limits and short columns; 100 for shares."""
         return 100.0 if self.key.startswith(SHARE) else 1.0
 
     def value(self, part: pd.DataFrame) -> float:
-        """Return it from a strategy's rows of :func:`lcc_rl.results.windows.windows_of`."""
+        """Return its value from a strategy's rows of :func:`lcc_rl.results.windows.windows_of`."""
         column, *per = self.columns
         if not {column, *per} <= set(part):
             return np.nan
@@ -92,28 +91,28 @@ class Measure:
         )
 
     def keeps(self, value: float, bound: float) -> bool:
-        """Whether a limit is kept; NaN, the value of a vehicle that does not exist, keeps it."""
+        """Whether a limit is kept; NaN, the value without such a vehicle, keeps it."""
         return not (value < bound if AT_LEAST in self.limit else value > bound)
 
     def bounded(self, bound: float) -> str:
-        """Return a limit in words, with line breaks as in the heading of a column."""
+        """Return the heading of a limit, with line breaks."""
         return self.limit.format(self.scale * bound)
 
     @property
     def limited(self) -> str:
-        """The words of its limit, without the bound."""
+        """The name of its limit, without the bound."""
         return re.split(r"\s*[≤≥]", self.limit.replace("\n", " "))[0]
 
 
 def _energy(kind: str, label: str = "", score: str = "") -> Measure:
-    """Return an energy of all vehicles over their distance [kJ/km]."""
+    """Return the measure of an energy of all vehicles divided by their distance [kJ/km]."""
     key = f"{kind}kj_per_km" if kind else "kj_per_km"
     of = f"all_{kind or 'energy_'}kj"
     return Measure(key, label, "{:.1f}", of=of, per=DISTANCE, factor=1e3, score=score)
 
 
 def _per(key: str, label: str, of: str, factor: float, form: str = "{:.2f}") -> Measure:
-    """Return a column of all vehicles over their distance."""
+    """Return the measure of a column of all vehicles divided by their distance."""
     return Measure(key, label, form, of=of, per=DISTANCE, factor=factor)
 
 
@@ -181,7 +180,7 @@ def score_measures() -> dict[str, Measure]:
 
 
 def table_columns() -> list[str]:
-    """Return the columns of episodes.parquet, or made of them, that tables need."""
+    """Return the columns of episodes.parquet, or derived from them, that tables need."""
     return list(dict.fromkeys((*WAYS, *(name for one in MEASURES for name in one.columns))))
 
 

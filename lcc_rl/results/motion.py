@@ -25,14 +25,15 @@ class SampleMotion:
 
     Args:
         time: ``[T]`` [s].
-        roles: of the N vehicles, front to back.
+        roles: roles of the N vehicles, front to back.
         speed: ``[T, N]`` [m/s].
-        gap: to the vehicle ahead, bumper to bumper, ``[T, N]`` [m].
-        front: front bumper of what the first vehicle follows, ``[T]`` [m]: of the leader, which
-            begins at 0; on a ring of the last vehicle, a round further on.
+        gap: gap to the vehicle ahead, bumper to bumper, ``[T, N]`` [m].
+        front: front bumper of the vehicle ahead of the first one, ``[T]`` [m]: the leader, which
+            starts at 0; on a ring the last vehicle, one round ahead.
         leader: the leader's speed, ``[T]`` [m/s]; None on a ring.
-        length: of every vehicle; or ``[N + 1]``, of what the first one follows, then of each [m].
-        circumference: of a ring [m]; None on an open road.
+        length: length of all vehicles [m]; or ``[N + 1]``, of the vehicle ahead of the first one,
+            then of each.
+        circumference: circumference of a ring [m]; None on an open road.
     """
 
     time: MotionSeries
@@ -46,7 +47,7 @@ class SampleMotion:
 
     @property
     def lengths(self) -> MotionSeries:
-        """Length of what the first vehicle follows, then of each, ``[N + 1]`` [m]."""
+        """Length of the vehicle ahead of the first one, then of each, ``[N + 1]`` [m]."""
         return np.broadcast_to(self.length, len(self.roles) + 1)
 
     @property
@@ -62,7 +63,7 @@ class SampleMotion:
         return np.column_stack([first, self.speed[:, :-1]])
 
     def at(self, moments: slice) -> SampleMotion:
-        """Return the motion at some moments only."""
+        """Return the motion at selected times."""
         return replace(
             self,
             time=self.time[moments],
@@ -74,14 +75,14 @@ class SampleMotion:
 
 
 def sample_episodes(steps: pd.DataFrame, strategy: str) -> dict[str, pd.DataFrame]:
-    """Return the sample episodes of a strategy by a name for readers.
+    """Return the sample episodes of a strategy by a readable name.
 
     Args:
-        steps: rows of steps.parquet; those of the first training seed are taken.
+        steps: rows of steps.parquet; the first training seed is used.
         strategy: its name.
 
     Raises:
-        ResultsError: if it has none.
+        ResultsError: if there is none.
     """
     if "strategy" not in steps:
         raise ResultsError("no sample episode is stored")
@@ -99,10 +100,10 @@ def sample_episodes(steps: pd.DataFrame, strategy: str) -> dict[str, pd.DataFram
     return found
 
 
-def telling(steps: pd.DataFrame) -> pd.DataFrame:
-    """Return the sample episode, of all strategies, in which the leader's speed varies most.
+def most_varied(steps: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of the sample episode in which the leader's speed varies most.
 
-    Without a leader the first vehicle's counts; of an evaluation with a row per episode.
+    Without a leader the speed of the first vehicle counts. The evaluation has a row per episode.
     """
     speed = next(name for name in steps.columns if name.endswith("_speed"))
     keys = ["profile", "driver_id"]
@@ -113,12 +114,12 @@ def telling(steps: pd.DataFrame) -> pd.DataFrame:
 def motion_of(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> SampleMotion:
     """Return the motion of one sample episode.
 
-    Positions follow from the gaps behind the leader; on a ring from those behind the first
-    vehicle, whose own follows from its speed.
+    Positions are computed from the gaps behind the leader; on a ring from those behind the first
+    vehicle, which moves by its speed.
 
     Args:
-        rows: of :func:`sample_episodes`.
-        scenario: the node of the evaluation's configuration.
+        rows: rows of one episode, see :func:`sample_episodes`.
+        scenario: section of the evaluation's configuration.
 
     Raises:
         ResultsError: if the rows lack the place of a vehicle.
@@ -141,24 +142,24 @@ def motion_of(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> SampleMotion:
 
 
 Series = MotionSeries | None
-# Time, leader's speed, speeds, gaps and roles, and, where vehicles have classes, their lengths.
+# Time, leader's speed, speeds, gaps, roles, and lengths if vehicles have classes.
 Found = tuple[MotionSeries, Series, MotionSeries, MotionSeries, tuple[str, ...], Series]
 
 
 def _of_platoon(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
-    """Read rows with one vehicle each; the leader is follower 0."""
+    """Read rows of one vehicle each; the leader is follower 0."""
     table = rows.pivot_table(index="time_s", columns="follower", values=["speed_mps", "gap_m"])
     speed, gap = table["speed_mps"], table["gap_m"]
     roles = parse_string(scenario["string"], scenario["road"]).roles
     count = speed.shape[1] - 1
-    # A case of a platoon has its own number of vehicles, all automated.
+    # A case has its own number of vehicles, all automated.
     roles = roles if len(roles) == count else (AUTOMATED,) * count
     leader, own = speed[0].to_numpy(float), speed.drop(columns=0).to_numpy(float)
     return speed.index.to_numpy(float), leader, own, gap.to_numpy(float), roles, None
 
 
 def _driver_of(scenario: Mapping[str, Any]) -> Callable[[str], str]:
-    """Return what tells people from controllers by their role: a role of people is ``human``."""
+    """Return a function of a role: ``human`` for roles with human drivers, else the role."""
     nodes = scenario.get("controllers", {})
     kinds = {role: node[TARGET] for role, node in nodes.items() if node}
     people = {role for role, kind in kinds.items() if kind == kinds.get(HUMAN)} - {AUTOMATED}
@@ -166,7 +167,7 @@ def _driver_of(scenario: Mapping[str, Any]) -> Callable[[str], str]:
 
 
 def _of_string(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
-    """Read rows with all vehicles each."""
+    """Read rows of all vehicles."""
     cars, others = _vehicles(rows, "cav"), _vehicles(rows, "hdv")
     count = len(cars) + len(others)
     places = _places(rows, cars, scenario)
@@ -189,7 +190,7 @@ def _of_string(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
 
 
 def _vehicles(rows: pd.DataFrame, group: str) -> list[str]:
-    """Return the names of a group's vehicles that drive in an episode, from front to back."""
+    """Return the names of a group's vehicles in an episode, front to back."""
     found = {str(name): re.fullmatch(rf"{group}(\d*)_speed", str(name)) for name in rows}
     numbers = [int(x.group(1) or 0) for name, x in found.items() if x and rows[name].notna().all()]
     return [f"{group}{number or ''}" for number in sorted(numbers)]
@@ -197,7 +198,7 @@ def _vehicles(rows: pd.DataFrame, group: str) -> list[str]:
 
 def _places(rows: pd.DataFrame, cars: list[str], scenario: Mapping[str, Any]) -> list[int]:
     """Return the places of the automated vehicles, 0 at the front."""
-    if not cars:  # a baseline without them
+    if not cars:  # a baseline without automated vehicles
         return []
     string = parse_string(scenario["string"], scenario["road"])
     if not string.drawn:

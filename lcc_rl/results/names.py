@@ -1,4 +1,4 @@
-"""Names of strategies and numbers of things as they stand in tables, figures and pages."""
+"""Names of strategies, headings and counts in tables, figures and pages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pandas as pd
 from lcc_rl.config.words import FILTERED
 from lcc_rl.functional.pattern import HUMAN
 
-# A column's unit by the end of its name.
+# Units of columns by the end of their names.
 SUFFIX_UNITS = {
     "kj_per_km": "kJ/km",
     "mps3": "m/s³",
@@ -21,7 +21,7 @@ SUFFIX_UNITS |= {"l_per_100km": "L/100 km", "per_100km": "1/100 km"}
 INITIALS = ("cav", "hdv", "ttc", "sd")
 NETWORK = "alcc"
 FILTER_ALONE = "constant_filtered"
-# Who learns, or has several gains: further words of a name, if any, say which.
+# Strategies with several variants, which further words of a name specify.
 SEVERAL = {
     "reference": "network, for itself",
     "own_energy": "network, for itself, weighted",
@@ -31,7 +31,7 @@ SEVERAL = {
     "ddpg": "DDPG",
     "hcfs": "HCFS",
 }
-WHO = SEVERAL | {
+LABELS = SEVERAL | {
     "idm": "one driver (IDM)",
     HUMAN: "simulated drivers",
     "recorded": "the recorded drivers",
@@ -51,30 +51,30 @@ WHO = SEVERAL | {
 
 
 def in_words(name: str) -> str:
-    """Return a strategy's name as it stands in tables, figures and pages.
+    """Return a strategy's name in tables, figures and pages.
 
-    A name that is not of this package, such as that of a user's file, stays as it is.
+    Other names, such as that of a user's file, are not changed.
 
     Examples:
         >>> in_words("alcc"), in_words("alcc ddpg"), in_words("my_idm_1.1")
         ('network, for all', 'network, for all (ddpg)', 'my_idm_1.1')
     """
-    if name.endswith(FILTERED) and name not in WHO:
+    if name.endswith(FILTERED) and name not in LABELS:
         return f"{in_words(name.removesuffix(FILTERED))}, filtered"
     first, _, rest = name.partition(" ")
-    if name not in WHO and first in SEVERAL:
+    if name not in LABELS and first in SEVERAL:
         return f"{SEVERAL[first]} ({rest.replace('_', ' ')})"
-    return WHO.get(name, name)
+    return LABELS.get(name, name)
 
 
 def worded(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table with the names of strategies, where it has any, in words."""
+    """Return a table with strategies in words, if it has any."""
     names = [name for name in ("strategy", "behind", "against") if name in table]
     return table.assign(**{name: [in_words(str(x)) for x in table[name]] for name in names})
 
 
 def heading(column: str) -> str:
-    """Return a column's name for readers.
+    """Return the heading of a column.
 
     Examples:
         >>> heading("total_energy_kj"), heading("cav_saving_pct")
@@ -87,10 +87,10 @@ def heading(column: str) -> str:
 
 
 def several(count: int, what: str) -> str:
-    """Return a number of things in words."""
+    """Return a count in words."""
     return f"{count} {what}{'s' * (count != 1)}"
 
 
 def counted_windows(windows: int, which: str = "") -> str:
-    """Return a number of windows in words, ``which`` such as ``"held-out "``."""
+    """Return a count of windows in words; ``which``: a prefix such as ``"held-out "``."""
     return several(windows, f"{which}window")

@@ -1,4 +1,4 @@
-"""Tables of tracking error, jerk and reward of a platoon, from the rows of episodes.parquet."""
+"""Tables of tracking error, jerk and reward of a platoon."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def case_table(episodes: pd.DataFrame, case: str) -> pd.DataFrame:
 
     Args:
         episodes: rows of one or more evaluations, one per strategy, run and follower.
-        case: name of the case; the sums of ``"windows"`` are means over the windows.
+        case: name of the case; for ``"windows"`` sums are means over the windows.
 
     Returns:
-        One row per strategy. Sums run over followers and frames and are means over seeds:
-        Σ|e_v(i,0)| and its standard deviation [m/s], Σ|jerk| and its standard deviation [m/s³],
-        Σ reward with its 95 % interval over seeds, switches and interventions. Smallest gap and
-        largest gap error [m], collided vehicles, peak jerk [m/s³], worst string ratio and the share
-        of frames driven by the learned policy are those of all seeds together.
+        One row per strategy. Means over seeds of sums over followers and steps: Σ|e_v(i,0)| and its
+        standard deviation [m/s], Σ|jerk| and its standard deviation [m/s³], Σ reward with its 95 %
+        interval over seeds, switches and interventions. Over all seeds: smallest gap and largest
+        gap error [m], collided vehicles, peak jerk [m/s³], worst string ratio and the share of
+        steps of the learned policy.
 
     Raises:
         ConfigError: if there is no such case.
@@ -39,7 +39,7 @@ def case_table(episodes: pd.DataFrame, case: str) -> pd.DataFrame:
 
 
 def _row(strategy: str, rows: pd.DataFrame) -> dict[str, object]:
-    seeds = rows["training_seed"].fillna(-1)  # not trained: no seed
+    seeds = rows["training_seed"].fillna(-1)  # without training there is no seed
     runs = rows.groupby(seeds)["run_id"].nunique()
 
     def per_run(column: str) -> pd.Series:

@@ -1,4 +1,4 @@
-"""Files of policies: weights, and the configuration of their training."""
+"""Policy files: weights and the configuration of their training."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from lcc_rl.settings import S, Settings, parse
 
 PRETRAINED = "pretrained"
 SHIPPED_POLICIES = Path(str(files("lcc_rl.assets"))) / PRETRAINED
-# Variants that build on the policy of another one.
+# Variants that use the policy of another one.
 BUILDS_ON = {"hcfs": "ddpg"}
 
 
 def read_checked(path: str | Path, kind: type[S], what: str) -> S:
-    """Read a file of tensors as a typed model, the one door of those that others may have made.
+    """Read a possibly foreign file of tensors as a typed model.
 
     Args:
         path: the file.
         kind: the model.
-        what: what the file should be, for the message.
+        what: name of the expected kind of file, for the message.
 
     Raises:
-        ResultsError: as :func:`read_torch`, or naming the first entry at fault.
+        ResultsError: as :func:`read_torch`, or naming the first wrong entry.
     """
     content = read_torch(path)
     if not isinstance(content, dict):
@@ -46,7 +46,7 @@ def read_checked(path: str | Path, kind: type[S], what: str) -> S:
 
 
 def check_weights(weights: dict[str, Any]) -> dict[str, Any]:
-    """Check that weights are finite numbers in single precision by name."""
+    """Check that weights are finite tensors in single precision by name."""
     for name, value in weights.items():
         if not isinstance(value, torch.Tensor) or value.dtype != torch.float32:
             kind = getattr(value, "dtype", type(value).__name__)
@@ -59,29 +59,29 @@ class PolicyFile(Settings):
     """Contents of a policy file."""
 
     weights: Annotated[dict[str, Any], Field(min_length=1), AfterValidator(check_weights)]
-    config: str  # of its training, YAML
-    provenance: Any = None  # of one that ships
+    config: str  # configuration of its training, YAML
+    provenance: Any = None  # provenance of a shipped policy
 
 
 def save_policy(weights: Mapping[str, Any], cfg: StudyConfig, path: Path) -> None:
-    """Write a policy's weights and, as text, the configuration of its training."""
-    # Copies: weights that are parts of one vector would be stored with all of it.
+    """Write a policy's weights and the configuration of its training as text."""
+    # Copies: parts of one vector would be stored with the whole vector.
     own = {name: weight.clone() for name, weight in weights.items()}
     write_torch({"weights": own, "config": as_text(cfg)}, path)
 
 
 def of_task(path: str, task: str | None) -> str:
-    """Return the policy that ships for a task where ``"pretrained"`` is asked and there is one."""
+    """Return the shipped policy of a task for ``"pretrained"`` if there is one, else the path."""
     if path == PRETRAINED and task is not None and (SHIPPED_POLICIES / f"{task}.pt").is_file():
         return f"{PRETRAINED}/{task}"
     return path
 
 
 def pretrained_path(variant: str) -> Path:
-    """Return the policy that ships with the package for a variant.
+    """Return the shipped policy of a variant.
 
     Raises:
-        ConfigError: if none does.
+        ConfigError: if there is none.
     """
     path = SHIPPED_POLICIES / f"{BUILDS_ON.get(variant, variant)}.pt"
     if not path.is_file():
@@ -94,7 +94,7 @@ def pretrained_path(variant: str) -> Path:
 
 
 def policy_file(path: str | Path, variant: str = "") -> Path:
-    """Return the file that :func:`load_policy` reads; arguments as there.
+    """Return the file that :func:`load_policy` reads.
 
     Raises:
         ConfigError: if no policy ships for the variant, or a training has not ended.
@@ -121,17 +121,17 @@ def load_policy(
     """Read a policy file without running code from it.
 
     Args:
-        path: the file or a run folder; ``"pretrained"`` for the policy that ships for
-            ``variant``, ``"pretrained/reference"`` for that of another one.
+        path: the file or a run folder; ``"pretrained"`` for the shipped policy of ``variant``,
+            ``"pretrained/reference"`` for that of another one.
         variant: name of a variant.
-        trust: modules outside this package that it may name.
+        trust: modules outside this package that the policy may name.
 
     Returns:
         The weights and the configuration.
 
     Raises:
         ConfigError: if no policy ships for the variant.
-        ResultsError: if it is missing, damaged or no policy.
+        ResultsError: if the file is missing, damaged or no policy.
     """
     path = policy_file(path, variant)
     content = read_checked(path, PolicyFile, "policy")

@@ -1,4 +1,4 @@
-"""Tables and reports for readers: on the terminal, in Markdown and in LaTeX."""
+"""Rendering of tables and reports: terminal, Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WIDTH, UNLIMITED = 80, 10_000  # characters
 
 
 class TableColumn(NamedTuple):
-    """A column of a table as text: its heading, its cells, and whether it holds numbers."""
+    """A column of a table as text: heading, cells, and whether it holds numbers."""
 
     heading: str
     cells: list[str]
@@ -33,7 +33,7 @@ class TableColumn(NamedTuple):
 
 
 def signed(value: float, form: str = "+z.1f") -> str:
-    """Return a number with its sign, a minus as in print, and no negative zero.
+    """Return a number with its sign, a typographic minus, and no negative zero.
 
     Examples:
         >>> signed(-2.34), signed(2.34)
@@ -45,9 +45,9 @@ def signed(value: float, form: str = "+z.1f") -> str:
 def columns(frame: pd.DataFrame) -> list[TableColumn]:
     """Return the columns of a table as text.
 
-    A column's unit is the end of its name (``energy_kj``, ``saving_pct``), and ``x``, ``x_low``,
-    ``x_high`` become one column. Numbers have about four digits, or as many decimals as
-    ``frame.attrs["decimals"]`` says.
+    A column's unit is the end of its name (``energy_kj``, ``saving_pct``). ``x``, ``x_low`` and
+    ``x_high`` become one column. Numbers have about four digits, or
+    ``frame.attrs["decimals"]`` decimals.
     """
     bounds = {f"{name}{end}" for name in frame for end in ("_low", "_high")}
     return [
@@ -66,7 +66,7 @@ def as_markdown(frame: pd.DataFrame) -> str:
 
 
 def markdown_row(cells: Iterable[str]) -> str:
-    """Return a row of a Markdown table, whatever its cells hold.
+    """Return a row of a Markdown table with escaped cells.
 
     Examples:
         >>> print(markdown_row(["a|b", "1"]))
@@ -77,7 +77,7 @@ def markdown_row(cells: Iterable[str]) -> str:
 
 
 def as_latex(frame: pd.DataFrame) -> str:
-    """Return a table for LaTeX (package booktabs), with headings and cells as on a page."""
+    """Return a table for LaTeX (package booktabs) with headings and cells of :func:`columns`."""
     shown = columns(frame)
     cells = pd.DataFrame({column.heading: column.cells for column in shown})
     places = "".join("r" if column.number else "l" for column in shown)
@@ -104,7 +104,7 @@ def _is_number(values: pd.Series) -> bool:
 
 
 def _places(values: pd.Series) -> int:
-    """Return the decimals that give a column about four significant digits."""
+    """Return the number of decimals for about four significant digits."""
     if not pd.api.types.is_float_dtype(values):
         return 0
     numbers = values.to_numpy(float)
@@ -126,20 +126,20 @@ def _cell(value: object, places: int) -> str:
 
 
 def terminal(report: Report, title: str = "", full: bool = False) -> RenderableType:
-    """Return a report for the terminal, within 80 characters: a row per strategy.
+    """Return a report for the terminal, within 80 characters, with a row per strategy.
 
     Args:
         report: the report.
-        title: above the table.
-        full: every measure, a column per strategy.
+        title: title of the table.
+        full: all measures with a column per strategy.
     """
-    said = [report.verdict] if report.verdict else []
+    notes = [report.verdict] if report.verdict else []
     if full:
         drawn: RenderableType = _side_by_side(report, title)
-        said += [fill(line, WIDTH) for line in report.remarks]
+        notes += [fill(line, WIDTH) for line in report.remarks]
     else:
         drawn = as_rich(report.short, report.shown, title, report.note)
-    return Group(drawn, Text("\n".join(said))) if said else drawn
+    return Group(drawn, Text("\n".join(notes))) if notes else drawn
 
 
 def as_rich(table: pd.DataFrame, shown: Sequence[Shown], title: str, caption: str) -> Table:
@@ -168,7 +168,7 @@ def saved_text(share: float, low: float, high: float) -> str:
 
 
 def full_rows(report: Report) -> Iterator[tuple[str, list[str]]]:
-    """Yield label and cells of every measure that any strategy has."""
+    """Yield label and cells of every measure with a value."""
     for one in report.rows:
         values = report.table[one.key].astype(float)
         if values.notna().any():
@@ -178,7 +178,7 @@ def full_rows(report: Report) -> Iterator[tuple[str, list[str]]]:
 
 
 def _side_by_side(report: Report, title: str) -> Group:
-    """Return tables with a column per strategy, as many as fit; names are wrapped at spaces."""
+    """Return tables with as many columns of strategies as fit; names are wrapped at spaces."""
     rows = list(full_rows(report))
     names = [in_words(str(name)) for name in report.table["strategy"]]
     room = WIDTH - max(len(label) for label, _ in rows)
@@ -202,24 +202,24 @@ def _side_by_side(report: Report, title: str) -> Group:
 
 
 def for_print(report: Report, names: Sequence[str] = ()) -> pd.DataFrame:
-    """Return columns of a report with their intervals, named for a page or a paper.
+    """Return columns of a report with their intervals and readable headings.
 
     Args:
         report: the report.
-        names: which; by default those that its short table shows.
+        names: names of columns; by default those of its short table.
 
     Raises:
-        ConfigError: for a column that is not there, naming the nearest.
+        ConfigError: for an unknown column, naming the nearest.
     """
     table = chosen(report.short, names or [column.key for column in report.shown])
-    return table.rename(columns={"who": "driven by", "score": report.label})
+    return table.rename(columns={"driver": "driven by", "score": report.label})
 
 
 def chosen(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
     """Return columns of a table with their intervals, all by default.
 
     Raises:
-        ConfigError: for a column that is not there, naming the nearest.
+        ConfigError: for an unknown column, naming the nearest.
     """
     known = [str(key) for key in table]
     for name in names:
@@ -231,9 +231,9 @@ def chosen(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
 
 
 def print_table(table: RenderableType) -> None:
-    """Print a table or a text, as wide as the terminal or ``COLUMNS``; else as its content."""
+    """Print a table or a text, as wide as the terminal, ``COLUMNS`` or its content."""
     console = Console()
     if not console.is_terminal and "COLUMNS" not in os.environ:
-        wide = Console(width=UNLIMITED).measure(table).maximum  # it measures within its width
+        wide = Console(width=UNLIMITED).measure(table).maximum  # limited by this width
         console = Console(width=max(wide, console.width))
     console.print(table)

@@ -1,4 +1,4 @@
-"""Reports of evaluations: measures, savings and limits by strategy, and what they amount to."""
+"""Reports of evaluations: measures, savings and limits by strategy, and a verdict."""
 
 from __future__ import annotations
 
@@ -33,34 +33,34 @@ from lcc_rl.results.task import Task
 from lcc_rl.results.units import burns_one_fuel, check_unit, in_unit
 from lcc_rl.results.windows import DISTANCE, DRIVE, TRAINED, WAYS, savings, windows_of
 
-# Baselines of tables and of the verdict on a network, in order: the first that there is.
+# Baselines of tables and verdicts; the first one that was evaluated is used.
 AGAINST = (HUMAN, "idm", "idm_acc_filtered", "idm_acc", "rule", "reference")
-RULE = "rule"  # the IDM tuned on the same data, by the gradient
+RULE = "rule"  # the IDM, tuned on the same data by the gradient
 RULE_ROWS = (RULE, "idm_acc_filtered", "idm_acc")
-# Strategies that networks are compared with. All but the rule learn nothing.
+# Strategies with which networks are compared. Only the rule is trained.
 UNTRAINED = (
     *("direct", "idm", HUMAN, RECORDED, "constant_filtered", RULE),
     *("idm_acc_filtered", "acc_filtered", "idm_acc", "acc"),
 )
-FEW_WINDOWS, SHORT = 5, 150.0  # windows; seconds of them
+FEW_WINDOWS, SHORT = 5, 150.0  # least number of windows; length of short ones [s]
 SCORE, FLOW_LOST = "score", "flow_lost"
-FEW_DRIVES = ("saving_drives_low", "saving_drives_high")  # a t-interval, of less than five
+FEW_DRIVES = ("saving_drives_low", "saving_drives_high")  # t-interval over fewer than five drives
 SAVED = Shown("saved_pct", "saved\n[%]")
 WAY, FLOW_SHARE = Shown("distance_pct", "dis-\ntance\n[%]"), Shown("flow_pct", "flow\n[%]")
 COLLISIONS, KEEPS = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
-FLOW_NAMED = 0.05  # share of the flow from which on a table says that it is lost
-MUCH = 0.01  # share of time beyond the reach of an energy model that tables and log name
-MOSTLY = 0.2  # share of time; drivers of I-80 behind its own leaders have 0.02, of the stream 0.06
+FLOW_NAMED = 0.05  # loss of flow that tables mention, as a share
+MUCH = 0.01  # share of time with infeasible accelerations that tables and log mention
+MOSTLY = 0.2  # share of time; I-80's drivers behind its leaders have 0.02, the stream's 0.06
 ALL = "all measures: table=all or --all."
 CAPTION = (
-    "Energy per vehicle and km, without what motion stores; {}shares of the time: "
+    "Energy per vehicle and km, net of kinetic energy; {}shares of the time: "
     f"TTC < 4 s; time gap > 2.5 s above 1 m/s; {ALL}"
 )
-BEHIND_FILTER = "networks, and those called filtered, drive behind the safety filter; "
+BEHIND_FILTER = "networks and strategies called filtered drive behind the safety filter; "
 FULL = (
-    "energies: mean per episode; path energy: without what the motion stores; saved: of path "
-    "energy per km, of a task of its score; intervals: over held-out windows (drives, if five or "
-    "more) and training seeds"
+    "energies: mean per episode; path energy: net of kinetic energy; saved: of path energy per "
+    "km, or of a task's score; intervals: over held-out windows, or drives if there are five or "
+    "more, and training seeds"
 )
 
 
@@ -69,17 +69,17 @@ class Report:
     """All measures of an evaluation behind one source of leaders, or of a case of a platoon.
 
     Args:
-        of: name of the source or case; empty where there is only one.
-        table: every measure, a row per strategy.
-        short: what a reader asks first; its columns ``shown``.
+        of: name of the source or case; empty if there is only one.
+        table: all measures, a row per strategy.
+        short: the most important measures, with the columns ``shown``.
         rows: the measures of the full table.
-        caption: what stands below ``short``.
-        full_caption: what stands below the full table.
-        against: the strategy that savings are against.
+        caption: caption of ``short``.
+        full_caption: caption of the full table.
+        against: the baseline of savings.
         score: column of ``short`` that is compared.
         label: its name with unit.
-        verdict: sentences on what came out; empty for none.
-        remarks: sentences on what limits the numbers.
+        verdict: sentences on the result; may be empty.
+        remarks: sentences on limitations of the numbers.
     """
 
     of: str
@@ -116,12 +116,12 @@ def together(reports: Sequence[Report]) -> Report:
 
 
 def windows_for(rows: Rows) -> pd.DataFrame:
-    """Return the windows of an evaluation with all measures of tables."""
+    """Return the windows of an evaluation with the columns of all tables."""
     return windows_of(rows, measures.table_columns())
 
 
 def baseline_of(strategies: Iterable[object]) -> str | None:
-    """Return the strategy that tables and figures compare with; None without one."""
+    """Return the baseline of tables and figures; None if there is none."""
     known = set(strategies)
     return next((name for name in AGAINST if name in known), None)
 
@@ -135,7 +135,7 @@ def summary(
     """Summarise every strategy.
 
     Args:
-        windows: of :func:`windows_for`, every strategy on the same windows and drivers.
+        windows: result of :func:`windows_for`; all strategies have the same windows and drivers.
         task: score, baseline and limits; by default path energy per km, against the first of
             :data:`AGAINST`, without limits.
         energy: the energy models, for the unit of a task.
@@ -143,10 +143,10 @@ def summary(
 
     Returns:
         One row per strategy: :data:`lcc_rl.results.measures.MEASURES`; ``saving``, the share of
-        the score that it saves ``against`` the baseline, and ``drawn_saving``, of the energy drawn
-        in an episode, with their intervals; the shares of distance and flow lost against it;
-        numbers of windows, drives and training seeds; and, of a task, score, limits and whether
-        it keeps them without a collision. Values that a strategy does not have are NaN.
+        the score saved ``against`` the baseline, and ``drawn_saving``, that of the energy drawn
+        in an episode, with their intervals; the shares of distance and flow lost; numbers of
+        windows, drives and training seeds; and for a task score, limits and whether they are kept
+        without a collision. Missing values are NaN.
 
     Raises:
         ConfigError: if the column of a limit, or the baseline, is missing.
@@ -155,7 +155,7 @@ def summary(
     against = task.against if task else against or baseline_of(parts)
     if against is not None and against not in parts:
         raise unknown_name("strategy to compare against", against, parts)
-    # Without automated vehicles none has a value that a limit bounds.
+    # Without automated vehicles the values of limits are missing.
     for column in task.limits if task and WAYS[0] in windows else ():
         if column not in windows:
             raise ConfigError(f"task.limits.{column}: episodes.parquet has no such column")
@@ -209,19 +209,18 @@ def report(
     """Return the report of an evaluation.
 
     Args:
-        windows: of :func:`windows_for`, behind one source of leaders.
-        task: the task, if it is one.
-        energy: the energy models, for units; where all burn one fuel, tables have it in g/km, too.
+        windows: result of :func:`windows_for` for one source of leaders.
+        task: the task, if any.
+        energy: the energy models, for units; if all burn one fuel, tables include it in g/km.
         filtered: whether there is a safety filter, for the caption.
         of: name of the source.
-        few: whether windows that are too few for a finding have a sentence, too.
-        against: the strategy that savings are against; by default that of the task, or the first
-            of :data:`AGAINST`.
+        few: whether the verdict mentions too few windows.
+        against: the baseline; by default that of the task, or the first of :data:`AGAINST`.
     """
     if task:
         task = replace(task, against=against) if against else task.among(windows["strategy"])
         task = task.resolved(windows)
-    table, said = summary(windows, task, energy, against), remarks(windows)
+    table, notes = summary(windows, task, energy, against), remarks(windows)
     percent = {f"saved_pct{end}": 100.0 * table[f"saving{end}"] for end in ("", "_low", "_high")}
     percent["distance_pct"] = -100.0 * table["distance_lost"] + 0.0  # no negative zero
     every = table.assign(**percent)
@@ -230,7 +229,7 @@ def report(
     rows = _rows(task, table["against"].iloc[0])
     words = "" if task else verdict(windows, table, few)
     words = "\n".join(filter(None, [words, few_drives(table)]))
-    made |= {"full_caption": FULL, "verdict": words, "remarks": said}
+    made |= {"full_caption": FULL, "verdict": words, "remarks": notes}
     return Report(of, table, short, shown, rows, **made)
 
 
@@ -260,18 +259,17 @@ def _rows(task: Task | None, against: str | None) -> list[Measure]:
 
 
 def _of_energy(table: pd.DataFrame, energy: Fleet | None, filtered: bool) -> dict[str, Any]:
-    """Return what is specific to a report without a task.
+    """Return the parts of a report that are specific to one without a task.
 
-    Of several strategies those with a controlled car have a row in the short table, those that
-    draw most first.
+    The short table has rows for strategies with an automated vehicle, largest energy first.
     """
-    # Beside others, a string without controlled cars is of fewer vehicles, and not to be compared.
+    # A string without automated vehicles has fewer vehicles and is not comparable.
     cars = table[table[PATH].notna()] if table[PATH].notna().any() else table
     cars = cars.sort_values(PATH_PER_KM, ascending=False, kind="stable").reset_index(drop=True)
     against = (cars["against"].iloc[0] or None) if len(cars) > 1 else None
-    who, flow = flow_against(cars)
-    way, whose = (WAY, "distance against theirs") if flow.isna().all() else (FLOW_SHARE, who)
-    note = "" if against is None else f"{saved_against(cars, against)}; {whose}; "
+    source, flow = flow_against(cars)
+    way, basis = (WAY, "distance against theirs") if flow.isna().all() else (FLOW_SHARE, source)
+    note = "" if against is None else f"{saved_against(cars, against)}; {basis}; "
     short = [one for one in MEASURES if one.short]
     columns = {"energy_kj_per_km": cars[PATH_PER_KM], FLOW_SHARE.key: flow}
     columns |= {one.shown.key: (one.scale * cars[one.key]).round(2) for one in short}
@@ -291,7 +289,7 @@ def _of_energy(table: pd.DataFrame, energy: Fleet | None, filtered: bool) -> dic
 
 
 def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
-    """Return what is specific to the report of a task: its score, and the limits."""
+    """Return the parts of a report that are specific to a task: score and limits."""
     way = Shown(FLOW, "flow\n[1/h]") if table[FLOW].notna().any() else WAY
     limits = [Shown(one.key, one.bounded(bound)) for one, bound in task.bounds.items()]
     shown = [
@@ -312,20 +310,20 @@ def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
 def shortened(
     table: pd.DataFrame, shown: Sequence[Shown]
 ) -> tuple[pd.DataFrame, tuple[Shown, ...]]:
-    """Return columns of a table with their intervals and strategies in words, and the columns."""
-    table = table.assign(who=[in_words(str(name)) for name in table["strategy"]])
-    shown = (Shown("who", "driven by"), *shown)
+    """Return columns of a table with intervals and strategies in words, and the columns."""
+    table = table.assign(driver=[in_words(str(name)) for name in table["strategy"]])
+    shown = (Shown("driver", "driven by"), *shown)
     names = [f"{one.key}{end}" for one in shown for end in ("", "_low", "_high")]
     return table[["strategy", *(x for x in names if x in table)]], shown
 
 
 def saved_against(found: pd.DataFrame, against: str, always: bool = False) -> str:
-    """Return what savings are against, what their intervals are over, and if they are too narrow.
+    """Return a caption on the baseline of savings and their intervals.
 
     Args:
         found: a row per strategy with its numbers of ``windows``, ``drives`` and ``seeds``.
         against: the baseline.
-        always: name intervals also if there is none.
+        always: mention intervals even if there are none.
     """
     words = f"saved: against {in_words(against)}"
     if not always and found["saving_low"].isna().all():
@@ -336,12 +334,12 @@ def saved_against(found: pd.DataFrame, against: str, always: bool = False) -> st
         up_to = "up to " if found.loc[found["seeds"] > 0, "seeds"].nunique() > 1 else ""
         over += f" and {up_to}{seeds} training seeds"
     if drives < min(LEAST_DRIVES, windows):
-        over += f" (too narrow: too few drives, {drives}, whose windows are alike)"
+        over += f" (too narrow: too few drives, {drives}, with similar windows)"
     return f"{words}, with the 95 % interval over {over}"
 
 
 def few_drives(table: pd.DataFrame) -> str:
-    """Return in a sentence the intervals over less than five drives; empty without."""
+    """Return a sentence with the intervals over fewer than five drives; empty without any."""
     found = table[table[FEW_DRIVES[0]].notna()]
     rows = zip(found["strategy"], *(100.0 * found[name] for name in FEW_DRIVES), strict=True)
     words = (f"{in_words(str(name))} {low:.1f} … {high:.1f}" for name, low, high in rows)
@@ -350,9 +348,9 @@ def few_drives(table: pd.DataFrame) -> str:
 
 
 def flow_against(table: pd.DataFrame) -> tuple[str, pd.Series]:
-    """Return whose flow the others' is compared with, and the differences [%].
+    """Return the caption of the flow's baseline, and the differences to it [%].
 
-    These are the recorded drivers, else the drivers that savings are against.
+    The baseline is the recorded drivers, else that of the savings.
     """
     known = set(table["strategy"])
     name = RECORDED if RECORDED in known else table["against"].iloc[0]
@@ -362,7 +360,7 @@ def flow_against(table: pd.DataFrame) -> tuple[str, pd.Series]:
 
 
 def flow_note(table: pd.DataFrame) -> str:
-    """Return in a sentence which strategies lose much of the flow; empty if none does."""
+    """Return a sentence on strategies that lose much flow; empty if none does."""
     lost = table[table[FLOW_LOST] > FLOW_NAMED]
     named = zip(lost["strategy"], lost[FLOW_LOST], strict=True)
     parts = (f"{in_words(str(name))} {100.0 * share:.0f} %" for name, share in named)
@@ -371,14 +369,14 @@ def flow_note(table: pd.DataFrame) -> str:
 
 
 def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> str:
-    """Return in a sentence what came out for the network; empty without one.
+    """Return a sentence on the result of the network; empty without one.
 
-    Without one that goes by its variant's name, each network has a sentence.
+    If no network has its variant's name, each network has a sentence.
 
     Args:
-        windows: of :func:`windows_for`.
+        windows: result of :func:`windows_for`.
         found: their :func:`summary`.
-        of_few: whether windows that are too few for a finding have a sentence, too.
+        of_few: whether too few windows are mentioned.
     """
     cars = found[found[PATH].notna()].to_dict("records")
     rows: dict[str, Any] = {str(row["strategy"]): row for row in cars}
@@ -396,14 +394,14 @@ def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> 
             few = f"{counted_windows(count)} allow no finding."
             words.append(f"Per vehicle and km: {', '.join(both)}; {few}")
     least = min(rows, key=lambda name: rows[name][PATH_PER_KM])
-    # It may be a rule of the user's own.
+    # It may be the user's rule.
     if words and rows[least]["windows"] >= FEW_WINDOWS and least not in (*names, other):
         words.append(f"Least energy: {in_words(least)}, {rows[least][PATH_PER_KM]:,.1f} kJ/km.")
     return "\n".join(words)
 
 
 def _sentence(windows: pd.DataFrame, rows: Mapping[str, Any], name: str, other: str) -> str:
-    """Return what came out for one network beside another strategy."""
+    """Return a sentence that compares a network with another strategy."""
     share = savings(windows, PATH, name, other, [DISTANCE])
     saved, low, high = (100.0 * x for x in (share.value, share.low, share.high))
     less = "less"
@@ -425,7 +423,7 @@ def _sentence(windows: pd.DataFrame, rows: Mapping[str, Any], name: str, other: 
 
 
 def remarks(windows: pd.DataFrame) -> list[str]:
-    """Return sentences on what limits the numbers of an evaluation."""
+    """Return sentences on limitations of the numbers of an evaluation."""
     means, found = measures.means(windows, (*REACH, BROKEN)), []
 
     def named(shares: pd.Series, least: float) -> str:
@@ -440,21 +438,20 @@ def remarks(windows: pd.DataFrame) -> list[str]:
     if names := named(means[BROKEN], 0.0):
         found.append(
             f"Steps that the filter's guarantee covers turn unsafe ({names}): brakes, delays or "
-            "sensors are not as scenario.actuators and scenario.sensors declare."
+            "sensors differ from scenario.actuators and scenario.sensors."
         )
     return found
 
 
 def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
-    """Return a warning for every driver whose desired speed the leaders mostly exceed.
+    """Return a warning for every driver with a desired speed that leaders mostly exceed.
 
-    Such a driver drops back behind any strategy: energies then compare distances, not ways of
-    driving. Behind a safety filter a desired speed means other things; networks have none of
-    their own, and the share of the drivers behind them.
+    Such a driver falls behind with any strategy, so energies reflect distances. There is no warning
+    for strategies behind a safety filter, or for networks, whose share is that of drivers behind.
 
     Args:
-        windows: of :func:`windows_for`.
-        of_task: whether a task is evaluated, which chooses the strategies to compare.
+        windows: result of :func:`windows_for`.
+        of_task: whether a task is evaluated, which defines the strategies.
     """
     remedies = {
         "direct": "drivers=highway, or drivers calibrated on such traffic",
@@ -462,7 +459,7 @@ def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
     }
     remedies[HUMAN] = remedies["direct"]
     if of_task:
-        remedies["idm"] = "compare with human, whose v0 is that of drivers=…"
+        remedies["idm"] = "compare with human, which has the v0 of drivers=…"
     shares = measures.means(windows, (FASTER,))[FASTER]
     people = [shares[name] for name in (HUMAN, "direct") if name in shares]
     for name in shares.index if people else ():
@@ -472,27 +469,27 @@ def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
             remedies.setdefault(name, option)
     return [
         f"the leaders drive faster than the desired speed of {name} for {shares[name]:.0%} of the "
-        f"time (more than {MOSTLY:.0%}): savings against it mean little. Raise v0: {remedy}"
+        f"time (more than {MOSTLY:.0%}): savings against it are not valid. Raise v0: {remedy}"
         for name, remedy in remedies.items()
         if shares.get(name, 0.0) > MOSTLY
     ]
 
 
 def sample_of(rows: pd.DataFrame, drivers: pd.DataFrame | None = None) -> str:
-    """Return how many windows and drivers rows are of, for a title."""
+    """Return the numbers of windows and drivers of rows, for a title."""
     windows, people = rows["profile_id"].nunique(), (rows if drivers is None else drivers)
     size = several(people["driver_id"].nunique(), "driver")
     return f"{counted_windows(windows, 'held-out ')} × {size}"
 
 
 def few_windows(windows: int, seconds: float | None = None) -> str:
-    """Return what an evaluation of few windows means; empty for one of enough, or of long ones.
+    """Return a warning on few windows; empty for enough or long ones.
 
     Args:
-        windows: how many windows were evaluated.
-        seconds: how long each of them is, if that is known.
+        windows: number of windows.
+        seconds: length of each, if it is known.
     """
     if windows >= FEW_WINDOWS or windows * (seconds or 0.0) >= SHORT:
         return ""
     found = counted_windows(windows) + (f" of {seconds:g} s" if seconds else "")
-    return f"{found}: these numbers show that everything runs, and mean nothing else"
+    return f"{found} are too few for conclusions: these numbers only show that everything runs"

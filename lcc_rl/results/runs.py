@@ -1,4 +1,4 @@
-"""Files of a run folder: its configuration, and what must not be overwritten."""
+"""Files of a run folder: its configuration, and results that must not be overwritten."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from lcc_rl.runs.states import CONFIG, no_run
 
 log = logging.getLogger("lcc_rl")
 
-EPISODES = "episodes.parquet"  # a run's last file: with it the run is finished
+EPISODES = "episodes.parquet"  # last file of a run, which shows that it is finished
 STEPS = "steps.parquet"
-PARTS, FINAL = ".parts", "evaluation"  # of a job of lcc-rl run: its parts' settings; its last part
+PARTS, FINAL = ".parts", "evaluation"  # parts' settings and last part of a job of lcc-rl run
 SECTION = re.compile(r"^(?=[a-z])", re.MULTILINE)  # before the name of a section of settings
-# What no command of other settings may replace: results, and what a stopped run resumes from.
+# Results and states of stopped runs, which commands with other settings must not replace.
 RUN_FILES = (EPISODES, "drivers.parquet", "checkpoint.pt", "command.txt", "blocks")
 
 
@@ -36,15 +36,15 @@ def save_config(cfg: BaseConfig, folder: Path) -> None:
 
 
 def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:
-    """Refuse to write into a folder that holds results, or a stopped run, of other settings.
+    """Refuse a folder with results, or a stopped run, of other settings.
 
     Args:
         cfg: the settings.
         folder: the folder.
-        *but: settings and sections that may differ, beside ``trust``.
+        *but: settings and sections that may differ, besides ``trust``.
 
     Raises:
-        ResultsError: naming what is there and the settings that differ.
+        ResultsError: naming a file and the settings that differ.
     """
     stored = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else {}
     if stored and not {"seed", "data"} <= stored.keys():
@@ -63,18 +63,18 @@ def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:
 
 
 def resumed_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:
-    """Read the configuration of a run that is to be resumed; arguments as below.
+    """Read the configuration of a run to resume; arguments as for :func:`load_config`.
 
     Raises:
-        ResultsError: naming a file that the run reads and that has changed since it began.
+        ResultsError: naming an input file that has changed since the run began.
     """
     cfg = load_config(folder, trust)
     now = inputs_of(as_plain(cfg))
     for section, known in cfg.inputs.items():
         for file in differing(known, now.get(section, {})):
             raise ResultsError(
-                f"{folder}: {file} ({section}) is not what it was when the run began; put it back, "
-                "or begin a new run"
+                f"{folder}: {file} ({section}) has changed since the run began; restore it, or "
+                "begin a new run"
             )
     return cfg
 
@@ -84,7 +84,7 @@ def load_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:
 
     Args:
         folder: the run's folder.
-        trust: modules outside this package that it may name.
+        trust: modules outside this package that the configuration may name.
 
     Raises:
         ConfigError: if the folder holds no run.
@@ -95,12 +95,12 @@ def load_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:
         raise no_run(Path(folder))
     cfg, places = trusted(read_settings(path), str(path), trust)
     for place in places:
-        log.warning("%s: %s names a place to write and is left out", path, place)
+        log.warning("%s: %s names a path to write to and is left out", path, place)
     return cfg
 
 
 def stored_config(folder: Path) -> dict[str, Any]:
-    """Read the configuration of a run to draw by, not to build from: it may name any module."""
+    """Read the configuration of a run for figures; nothing is built from it."""
     return read_settings(folder / CONFIG)
 
 
@@ -114,13 +114,13 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def flat_settings(path: Path) -> dict[str, Any]:
-    """Read a stored configuration as a flat mapping; sections that many runs share are parsed once.
+    """Read a stored configuration as a flat mapping; shared sections are parsed once.
 
     Raises:
         ResultsError: if it is missing or damaged.
     """
     text = read_text(path)
-    with suppress(ResultsError):  # not written in sections, or damaged
+    with suppress(ResultsError):  # without sections, or damaged
         return {key: x for part in SECTION.split(text) if part for key, x in _section(part)}
     return dict(flatten(_settings(text, str(path))))
 
@@ -131,7 +131,7 @@ def _section(text: str) -> list[tuple[str, Any]]:
 
 
 def _settings(text: str, where: str) -> dict[str, Any]:
-    """Parse settings, or a section of them."""
+    """Parse settings or a section of them."""
     content = parse_yaml(text, where)
     for name in SECTIONS:
         if not isinstance(content.get(name, {}), Mapping):
@@ -142,10 +142,10 @@ def _settings(text: str, where: str) -> dict[str, Any]:
 
 @contextmanager
 def naming_run(path: Path) -> Iterator[None]:
-    """Name a run, or a table, whose rows or settings are not what their reader expects.
+    """Convert errors of unexpected rows or settings to a ResultsError that names the run.
 
     Raises:
-        ResultsError: instead of what pandas raises.
+        ResultsError: in place of the error.
     """
     try:
         yield
@@ -153,11 +153,11 @@ def naming_run(path: Path) -> Iterator[None]:
         raise
     except (LookupError, ValueError, TypeError) as error:
         text = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ResultsError(f"{path}: not what a run writes: {text}") from error
+        raise ResultsError(f"{path}: not written by a run: {text}") from error
 
 
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    """Return the keys whose values differ or that only one of two flat mappings has, sorted."""
+    """Return the sorted keys with different values, or in one of two flat mappings only."""
     return [key for key in sorted(one.keys() | other.keys()) if one.get(key) != other.get(key)]
 
 
@@ -171,11 +171,11 @@ def flatten(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield name, str(value) if isinstance(value, list) else value
 
 
-def told_apart(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return for each of several flat mappings what tells it from the others, ``key=value, …``.
+def distinguished(settings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return for each flat mapping the values by which it differs, ``key=value, …``.
 
-    As few keys as that needs, each with as many of its last words as no other setting ends in:
-    ``safety.weight=0.5``. Hashes of files are named only where no setting differs.
+    As few keys as possible are used, each with as many of its last words as are unique:
+    ``safety.weight=0.5``. Hashes of files are used only if no setting differs.
     """
     every = list(dict.fromkeys(key for one in settings for key in one))
 
@@ -191,7 +191,7 @@ def told_apart(settings: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _last_words(key: str, keys: Sequence[str]) -> str:
-    """Return the last words of a dotted key, as many as tell it from all others."""
+    """Return as many of the last words of a dotted key as are unique."""
     words = key.split(".")
     ends = (".".join(words[-count:]) for count in range(1, len(words)))
     return next((end for end in ends if sum(f".{x}".endswith(f".{end}") for x in keys) == 1), key)

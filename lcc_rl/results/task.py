@@ -1,4 +1,4 @@
-"""What a task asks for: score, baseline and limits."""
+"""Tasks: score, baseline and limits."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ class Task(Settings):
     """Score, baseline and limits of a task."""
 
     name: str
-    # What is minimised: energy, net_energy or path_energy of all vehicles over their distance, or
-    # a column of episodes.parquet.
+    # The score, which is minimised: energy, net_energy or path_energy of all vehicles divided by
+    # their distance, or a column of episodes.parquet.
     score: str = "net_energy"
-    unit: str = "kJ/km"  # of an energy over a distance, see lcc_rl.results.units
-    against: str = HUMAN  # the strategy that the others are compared with
-    # Bounds by column: the largest value of max_… and the smallest of min_… in any episode, and
-    # the largest mean of share_… over all episodes, the smallest mean of flow_vph; ``recorded`` for
-    # the value of the recorded drivers, ``98 %`` for that share of the value of ``against``.
+    unit: str = "kJ/km"  # unit of energy per distance, see lcc_rl.results.units
+    against: str = HUMAN  # the baseline
+    # Bounds by column: largest value of max_… and smallest of min_… in any episode, largest mean of
+    # share_… and smallest mean of flow_vph over all episodes. ``recorded``: the value of the
+    # recorded drivers; ``98 %``: this share of the value of ``against``.
     limits: Mapping[str, Bound] = field(default_factory=dict)
 
     def validate(self) -> None:
@@ -55,13 +55,13 @@ class Task(Settings):
     def among(self, strategies: Iterable[str]) -> Task:
         """Return the task for an evaluation of these strategies.
 
-        If the strategy to compare against was not evaluated, the first that was is used.
+        If the baseline was not evaluated, the first strategy is used.
         """
         names = list(dict.fromkeys(map(str, strategies)))
         return self if self.against in names else replace(self, against=names[0])
 
     def resolved(self, windows: pd.DataFrame) -> Task:
-        """Return the task with numbers as the limits that are those of other strategies."""
+        """Return the task with numbers for limits that refer to other strategies."""
         known, found = measures.limit_measures(), dict(self.limits)
         for key, bound in self.limits.items():
             if isinstance(bound, str):
@@ -73,7 +73,7 @@ class Task(Settings):
 
     @property
     def bounds(self) -> dict[Measure, float]:
-        """The limits by measure, without those of other strategies that are not known."""
+        """The limits by measure, without unknown ones of other strategies."""
         known = measures.limit_measures()
         return {
             known[key]: bound for key, bound in self.limits.items() if not isinstance(bound, str)
@@ -81,7 +81,7 @@ class Task(Settings):
 
     @property
     def measure(self) -> Measure:
-        """What is minimised."""
+        """The measure of the score."""
         return measures.score_measures()[self.score]
 
     @property

@@ -1,4 +1,4 @@
-"""What a stored configuration may name: code of this package, and no place to write."""
+"""Checks of stored configurations: they may name code of this package and no path to write."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.settings import TARGET, find_target
 
-# Packages whose classes a stored configuration may name, and the one whose functions it may.
+# Packages of classes that a stored configuration may name, and the module of functions.
 ROOMS = "agents data drivers energy evaluation functional pieces runs.loggers synthetic"
 REGISTRY = tuple(f"lcc_rl.{room}" for room in ROOMS.split())
 FUNCTIONS = "lcc_rl.drivers.population"
-RETIRED = ("objective",)  # settings of earlier versions that changed no row
+RETIRED = ("objective",)  # removed settings that changed no row
 
 
 def trusted(
     content: dict[str, Any], where: str, trust: Sequence[str] = ()
 ) -> tuple[Any, list[str]]:
-    """Return a stored configuration that can be built without harm.
+    """Return a stored configuration that can be built safely.
 
     Args:
         content: the configuration as plain containers.
-        where: the file it comes from, for messages.
+        where: its file, for messages.
         trust: modules outside this package that it may name.
 
     Returns:
-        The configuration, in which nothing names a place to write and nothing is trusted but
-        ``trust``; and what named a place, as ``key=value``.
+        The configuration, without paths to write to and with ``trust`` only; and the removed paths
+        as ``key=value``.
 
     Raises:
-        ResultsError: naming the key at fault.
+        ResultsError: naming the wrong key.
     """
     for key, _, value in settings_at(content):
         if isinstance(value, str) and "${" in value:
@@ -60,13 +60,13 @@ def trusted(
 def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] = ()) -> None:
     """Check that a stored configuration names no code outside :data:`REGISTRY`.
 
-    Building a node imports and calls what it, its ``law`` and its ``model`` name, and so does a
-    controller that ``compare`` names by its path or file. Functions of the registry may write
-    files; only those that make a population may be named.
+    Building a node imports and calls its class, ``law`` and ``model``, as does a controller in
+    ``compare`` by path or file. Functions of the registry may write files; only functions that
+    return a population may be named.
 
     Args:
         content: the configuration as plain containers.
-        where: the file it comes from, for the message.
+        where: its file, for the message.
         trust: further modules that may be named, e.g. ``["mine"]``.
 
     Raises:
@@ -80,7 +80,7 @@ def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] =
             found = find_target(str(value), where) if _within_registry(module) else None
         except ConfigError as error:
             raise ResultsError(f"{error}; of another release, or damaged") from error
-        # A module also holds what it imports, such as import_module.
+        # A module also contains its imports, such as import_module.
         home = str(getattr(found, "__module__", ""))
         if not _within_registry(home) or not (inspect.isclass(found) or home == FUNCTIONS):
             raise ResultsError(
@@ -90,7 +90,7 @@ def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] =
 
 
 def _named(content: Any) -> Iterator[tuple[str, str]]:
-    """Yield the keys and dotted paths of all classes and functions that settings name."""
+    """Yield the keys and dotted paths of all classes and functions in settings."""
     for key, _, value in settings_at(content):
         last, dotted = key.rpartition(".")[2], "." in str(value)
         if last == TARGET or (last == "law" and value) or (last == "model" and dotted):
@@ -104,13 +104,13 @@ def _named(content: Any) -> Iterator[tuple[str, str]]:
 
 
 def own_modules(cfg: Any) -> list[str]:
-    """Return the modules outside :data:`REGISTRY` that a configuration names, sorted."""
+    """Return the modules outside :data:`REGISTRY` in a configuration, sorted."""
     modules = {value.rpartition(".")[0] for _, value in _named(as_plain(cfg))}
     return sorted(module for module in modules if not _within_registry(module))
 
 
-def said_again(cfg: Any) -> str:
-    """Return how a command that resumes a run names the modules outside the registry."""
+def trust_option(cfg: Any) -> str:
+    """Return the option with the modules outside the registry for a command that resumes a run."""
     own = own_modules(cfg)
     return f" trust=[{','.join(own)}]" if own else ""
 

@@ -8,7 +8,7 @@ from lcc_rl.errors import ConfigError, unknown_name
 KJ_PER_WH = 3.6
 MPG = 235.215  # miles per US gallon times litres per 100 km
 ELECTRIC = {"kJ/km": 1.0, "Wh/km": 1.0 / KJ_PER_WH}
-OF_FUEL = ("g/km", "L/100km", "mpg")  # of vehicles that all burn one fuel
+OF_FUEL = ("g/km", "L/100km", "mpg")  # units for vehicles that all burn one fuel
 ENERGY_UNITS = (*ELECTRIC, *OF_FUEL)
 
 
@@ -18,10 +18,10 @@ def in_unit(kj_per_km: float, unit: str, energy: Fleet) -> float:
     Args:
         kj_per_km: the energy per distance [kJ/km].
         unit: one of :data:`ENERGY_UNITS`.
-        energy: the energy models, which know their fuel.
+        energy: the energy models.
 
     Raises:
-        ConfigError: if the unit is unknown, or one of fuel and the vehicles do not all burn one.
+        ConfigError: if the unit is unknown, or one of fuel and not all vehicles burn the same fuel.
     """
     check_unit(unit, energy)
     if unit in ELECTRIC:
@@ -30,18 +30,18 @@ def in_unit(kj_per_km: float, unit: str, energy: Fleet) -> float:
     grams = kj_per_km * 1e3 / model.heating_value
     if unit == "g/km":
         return grams
-    litres = grams / model.density / 10.0  # g/km over g/L, times 100 km
+    litres = grams / model.density / 10.0  # (g/km) / (g/L) · 100 km
     return litres if unit == "L/100km" else MPG / litres
 
 
 def check_unit(unit: str, energy: Fleet) -> None:
-    """Check that a unit is known and means something for all vehicles, see :func:`in_unit`."""
+    """Check that a unit is known and valid for all vehicles, see :func:`in_unit`."""
     if unit not in ENERGY_UNITS:
         raise unknown_name("unit (task.unit)", unit, ENERGY_UNITS)
     if unit in OF_FUEL and not burns_one_fuel(energy):
         raise ConfigError(
-            f"task.unit={unit} needs vehicles that all burn one fuel; these burn several, or some "
-            "none (energy=…): choose kJ/km or Wh/km"
+            f"task.unit={unit} needs vehicles that all burn one fuel; here they burn several or "
+            "no fuel (energy=…): choose kJ/km or Wh/km"
         )
 
 

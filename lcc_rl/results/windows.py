@@ -18,48 +18,48 @@ from lcc_rl.results.runs import EPISODES
 
 WINDOWS, DRIVERS = "windows.parquet", "drivers.parquet"
 PAIR_KEYS = ["profile_id", "driver_id"]
-REPEAT = "repeat"  # which draw of the noise of its profile and driver a row is of, if several
-DRIVE = "drive"  # what a row's window is cut from; windows of one are alike
-SOURCE = "source"  # of a row's leader, if a mixture has several
+REPEAT = "repeat"  # number of the draw of the noise, if there are several
+DRIVE = "drive"  # drive of a row's window; windows of one drive are similar
+SOURCE = "source"  # source of a row's leader, if a mixture has several
 LEADER_COLUMNS = ("leader_path_energy_kj", "leader_speed_mps")
 STRATEGY, TRAINED = "strategy", "training_seed"
 WINDOW_KEYS = [STRATEGY, TRAINED, "profile_id"]
-PER_WINDOW = ["profile", SOURCE, DRIVE]  # the same in all rows of a window
-WAYS = ("cav_distance_m", "hdv_distance_m")  # of all vehicles
+PER_WINDOW = ["profile", SOURCE, DRIVE]  # constant within a window
+WAYS = ("cav_distance_m", "hdv_distance_m")  # their sum is the distance of all vehicles
 DISTANCE, DAMPING = "distance_m", "damping_time_s"
 ENERGIES = ("energy_kj", "net_energy_kj", "path_energy_kj", *AVERAGED, *BURNT)
-FOLDED = 100_000  # rows of partial sums that are kept before they are added up
+FOLDED = 100_000  # most rows of partial sums before they are added
 PER_KM = "vehicle and km"
-# What the energies of each group of vehicles are divided by.
+# Distances by which the energies of each group of vehicles are divided.
 DRIVEN = {"cav": WAYS[:1], "hdv": WAYS[1:], "total": WAYS}
-# Of columns that are not averaged: by their first word, and whole names.
+# Aggregation of columns that are not averaged, by first word or whole name.
 HOW = {"min": "min", "max": "max", "worst": "max", "episodes": "sum", "collisions": "sum"}
 
 
 def how(column: str) -> str:
-    """Return how values of a column are put together: ``mean``, ``sum``, ``min`` or ``max``."""
+    """Return the aggregation of a column: ``mean``, ``sum``, ``min`` or ``max``."""
     return HOW.get(column, HOW.get(column.partition("_")[0], "mean"))
 
 
 def windows_of(rows: Rows, columns: Sequence[str] = ()) -> pd.DataFrame:
-    """Fold the rows of an evaluation to means over drivers and repeats.
+    """Aggregate the rows of an evaluation to means over drivers and repeats.
 
     Args:
         rows: rows of episodes.parquet; of a dataset one block is in memory at a time.
-        columns: which; by default all measures.
+        columns: columns to aggregate; by default all measures.
 
     Returns:
-        A row per strategy, training seed and window; columns that begin with ``min_`` or ``max_``
-        contain the least or the largest value. ``episodes`` is the number of rows, ``collisions``
-        of those that collided, ``worst_share_…`` the largest share of an episode.
+        A row per strategy, training seed and window. Columns ``min_…`` and ``max_…`` are the
+        smallest and largest values, ``episodes`` the number of rows, ``collisions`` that of rows
+        with a collision, ``worst_share_…`` the largest share of an episode.
     """
     return fold(rows, [*WINDOW_KEYS, *PER_WINDOW], columns)
 
 
 def fold(rows: Rows, by: Sequence[str], columns: Sequence[str] = ()) -> pd.DataFrame:
-    """Fold rows by keys, block by block; :func:`how` says how. Keys that do not exist are left out.
+    """Aggregate rows by keys, block by block, see :func:`how`; missing keys are left out.
 
-    Memory grows with the groups, not with the rows.
+    Memory grows with the number of groups, not of rows.
     """
     parts: list[pd.DataFrame] = []
     for frame in _frames(rows, [*by, *columns] if columns else []):
@@ -103,7 +103,7 @@ def _derived(rows: pd.DataFrame) -> pd.DataFrame:
         found |= dict.fromkeys(("collisions", "collided"), rows["collided"].astype(float))
     if ways := [name for name in WAYS if name in rows]:
         found[DISTANCE] = rows[ways].sum(axis=1)
-    for name in ENERGIES:  # where no vehicle is automated, of the others
+    for name in ENERGIES:  # without automated vehicles, those of the others
         parts = [rows[f"{x}_{name}"] for x in ("total", "hdv") if f"{x}_{name}" in rows]
         if parts:
             found[f"all_{name}"] = parts[0].fillna(parts[-1])
@@ -113,7 +113,7 @@ def _derived(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _sums(frame: pd.DataFrame, by: Sequence[str], columns: Sequence[str]) -> pd.DataFrame:
-    """Return sums, counts and ends of columns by keys."""
+    """Return sums, counts and extremes of columns by keys."""
     numbers = [str(name) for name in frame.select_dtypes(["number", "bool"])]
     names = [
         name for name in columns or numbers if name in numbers and name not in (*PAIR_KEYS, TRAINED)
@@ -135,7 +135,7 @@ def _sums(frame: pd.DataFrame, by: Sequence[str], columns: Sequence[str]) -> pd.
 
 
 def _added(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    """Add up partial sums of the same groups."""
+    """Add partial sums of the same groups."""
     if len(parts) == 1:
         return parts[0]
     total = pd.concat(parts)
@@ -146,13 +146,12 @@ def _added(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Means:
-    """Means over the episodes of an evaluation in which all windows have the same drivers.
+    """Means over the episodes of an evaluation with the same drivers in all windows.
 
     Args:
-        windows: of :func:`windows_of`.
-        drivers: energies and distances, a row per strategy and driver: means over windows and
-            seeds.
-        per: what energies are per.
+        windows: result of :func:`windows_of`.
+        drivers: energies and distances per strategy and driver, means over windows and seeds.
+        per: unit to which energies refer.
     """
 
     windows: pd.DataFrame
@@ -161,19 +160,19 @@ class Means:
 
     @classmethod
     def of(cls, rows: pd.DataFrame) -> Self:
-        """Return the means of the rows of episodes.parquet."""
+        """Return the means of rows of episodes.parquet."""
         energies = [str(name) for name in rows if str(name).endswith("energy_kj") or name in WAYS]
         return cls(windows_of(rows), fold(rows, [STRATEGY, "driver_id"], energies))
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Return the means of an evaluation: as kept in its folder, else of its episodes."""
+        """Return the means of an evaluation: stored in its folder, else of its episodes."""
         if (folder / WINDOWS).exists():
             return cls(read_parquet(folder / WINDOWS), read_parquet(folder / DRIVERS))
         return cls.of(read_parquet(folder / EPISODES))
 
     def per_km(self) -> Self:
-        """Return the means whose drivers' energies, and whose savings, are per vehicle and km."""
+        """Return the means with energies and savings per vehicle and km."""
         drivers = self.drivers.copy()
         for group, names in DRIVEN.items():
             way = drivers[[name for name in names if name in drivers]].sum(axis=1) / 1e3
@@ -182,7 +181,7 @@ class Means:
         return replace(self, drivers=drivers, per=PER_KM)
 
     def saving(self, column: str, strategy: str, baseline: str) -> Estimate:
-        """Return what a strategy saves over windows, see :func:`savings`."""
+        """Return the saving of a strategy over windows, see :func:`savings`."""
         per = DRIVEN[column.partition("_")[0]] if self.per == PER_KM else ()
         return savings(self.windows, column, strategy, baseline, per)
 
@@ -192,20 +191,20 @@ def savings(
 ) -> Estimate:
     """Return the share of the baseline's mean energy that a strategy saves.
 
-    ``savings(rows, "total_path_energy_kj", "alcc", "human", per=WAYS)`` is what tables show.
+    Tables show ``savings(rows, "total_path_energy_kj", "alcc", "human", per=WAYS)``.
 
     Args:
-        rows: of an evaluation, or of :func:`windows_of`.
+        rows: rows of an evaluation, or result of :func:`windows_of`.
         column: the energy.
-        strategy: the strategy that saves.
-        baseline: the strategy that it is compared with.
-        per: columns of distances, by whose sum the energy is divided, total by total; without,
-            the energies of whole episodes are compared, and falling behind lowers them.
+        strategy: the strategy.
+        baseline: its baseline.
+        per: columns of distances; the total energy is divided by their sum. Without them energies
+            of whole episodes are compared, which falling behind lowers.
 
     Returns:
         The share with its interval over windows or drives, and seeds
-        (:func:`lcc_rl.results.bootstrap.estimate`), on the windows that both were evaluated on;
-        NaN if one of them is missing.
+        (:func:`lcc_rl.results.bootstrap.estimate`), for the windows of both; NaN if one of them is
+        missing.
     """
     chosen = rows[rows[STRATEGY].isin([strategy, baseline])]
     if TRAINED not in chosen:
@@ -248,7 +247,7 @@ def driver_savings(drivers: pd.DataFrame, column: str, strategy: str, baseline: 
 
 
 def per_seed(windows: pd.DataFrame, column: str) -> dict[str, pd.Series]:
-    """Return, for each strategy, the mean of a column over the windows of each training seed."""
+    """Return for each strategy the mean of a column over windows by training seed."""
     found = {
         str(strategy): rows.groupby(TRAINED, dropna=False)[column].mean()
         for strategy, rows in windows.groupby(STRATEGY, sort=False)
@@ -257,7 +256,7 @@ def per_seed(windows: pd.DataFrame, column: str) -> dict[str, pd.Series]:
 
 
 def by_source(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield the rows of each source of leaders with its name; without one, all rows and ""."""
+    """Yield the name and rows of each source of leaders; "" and all rows without sources."""
     if SOURCE not in rows:
         yield "", rows
         return

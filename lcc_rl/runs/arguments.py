@@ -1,4 +1,4 @@
-"""Flags of commands: words of a command line, read as typed values and refused in one line."""
+"""Parser of command-line flags with typed values and one-line errors."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Arguments(ArgumentParser):
         super().__init__(description=wrapped(description or ""), **settings)
 
     def error(self, message: str) -> NoReturn:
-        raise ConfigError(f"{message} ({self.prog} -h lists what there is)")
+        raise ConfigError(f"{message} ({self.prog} -h lists all flags)")
 
 
 def wrapped(text: str) -> str:
-    """Return a text whose paragraphs fit 80 columns; those with commands stay as they are."""
+    """Return a text with paragraphs wrapped at 80 columns, except those with commands."""
     parts = text.strip().split("\n\n")
     prose = [
         part if "lcc-rl " in part else fill(" ".join(part.split()), HELP_WIDTH) for part in parts
@@ -38,7 +38,7 @@ def wrapped(text: str) -> str:
 
 
 def typed(kind: Any) -> Callable[[str], Any]:
-    """Return what reads a flag's word as an annotated type: :data:`lcc_rl.settings.Count` …."""
+    """Return a parser of words for an annotated type, such as :data:`lcc_rl.settings.Count`."""
     adapter = TypeAdapter(kind, config=FINITE)
 
     def read(word: str) -> Any:

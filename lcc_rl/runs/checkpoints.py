@@ -1,4 +1,4 @@
-"""The typed model of a training's checkpoint, by which one that others made is checked."""
+"""The typed model of a checkpoint, which checks foreign files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Handlers of the signals that end a command: Ctrl-C, a scheduler's, a closed terminal's."""
+"""Handlers of signals that end a command: Ctrl-C, scheduler, closed terminal."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ ENDING_SIGNALS = (
     signal.SIGTERM,
     *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []),
 )
-TOGETHER = 1.0  # a scheduler, a terminal and a parent process may all send one [s]
+TOGETHER = 1.0  # signals of scheduler, terminal and parent within this time count as one [s]
 Restore = Callable[[], None]
 
 
 def _end(*_: Any) -> NoReturn:
     os.write(2, b"lcc_rl: interrupted\n")
-    # An exception could be swallowed by whatever is being imported.
+    # A module that is being imported could suppress an exception.
     os._exit(INTERRUPTED)
 
 
 def end_quietly() -> None:
-    """Exit with one line instead of a traceback while a command is still importing."""
+    """Exit with one line instead of a traceback while a command imports modules."""
     for kind in ENDING_SIGNALS:
         # A shell may have started this process in the background with SIGINT ignored.
         if signal.getsignal(kind) is not signal.SIG_IGN:
@@ -40,7 +40,7 @@ def end_quietly() -> None:
 def _handled_by(
     action: Callable[[int, Restore], None], also_ignored: Collection[int] = ()
 ) -> Iterator[None]:
-    """Let signals call ``action(signal, restore)`` in the main thread; restore them at the end."""
+    """Make signals call ``action(signal, restore)`` in the main thread; restore them at the end."""
     main = threading.current_thread() is threading.main_thread()
     before = {kind: signal.getsignal(kind) for kind in ENDING_SIGNALS} if main else {}
 
@@ -61,7 +61,7 @@ def _handled_by(
 def interruptible() -> Iterator[threading.Event]:
     """Raise KeyboardInterrupt on a signal that ends a command, and set the event.
 
-    What the interrupt breaks into may answer with an error of its own.
+    Interrupted code may raise another error.
     """
     event = threading.Event()
 
@@ -75,18 +75,18 @@ def interruptible() -> Iterator[threading.Event]:
 
 @contextmanager
 def ending_quietly() -> Iterator[None]:
-    """Exit on a signal as :func:`end_quietly` does, while a command imports more."""
-    gc.disable()  # a fifth of the time
+    """Exit on a signal as :func:`end_quietly` does, while a command imports further modules."""
+    gc.disable()  # saves a fifth of the time
     try:
         with _handled_by(_end):
             yield
     finally:
-        gc.freeze()  # modules stay: later searches for garbage leave them out
+        gc.freeze()  # later garbage collection skips modules
         gc.enable()
 
 
 def was_interrupted(error: BaseException | None) -> bool:
-    """Whether an error followed from an interrupt, which broke into what cannot bear it."""
+    """Whether an error was caused by an interrupt."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__context__
     return error is not None
@@ -94,10 +94,10 @@ def was_interrupted(error: BaseException | None) -> bool:
 
 @contextmanager
 def stop_signal() -> Iterator[threading.Event]:
-    """Set the event on the first signal; one that comes a second later acts as before.
+    """Set the event on the first signal; a signal a second later has its default action.
 
-    SIGINT counts although the shell that started the process in the background ignores it; an
-    ignored SIGHUP (``nohup``) does not.
+    SIGINT counts even if the shell ignores it for background processes; an ignored SIGHUP
+    (``nohup``) does not.
     """
     event = threading.Event()
     last = 0.0

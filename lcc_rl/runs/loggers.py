@@ -19,7 +19,7 @@ from lcc_rl.settings import Settings
 
 TrainingRow = Mapping[str, float]
 RUN_TAG = "lcc_rl.id"
-NOT_MLFLOW = re.compile(r"[^\w\-. :/]")  # signs that names of its parameters may not have
+NOT_MLFLOW = re.compile(r"[^\w\-. :/]")  # characters that MLflow's names must not contain
 
 
 class Silent:
@@ -34,16 +34,16 @@ class Silent:
 class RowLogger(Settings):
     """Logs settings, training rows and the result of a run by TensorBoard, wandb or MLflow.
 
-    The run has the name of its folder. Its id is a hash of the folder's place and the settings, by
-    which a resumed run is the same one. Measures of the evaluation are named ``result/…``.
+    The run has the name of its folder. Its id is a hash of the folder's path and the settings, so a
+    resumed run is the same one. Measures of the evaluation are named ``result/…``.
     """
 
-    WRITES = ("where",)  # settings that name a place to write
+    WRITES = ("where",)  # settings that name a path to write to
 
     kind: Literal["tensorboard", "wandb", "mlflow"]
     where: str | None = None  # folder or tracking address; null: logs in the run's folder
     project: str = "lcc_rl"  # wandb's project, or MLflow's experiment
-    offline: bool = True  # wandb keeps its files on this machine until wandb sync
+    offline: bool = True  # wandb stores files locally until wandb sync
 
     @contextmanager
     def opened(self, folder: Path) -> Iterator[Callable[[TrainingRow], None]]:
@@ -52,13 +52,13 @@ class RowLogger(Settings):
             yield lambda row: send(_numbers(row), step=int(row["iteration"]))
 
     def log_result(self, folder: Path, row: Mapping[str, Any]) -> None:
-        """Log the numbers of what an evaluation measured."""
+        """Log the measures of an evaluation."""
         with self._run(folder) as send:
             send({f"result/{name}": value for name, value in _numbers(row).items()})
 
     @contextmanager
     def _run(self, folder: Path) -> Iterator[Callable[..., Any]]:
-        """Yield what logs numbers by their names, at a step if it is given one."""
+        """Yield a function that logs numbers by name, optionally at a step."""
         where, name = self.where or str(folder / "logs"), folder.resolve().name
         stored = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else {}
         settings = {key: value for key, value in stored.items() if key not in NOT_IDENTITY}
@@ -93,7 +93,7 @@ class RowLogger(Settings):
 def _of_mlflow(
     address: str, project: str, name: str, run_id: str, settings: Mapping[str, Any]
 ) -> tuple[Callable[..., Any], Callable[[], Any]]:
-    """Start or resume a run of MLflow, which chooses ids itself; return what logs and ends it."""
+    """Start or resume a run of MLflow, which chooses ids; return functions to log and to end it."""
     import mlflow
 
     mlflow.set_tracking_uri(address)

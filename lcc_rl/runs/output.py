@@ -1,4 +1,4 @@
-"""What a command writes to the terminal, whose reader may stop, and what to its log."""
+"""Output of commands: terminal, log files and broken pipes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import Any, cast
 
 from rich import box
 
-# Between INFO, the details, and WARNING: what a waiting user wants to know.
+# Level of headlines, between INFO (details) and WARNING.
 HEADLINE = 25
 logging.addLevelName(HEADLINE, "NOTE")
 
-# Looks of every table on the terminal, which has room for 80 characters.
+# Options of tables on a terminal of 80 characters.
 PLAIN: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": 0, "show_edge": False}
 PLAIN |= {"caption_justify": "left"}
 
@@ -24,21 +24,21 @@ log = logging.getLogger("lcc_rl")
 
 
 class ShortFormatter(logging.Formatter):
-    """The time and the message; the level only of warnings and errors."""
+    """Formats time and message, with the level for warnings and errors."""
 
     def format(self, record: logging.LogRecord) -> str:
         text = super().format(record)
         return f"{record.levelname} {text}" if record.levelno >= logging.WARNING else text
 
 
-def tell(text: str) -> None:
-    """Log a line that :func:`headlines` lets through to the terminal."""
+def show_headline(text: str) -> None:
+    """Log a headline, which :func:`headlines` shows on the terminal."""
     log.log(HEADLINE, text)
 
 
 @contextmanager
 def headlines() -> Iterator[None]:
-    """Show headlines and warnings on the terminal, without dates; log files get every line."""
+    """Show only headlines and warnings on the terminal, without dates; log files get all lines."""
     changed = []
     for handler in logging.getLogger().handlers:
         if isinstance(handler, logging.StreamHandler) and not isinstance(
@@ -56,15 +56,15 @@ def headlines() -> Iterator[None]:
 
 
 class Unbroken:
-    """A stream of text that drops what is written once that is impossible.
+    """A text stream that drops its output once writing fails.
 
-    ``lcc-rl train … | head -1`` trains to the end: its results are files.
+    ``lcc-rl train … | head -1`` thus trains to the end.
 
     Args:
-        stream: the stream itself.
+        stream: the stream.
 
     Attributes:
-        failure: what went wrong, unless the reader went away; None so far.
+        failure: the first error other than a closed pipe, or None.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -80,7 +80,7 @@ class Unbroken:
         return len(text)
 
     def flush(self) -> None:
-        """Hand over what is written, or drop it."""
+        """Flush the stream, or drop its output."""
         self._attempt(self._stream.flush)
 
     def _attempt(self, action: Callable[[], Any]) -> None:
@@ -89,7 +89,7 @@ class Unbroken:
         except OSError as error:
             if not isinstance(error, BrokenPipeError):
                 self.failure = self.failure or error
-            # What is still buffered, and all that follows, goes nowhere.
+            # Buffered and further output is dropped.
             with suppress(OSError):
                 nowhere = os.open(os.devnull, os.O_WRONLY)
                 os.dup2(nowhere, self._stream.fileno())
@@ -98,13 +98,13 @@ class Unbroken:
 
 @contextmanager
 def unbroken_output() -> Iterator[None]:
-    """Let no output end a command: it is dropped if it is not read or cannot be written.
+    """Drop output that is not read or cannot be written, so that it does not end a command.
 
-    A stream that was closed (``>&-``) becomes one to nowhere, and a sign that the terminal's
-    encoding lacks is written as its code.
+    A closed stream (``>&-``) becomes a null device. Characters that the terminal's encoding lacks
+    are written as their codes.
 
     Raises:
-        OSError: at the end, if output could not be written although it is read.
+        OSError: at the end, if output that is read could not be written.
     """
     own, end = {}, None
     with ExitStack() as stack:
@@ -116,7 +116,7 @@ def unbroken_output() -> Iterator[None]:
                 stack.enter_context(redirect(cast(Any, unbroken)))
         try:
             yield
-        except SystemExit as stop:  # as a command ends that returns its code
+        except SystemExit as stop:  # raised by commands with an exit code
             if stop.code:
                 raise
             end = stop
@@ -131,7 +131,7 @@ def unbroken_output() -> Iterator[None]:
 
 
 def _open_closed() -> None:
-    """Give closed standard streams a place; a file opened later would get their numbers."""
+    """Open closed standard streams, so that later files do not get their numbers."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)

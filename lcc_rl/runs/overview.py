@@ -15,21 +15,21 @@ from lcc_rl.runs.progress import clock
 from lcc_rl.runs.states import STATES, RunState, survey
 
 STATE_COLOURS = {"finished": "green", "running": "cyan", "stopped": "yellow", "failed": "red"}
-EVERY = 2.0  # between two looks at the folder [s]
+EVERY = 2.0  # time between surveys of the folder [s]
 URGENCY = ("running", "failed", "stopped", "finished")
 
 
 def counts(states: Sequence[RunState], planned: int = 0) -> dict[str, int]:
-    """Count the runs by state; those not started count as ``waiting``."""
+    """Count the runs by state; runs that have not started count as ``waiting``."""
     numbers = {kind: sum(state.state == kind for state in states) for kind in STATES}
     return {**numbers, "waiting": max(0, planned - len(states))}
 
 
 def remaining(states: Sequence[RunState], planned: int = 0) -> float | None:
-    """Estimate the seconds until all runs are finished; None if nothing is known.
+    """Estimate the time until all runs are finished [s]; None if it is unknown.
 
-    A run that waits or stopped is assumed to last as long as the average running one, with as
-    many in parallel as now.
+    Waiting and stopped runs are assumed to last as long as the average running one, with the
+    present number of parallel runs.
     """
     running = [state for state in states if state.state == "running" and state.eta_s is not None]
     known = [state for state in running if 0 < state.done < state.total]
@@ -52,7 +52,7 @@ def overview_line(root: Path, states: Sequence[RunState], planned: int) -> str:
 
 
 def left(state: RunState) -> str:
-    """Return the remaining time of a run, as far as it is known."""
+    """Return the remaining time of a run as text, if it is known."""
     if state.state != "running" or not state.total or state.eta_s is None:
         return ""
     return f"ETA {clock(state.eta_s)}" if state.done < state.total else "evaluating"
@@ -71,8 +71,8 @@ def states_table(
     Args:
         root: folder of the runs.
         states: its runs.
-        planned: number of runs in all.
-        most: number of rows; running and failed runs come first. None for all.
+        planned: total number of runs.
+        most: most rows; running and failed runs come first. None: all.
     """
     shown = sorted(states, key=lambda state: URGENCY.index(state.state)) if most else states
     table = Table(**PLAIN)
@@ -82,7 +82,7 @@ def states_table(
     for state in shown[:most]:
         colour = STATE_COLOURS[state.state]
         kind = f"[{colour}]{state.state}[/]"
-        # An error below the name, where it has room.
+        # The error is below the name, which has space.
         name = f"{state.name}\n  {state.error}" if state.error else state.name
         table.add_row(escape(name), kind, progress(state), left(state))
     if most and len(shown) > most:
@@ -94,7 +94,7 @@ def live(root: Path, planned: Callable[[], int], console: Console) -> Live:
     """Return a live table for a terminal, updated every :data:`EVERY` seconds."""
 
     def picture() -> Group:
-        # Seven lines: heading, borders and summary; a long error may still wrap.
+        # Seven lines for heading, borders and summary; a long error may still wrap.
         return states_table(root, survey(root), planned(), max(1, console.height - 7))
 
     return Live(get_renderable=picture, console=console, refresh_per_second=1 / EVERY)

@@ -1,4 +1,4 @@
-"""Setup of torch: device, threads, and precision of float32 matrix products, measured here."""
+"""Setup of torch: device, threads and measured precision of float32 matrix products."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lcc_rl.io.memory import torch_device
 
 log = logging.getLogger("lcc_rl")
 
-SINGLE_PRECISION = 1e-4  # relative error beyond which products are no longer single precision
+SINGLE_PRECISION = 1e-4  # relative error above which products are not in single precision
 
 
 def prepare_torch(cfg: BaseConfig) -> torch.device:
@@ -25,10 +25,10 @@ def prepare_torch(cfg: BaseConfig) -> torch.device:
 
 
 def set_precision(name: str) -> float:
-    """Set torch's precision of float32 matrix products and log the error here.
+    """Set torch's precision of float32 matrix products and log their error on this machine.
 
-    Below ``highest`` torch may choose other kernels, which are faster on some processors; whether
-    they compute in single precision at all depends on the machine, so the error is measured.
+    Below ``highest`` torch may choose faster kernels. Whether they compute in single precision
+    depends on the machine, so the error is measured.
 
     Args:
         name: ``highest``, ``high`` or ``medium``, as in ``torch.set_float32_matmul_precision``.
@@ -48,7 +48,7 @@ def set_precision(name: str) -> float:
 
 
 def product_error() -> float:
-    """Largest error of a product ``[1024, 200] × [200, 100]``, relative to its largest entry."""
+    """Return the largest error of a product ``[1024, 200] × [200, 100]`` over its maximum."""
     generator = torch.Generator().manual_seed(0)
     left = torch.randn(1024, 200, generator=generator)
     right = torch.randn(200, 100, generator=generator)

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from lcc_rl.config import is_sweep
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.runs.output import tell
+from lcc_rl.runs.output import show_headline
 from lcc_rl.runs.states import PROGRESS, check_present, read_progress
 
 log = logging.getLogger("lcc_rl")
@@ -41,15 +41,15 @@ def bar(console: Console, shown: bool, transient: bool = False) -> Progress:
 
 
 class Phases:
-    """Reports the progress of a job in phases, each of which counts anew.
+    """Reports the progress of a job in phases with separate counts.
 
-    On a terminal a live bar, which disappears at the end; otherwise a line at most every ``every``
-    seconds.
+    A terminal shows a live bar, which disappears at the end; else a line is written at most every
+    ``every`` seconds.
 
     Args:
         title: name of the job.
         console: console of the bar.
-        tell: takes the lines.
+        emit: function that receives the lines.
         every: seconds between lines without a terminal.
     """
 
@@ -57,10 +57,10 @@ class Phases:
         self,
         title: str,
         console: Console,
-        tell: Callable[[Sequence[str]], None],
+        emit: Callable[[Sequence[str]], None],
         every: float = 10.0,
     ) -> None:
-        self.title, self.tell, self.every = title, tell, every
+        self.title, self.emit, self.every = title, emit, every
         self.live = console.is_terminal
         self.bar = bar(console, self.live, transient=True)
         self.task = self.bar.add_task(title, total=None, note="")
@@ -85,22 +85,22 @@ class Phases:
         self.bar.update(self.task, completed=done, total=total, note=note)
         if not self.live and now - self.last_line >= self.every:
             self.last_line = now
-            self.tell([f"{self.title}: {note}"])
+            self.emit([f"{self.title}: {note}"])
 
 
 class ProgressReporter:
     """Reports rate, ETA and current values of a long job.
 
-    On a terminal a live bar, except in a sweep (:mod:`lcc_rl.runs.sweeps` draws one table);
-    otherwise a line at most every ``every`` seconds. The log file always gets the lines, and
+    A terminal shows a live bar, except in a sweep (:mod:`lcc_rl.runs.sweeps` draws one table); else
+    a line is written at most every ``every`` seconds. The log file always gets the lines, and
     ``folder/progress.json`` holds the latest state.
 
     Args:
         title: name of the job.
-        total: units of work in all.
+        total: units of work.
         unit: name of a unit.
-        start: units already done (after a resume).
-        folder: folder of ``progress.json``; None for none.
+        start: units already done (after resuming).
+        folder: folder of ``progress.json``; None: none is written.
         every: seconds between lines.
         console: console of the bar; standard error by default.
     """
@@ -118,13 +118,13 @@ class ProgressReporter:
         self.title, self.total, self.unit, self.start = title, total, unit, start
         self.folder, self.every = folder, every
         self.console = console or Console(stderr=True)
-        # A training of the main job has the bar that its parent draws.
+        # Trainings of the main job have the bar of their parent.
         alone = not is_sweep() and parent_process() is None
         self.live = self.console.is_terminal and alone
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
         self.begun = self.last_line = time.monotonic()
-        self.marks: list[tuple[float, int]] = []  # when how many units were done
+        self.marks: list[tuple[float, int]] = []  # (time, units done)
         self.bar = bar(self.console, self.live)
         note = f"{start}/{total}"
         self.task: TaskID = self.bar.add_task(title, total=total, completed=start, note=note)
@@ -137,16 +137,16 @@ class ProgressReporter:
         self.bar.stop()
 
     def update(self, done: int, values: Mapping[str, float] | None = None) -> None:
-        """Report that ``done`` units are finished, with values to show."""
+        """Report that ``done`` units are finished, with values to display."""
         rate = self._rate(done)
         remaining = (self.total - done) / rate if rate > 0 else 0.0
         values = dict(values or {})
         shown = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
         eta = f"ETA {clock(remaining)}"
-        # The bar has room for no rate: lines of 80 characters.
+        # The rate does not fit into 80 characters.
         self.bar.update(self.task, completed=done, note=f"{done}/{self.total}  {shown}  {eta}")
         if len(self.marks) < 2 and done < self.total:
-            return  # the first one compiles and fills buffers: it tells nothing of the others
+            return  # the first unit compiles and fills buffers
         self._write_state(done, remaining, values)
         if time.monotonic() - self.last_line >= self.every or done >= self.total:
             self.last_line = time.monotonic()
@@ -154,7 +154,7 @@ class ProgressReporter:
             self._line(f"{self.title}: {self.unit} {done}/{self.total}  {note}")
 
     def _rate(self, done: int) -> float:
-        """Return the units per second of the later half of the time, without the first update."""
+        """Return the units per second in the second half of the time, without the first update."""
         now = time.monotonic()
         self.marks.append((now, done))
         while len(self.marks) > 2 and self.marks[1][0] <= 0.5 * (self.begun + now):
@@ -166,7 +166,7 @@ class ProgressReporter:
         if not self.live:
             log.info(text)
             return
-        # The terminal has the bar; only the log file gets the line.
+        # The terminal has the bar; the log file gets the line.
         record = log.makeRecord(log.name, logging.INFO, "", 0, text, (), None)
         for handler in logging.getLogger().handlers:
             if isinstance(handler, logging.FileHandler):
@@ -187,7 +187,7 @@ def watch_jobs(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0
     """Show the progress of jobs in other processes until all are done or one fails.
 
     Args:
-        jobs: folder (of ``progress.json``) and future of each job.
+        jobs: folder of ``progress.json`` and future of each job.
         every: seconds between lines without a terminal.
     """
     console = Console(stderr=True)
@@ -200,7 +200,7 @@ def watch_jobs(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0
             running = bool(wait(futures, 1.0, FIRST_EXCEPTION).not_done)
             due = not console.is_terminal and time.monotonic() - last >= every
             last = time.monotonic() if due else last
-            told = []
+            parts = []
             for name, (folder, future) in jobs.items():
                 state = read_progress(folder)
                 if state is None:
@@ -211,8 +211,8 @@ def watch_jobs(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0
                 note = f"{count}  {reward}"
                 shown.update(tasks[name], completed=int(done), total=total, note=note)
                 if not future.done():
-                    told.append(f"{name} {count}, {reward}")
-            if due and told:
-                tell("; ".join(told))
+                    parts.append(f"{name} {count}, {reward}")
+            if due and parts:
+                show_headline("; ".join(parts))
             if any(future.done() and future.exception() for future in futures):
                 return

@@ -1,6 +1,6 @@
-"""State of a run (finished, running, stopped, failed), read from its folder.
+"""State of a run (finished, running, stopped, failed) from its folder.
 
-A run locks its folder while it works, writes ``error.txt`` when it fails and its main table last.
+A run locks its folder, writes ``error.txt`` if it fails, and writes its main table last.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from lcc_rl.io.settings import read_json, read_text
 from lcc_rl.runs.interrupts import was_interrupted
 
 LOCK, ERROR, PROGRESS, HYDRA_FOLDER = ".lock", "error.txt", "progress.json", ".hydra"
-# The table that a run writes last: a training or evaluation, a calibration.
+# The last table of a run: of a training or evaluation, of a calibration.
 RESULT_TABLES = ("episodes.parquet", "drivers.parquet")
 CONFIG = "config.yaml"
 MARKS = {CONFIG, ERROR, LOCK, *RESULT_TABLES}
-MOST_NAMED = 3  # runs or tables that a message names
+MOST_NAMED = 3  # most runs or tables in a message
 STATES = ("finished", "running", "stopped", "failed")
 
 
@@ -42,7 +42,7 @@ class Busy(LccError):
 
 
 def busy(folder: Path) -> Busy:
-    """Build the error for a folder in which another process works."""
+    """Return the error for a folder that another process uses."""
     return Busy(f"{folder}: another process is working on this run")
 
 
@@ -51,11 +51,11 @@ class RunState:
     """State of a run.
 
     Args:
-        name: folder of the run, relative to the folder surveyed.
+        name: folder of the run, relative to the surveyed folder.
         state: one of ``STATES``.
         done: iterations done.
-        total: iterations in all; 0 if unknown.
-        eta_s: remaining time estimated by a running run [s].
+        total: total iterations; 0 if unknown.
+        eta_s: estimated remaining time of a running run [s].
         error: first line of the error of a failed run.
     """
 
@@ -69,20 +69,20 @@ class RunState:
 
 @contextmanager
 def claim(folder: Path) -> Iterator[None]:
-    """Lock a run's folder and remove what a killed process left half-written.
+    """Lock a run's folder and remove temporary files of killed processes.
 
-    The lock is released however the process ends.
+    The lock is released at any end of the process.
     """
     made: list[Path] = []
     lock = FileLock(folder / LOCK)
     try:
-        str(folder.resolve()).encode()  # pyarrow knows names in UTF-8 only
+        str(folder.resolve()).encode()  # pyarrow supports names in UTF-8 only
         made = [path for path in (folder, *folder.parents) if not path.exists()]
         folder.mkdir(parents=True, exist_ok=True)
-        lock.acquire(timeout=0.3)  # a query of the state holds the lock for a moment
+        lock.acquire(timeout=0.3)  # queries of the state hold the lock briefly
     except Timeout:
         raise busy(folder) from None
-    except (OSError, NotImplementedError, ValueError) as error:  # the last one: of a name
+    except (OSError, NotImplementedError, ValueError) as error:  # ValueError: invalid name
         raise ResultsError(f"{folder}: cannot be written: {error}") from error
     try:
         remove_leftovers(folder)
@@ -91,7 +91,7 @@ def claim(folder: Path) -> Iterator[None]:
         with suppress(OSError):
             (folder / LOCK).unlink()
         lock.release()
-        with suppress(OSError):  # one that holds something
+        with suppress(OSError):  # not empty
             for path in made:
                 path.rmdir()
 
@@ -104,7 +104,7 @@ def is_claimed(folder: Path) -> bool:
                 return False
     except Timeout:
         return True
-    except (OSError, NotImplementedError):  # a file system without locks, a name too long
+    except (OSError, NotImplementedError):  # file system without locks, or name too long
         return False
     return False
 
@@ -119,14 +119,14 @@ def working(folder: Path) -> Iterator[None]:
         except Interrupted:
             raise
         except Exception as error:
-            # A finished run that a command could not repeat stays one.
+            # A finished run remains finished if it could not be repeated.
             if not is_finished(folder):
                 record(folder, error)
             raise
 
 
 def check_present(folder: Path) -> None:
-    """Check that the folder of a run was not removed meanwhile; a file would make it anew."""
+    """Check that the folder of a run was not removed; writing a file would create it again."""
     if not folder.is_dir():
         raise ResultsError(f"{folder}: cannot be written: the folder was removed during the run")
 
@@ -138,16 +138,16 @@ def forget(folder: Path) -> None:
 
 
 def withdraw(folders: Sequence[Path]) -> None:
-    """Remove the folder of a run that did not begin, and those above it, if they hold no more."""
+    """Remove the folder of a run that did not begin, and its parents, if they are empty."""
     if _holds_only(folders[0], {HYDRA_FOLDER, ERROR, LOCK}):
         shutil.rmtree(folders[0])
-        with suppress(OSError):  # one that holds something else
+        with suppress(OSError):  # not empty
             for folder in folders[1:]:
                 folder.rmdir()
 
 
 def clean(root: Path) -> list[Path]:
-    """Remove the folders of failed runs that hold neither rows nor a state; return them."""
+    """Remove the folders of failed runs without rows and states; return them."""
     failed = [root / run.name for run in survey(root) if run.state == "failed"]
     empty = [
         run for run in failed if _holds_only(run, {HYDRA_FOLDER, ERROR, LOCK, CONFIG, PROGRESS})
@@ -158,7 +158,7 @@ def clean(root: Path) -> list[Path]:
 
 
 def _holds_only(folder: Path, names: set[str]) -> bool:
-    """Whether a folder holds nothing but files of these names, and logs."""
+    """Whether a folder holds only files of these names and logs."""
     with suppress(OSError):
         return {path.name for path in folder.iterdir() if path.suffix != ".log"} <= names
     return False
@@ -167,7 +167,7 @@ def _holds_only(folder: Path, names: set[str]) -> bool:
 def record(folder: Path, error: BaseException) -> None:
     """Write ``error.txt``: the error in one line, with a traceback unless it is an input error.
 
-    An error that followed from an interrupt is no failure and leaves no file.
+    An error caused by an interrupt is no failure and leaves no file.
     """
     if was_interrupted(error):
         return
@@ -179,17 +179,17 @@ def record(folder: Path, error: BaseException) -> None:
 
 
 def described_error(error: BaseException) -> str:
-    """Return an error as one line; its type comes first unless it is an input error."""
+    """Return an error in one line, with its type unless it is an input error."""
     return one_line(str(input_error(error) or f"{type(error).__name__}: {error}"))
 
 
 def is_finished(folder: Path) -> bool:
-    """Whether a run's folder holds the table that is written last."""
+    """Whether a run's folder holds its last table."""
     return any((folder / table).exists() for table in RESULT_TABLES)
 
 
 def inspect_run(folder: Path, name: str | None = None) -> RunState:
-    """Return the state of the run in a folder; one that cannot be entered has failed."""
+    """Return the state of the run in a folder; failed if the folder cannot be read."""
     name = folder.name if name is None else name
     try:
         return _inspected(folder, name)
@@ -212,7 +212,7 @@ def _inspected(folder: Path, name: str) -> RunState:
 
 
 def read_progress(folder: Path) -> dict[str, float] | None:
-    """Return the content of a run's ``progress.json``, None if there is none."""
+    """Return the content of a run's ``progress.json``; None if there is none."""
     try:
         content = dict(read_json(folder / PROGRESS))
         numbers = {
@@ -230,7 +230,7 @@ def run_folders(root: Path) -> list[Path]:
     if not root.is_dir():
         raise ResultsError(f"{root}: no such folder")
     found = []
-    # A folder that cannot be listed may be a run, whose state says so.
+    # A folder that cannot be listed may be a run; its state contains the error.
     for place, folders, files in os.walk(root, onerror=lambda e: found.append(Path(e.filename))):
         is_run = bool(MARKS.intersection(files)) or HYDRA_FOLDER in folders
         own = SUBFOLDERS if is_run else ()
@@ -242,7 +242,7 @@ def run_folders(root: Path) -> list[Path]:
 
 
 def no_run(folder: Path) -> ConfigError:
-    """Build the error for a folder that is no run, which names the runs and tables in it."""
+    """Return the error for a folder that is no run, naming the runs and tables in it."""
     runs = (
         [run for run in run_folders(folder) if (run / CONFIG).is_file()] if folder.is_dir() else []
     )

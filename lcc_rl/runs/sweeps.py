@@ -1,4 +1,4 @@
-"""Sweeps: names of folders, those of single runs too, the plan, one run, the final report."""
+"""Sweeps: names of folders (also of single runs), plan, runs and final report."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ from lcc_rl.runs.states import (
 log = logging.getLogger("lcc_rl")
 
 PLAN = "sweep.json"
-MOST_RUNS = 100_000  # of a sweep: Hydra would hold all of them in memory
+MOST_RUNS = 100_000  # most runs of a sweep: Hydra holds all of them in memory
 LONGEST_NAME = 100  # characters of a folder's name before the hash
 SILENT = logging.CRITICAL + 1
 
 
 def register_resolvers() -> None:
-    """Register the OmegaConf resolvers of the folders of runs and sweeps, and of a sweep's jobs."""
+    """Register the OmegaConf resolvers for folders of runs and sweeps and for parallel jobs."""
     OmegaConf.register_new_resolver("lcc.folder", chosen_folder, replace=True)
     OmegaConf.register_new_resolver("lcc.hydra", hydra_folder, replace=True)
-    # Cached: every job must get the folder of the whole command.
+    # Cached, so that every job gets the folder of the whole command.
     OmegaConf.register_new_resolver("lcc.sweep", sweep_name, use_cache=True, replace=True)
     OmegaConf.register_new_resolver("lcc.run", run_name, replace=True)
     OmegaConf.register_new_resolver("lcc.jobs", parallel_jobs, replace=True)
@@ -69,34 +69,34 @@ def sweep_name(given: str | None, typed: Sequence[str]) -> str:
 
 
 def chosen_folder(resumed: str | None, fresh: str) -> str:
-    """Return where a run goes: a resumed one on in its own folder, which Hydra would make anew."""
+    """Return the folder of a run: that of a resumed run, which must exist, or a new one."""
     if resumed and not (Path(resumed) / CONFIG).is_file():
         raise ConfigError(f"resume={no_run(Path(resumed))}")
     return str(resumed or fresh)
 
 
 def hydra_folder(folder: str | None) -> str | None:
-    """Return where Hydra notes its own settings: nowhere in a folder that holds a run before."""
+    """Return the folder of Hydra's settings; None in a folder that already holds a run."""
     return None if folder and (Path(folder) / CONFIG).is_file() else ".hydra"
 
 
 def run_name(*, _root_: DictConfig) -> str:
-    """Return the name of a run's folder: the varied overrides and the hash of the configuration.
+    """Return the name of a run's folder: varied overrides and hash of the configuration.
 
-    An existing folder with the same hash is used again.
+    An existing folder with the same hash is reused.
     """
     mark, sweep = _mark(_root_), Path(_root_.hydra.sweep.dir)
     for folder in sorted(sweep.glob(f"*{mark}")):
         return folder.name
     typed, varied = result_overrides(words_of(_root_)), read_plan(sweep).varied
-    # A comma would part two values where a setting names the folder.
+    # A comma would separate two values in a setting that names the folder.
     shown = "+".join(item.lstrip("+") for item in typed if key_of(item) in varied)
     text = re.sub(r"[^\w.=+~-]+", "-", shown).strip("-")[:LONGEST_NAME]
     return f"{text}_{mark}".lstrip("_")
 
 
 def _mark(root: DictConfig) -> str:
-    """Return a short hash of a run's settings; of what was typed if its job will refuse them."""
+    """Return a short hash of a run's settings, or of the command line if they are invalid."""
     settings = OmegaConf.masked_copy(root, [str(key) for key in root if key != "hydra"])
     typed = words_of(root)
     try:
@@ -106,7 +106,7 @@ def _mark(root: DictConfig) -> str:
 
 
 def words_of(config: DictConfig) -> list[str]:
-    """Return what was typed, in which a reference such as ``${seed}`` is a text like any other."""
+    """Return the command line with references such as ``${seed}`` as plain text."""
     typed: Any = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
     return [str(item) for item in typed]
 
@@ -129,12 +129,12 @@ register_resolvers()
 class SweepCallback(Callback):
     """Writes the plan of a sweep at its start and draws its runs on a terminal.
 
-    Before a single run, leaves a folder alone in which another process works.
+    A single run is refused in a folder that another process uses.
     """
 
-    folder: Path | None = None  # of this process's sweep; Hydra does not keep it
+    folder: Path | None = None  # folder of this process's sweep; Hydra does not store it
     target: ClassVar[Path | None] = None  # the folder that Hydra writes to
-    made: ClassVar[list[Path]] = []  # it and those above it that this command makes
+    made: ClassVar[list[Path]] = []  # it and its parents, if this command creates them
     table: Live | None = None
     lines: ClassVar[Any] = None  # logging configuration without a table
 
@@ -144,13 +144,13 @@ class SweepCallback(Callback):
         try:
             type(self).target = folder = Path(config.hydra.run.dir)
             type(self).made = [x for x in (folder, *folder.parents) if not os.path.lexists(x)]
-        except OmegaConfBaseException:  # resume=nowhere: Hydra says so itself when it gets there
+        except OmegaConfBaseException:  # resume=nowhere: Hydra raises the error later
             return
         if is_claimed(folder):
             refuse(busy(folder))
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Write the plan and log the folder; exit with one line where it cannot be run."""
+        """Write the plan and log the folder; exit with one line if the sweep cannot run."""
         launcher = str(config.hydra.launcher.get("_target_"))
         if launcher.endswith(".SlurmLauncher") and which("srun") is None:
             refuse("there is no SLURM here (no srun); use hydra/launcher=lcc_submitit_local")
@@ -171,7 +171,7 @@ class SweepCallback(Callback):
 
     @classmethod
     def _draw(cls, config: DictConfig, planned: int) -> None:
-        """Show a table instead of log lines, which Hydra configures again after every run."""
+        """Show a table in place of log lines, which Hydra configures again for every run."""
         hydra = config.hydra
         cls.lines = hydra.hydra_logging.copy()
         with read_write(config):
@@ -182,7 +182,7 @@ class SweepCallback(Callback):
 
     @classmethod
     def end(cls) -> Path | None:
-        """Stop the table; return the folder of the sweep, None without one."""
+        """Stop the table; return the folder of the sweep or None."""
         if cls.table is not None:
             cls.table.stop()
             configure_log(cls.lines)
@@ -191,13 +191,13 @@ class SweepCallback(Callback):
 
 
 def refuse(reason: object) -> NoReturn:
-    """Exit with one line; Hydra turns any other exception of a callback into a warning."""
+    """Exit with one line; other exceptions of a callback become warnings in Hydra."""
     print(f"lcc_rl: error: {reason}", file=sys.stderr)
     sys.exit(BAD_INPUT)
 
 
 def mute() -> None:
-    """Disable log lines on the terminal; log files keep them."""
+    """Disable log lines on the terminal, not in log files."""
     for handler in logging.getLogger().handlers:
         if type(handler) is logging.StreamHandler:
             handler.setLevel(SILENT)
@@ -219,7 +219,7 @@ class SweepPlan:
 
     Args:
         runs: number of runs; 0 if unknown.
-        varied: dotted keys that differ between runs.
+        varied: dotted keys of settings that differ between runs.
     """
 
     runs: int = 0
@@ -239,7 +239,7 @@ def make_plan(config: DictConfig) -> SweepPlan:
 
 
 def read_plan(folder: Path) -> SweepPlan:
-    """Return the plan of the sweep in a folder, an empty one if there is none."""
+    """Return the plan of the sweep in a folder; an empty one if there is none."""
     try:
         plan = SweepPlan(**read_json(folder / PLAN))
         return SweepPlan(int(plan.runs), [str(key) for key in plan.varied])
@@ -248,7 +248,7 @@ def read_plan(folder: Path) -> SweepPlan:
 
 
 def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path) -> Any:
-    """Do one run of a sweep; an error is recorded in its folder and does not stop the sweep.
+    """Execute one run of a sweep; an error is recorded in its folder and does not stop the sweep.
 
     Returns:
         The function's result; None if it failed.
@@ -259,13 +259,13 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
         return function(cfg)
     except Interrupted as error:
         log.info("%s", error)
-        # An ordinary exception would stop this run only.
+        # Another exception would stop this run only.
         raise KeyboardInterrupt from error
     except Busy as error:
-        log.info("%s: left to it", error)
+        log.info("%s: skipped", error)
         return None
     except Exception as error:
-        if was_interrupted(error):  # the interrupt broke into a library, which made it this error
+        if was_interrupted(error):  # a library converted the interrupt to this error
             raise KeyboardInterrupt from error
         record(folder, error)
         log.error("%s failed: %s", folder.name, described_error(error))
@@ -273,7 +273,7 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
 
 
 def conclude(folder: Path) -> None:
-    """Log how a sweep ended."""
+    """Log the result of a sweep."""
     states = survey(folder)
     if not states:
         raise LccError(f"nothing was swept, in {folder}: is a list of values empty?")
@@ -286,6 +286,6 @@ def conclude(folder: Path) -> None:
         log.error("failed: %s: %s", state.name, state.error)
     if failed:
         raise LccError(
-            f"{len(failed)} of {len(states)} runs failed; the same command tries them again "
-            f"(error.txt in the folder of each says why, {folder})"
+            f"{len(failed)} of {len(states)} runs failed; the same command repeats them "
+            f"(reasons: error.txt in the folder of each run, {folder})"
         )

@@ -1,1 +1,1 @@
-"""Studies: many runs of the entry points, with their tables, figures and page."""
+"""Studies: sets of runs with tables, figures and a page."""

@@ -1,16 +1,16 @@
-"""Reproduce a paper's study, its tables and figures: lcc-rl reproduce alcc.
+"""Reproduce a paper's study with tables and figures: lcc-rl reproduce alcc.
 
   lcc-rl reproduce alcc                           # embedded stream, 8 seeds
   lcc-rl reproduce alcc data=ngsim data.path=...  # trajectories; any override
-  lcc-rl reproduce alcc --recipe quickstart --parts main  # an hour, not days
+  lcc-rl reproduce alcc --recipe quickstart --parts main  # an hour instead of days
   lcc-rl reproduce alcc --parts main agent=analytic       # another agent
   lcc-rl reproduce alcc --recipe smoke --seeds 1  # everything once, in seconds
   lcc-rl reproduce hcfs                           # platoon: DDPG, CACC, hybrids
   lcc-rl reproduce ring                           # one automated car in a wave
-  lcc-rl reproduce road data=table data.path=...  # what 5, 10, 20 % would bring
+  lcc-rl reproduce road data=table data.path=...  # effect of 5, 10, 20 %
 
-The same command resumes where it stopped: finished runs are skipped, interrupted trainings are
-resumed. results.md in the study's folder shows every table and figure.
+The same command resumes a stopped study: finished runs are skipped, interrupted trainings are
+resumed. results.md in the study's folder shows all tables and figures.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from lcc_rl.studies.study import Study
 log = logging.getLogger("lcc_rl")
 
 SET_BY_STUDY = ("seed", "variant")
-# What the folder of a study holds.
+# Contents of a study's folder.
 MADE = {
     RESULTS_PAGE,
     "calibration",
@@ -50,8 +50,8 @@ MADE = {
 }
 MADE |= {f"{name}.parquet" for name in ("trajectories", "leaders", "episodes", "steps", "training")}
 OWN_FOLDER_WORDS = (
-    "every run has its own; --seeds is their number, counted from 0, and options of this command "
-    "choose the variants"
+    "it differs by run; --seeds is the number of seeds, from 0, and options of this command choose "
+    "the variants"
 )
 STUDY_RESULTS: dict[str, Callable[..., StudyResults]] = {
     "alcc": alcc_results.study_results,
@@ -62,7 +62,7 @@ STUDY_RESULTS: dict[str, Callable[..., StudyResults]] = {
 
 
 def run(given: Namespace) -> None:
-    """Run the study that was named."""
+    """Run the chosen study."""
     if given.study == "ring":
         ring.run(given.out, given.overrides)
     elif given.study == "road":
@@ -83,13 +83,13 @@ def parser() -> ArgumentParser:
     top = Arguments(description=__doc__)
     commands = top.add_subparsers(required=True, dest="study")
     one = _trained(commands, "alcc", "Adaptive Leading Cruise Control (arXiv 2210.02147)")
-    _listing(one, "--parts", alcc.STUDY_PARTS, "which parts to run: " + ",".join(alcc.STUDY_PARTS))
+    _listing(one, "--parts", alcc.STUDY_PARTS, "parts to run: " + ",".join(alcc.STUDY_PARTS))
     names = f"all by default: {','.join(alcc.ABLATIONS)}; or your own as name:override"
-    _listing(one, "--ablations", (), f"which ablations; {names}")
+    _listing(one, "--ablations", (), f"ablations; {names}")
     _trained(commands, "hcfs", "Hybrid Car-Following Strategy (IEEE T-ASE 2021)")
     _subcommand(commands, "ring", "field experiment on a ring (Stern et al. 2018)")
-    two = _subcommand(commands, "road", "what automated cars would bring on a recorded road")
-    _listing(two, "--shares", road.ROAD_SHARES, "of automated cars, in per cent: 5,10,20")
+    two = _subcommand(commands, "road", "effect of automated cars on a recorded road")
+    _listing(two, "--shares", road.ROAD_SHARES, "shares of automated cars in per cent: 5,10,20")
     return top
 
 
@@ -105,19 +105,19 @@ def _trained(commands: Any, name: str, text: str) -> ArgumentParser:
     """Add the subcommand of a study with trainings."""
     one = _subcommand(commands, name, text)
     one.add_argument("--seeds", type=int, default=8, help="trainings of every learned variant")
-    one.add_argument("--jobs", type=int, default=2, help="trainings at a time")
-    text = f"experiment: paper_{name}, quickstart …; in alcc with agent=… that agent's own length"
+    one.add_argument("--jobs", type=int, default=2, help="parallel trainings")
+    text = f"experiment: paper_{name}, quickstart …; for alcc with agent=…: the agent's length"
     one.add_argument("--recipe", help=text)
     return one
 
 
 def _listing(target: ArgumentParser, name: str, default: tuple[str, ...], text: str) -> None:
-    """Add an option that takes names separated by commas."""
+    """Add an option with names separated by commas."""
     target.add_argument(name, type=lambda words: words.split(","), default=default, help=text)
 
 
 def main(words: list[str]) -> int:
-    """Run a command; words that are no options are overrides of every run."""
+    """Run a command; further words are overrides of all runs."""
     top = parser()
     arguments, overrides = top.parse_known_args(words)
     if wrong := [item for item in overrides if item.startswith("-")]:

@@ -18,10 +18,10 @@ RESULTS_PAGE = "results.md"
 
 
 class StudyResults:
-    """Tables and figures of a study, written as they are added.
+    """Tables and figures of a study, written when they are added.
 
     Args:
-        folder: gets ``tables/<name>.parquet``, ``figures/<name>.png`` and ``results.md``.
+        folder: folder of ``tables/<name>.parquet``, ``figures/<name>.png`` and ``results.md``.
         formats: further formats of the figures.
     """
 
@@ -31,7 +31,7 @@ class StudyResults:
         self.blocks: list[str] = []
 
     def table(self, name: str, caption: str, table: pd.DataFrame) -> None:
-        """Write a table below a caption."""
+        """Write a table with a caption."""
         write_parquet(table, self.folder / "tables" / f"{name}.parquet")
         self.tables[name] = table
         self.blocks.append(f"**{caption}** (`{name}`)\n\n{as_markdown(worded(table))}")

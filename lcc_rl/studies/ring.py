@@ -1,6 +1,6 @@
 """The field experiment on a ring (Stern et al. 2018), simulated: lcc-rl reproduce ring.
 
-Humans drive all cars until a wave has developed; then one car is automated, or stays a human's.
+Humans drive all cars until a wave has developed. Then one car is automated or still human-driven.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ FIELD = {"driven by": "field experiment", "speeds against humans": "−80.8 %", 
 
 
 def run(folder: Path, overrides: Sequence[str]) -> None:
-    """Evaluate the rules and the shipped policy after a handover.
+    """Evaluate the rules and the shipped policy after the handover.
 
     Args:
         folder: the study's folder.
         overrides: further options of ``lcc-rl evaluate``.
 
     Raises:
-        LccError: one clear error for wrong settings or files.
+        LccError: for any error in settings or files, in one line.
     """
     complete(load("evaluate", [*SETTINGS, *overrides]), folder / RING_EVALUATION)
 
@@ -50,9 +50,9 @@ def run(folder: Path, overrides: Sequence[str]) -> None:
 def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     """Write the study's table and diagrams from its evaluation.
 
-    Speeds vary by each car's standard deviation in time; fuel is net of kinetic energy, per km of
-    all cars. The field experiment is compared with the wave before the handover, the others with
-    the same minutes of human drivers.
+    The variation of speeds is each car's standard deviation in time. Fuel is net of kinetic energy,
+    per km of all cars. The field experiment is compared with the wave before the handover, the
+    others with human drivers in the same minutes.
 
     Raises:
         ResultsError: if a table is missing or cannot be read.
@@ -73,10 +73,10 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
 
 
 def table(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return a row per driver of the automated car, and the field experiment's.
+    """Return a row per controller of the automated car, and that of the field experiment.
 
     Args:
-        rows: rows of the evaluation, an episode each.
+        rows: rows of the evaluation, one per episode.
     """
     rows = rows.assign(
         fuel=rows["total_net_energy_kj"] / (rows["cav_distance_m"] + rows["hdv_distance_m"])

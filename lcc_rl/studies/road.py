@@ -1,7 +1,7 @@
-"""What automated cars would bring on a recorded road: lcc-rl reproduce road.
+"""Effect of automated cars on a recorded road: lcc-rl reproduce road.
 
 Drivers are calibrated to trajectories. Strings of them drive behind the recorded leaders, with
-shares of automated cars and without any.
+and without automated cars.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from lcc_rl.results.windows import DRIVE, savings
 from lcc_rl.studies.alcc.study import DRIVERS_FILE
 from lcc_rl.studies.results import StudyResults
 
-ROAD_SHARES = ("5", "10", "20")  # of automated cars [%]
-# Drivers who keep up: a desired speed below that of the leaders would leave a string behind.
+ROAD_SHARES = ("5", "10", "20")  # shares of automated cars [%]
+# Strings with desired speeds below those of the leaders would fall behind.
 FITTED = (
     "data=platoons",
     "calibration=energy",
@@ -49,20 +49,20 @@ DRIVEN = (
     "ACC: {_target_: lcc_rl.pieces.LinearACC, desired_speed: 45}}",
 )
 LEADERS_FILE, SHARES_FOLDER = "leaders.parquet", "evaluation"
-OF_DRIVE = " leader "  # between recording and leader in the name of a drive
-LONGEST = 4000  # steps of a window at most
+OF_DRIVE = " leader "  # separates recording and leader in the name of a drive
+LONGEST = 4000  # most steps of a window
 FUEL = "fuel_l_per_100km"
 DRAWN = (FUEL, "flow_vph", "brakings_below_2_per_100km", "share_time_gap_short")
 COMPARED = (*DRAWN, "co2_g_per_km", "brakings_below_3_per_100km", "travel_time_s_per_km")
 
 
 def run(folder: Path, overrides: Sequence[str], shares: Sequence[str] = ROAD_SHARES) -> None:
-    """Calibrate drivers and evaluate every share; finished parts are skipped.
+    """Calibrate drivers and evaluate all shares; finished parts are skipped.
 
     Args:
         folder: the study's folder.
         overrides: options of ``lcc-rl calibrate`` (data, calibration) and ``lcc-rl evaluate``.
-        shares: of automated cars [%].
+        shares: shares of automated cars [%].
 
     Raises:
         LccError: one clear error for wrong settings or files.
@@ -71,7 +71,7 @@ def run(folder: Path, overrides: Sequence[str], shares: Sequence[str] = ROAD_SHA
     driven = [item for item in overrides if item not in of_data]
     given, found = {top_key(item) for item in driven}, []
     cfg = load("pipeline", ["~experiment", *_beside(FITTED, of_data)])
-    first = _evaluation(driven, "50")  # refused before data are read
+    first = _evaluation(driven, "50")  # checked before data are read
     check_shares(shares, first.scenario.string["size"])
     read_once(cfg, folder, learns=False)
     if "leader" not in given:
@@ -89,21 +89,21 @@ def run(folder: Path, overrides: Sequence[str], shares: Sequence[str] = ROAD_SHA
 
 
 def check_shares(shares: Sequence[str], size: int) -> None:
-    """Refuse shares [%] of a string that are no whole number of its cars.
+    """Refuse shares [%] that are no whole number of cars of the string.
 
     Raises:
-        ConfigError: naming the share, and a size that has it.
+        ConfigError: naming the share, and a size for which it is.
     """
     for share in shares:
         try:
             number = float(share)
         except ValueError:
             number = math.nan
-        words = f"--shares takes per cent above 0 and at most 100, got {share!r} (humans alone are "
-        require(0.0 < number <= 100.0, words + "in every table)")
+        words = f"--shares takes per cent above 0 and at most 100, got {share!r} (0 is in "
+        require(0.0 < number <= 100.0, words + "every table)")
         sizes = (n for n in range(size, 100 * size) if (number * n / 100.0 + 1e-9) % 1.0 < 1e-6)
         if (enough := next(sizes, size)) != size:
-            words = f"{size} vehicles have no {share} %; scenario.string.size={enough} has"
+            words = f"{size} vehicles have no {share} %; use scenario.string.size={enough}"
             raise ConfigError(f"--shares {','.join(shares)}: {words}")
 
 
@@ -117,9 +117,9 @@ def _beside(defaults: Sequence[str], words: Sequence[str]) -> list[str]:
 
 
 def leader_drives(episodes: pd.DataFrame, time_step: float) -> pd.DataFrame:
-    """Return ``drive``, ``time_s`` and ``speed_mps`` of all leaders, whoever followed.
+    """Return ``drive``, ``time_s`` and ``speed_mps`` of all leaders, over all followers.
 
-    A drive is as long as its leader was seen, at steps of ``time_step`` [s].
+    A drive is as long as its leader's record, at steps of ``time_step`` [s].
     """
     keys = ["recording", "leader_id"]
     rows = episodes.sort_values([*keys, "time_s"]).drop_duplicates([*keys, "time_s"])
@@ -131,10 +131,10 @@ def leader_drives(episodes: pd.DataFrame, time_step: float) -> pd.DataFrame:
 
 
 def window_steps(samples: np.ndarray, begun: int) -> int:
-    """Return the steps of the windows that count the most time of all drives.
+    """Return the length of windows [steps] that covers the most time of all drives.
 
     Args:
-        samples: of every drive.
+        samples: samples of each drive.
         begun: first steps of a window, which do not count.
     """
     sizes = np.unique(np.minimum(samples, LONGEST + 1))
@@ -143,7 +143,7 @@ def window_steps(samples: np.ndarray, begun: int) -> int:
 
 
 def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
-    """Write the study's table and figure, and what was found in data and drivers.
+    """Write the study's table and figure, and the reports on data and drivers.
 
     Raises:
         ResultsError: if a table is missing or cannot be read.
@@ -166,7 +166,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     )
     shown = [Shown(x.shown.key, x.label.replace(" [", "\n[")) for x in MEASURES if x.key in DRAWN]
     of = [f"{x:g} %" for x in table["automated_pct"]]
-    named = table.assign(of=of, who=[in_words(str(name)) for name in table["strategy"]])
+    named = table.assign(of=of, driver=[in_words(str(name)) for name in table["strategy"]])
     one = Report("", table, named, tuple(shown), (), "", "")
     found.figure("road", "The same values and intervals; shares of time in %", measures_of(one))
     for name, file in (("Data", folder / TRAJECTORIES), ("Drivers", folder / DRIVERS_FILE)):
@@ -179,11 +179,11 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
 
 
 def rows_of(share: str, windows: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """Yield a row per strategy: measures, and what is left of the humans' by the intervals.
+    """Yield a row per strategy: measures, with intervals from those of the ratio to humans'.
 
     Args:
-        share: of automated cars [%].
-        windows: of :func:`lcc_rl.results.report.windows_for`.
+        share: share of automated cars [%].
+        windows: result of :func:`lcc_rl.results.report.windows_for`.
     """
     parts = {str(name): part for name, part in windows.groupby("strategy", sort=False)}
     for name, part in parts.items():

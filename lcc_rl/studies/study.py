@@ -1,4 +1,4 @@
-"""What every study is given: where it goes, how long and how often it trains."""
+"""Settings of a study with trainings."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class Study:
         folder: the study's folder.
         recipe: ``experiment`` of every training; None for the defaults of the agent.
         seeds: number of trainings of every learned variant, numbered from 0.
-        overrides: further settings of every run, data and calibration included.
-        jobs: number of trainings at a time.
+        overrides: further settings of all runs, including data and calibration.
+        jobs: number of parallel trainings.
 
     Raises:
-        ConfigError: naming the setting out of range.
+        ConfigError: naming a setting that is out of range.
     """
 
     folder: Path

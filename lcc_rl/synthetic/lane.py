@@ -19,10 +19,10 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import PARAMETERS, simulate_follower
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
-# A driver whose desired speed is below this multiple of its platoon's level would fall behind.
+# Drivers with a desired speed below this multiple of their platoon's level would fall behind.
 KEEPS_UP = 1.2
-WARM_UP_S = 30.0  # driven but not recorded, so that no pair starts in equilibrium
-PAUSE_S = 20.0  # between the platoons of a recording
+WARM_UP_S = 30.0  # not recorded, so that no pair starts at equilibrium [s]
+PAUSE_S = 20.0  # time between the platoons of a recording [s]
 AUTOMOBILE = 2  # NGSIM vehicle class
 LENGTHS_M = (4.6, 0.45, 3.5, 6.0)  # mean, standard deviation and range of automobile lengths
 
@@ -50,15 +50,15 @@ def drive_platoons(
     noise: float,
     recordings: Sequence[tuple[NDArray[np.int64], np.random.Generator]],
 ) -> list[Stream]:
-    """Simulate recordings, in each of which platoons drive one after another on one lane.
+    """Simulate recordings of successive platoons on one lane.
 
     Args:
         leader: stochastic leader of every platoon.
         drivers: population from which the followers are drawn.
-        vehicles: vehicles per platoon, the leader included.
+        vehicles: vehicles per platoon, including the leader.
         noise: relative noise of the drivers' acceleration (A18).
-        recordings: of each the recorded steps of every platoon ``[platoons]``, and the source of
-            all its randomness.
+        recordings: the recorded steps of every platoon ``[platoons]`` and the generator of each
+            recording.
 
     Raises:
         ConfigError: if drivers have another model than the IDM.
@@ -89,7 +89,7 @@ def _drawn(
 ) -> list[tuple[Floats, NDArray[np.int64], Floats, Floats]]:
     """Draw leaders' speeds, drivers, noise and lengths of each recording, platoons last.
 
-    Series of short recordings go on, so that all have the length of the longest.
+    Series of short recordings are extended to the length of the longest.
     """
     warm_up, (mean, spread, shortest, longest) = round(WARM_UP_S / FRAME), LENGTHS_M
     most, drawn = warm_up + max(int(seen.max()) for seen, _ in recordings), []
@@ -117,11 +117,10 @@ def draw_drivers(
         drivers: the population.
         level: congestion level of every platoon ``[platoons]`` [m/s].
         shape: drivers per platoon and platoons.
-        generator: source of all randomness.
+        generator: generator of all random numbers.
 
     Returns:
-        Indices into the population, of the given shape; where no driver is fast enough, the
-        fastest.
+        Indices into the population, of the given shape; the fastest driver if none is fast enough.
     """
     order = torch.argsort(drivers.desired_speed, stable=True)
     ascending = drivers.desired_speed[order].numpy()
@@ -131,7 +130,7 @@ def draw_drivers(
 
 
 def drive_ranks(ahead: Tensor, ranks: list[DriverPopulation], xi: Tensor) -> tuple[Floats, Floats]:
-    """Drive platoons behind their leaders, from the equilibrium at the first speed.
+    """Drive platoons behind their leaders from equilibrium at the first speed.
 
     Args:
         ahead: speeds of the leaders ``[time + 1, platoons]`` [m/s].
@@ -139,7 +138,7 @@ def drive_ranks(ahead: Tensor, ranks: list[DriverPopulation], xi: Tensor) -> tup
         xi: relative error of the executed acceleration ``[time, ranks, platoons]`` (A18).
 
     Returns:
-        Speeds ``[time + 1, vehicles, platoons]``, the leaders' included [m/s], and gaps
+        Speeds ``[time + 1, vehicles, platoons]``, including the leaders' [m/s], and gaps
         ``[time + 1, ranks, platoons]`` [m].
     """
     speeds, gaps = [ahead], []
@@ -156,7 +155,7 @@ def drive_ranks(ahead: Tensor, ranks: list[DriverPopulation], xi: Tensor) -> tup
 
 
 def _truth(ranks: list[DriverPopulation]) -> pd.DataFrame:
-    """Parameters of all drivers, in the order of their ids."""
+    """Return the parameters of all drivers, in the order of their ids."""
     vehicle = _identity(len(ranks) + 1, len(ranks[0]))[1:].T.ravel()
     parameters = [drivers.parameters() for drivers in ranks]
     columns = {"vehicle": vehicle, "preceding": vehicle - 1}
@@ -168,7 +167,7 @@ def _truth(ranks: list[DriverPopulation]) -> pd.DataFrame:
 
 
 def _positions(speed: Floats, gap: Floats, length: Floats) -> Floats:
-    """Front bumpers ``[time, vehicles, platoons]`` [m]; the last vehicle starts at its length."""
+    """Return front bumpers ``[time, vehicles, platoons]`` [m]; the last starts at its length."""
     step = 0.5 * FRAME * (speed[1:, 0] + speed[:-1, 0])
     first = np.concatenate([np.zeros_like(step[:1]), np.cumsum(step, axis=0)])
     behind = np.cumsum(gap + length[:-1], axis=1)
@@ -176,14 +175,14 @@ def _positions(speed: Floats, gap: Floats, length: Floats) -> Floats:
 
 
 def _identity(vehicles: int, platoons: int) -> NDArray[np.int64]:
-    """Vehicle ids ``[vehicles, platoons]``, from 1, platoon by platoon."""
+    """Return vehicle ids ``[vehicles, platoons]``, from 1, platoon by platoon."""
     return np.arange(1, vehicles * platoons + 1).reshape(platoons, vehicles).T
 
 
 def _samples(
     speed: Floats, position: Floats, length: Floats, warm_up: int, seen: NDArray[np.int64]
 ) -> pd.DataFrame:
-    """Rows of the recorded part; platoon after platoon along the time of the recording."""
+    """Return the rows of the recorded part, with successive platoons in time."""
     vehicles, platoons = length.shape
     time, platoon = np.nonzero(np.arange(len(speed) - warm_up)[:, None] < seen)
     start = np.concatenate([[0], np.cumsum(seen + round(PAUSE_S / FRAME))[:-1]])

@@ -10,41 +10,39 @@ from lcc_rl.settings import NonNegative, Positive, Settings, Share
 
 
 class StopAndGo(Settings):
-    """Leaders that track a target speed which jumps, as in stop-and-go waves.
+    """Leaders that follow a target speed with jumps, as in stop-and-go waves.
 
-    Every leader has a congestion level, Gaussian over leaders. Its target speed is the sum of its
-    level, a wave and a ripple, at least zero; a free speed may bound level and wave together, and
-    in the lowest waves traffic may stand. Wave and ripple each take a new Gaussian value after
-    exponentially distributed times; waves are rare and large, ripples frequent and small. The
-    speed follows the target as a critically damped second-order system within acceleration
-    limits, so that acceleration is continuous. Jumps reproduce the heavy-tailed accelerations of
-    recorded traffic better than a Gaussian process does.
+    Every leader has a congestion level, Gaussian over leaders. Its target speed is the sum of
+    level, wave and ripple, at least zero. A free speed may bound level plus wave, and traffic may
+    stand in the lowest waves. Wave and ripple each get a new Gaussian value after exponentially
+    distributed times; waves are rare and large, ripples frequent and small. The speed follows the
+    target as a critically damped second-order system within acceleration limits, so acceleration
+    is continuous. Jumps reproduce the heavy-tailed accelerations of recorded traffic better than a
+    Gaussian process.
 
-    The default values are fitted to NGSIM I-80 by a differential evolution and a Nelder–Mead
-    search (``tools/fit_stream.py`` at commit bb30b35): they minimise the distance between the
-    leaders of the synthetic pairs and those of 264 real pairs in the mean and quantiles of
-    speed, acceleration and 30 s energy and in the
-    autocorrelation of acceleration, for platoons of four vehicles.
+    The default values are fitted to NGSIM I-80 by differential evolution and a Nelder–Mead search
+    (``tools/fit_stream.py`` at commit bb30b35). They minimise the distance between the leaders of
+    synthetic pairs and those of 264 real pairs in mean and quantiles of speed, acceleration and
+    30 s energy and in the autocorrelation of acceleration, for platoons of four vehicles.
     """
 
     mean_speed_mps: Positive = 5.21  # mean of the levels [m/s]
     level_spread_mps: NonNegative = 2.78  # standard deviation of the levels over leaders [m/s]
     wave_spread_mps: NonNegative = 2.59  # standard deviation of the waves [m/s]
-    wave_s: Positive = 4.92  # mean time that a wave holds [s]
+    wave_s: Positive = 4.92  # mean duration of a wave [s]
     ripple_spread_mps: NonNegative = 1.32  # standard deviation of the ripples [m/s]
-    ripple_s: Positive = 2.13  # mean time that a ripple holds [s]
+    ripple_s: Positive = 2.13  # mean duration of a ripple [s]
     response_s: Positive = 0.99  # time constant of the response to a jump [s]
     acceleration_limit: Positive = 2.5  # [m/s²]
     braking_limit: Positive = 3.5  # [m/s²]
-    # Bound of level and wave together: the speed of free traffic, from which waves only slow
-    # down [m/s]; None: no bound.
+    # Upper bound of level plus wave, the speed of free traffic [m/s]; None: no bound.
     free_speed_mps: Positive | None = None
-    stop_share: Share = 0.0  # of the waves, the lowest ones, in which traffic stands
+    stop_share: Share = 0.0  # share of the waves, the lowest ones, in which traffic stands
 
     def drive(
         self, count: int, steps: int, time_step: float, generator: np.random.Generator
     ) -> tuple[Floats, Floats]:
-        """Drive leaders side by side.
+        """Drive leaders in parallel.
 
         Levels and jumps are stratified samples of their distributions, which reduces the variance
         of a stream's statistics between seeds.
@@ -53,7 +51,7 @@ class StopAndGo(Settings):
             count: number of leaders.
             steps: number of steps.
             time_step: duration of a step [s].
-            generator: source of all randomness.
+            generator: generator of all random numbers.
 
         Returns:
             Speeds ``[steps + 1, count]`` [m/s] and levels ``[count]`` [m/s].
@@ -69,7 +67,7 @@ class StopAndGo(Settings):
         return self._track(np.maximum(target, 0.0), time_step), level
 
     def _track(self, target: Floats, time_step: float) -> Floats:
-        """Speeds of leaders that track target speeds, both ``[steps + 1, count]``."""
+        """Return speeds of leaders for target speeds, both ``[steps + 1, count]``."""
         speed = target[0]
         acceleration = np.zeros_like(speed)
         speeds = [speed]
@@ -78,7 +76,7 @@ class StopAndGo(Settings):
             wanted = acceleration + time_step * pull
             wanted = np.clip(wanted, -self.braking_limit, self.acceleration_limit)
             reached = np.maximum(speed + wanted * time_step, 0.0)
-            # At a stop the executed acceleration counts, or the leader would start off late.
+            # At a stop the executed acceleration counts; else the leader would start late.
             acceleration = (reached - speed) / time_step
             speed = reached
             speeds.append(speed)
@@ -86,15 +84,15 @@ class StopAndGo(Settings):
 
 
 def jumps(shape: tuple[int, int], rate: float, generator: np.random.Generator) -> Floats:
-    """Standard normal values that hold until the next jump.
+    """Return standard normal values that are constant until the next jump.
 
     Args:
         shape: steps and number of processes.
         rate: probability of a jump in a step.
-        generator: source of all randomness.
+        generator: generator of all random numbers.
 
     Returns:
-        Values of the given shape; all of them together are a stratified sample.
+        Values of the given shape, together a stratified sample.
     """
     jump = generator.random(shape) < rate
     jump[0] = True
@@ -105,7 +103,7 @@ def jumps(shape: tuple[int, int], rate: float, generator: np.random.Generator) -
 
 
 def stratified_normal(count: int, generator: np.random.Generator) -> Floats:
-    """Standard normal numbers, one from each of ``count`` equally likely ranges, shuffled."""
+    """Return shuffled standard normal numbers, one from each of ``count`` equiprobable ranges."""
     place = generator.permutation(count) + generator.random(count)
-    # The first range reaches down to probability 0, whose quantile is −∞.
+    # The first range begins at probability 0, with the quantile −∞.
     return ndtri(np.clip(place / count, 0.01 / count, 1.0 - 0.01 / count))

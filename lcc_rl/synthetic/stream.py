@@ -1,9 +1,9 @@
 """Synthetic congested traffic with known drivers, the default data source.
 
-A lane of IDM drivers drawn from the calibrated I-80 population drives in platoons behind
-stochastic stop-and-go leaders (:class:`lcc_rl.synthetic.stop_and_go.StopAndGo`). The stream has the
-columns and the rounding of NGSIM files and passes the same extraction and calibration. Unlike
-there, the parameters of every driver are known.
+IDM drivers from the calibrated I-80 population drive in platoons behind stochastic stop-and-go
+leaders (:class:`lcc_rl.synthetic.stop_and_go.StopAndGo`). The stream has the columns and the
+rounding of NGSIM files, and the same extraction and calibration apply. Unlike in recorded data,
+the parameters of every driver are known.
 """
 
 from __future__ import annotations
@@ -41,25 +41,24 @@ FIRST_START = datetime(2005, 1, 1, 12, tzinfo=UTC)
 class StreamSource(Settings):
     """Source of synthetic car-following episodes, in the columns and the rounding of NGSIM.
 
-    The default size gives 270 pairs in three recordings; the I-80 data that the leader is fitted
-    to hold 264 pairs in three recordings.
+    The default size gives 270 pairs in three recordings; the I-80 data have 264 in three.
     """
 
-    WRITES = ("keep",)  # settings that name a place to write
+    WRITES = ("keep",)  # settings that name a path to write to
 
-    # Their leaders, drivers and vehicle ids are independent.
+    # Recordings with independent leaders, drivers and vehicle ids.
     recordings: Annotated[int, Field(ge=1, le=1000)] = 3
-    platoons: Annotated[int, Field(ge=1, le=10_000)] = 30  # per recording, one after another
-    # Per platoon, the stochastic leader included.
+    platoons: Annotated[int, Field(ge=1, le=10_000)] = 30  # successive platoons per recording
+    # Vehicles per platoon, including the stochastic leader.
     vehicles: Annotated[int, Field(ge=2, le=1000)] = 4
-    duration_s: Range = (60.0, 90.0)  # of how long a platoon is seen [s]
-    seed: Seed = 0  # of the data; the run's own seed leaves them alone
+    duration_s: Range = (60.0, 90.0)  # range of the recorded time of a platoon [s]
+    seed: Seed = 0  # seed of the data, independent of the run's seed
     noise: Share = 0.05  # drivers execute a(1 + ξ), ξ ~ U(0, noise) (A18)
     leader: StopAndGo = field(default_factory=StopAndGo)
     drivers: InstanceOf[DriverPopulation] | None = None  # None: the shipped I-80 drivers
-    # What counts as car following; the default is that of real files.
+    # Criteria of car following; the default is that of real files.
     criteria: Criteria = field(default_factory=Criteria)
-    keep: None = None  # no file is written; the hashes of runs hold this setting
+    keep: None = None  # no file is written; the setting remains in the hashes of runs
 
     def validate(self) -> None:
         low, high = self.duration_s
@@ -99,7 +98,7 @@ def as_recorded(samples: pd.DataFrame) -> Trajectories:
     """Return samples with the rounding of NGSIM files: three decimals of a foot, in float32.
 
     Args:
-        samples: see :class:`lcc_rl.synthetic.lane.Stream`; recordings in order of their names.
+        samples: see :class:`lcc_rl.synthetic.lane.Stream`; recordings are sorted by name.
     """
     columns = {str(name): samples[name].to_numpy() for name in samples if name != "time_s"}
     columns["recording"], names = pd.factorize(columns["recording"])
@@ -113,5 +112,5 @@ def as_recorded(samples: pd.DataFrame) -> Trajectories:
 
 
 def recording_name(index: int) -> str:
-    """Name of a recording as the reader gives it: its start, one hour apart."""
+    """Return the name of a recording, its start; starts are one hour apart."""
     return (FIRST_START + timedelta(hours=index)).strftime("%Y-%m-%dT%H:%M:%SZ")

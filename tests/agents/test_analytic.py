@@ -131,7 +131,7 @@ def test_divergence_is_named(tmp_path) -> None:
     with torch.no_grad():
         next(trainer.agent.policy.parameters()).fill_(math.nan)
     with pytest.raises(
-        Diverged, match=r"weight module.* became no number in iteration 1 of 5; .*learning_rate"
+        Diverged, match=r"weight module.* is not finite in iteration 1 of 5; .*learning_rate"
     ):
         trainer.run()
 

@@ -55,7 +55,7 @@ def test_a_rule_whose_actions_have_an_unknown_scale_is_refused() -> None:
     cfg.scenario.controllers["automated"] = Node.of(
         {"_target_": f"{__name__}.Scaled", "scale": 2.0}, "automated"
     )
-    with pytest.raises(ConfigError, match="needs to know the acceleration of action 1"):
+    with pytest.raises(ConfigError, match="needs the acceleration of action 1"):
         make_agent(cfg)
 
 

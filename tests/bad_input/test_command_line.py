@@ -85,12 +85,12 @@ def test_nothing_that_is_there_is_written_over(run, tmp_path) -> None:
     (tmp_path / "v.html").write_text("kept")
     for words in NAMED:
         said = refused(words.split(), tmp_path)
-        assert re.search("is already there|already holds|is no folder", said), words
+        assert re.search("exists already|already holds|is no folder", said), words
 
 
 def test_so_do_the_benchmarks(run, tmp_path, monkeypatch) -> None:
     for typed, said in (
-        ("env --out run/episodes.parquet", "is already there"),
+        ("env --out run/episodes.parquet", "exists already"),
         ("env --threads 100000", "--threads: must be less"),
         ("reed", "Did you mean 'read'"),
     ):

@@ -10,6 +10,7 @@ import torch
 from commands import DATA
 from helpers import check_refused, compose, single_env, small_env, wavy_profiles
 from tensordict import TensorDict
+from torch import nn
 
 from lcc_rl.config.nodes import Node
 from lcc_rl.drivers.population import bootstrap
@@ -49,7 +50,7 @@ def test_every_way_to_reset_refuses_them(envs) -> None:
     with pytest.raises(ConfigError, match=r"vehicles\.gap is no"):
         play(env, lambda td: td, given, [REWARD])
     with pytest.raises(ConfigError, match=r"vehicles\.gap is no"):
-        DifferentiableRollout(env, [REWARD]).start(given)
+        DifferentiableRollout(env, nn.Identity(), [REWARD]).start(given)
     with pytest.raises(ConfigError, match=r"TensorDict of \[2\] episodes, .* got \[3\]"):
         env.reset(TensorDict({SEED: torch.zeros(3, 1).long()}, [3]))
 

@@ -95,7 +95,7 @@ def test_a_stored_configuration_writes_nowhere_but_into_its_folder(run, tmp_path
     assert (cfg.data.made().keep, cfg.logger.made().where) == (None, None)
     assert cfg.logger.made().kind == "tensorboard"
     assert "data.keep=" in caplog.text
-    assert "names a place to write and is left out" in caplog.text
+    assert "names a path to write to and is left out" in caplog.text
     change(run, {"logger": None})
     run_command("lcc_rl.cli.train", f"resume={run}", cwd=tmp_path, check=True)
     assert list(tmp_path.iterdir()) == [run]
@@ -195,7 +195,7 @@ FITS = [
     ({"scenario.time_step": 0.5}, "idm", r"p\.pt.*scenario\.time_step=0\.5, got 0\.1"),
     ({"scenario.controllers.automated.max_acceleration": 1.0}, "alcc", r"max_acceleration=1\.0"),
     ({}, "reference", "trained as variant alcc"),
-    ({}, "none", "learns nothing"),
+    ({}, "none", "has no agent"),
 ]
 
 
@@ -286,7 +286,7 @@ TAMPERED: dict[str, tuple[Callable[[dict], object], str]] = {
     "less": (lambda state: state.pop("memory"), "memory is required"),
     "bytes": (cast(torch.int8), "weight is torch.int8"),
     "complex": (cast(torch.complex64), "weight is torch.complex64"),
-    "optimizer": (spoil_optimizer, r"0\.exp_avg holds values that are no numbers"),
+    "optimizer": (spoil_optimizer, r"0\.exp_avg holds values that are not finite"),
 }
 
 

@@ -68,9 +68,9 @@ WRONG = {
 # Options without effect on the variant, and why.
 IGNORED = {
     "variant=cacc split.by=vehicle": "leader=trajectories",
-    f"controller@{AUTO}=handover agent=td3": "handover drives the .* takes no action",
+    f"controller@{AUTO}=handover agent=td3": "handover drives the .* uses no action",
     "scenario.circumference=200": "belongs to scenario.road=ring",
-    "variant=idm training.episodes=20": "variant idm learns nothing",
+    "variant=idm training.episodes=20": "variant idm has no agent",
     "variant=alcc scenario.string=human*3 training.episodes=20": "no vehicle .* is automated",
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",
     "sweep=mine": "names the folder of a sweep, -m",

@@ -112,7 +112,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("table", COMMAS.replace(";11,", ";1l,", 1), "column 'v' holds '1l,"),
     ("table", csv(TABLE.assign(v="")), "data row 1, column 'v' is blank"),
     ("table", table(id=""), "data row 501, column 'id' is blank"),
-    ("table", table(id="x" * 1001), "data row 501, column 'id' holds a text of 1,001 signs"),
+    ("table", table(id="x" * 1001), "data row 501, column 'id' holds a text of 1,001 characters"),
     ("record", RECORD + "0,1\n1,fast\n", "data row 2, column 'speed_mps' holds 'fast'"),
     # Rows that contradict each other, and times.
     ("table", csv(LATE), r"data row 1191, vehicle 3 is 1e\+11 s after the first"),
@@ -121,9 +121,9 @@ BAD: list[tuple[str, str | bytes, str]] = [
     (
         "episodes",
         TWICE,
-        "row 601, column 'time_s' repeats a moment of its episode with other values, as do 50 %",
+        "row 601, column 'time_s' repeats a time of its episode with other values, as do 50 %",
     ),
-    ("table", csv(TABLE.assign(t=0.0)), "data row 2, vehicle 1, column 't' repeats a moment of"),
+    ("table", csv(TABLE.assign(t=0.0)), "data row 2, vehicle 1, column 't' repeats a time of"),
     ("leaders", RECORD + "0,1\n1,2\n2,1\n", r"covers 0–2 s, not the stretch 0–9 s"),
     # Values that are implausible, and units.
     ("ngsim", csv_text(pair(v_Length=4.5, Preceding=0)[:20]), "is 4.5 feet; .*data.units=metres"),

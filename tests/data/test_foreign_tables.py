@@ -53,8 +53,8 @@ def test_the_name_of_a_column_may_say_its_unit(tmp_path) -> None:
         frame = long_table(rows=400).rename(columns={BY_GAP[key]: name})
         frame[name] /= UNITS[quantity][unit]
         path = written(tmp_path, frame, "named.csv", quotechar='"')
-        words = re.escape(f"the name of column {name!r} says {unit}, and it is read in")
-        with pytest.raises(DataError, match=rf"{words} .*; set data\.units\.{key}={unit}, or give"):
+        words = re.escape(f"the name of column {name!r} contains {unit}, but it is read in")
+        with pytest.raises(DataError, match=rf"{words} .*; set data\.units\.{key}={unit}, or"):
             TableSource(path=path, columns=columns).load()
         loaded = TableSource(path=path, columns=columns, units={key: unit}).load()
         assert len(loaded.episodes) == 800, name

@@ -158,7 +158,7 @@ def test_without_a_clock_a_file_is_a_recording(tmp_path: Path) -> None:
         (tmp_path / "file.csv").write_text(text)
         both = read_ngsim([tmp_path / "file.csv", tmp_path / "other.txt.gz"])
         assert both.report.recordings == {"file#1": 4000, "other#1": 4000}, clock
-        assert "Global_Time does not tell the recording of 4,000 rows" in str(both.report)
+        assert "Global_Time does not identify the recording of 4,000 rows" in str(both.report)
 
 
 def test_parts_of_a_recording_in_two_files_join(tmp_path: Path) -> None:

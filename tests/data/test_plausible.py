@@ -112,7 +112,7 @@ def test_consistent_gaps_have_the_slope_one_and_no_lag_also_with_a_biased_speedo
     if not bias:
         assert judged(wavy())[-1].endswith("speeds 1.00, lag 0.0 s of 3 pair(s)")
     short = judged(wavy(12.0))
-    assert short[-1].endswith("1 m/s; too little to tell slope and lag of 3")
+    assert short[-1].endswith("1 m/s; slope and lag unknown for 3")
 
 
 BOTH, LEADER, FOLLOWER = [*SPEEDS], SPEEDS[:1], SPEEDS[1:]
@@ -202,7 +202,7 @@ def test_a_faulty_sensor_fits_no_unit_and_is_refused_only_where_all_are() -> Non
     table, rng = irregular(), np.random.default_rng(0)
     noise = 20 + 5 * np.cumsum(rng.normal(size=len(table))) / 10
     one = table.assign(gap_m=table["gap_m"].where(table["episode"] > 0, noise))
-    assert judged(one)[-1].endswith("of 2 pair(s), too little to tell slope and lag of 1")
+    assert judged(one)[-1].endswith("of 2 pair(s), slope and lag unknown for 1")
     with pytest.raises(DataError, match=r"f\.csv: the gap changes by -?0\.\d\d m .* no unit fits"):
         judged(table.assign(gap_m=noise))
 
@@ -215,7 +215,7 @@ def test_a_start_from_standing_is_not_said_to_be_in_another_unit() -> None:
     )
     table = pd.DataFrame({"episode": 0, "time_s": time, "gap_m": gap})
     table = table.assign(leader_speed_mps=leader, follower_speed_mps=follower)
-    with pytest.raises(DataError, match=r"max_hard=0\.005; gaps agree: .* such starts"):
+    with pytest.raises(DataError, match=r"max_hard=0\.005; gaps agree: .* such changes"):
         judged(table, max_acceleration=999.0)
 
 

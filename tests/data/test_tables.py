@@ -200,7 +200,7 @@ def test_a_leader_that_is_not_there_and_duplicates_are_counted(tmp_path) -> None
     frame.loc[frame["id"] == 2, "ahead"] = 77
     frame.loc[20, "v"] = np.nan
     loaded = TableSource(path=written(tmp_path, frame), columns=BY_GAP).load()
-    words = "dropped 2 rows: rows of a moment that their vehicle has already, 0 of them with"
+    words = "dropped 2 rows: rows that repeat a time of their vehicle, 0 of them with"
     assert any(line.startswith(words) for line in loaded.report)
     assert "dropped 1 rows: blank time, speed or position" in loaded.report
     assert loaded.episodes["follower_id"].unique().tolist() == [3]

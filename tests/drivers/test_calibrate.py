@@ -139,8 +139,8 @@ def test_the_report_counts_records_and_drivers(cfg, source, tmp_path):
     table.to_parquet(path)
     out, lines = io.StringIO(), []
     cfg.calibration = cfg.calibration.changed(modes=["local"])
-    tell = lines.extend
-    drivers = calibration.run(cfg, tmp_path / "run", Console(file=out, width=100), tell)
+    emit = lines.extend
+    drivers = calibration.run(cfg, tmp_path / "run", Console(file=out, width=100), emit)
     assert len(drivers) == 4
     assert any(line.startswith("local: RMSPE of 4 records of 3 drivers: ") for line in lines)
     assert "4 records of 3 drivers" in out.getvalue()

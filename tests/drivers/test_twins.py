@@ -187,7 +187,9 @@ def test_noises_of_the_gap_are_tried_and_weigh_rough_leaders_only_where_asked(mo
     assert choose_reaction(every, records, rows) == Reaction(0.0, 0.2)
     result = Calibrator(reaction=True, perception=True)(observed)
     assert "gap_noise" in result.drivers
-    assert any("of it behind the calmest, middle and roughest" in line for line in result.report)
+    assert any(
+        "of this loss behind the calmest, middle and roughest" in line for line in result.report
+    )
     with pytest.raises(ConfigError, match="perception chooses a part of the reaction"):
         Calibrator(perception=True)
 
@@ -199,5 +201,5 @@ def test_drivers_that_hold_their_speeds_tell_nothing() -> None:
     with pytest.raises(DataError, match=r"hold their speeds: too little .* use calibration=local"):
         Calibrator(modes=["local"], reaction=True)(episodes)
     report = "\n".join(Calibrator(modes=["local"])(episodes).report)
-    assert "hold their speeds: too little to tell" in report
+    assert "hold their speeds: too little to compare" in report
     assert "inf" not in report

@@ -199,8 +199,9 @@ def test_every_path_drives_trucks_alike() -> None:
         rolled = small_env("alcc", 8, overrides, seed=3).rollout(
             40, shared_policy(policy), break_when_any_done=False
         )
-        unrolled = DifferentiableRollout(small_env("alcc", 8, overrides, seed=3), keys, ())
-        _, record = unrolled.play(unrolled.start(), policy.module, 40)
+        env = small_env("alcc", 8, overrides, seed=3)
+        unrolled = DifferentiableRollout(env, policy.module, keys)
+        _, record = unrolled.play(unrolled.start(), 40)
         steps = unrolled.assemble(record)["next"]
     env = small_env("alcc", 8, overrides, seed=3)
     collector = StringCollector(

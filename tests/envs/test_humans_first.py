@@ -6,7 +6,8 @@ import json
 
 import pytest
 import torch
-from helpers import check_refused, compose, make_agent
+from helpers import OBSERVATION, check_refused, compose, make_agent
+from torch import nn
 
 from lcc_rl.agents.factory import make_trainer
 from lcc_rl.config import load
@@ -44,9 +45,11 @@ def test_a_training_takes_over_where_humans_are(tmp_path) -> None:
         assert torch.equal(begun[key], reached[key][:, -1]), key
     # The episode is as long as the scenario says, and the policy drives in it.
     assert (trainer.horizon, trainer.env.base_env.horizon) == (30, 230)
-    told = DifferentiableRollout(trainer.env, [("command", "automated")])
+    brake = nn.Linear(begun[OBSERVATION].shape[-1], 1)  # at full strength
+    nn.init.constant_(brake.bias, -100.0)
+    told = DifferentiableRollout(trainer.env, brake, [("command", "automated")])
     begun = told.skip(told.start(), trainer.agent.burn_in)
-    after, _ = told.play(begun, lambda seen: -torch.ones_like(seen[..., :1]), 1)
+    after, _ = told.play(begun, 1)
     torch.testing.assert_close(
         after["command", "automated"], torch.full((3, 1, 1), -3.0), atol=0, rtol=0
     )

@@ -48,8 +48,9 @@ def test_entries_equal_those_of_a_rollout(variant, more) -> None:
     with torch.no_grad():
         env = small_env(variant, 5, overrides, seed=3)
         expected = env.rollout(20, shared_policy(policy), break_when_any_done=False)
-        unrolled = DifferentiableRollout(small_env(variant, 5, overrides, seed=3), WANTED, observed)
-        _, record = unrolled.play(unrolled.start(), policy.module, 20)
+        env = small_env(variant, 5, overrides, seed=3)
+        unrolled = DifferentiableRollout(env, policy.module, WANTED, observed)
+        _, record = unrolled.play(unrolled.start(), 20)
         got = unrolled.assemble(record)
     for key in [*WANTED, *observed, ("done",), ("terminated",), OBSERVATION]:
         assert torch.equal(got.get(("next", *key)), expected.get(("next", *key))), key
@@ -58,8 +59,8 @@ def test_entries_equal_those_of_a_rollout(variant, more) -> None:
 
 def total_power(env: TransformedEnv, network, seed: int = 0) -> torch.Tensor:
     env.set_seed(seed)
-    unrolled = DifferentiableRollout(env, [("vehicles", "power")])
-    _, record = unrolled.play(unrolled.start(), network, 20)
+    unrolled = DifferentiableRollout(env, network, [("vehicles", "power")])
+    _, record = unrolled.play(unrolled.start(), 20)
     return unrolled.assemble(record)["next", "vehicles", "power"].sum() / 20000.0
 
 
@@ -110,8 +111,8 @@ def test_gradients_are_finite_through_contact_and_standstill() -> None:
         network = make_actor(7, 1, (8,), 0).module
         with torch.no_grad():
             network[0][-1].bias.fill_(bias * 0.1)
-        unrolled = DifferentiableRollout(env, WANTED)
-        _, record = unrolled.play(unrolled.start(), network, 100)
+        unrolled = DifferentiableRollout(env, network, WANTED)
+        _, record = unrolled.play(unrolled.start(), 100)
         data = unrolled.assemble(record)
         if bias > 0:
             assert data["next", "terminated"].any()
@@ -125,15 +126,14 @@ def test_gradients_are_finite_through_contact_and_standstill() -> None:
 def test_compiled_equals_eager_over_an_episode(fleet) -> None:
     if which(os.environ.get("CXX", "g++")) is None:
         pytest.skip("no compiler on this machine")
-    plain, fast = (
-        DifferentiableRollout(
-            small_env("alcc", 8, ["scenario.horizon=100", *fleet]), WANTED, OBSERVED, compiled=c
-        )
-        for c in (False, True)
-    )
-    size = plain.env.full_observation_spec[OBSERVATION].shape[-1]
+    envs = [small_env("alcc", 8, ["scenario.horizon=100", *fleet]) for _ in range(2)]
+    size = envs[0].full_observation_spec[OBSERVATION].shape[-1]
     network = make_actor(size, 1, (16,), 0).module
-    rolls = [u.assemble(u.play(u.start(), network, 100)[1])["next"] for u in (plain, fast)]
+    plain, fast = (
+        DifferentiableRollout(env, network, WANTED, OBSERVED, compiled=c)
+        for env, c in zip(envs, (False, True), strict=True)
+    )
+    rolls = [u.assemble(u.play(u.start(), 100)[1])["next"] for u in (plain, fast)]
     for key in [("vehicles", "gap"), ("vehicles", "speed")]:
         assert torch.allclose(rolls[0].get(key), rolls[1].get(key), rtol=1e-5, atol=1e-5), key
     slopes = []
@@ -142,4 +142,4 @@ def test_compiled_equals_eager_over_an_episode(fleet) -> None:
         (2.0 * roll["vehicles", "power"].mean()).backward()
         slopes.append(torch.cat([w.grad.flatten() for w in network.parameters()]).clone())
     assert torch.allclose(slopes[0], slopes[1], rtol=1e-3, atol=1e-4 * float(slopes[0].norm()))
-    assert all(part.function is not part.plain for part in (fast.advance, fast.pull))
+    assert all(part.function is not part.plain for part in (fast.drive, fast.pull))

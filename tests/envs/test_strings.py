@@ -241,7 +241,7 @@ def test_a_configuration_that_does_not_fit_is_refused() -> None:
                 ["scenario.filters={auto: null}"],
                 r"unknown role \(scenario\.filters\) 'auto'",
             ),
-            ("alcc", ["scenario.start.human=null"], r"scenario\.start lacks human"),
+            ("alcc", ["scenario.start.human=null"], r"scenario\.start has no entry for human"),
             ("alcc", [string("automated (human")], "this bracket is never closed at character 11"),
             ("alcc", ["reward.terms=null"], "terms"),
         ],

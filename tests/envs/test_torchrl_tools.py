@@ -267,7 +267,7 @@ def test_double_precision_by_default() -> None:
 def test_a_step_without_its_state_is_refused_in_one_line() -> None:
     env = single_env("alcc", 2)
     env.reset()
-    with pytest.raises(ConfigError, match=r"what reset or step_mdp returned.*only action"):
+    with pytest.raises(ConfigError, match=r"TensorDict of reset or step_mdp.*only action"):
         env.step(TensorDict({"action": torch.zeros(2, 1)}, [2]))
     for drop in (room.SelectTransform(*OBS), room.ExcludeTransform(("vehicles", "gap"))):
         with pytest.raises(ConfigError, match=r"transforms must keep it"):

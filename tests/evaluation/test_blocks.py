@@ -129,7 +129,7 @@ def test_an_interrupted_command_names_the_one_that_goes_on(tmp_path, monkeypatch
         done = run_command("lcc_rl.cli.evaluate", *words, cwd=tmp_path)
     assert done.returncode == 130
     assert re.search(
-        r"stopped; go on with: lcc-rl evaluate resume=\S*run trust=\[mine\]$", done.stderr.strip()
+        r"stopped; resume with: lcc-rl evaluate resume=\S*run trust=\[mine\]$", done.stderr.strip()
     )
 
 

@@ -103,12 +103,12 @@ def test_a_recurrent_policy_of_torchrl_drives() -> None:
 def test_what_is_no_policy_of_these_keys_is_refused_in_a_line() -> None:
     network = networks()[0]
     cases = [
-        ({"x": nn.Linear(5, 1)}, "x is given observations of 7 numbers, and fails: mat1 and mat2"),
-        ({"x": nn.Linear(WIDTH, 2)}, r"x is given .* shape '\[1, 1, 1\]' is invalid"),
+        ({"x": nn.Linear(5, 1)}, "x fails for observations of 7 numbers: mat1 and mat2"),
+        ({"x": nn.Linear(WIDTH, 2)}, r"x fails .* shape '\[1, 1, 1\]' is invalid"),
         ({"x": TensorDictModule(network, ["obs"], ["action"])}, r"x reads \['obs'\] and writes"),
         ({"x": TensorDictModule(network, ["observation"], ["act"])}, r"writes \['act'\]: expected"),
         ({"alcc": network}, "a policy alcc, which stands for 'network, for all': choose another"),
     ]
     check_refused(lambda who: lcc_rl.compare(who, overrides=SMALL), cases, ConfigError)
-    with pytest.raises(ConfigError, match="x is a policy, and variant idm learns nothing"):
+    with pytest.raises(ConfigError, match="x is a policy, and variant idm has no agent"):
         lcc_rl.compare({"x": network}, "idm", [*NO_AGENT])

@@ -192,8 +192,8 @@ def test_a_file_that_the_package_hides_is_refused(tmp_path) -> None:
 def test_what_cannot_be_named_or_told_apart_is_refused(tmp_path) -> None:
     names = ("rule", "alcc", "idm_acc", "acc_filtered")
     cases = [
-        ([lambda gap: gap], "at the top of a module"),
-        ([partial(steady, gain=0.1)], "at the top of a module"),
+        ([lambda gap: gap], "at the top level of a module"),
+        ([partial(steady, gain=0.1)], "at the top level of a module"),
         *(({x: PATH}, f"names Steady {x}, which stands for '.+': choose") for x in names),
         ([PATH, PATH], "two Steady: give each a name"),
     ]

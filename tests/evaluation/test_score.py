@@ -82,14 +82,14 @@ def test_the_hash_is_of_the_code_of_an_own_controller(tmp_path, monkeypatch) -> 
 def test_mistakes_are_named(tmp_path) -> None:
     cases = [
         ("idm_ac", "'idm_acc'"),
-        ("direct", "no controller that could be scored"),
+        ("direct", "direct cannot be scored"),
         ("idm --task i80", "nothing could be played: i80: .*i80-follow"),
         ("idm --task i80-follow --on moon", "no such source, only stream, "),
         ("idm --source ../x leader=i24", "expected a new name"),
         ("idm --source x agent=ddpg", "expected settings of data, "),
         ("idm data=stream", "each task has its own"),
         ("idm --name idm_acc", "--name idm_acc stands for .tuned IDM. in"),
-        ("acc_filtered --task i80-follow", "no safety filter: score acc, .* without one"),
+        ("acc_filtered --task i80-follow", "the task has no safety filter: score acc without one"),
     ]
     to = ("--out", str(tmp_path / "a"))
     check_refused(lambda words: main([*words.split(), *to]), cases, ConfigError)

@@ -61,7 +61,7 @@ def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, ca
     np.testing.assert_allclose(every["score"], run.headline["score"])
     limits = task_of(cfg).limits
     assert {*limits, *(f"limit_{x}" for x in limits), "total_path_energy_kj"} <= set(every)
-    table_again([str(tmp_path), "--format", "latex", "--columns", "who,saved_pct"])
+    table_again([str(tmp_path), "--format", "latex", "--columns", "driver,saved_pct"])
     heads = capsys.readouterr().out.splitlines()[2]
     assert heads.split(" & ") == ["driven by", r"saved [\%] \\"]
     with pytest.raises(ConfigError, match="Did you mean 'saved_pct'"):

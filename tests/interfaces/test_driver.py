@@ -170,7 +170,7 @@ def test_own_drivers_drive_as_people_do() -> None:
     assert found[4] < 0.6 * found[0]
     gentle = Driver("human", 0.1, drivers=fixed(45.0, 2.0))
     assert gentle.step(start) < found[0] - 0.3
-    with pytest.raises(ConfigError, match=f"drivers are of rules; {POLICY} is a policy"):
+    with pytest.raises(ConfigError, match=f"drivers needs a rule; {POLICY} is a policy"):
         Driver(POLICY, 0.1, drivers=POPULATION)
 
 

@@ -78,7 +78,7 @@ def test_a_pytorch_program_computes_the_same_and_says_what_it_reads(module, tmp_
     given = (states(module), memories(module))
     torch.testing.assert_close(loaded(*given), module(*given))
     assert [item["name"] for item in json.loads(about["lcc_rl"])["inputs"]] == module.names
-    with pytest.raises(ResultsError, match="is already there"):
+    with pytest.raises(ResultsError, match="exists already"):
         lcc_rl.export("pretrained/i80-follow", path)
 
 

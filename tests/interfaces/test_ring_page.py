@@ -218,7 +218,7 @@ def test_what_the_page_cannot_compute_is_one_clear_error(tmp_path) -> None:
     }
     for words, given in settings.items():
         ring = [given, *("+controller@scenario.controllers.truck=idm",) * given.endswith("truck")]
-        with pytest.raises(ConfigError, match=f"cannot carry {words}"):
+        with pytest.raises(ConfigError, match=f"does not support {words}"):
             export(RING, tmp_path / "ring.html", overrides=ring)
     with pytest.raises(ConfigError, match="has no road"):
         export(RING, tmp_path / "ring.onnx", overrides=["scenario.circumference=300"])

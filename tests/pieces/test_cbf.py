@@ -62,7 +62,7 @@ def test_faults_need_a_filter_that_reckons_with_them(faults, action) -> None:
     both = ["+filter=cbf", f"+faults={faults}", "scenario.horizon=150"]
     blind, knows = (driven(action, *both, f"{AUTO}.robust={x}") for x in ("false", "true"))
     assert blind["ttc"].min() < 4.0
-    assert "promised" not in blind  # it answers for nothing
+    assert "promised" not in blind  # its guarantee covers no step
     promised = knows["promised"] == 1.0
     assert promised.double().mean() > 0.9
     assert (knows["ttc"][promised] >= 4.0).all()

@@ -157,7 +157,8 @@ def test_the_overview_has_the_savings_of_the_table_and_colours_are_on_the_image(
     own = steps().assign(strategy="own_energy")
     figure = run_figures.overview(frame, own, "own_energy", found)
     right = figure.axes[1]
-    assert [x.get_text().replace("\n", " ") for x in right.get_yticklabels()] == list(table["who"])
+    labels = [x.get_text().replace("\n", " ") for x in right.get_yticklabels()]
+    assert labels == list(table["driver"])
     shown = right.lines[0].get_xdata()
     np.testing.assert_allclose(shown, table["saved_pct"].fillna(0.0))
     ends = [line[:, 0] for line in right.collections[0].get_segments() if len(line)]

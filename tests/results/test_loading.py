@@ -20,7 +20,7 @@ from lcc_rl.commands import animate
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.loading import load_sweep
-from lcc_rl.results.runs import told_apart
+from lcc_rl.results.runs import distinguished
 
 TABLE = "episodes.parquet"
 
@@ -90,7 +90,7 @@ def test_what_tells_runs_apart_is_few_settings_by_their_last_words() -> None:
         ([{"seed": 0}, {"seed": 0, "other.seed": 1}], ["other.seed=None", "other.seed=1"]),
         ([{"seed": 0}, {"seed": 0}], ["", ""]),
     ):
-        assert told_apart(settings) == expected
+        assert distinguished(settings) == expected
 
 
 def sweep_of(root: Path, *runs: dict[str, object], **columns: object) -> pd.DataFrame:
@@ -115,8 +115,8 @@ def test_the_runs_of_a_sweep_are_read_as_one_evaluation(tmp_path) -> None:
     assert rows["training_seed"].tolist() == [pd.NA, 0, 1, 0, 1]
     assert sweep_of(tmp_path / "seeds", *grid[:2])["strategy"].tolist() == ["idm", "alcc", "alcc"]
     refusals = [
-        ([{"seed": 0}, {"seed": 0, "table": "all"}], "one training twice: alcc, seed 0"),
-        ([{"seed": 0}, {"seed": 1, "leader": 8.0}], r"meet different leaders .*results\.load"),
+        ([{"seed": 0}, {"seed": 0, "table": "all"}], "a training twice: alcc, seed 0"),
+        ([{"seed": 0}, {"seed": 1, "leader": 8.0}], r"have different leaders .*results\.load"),
     ]
     for place, (runs, words) in enumerate(refusals):
         with pytest.raises(ConfigError, match=words):
@@ -233,7 +233,7 @@ MOVED |= {"time_s": [0.1, 0.2], "cav_speed": [9.0, 9.0], "cav_gap": [20.0, 20.0]
 
 
 def test_an_animation_of_foreign_files_is_refused_in_a_line(tmp_path) -> None:
-    lacks = r"\d: not what a run writes: KeyError: "
+    lacks = r"\d: not written by a run: KeyError: "
     cases = [
         ({"strategy": ["idm"] * 2}, {}, lacks + "'training_seed'"),
         ({"a": [1]}, {}, lacks + "'strategy'"),

@@ -126,7 +126,7 @@ def test_the_headline_is_the_summary_and_those_that_draw_most_stand_first() -> N
 def test_humans_alone_have_a_row_and_none_beside_controlled_cars() -> None:
     humans = episodes()[lambda rows: rows["strategy"] == "direct"].assign(cav_distance_m=np.nan)
     (row,) = report(windows_for(humans)).short.to_dict("records")
-    assert row["who"] == "no automated car"
+    assert row["driver"] == "no automated car"
     assert row["energy_kj_per_km"] == pytest.approx(humans["hdv_path_energy_kj"].mean() / 0.15)
     assert "direct" not in report(windows_for(episodes())).short["strategy"].tolist()
 
@@ -182,7 +182,7 @@ def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     found = said(pd.concat(both).drop_duplicates())
     first, second, least = found.verdict.splitlines()
     most = found.short.iloc[-1]
-    assert least == f"Least energy: {most['who']}, {most['energy_kj_per_km']:,.1f} kJ/km."
+    assert least == f"Least energy: {most['driver']}, {most['energy_kj_per_km']:,.1f} kJ/km."
     assert first == words.splitlines()[0].replace("the network, for all", "near", 1)
     assert second.startswith("With far, energy")
     assert sample_of(frame) == f"12 held-out windows × {frame['driver_id'].nunique()} drivers"

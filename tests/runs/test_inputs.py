@@ -99,7 +99,7 @@ def test_a_changed_file_is_said_on_resume_and_seen_by_a_sweep(place, entry, anew
     drivers(place, 1.1)
     done = run_command(f"lcc_rl.cli.{entry}", f"resume='{run}'", cwd=place)
     assert done.returncode == 2
-    assert "d.parquet (drivers) is not what it was when the run began" in done.stderr
+    assert "d.parquet (drivers) has changed since the run began" in done.stderr
     done = run_command(*sweep, cwd=place)
     assert "finished before" not in done.stdout
     assert [settings] == list(run.parent.glob("*/config.yaml"))
@@ -109,7 +109,7 @@ def test_a_changed_file_is_said_on_resume_and_seen_by_a_sweep(place, entry, anew
 
 
 def test_what_a_run_reads_is_no_setting() -> None:
-    with pytest.raises(Exception, match="inputs: a run notes itself which files it reads"):
+    with pytest.raises(Exception, match="inputs: runs record the files that they read"):
         load("train", ["inputs={}"])
 
 

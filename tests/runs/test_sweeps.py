@@ -170,11 +170,11 @@ def test_launchers_give_the_rows_of_the_serial_one(tmp_path, launcher) -> None:
 
 @pytest.mark.slow
 def test_random_kills_lose_nothing() -> None:
-    """Ten kills that met a command at work; by hand: python tools/kill_test.py --kills 200."""
+    """Ten kills that ended an active command; by hand: python tools/kill_test.py --kills 200."""
     words = [sys.executable, str(ROOT / "tools" / "kill_test.py"), "--kills=10"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
-    assert "nothing lost, all readable, rows identical" in done.stdout
+    assert "all files are present and readable, rows are identical" in done.stdout
 
 
 def test_a_sweep_on_slurm_without_slurm_is_refused_in_one_line(

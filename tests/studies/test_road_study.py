@@ -48,7 +48,7 @@ def test_one_command_writes_table_figure_and_reports(tmp_path) -> None:
 def test_shares_that_no_string_has_are_refused_by_name() -> None:
     road.check_shares(["5", "10", "12.5", "100"], 40)
     cases = [(share, f"got {share!r}") for share in ("0", "101", "abc", "")]
-    cases += [("2", "--shares 2: 20 vehicles have no 2 %; scenario.string.size=50 has")]
+    cases += [("2", "--shares 2: 20 vehicles have no 2 %; use scenario.string.size=50")]
     check_refused(lambda share: road.check_shares([share], 20), cases, ConfigError)
 
 

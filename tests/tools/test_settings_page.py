@@ -20,6 +20,6 @@ def test_a_setting_has_type_default_and_the_words_beside_it() -> None:
     assert rows["mask_terminal"] == [
         "bool",
         "True",
-        "no value is expected after a collision; False: one is",
+        "value 0 after a collision; False: the critic's value",
     ]
     assert rows["target_every"][1] == "{'actor': 1, 'critic': 1}"

@@ -86,14 +86,14 @@ def calibrate(options: Namespace) -> list[Row]:
     observed = observe(source.load().episodes)
     few = np.linspace(0, observed.count - 1, 2 if options.quick else 6).round().astype(int)
     compiled = numba.njit(fastmath=True, error_model="numpy")(squared_error)
-    everyone = [objective(observed, index, compiled) for index in range(observed.count)]
-    everyone[0](np.array([20.0, 1.0]))  # compiles
+    objectives = [objective(observed, index, compiled) for index in range(observed.count)]
+    objectives[0](np.array([20.0, 1.0]))  # compiles
     found: dict[str, Any] = {}
     plain = [objective(observed, int(index)) for index in few]
     runs = {
         OURS: ours(found, observed),
         PYTHON: scipy(found, PYTHON, plain, options.quick),
-        NUMBA: scipy(found, NUMBA, everyone, options.quick),
+        NUMBA: scipy(found, NUMBA, objectives, options.quick),
     }
     spent = alternate(runs, options.repeats)
     spent[PYTHON] = spent[PYTHON] * (observed.samples.sum() / observed.samples[few].sum())

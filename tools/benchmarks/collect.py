@@ -13,6 +13,7 @@ from torchrl.envs import TransformedEnv
 
 from benchmarks.harness import Row, Run, endings, installed, rates
 from benchmarks.plain import PlainLoop, State, alcc, check_resets, training
+from benchmarks.plain_numba import NUMBA, NumbaLoop, check_loops
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.agent import Scene
@@ -33,9 +34,10 @@ def collect(options: Namespace) -> list[Row]:
     far apart that no episode ends; then, "in training", gaps are spread at the start, vehicles
     collide, and episodes that end are replaced, by the plain loop, too. stable-baselines3 calls
     ``predict`` and steps the plain loop as a VecEnv of equal width; its network has the same
-    layers.
+    layers. Loops of numbers that numba compiles, with the same network, are the limit.
     """
     check_resets(options)
+    check_loops(training(options, 16), 20 if options.quick else 200)
     batch, steps = (16, 10) if options.quick else (1024, 60)
     policy = DDPG().start(Scene(7)).policy
     runs: dict[str, Run] = {}
@@ -51,7 +53,7 @@ def collect(options: Namespace) -> list[Row]:
         against |= {own: [plain], theirs: [plain, own]}
     counts = dict.fromkeys(runs, batch * steps)
     rows = rates(options, runs, "steps/s", counts, against, batch)
-    for size in (batch,) if options.quick else (20, batch, 8192):
+    for size in (batch,) if options.quick else (20, 64, batch, 8192):
         for ending in endings(options):
             rows += in_training(options, policy, size, steps, ending)
     return rows
@@ -65,11 +67,13 @@ def in_training(options: Namespace, policy: Any, batch: int, steps: int, ending:
         plain: loop(training(options, batch), policy.module, steps, compiled, resets=True),
         own: collector(training(options, batch), policy, steps, compiled),
     }
+    env = training(options, batch)
+    runs[NUMBA] = numba_loop(NumbaLoop(PlainLoop(env), env.reset()), policy.module, steps)
     if installed():
         from benchmarks.theirs import PlainVector, predicting
 
         runs[other] = predicting(options, PlainVector(training(options, batch), compiled), steps)
-    counts, against = dict.fromkeys(runs, batch * steps), {own: [plain, other]}
+    counts, against = dict.fromkeys(runs, batch * steps), {own: [plain, other, NUMBA]}
     return rates(options, runs, "steps/s", counts, against, batch, first=compiled)
 
 
@@ -128,6 +132,22 @@ def loop(
             seen = following
         if resets:
             moment.update(seen=seen, state=state)
+        for entries in zip(*kept, strict=True):
+            torch.stack(entries, dim=1)
+
+    return run
+
+
+def numba_loop(loops: NumbaLoop, network: Callable[[Tensor], Tensor], steps: int) -> Run:
+    """Return the same as a loop over numbers, whose network is that of torch."""
+
+    def run() -> None:
+        kept = []
+        for _ in range(steps):
+            seen = torch.from_numpy(loops.seen.copy())
+            action = network(seen)
+            rewards, ends = loops.step(action.numpy().ravel())
+            kept.append((seen, action, *map(torch.from_numpy, (rewards, *ends, loops.seen.copy()))))
         for entries in zip(*kept, strict=True):
             torch.stack(entries, dim=1)
 

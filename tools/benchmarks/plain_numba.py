@@ -1,4 +1,4 @@
-"""The ALCC study of a string of many human drivers as loops that numba compiles."""
+"""The ALCC study as loops of numbers that numba compiles: the limit of what is fast."""
 
 from __future__ import annotations
 
@@ -9,12 +9,17 @@ import numba
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from torchrl.envs import TransformedEnv
 
+from benchmarks.harness import agree
 from benchmarks.plain import PlainLoop
 from lcc_rl.functional.estimation import REFERENCE_SPEED
 from lcc_rl.functional.power import POWER_COEFFICIENTS
 from lcc_rl.functional.random import LOW_BITS, STEP_INCREMENT, STREAM_INCREMENT
+from lcc_rl.functional.safety import NEVER
+from lcc_rl.pieces.rewards import TOUCH
 
+NUMBA = "loops in numba"  # its name in tables
 compiled: Callable[[Any], Any] = numba.njit(fastmath=True, error_model="numpy")
 
 
@@ -43,17 +48,50 @@ KNOWN = (
 
 
 class Constants(NamedTuple):
-    """What all drivers share, and how their accelerations are measured."""
+    """What all episodes share."""
 
     known: tuple[float, ...]  # the values of KNOWN
     root: float
     dt: float
     noise: float
-    stream: int
     error: float
     learning: float
     inverse_power: float
-    price: float
+    horizon: int
+    largest: float  # acceleration of action 1
+    safety: tuple[float, ...]  # weight, floor, threshold, margin
+    efficiency: tuple[float, ...]  # weight, threshold
+    prices: tuple[float, ...]  # of the energies of both vehicles, and of a collision
+    start: tuple[float, ...]  # standstill gap, time gap, lowest and highest factor, cap of others
+    # Of the leader's profile and its start, the own gap, the first driver and its noise.
+    streams: tuple[int, ...]
+
+
+class Tables(NamedTuple):
+    """Arrays that all episodes read."""
+
+    speeds: Any  # of all leaders, one after the other
+    offsets: Any
+    starts: Any
+    desired_speeds: Any
+    time_gaps: Any
+    prior: Any
+    thresholds: Any  # of the mean over all drivers, with its sums
+    sums: Any
+    scales: Any
+
+
+@compiled
+def choose(seed: int, count: int, stream: int) -> int:
+    """Draw an index, see :func:`lcc_rl.functional.random.choose`."""
+    return draw_bits(seed + (stream * STREAM_INCREMENT & LOW_BITS)) * count >> 32
+
+
+@compiled
+def uniform(seed: int, step: int, stream: int) -> float:
+    """Draw from U[0, 1), see :func:`lcc_rl.functional.random.uniform`."""
+    counter = step * STEP_INCREMENT + (stream * STREAM_INCREMENT & LOW_BITS)
+    return (draw_bits(seed + counter) >> 8) * 2.0**-24
 
 
 @compiled
@@ -101,82 +139,193 @@ def learn(
 
 
 @compiled
-def advance(
-    seeds: Any, step: int, cav: Any, motion: Any, drivers: Any, beliefs: Any, table: Any, k: Any
-) -> Any:
-    """Advance the drivers of all episodes; return the price of their energies.
+def begin(clock: Any, motion: Any, drivers: Any, beliefs: Any, t: Any, k: Any) -> None:
+    """Write the first moment of an episode with the seed in its clock."""
+    seed = clock[0]
+    profile = choose(seed, len(t.offsets), k.streams[0])
+    clock[1], clock[2] = 0, t.offsets[profile] + choose(seed, t.starts[profile], k.streams[1])
+    speed = t.speeds[clock[2]]
+    motion[:, 0] = speed
+    factor = k.start[2] + (k.start[3] - k.start[2]) * uniform(seed, 0, k.streams[2])
+    motion[1, 1] = factor * (k.start[0] + k.start[1] * speed)
+    for n in range(len(drivers)):
+        driver = choose(seed, len(t.time_gaps), k.streams[3] + n)
+        v0, headway = t.desired_speeds[driver], t.time_gaps[driver]
+        drivers[n, 0], drivers[n, 1], beliefs[n] = v0, headway, t.prior
+        free = max(1.0 - (speed / v0) ** 4, 1e-6)
+        steady = (k.known[2] + headway * speed) / free**0.5
+        motion[n + 2, 1] = min(steady, 2.0 * k.known[2] + k.start[4] * speed)
+
+
+@compiled
+def rewarded(lead: float, cav: float, before: float, gap: float, k: Any) -> float:
+    """Return the reward of the automated vehicle's own motion."""
+    weight, floor, threshold, margin = k.safety
+    room = max(gap - margin, TOUCH) if gap > 0.0 else gap
+    ttc = 0.01 if room <= 0.0 else room / (cav - lead) if cav > lead else NEVER
+    late = gap / max(cav, 1.0) >= k.efficiency[1]
+    power = motor_power(before, (cav - before) / k.dt)
+    safe = weight * np.log(min(max(ttc, floor), threshold) / threshold)
+    return safe - k.efficiency[0] * late - k.prices[0] * power
+
+
+@compiled
+def drive(
+    clock: Any,
+    motion: Any,
+    drivers: Any,
+    beliefs: Any,
+    ahead: float,
+    reached: float,
+    t: Any,
+    k: Any,
+) -> tuple[float, bool]:
+    """Advance the drivers of an episode; return the price of their energies, and any collision.
 
     Args:
-        seeds: of the episodes, ``[batch]``.
-        step: the step of all of them.
-        cav: speed of the automated vehicle before and after the step, ``[batch, 2]``.
-        motion: speed and gap of every driver, ``[batch, n, 2]``; written in place.
-        drivers: v0 and T, ``[batch, n, 2]``.
-        beliefs: (q, T) and their covariance, ``[batch, n, 5]``; written in place.
-        table: thresholds and sums of the mean over all drivers.
-        k: the constants.
+        clock: seed, step and place in the leader's record.
+        motion: speed and gap of every vehicle, the leader first, ``[n + 2, 2]``; written in place.
+        drivers: v0 and T, ``[n, 2]``.
+        beliefs: (q, T) and their covariance, ``[n, 5]``; written in place.
+        ahead, reached: speed of the automated vehicle before and after the step.
+        t, k: tables and constants.
     """
-    prices = np.zeros(len(seeds), np.float32)
-    for row in range(len(seeds)):
-        ahead, ahead_reached = cav[row, 0], cav[row, 1]
-        for n in range(motion.shape[1]):
-            speed, gap = motion[row, n, 0], motion[row, n, 1]
-            rate, inverse = speed - ahead, 1.0 / max(gap, k.known[4])
-            wish = k.known[2] + max(speed * (drivers[row, n, 1] + rate / k.root), 0.0)
-            load = (speed / drivers[row, n, 0]) ** 4 + (wish * inverse) ** 2
-            counter = step * STEP_INCREMENT + (k.stream + n) * STREAM_INCREMENT
-            draw = (draw_bits(seeds[row] + counter) >> 8) * 2.0**-24
-            command = limited(load, k.known) * (1.0 + k.noise * draw)
-            reached = max(speed + command * k.dt, 0.0)
-            found = learn(beliefs[row, n], speed, rate, inverse, reached, k)
-            for i in range(5):
-                beliefs[row, n, i] = found[i + 1]
-            predicted = found[0]
-            if step < k.learning:
-                predicted = mean(speed, rate, inverse, table[0], table[1], k)
-            prices[row] += k.price * motor_power(speed, predicted)
-            motion[row, n, 0] = reached
-            motion[row, n, 1] = gap + 0.5 * k.dt * ((ahead - speed) + (ahead_reached - reached))
-            ahead, ahead_reached = speed, reached
-    return prices
+    price, crashed = 0.0, False
+    for n in range(len(drivers)):
+        speed, gap = motion[n + 2, 0], motion[n + 2, 1]
+        rate, inverse = speed - ahead, 1.0 / max(gap, k.known[4])
+        wish = k.known[2] + max(speed * (drivers[n, 1] + rate / k.root), 0.0)
+        load = (speed / drivers[n, 0]) ** 4 + (wish * inverse) ** 2
+        draw = uniform(clock[0], clock[1], k.streams[4] + n)
+        own = max(speed + limited(load, k.known) * (1.0 + k.noise * draw) * k.dt, 0.0)
+        found = learn(beliefs[n], speed, rate, inverse, own, k)
+        for i in range(5):
+            beliefs[n, i] = found[i + 1]
+        predicted = found[0]
+        if clock[1] < k.learning:
+            predicted = mean(speed, rate, inverse, t.thresholds, t.sums, k)
+        price += k.prices[1] * motor_power(speed, predicted)
+        gap += 0.5 * k.dt * ((ahead - speed) + (reached - own))
+        motion[n + 2, 0], motion[n + 2, 1] = own, gap
+        crashed |= gap <= 0.0
+        ahead, reached = speed, own
+    return price, crashed
 
 
-class NumbaString:
-    """The drivers of a string behind an automated vehicle at constant speed, without TorchRL.
+@compiled
+def advance(
+    clock: Any, motion: Any, drivers: Any, beliefs: Any, t: Any, k: Any, action: Any, seen: Any
+) -> Any:
+    """Take a step of all episodes and replace those that end.
+
+    Args:
+        clock, motion, drivers, beliefs: as for :func:`drive`, with a row per episode.
+        t, k: tables and constants.
+        action: in [−1, 1], ``[batch]``.
+        seen: where the next observation goes, ``[batch, 7]``.
+
+    Returns:
+        Rewards, and where an episode ends by a collision, and at all.
+    """
+    rewards, ends = np.empty(len(clock), np.float32), np.zeros((2, len(clock)), np.bool_)
+    for row in range(len(clock)):
+        now, cars = clock[row], motion[row]
+        lead, before, gap = cars[0, 0], cars[1, 0], cars[1, 1]
+        ahead = t.speeds[now[2] + now[1] + 1]
+        cav = max(before + action[row] * k.largest * k.dt, 0.0)
+        gap += 0.5 * k.dt * ((lead - before) + (ahead - cav))
+        price, crashed = drive(now, cars, drivers[row], beliefs[row], before, cav, t, k)
+        cars[0, 0], cars[1, 0], cars[1, 1] = ahead, cav, gap
+        crashed |= gap <= 0.0
+        rewards[row] = rewarded(ahead, cav, before, gap, k) - price - k.prices[2] * crashed
+        now[1] += 1
+        ends[0, row], ends[1, row] = crashed, crashed or now[1] >= k.horizon
+        if ends[1, row]:
+            now[0] = draw_bits(now[0] + 1)
+            begin(now, cars, drivers[row], beliefs[row], t, k)
+        v, w, x = cars[0, 0], cars[1, 0], cars[2, 0]
+        values = (v, w, v - w, cars[1, 1], x, w - x, cars[2, 1])
+        for i in range(7):
+            seen[row, i] = values[i] * t.scales[i]
+    return rewards, ends
+
+
+class NumbaLoop:
+    """An automated vehicle and drivers behind it, without TorchRL and torch.
 
     Args:
         plain: the same in torch, whose settings it shares.
-        start: where the episodes begin.
+        first: where the episodes begin.
     """
 
-    def __init__(self, plain: PlainLoop, start: TensorDictBase) -> None:
-        human, estimator, state = plain.human, plain.estimator, plain.start(start)
+    def __init__(self, plain: PlainLoop, first: TensorDictBase) -> None:
+        human, mean, own = plain.human, plain.estimator.mean, plain.motion.starts["automated"]
         known = tuple(getattr(human.drivers, name) for name in KNOWN)
-        root = 2.0 * (known[0] * known[1]) ** 0.5
-        average, error = estimator.mean, estimator.measurement_error**2
+        safety, efficiency, leader = plain.safety, plain.efficiency, plain.leader
+        index = int(human.index.flatten()[0])
         self.constants = Constants(
             known,
-            root,
+            2.0 * (known[0] * known[1]) ** 0.5,
             plain.motion.time_step,
             human.noise,
-            human.noise_stream,
-            error,
-            estimator.learning_steps,
-            average.inverse_power,
-            plain.hdv_price,
+            plain.estimator.measurement_error**2,
+            plain.estimator.learning_steps,
+            mean.inverse_power,
+            plain.horizon,
+            plain.max_acceleration,
+            (safety.weight, safety.floor, safety.threshold, safety.margin),
+            (efficiency.weight, efficiency.threshold),
+            (plain.cav_price, plain.hdv_price, plain.penalty),
+            (
+                *(own.standstill_gap, own.time_gap, own.lowest, own.highest),
+                plain.motion.starts["human"].cap_time_gap,
+            ),
+            (
+                *(leader.profile_stream, leader.start_stream, own.stream),
+                *(human.driver_stream + index, human.noise_stream + index),
+            ),
         )
-        self.table = (average.thresholds.numpy(), average.sums.numpy())
-        pairs = [("speed", "gap"), ("desired_speed", "desired_time_gap")]
-        pairs += [("estimate", "covariance")]
-        self.parts = [torch.cat([state[key] for key in pair], -1).numpy() for pair in pairs]
-        self.seeds = state["seed"].flatten().numpy()
-        self.cav = state["cav"].expand(-1, 2).contiguous().numpy()
+        prior = (plain.estimator.prior_estimate, plain.estimator.prior_covariance)
+        arrays = [leader.speeds.flatten(), leader.offsets, leader.starts]
+        arrays += [human.desired_speeds.flatten(), human.time_gaps.flatten()]
+        arrays += [torch.cat([x.flatten() for x in prior])]
+        arrays += [mean.thresholds, mean.sums, plain.scales]
+        self.tables = Tables(*(array.numpy() for array in arrays))
+        now = plain.start(first)
+        self.clock = torch.cat([now[key] for key in ("seed", "step", "place")], -1).numpy()
+        cars = [torch.stack([now["leader"], torch.zeros_like(now["leader"])], -1)]
+        cars += [torch.stack([now["cav"], now["cav_gap"]], -1)]
+        self.motion = torch.cat([*cars, torch.cat([now["speed"], now["gap"]], -1)], 1).numpy()
+        pairs = [("desired_speed", "desired_time_gap"), ("estimate", "covariance")]
+        self.drivers, self.beliefs = (
+            torch.cat([now[key] for key in pair], -1).numpy() for pair in pairs
+        )
+        self.seen = plain.observe(now).numpy()
+
+    def step(self, action: Any) -> Any:
+        """Take a step by actions ``[batch]``; return the rewards and the ends of episodes."""
+        now = (self.clock, self.motion, self.drivers, self.beliefs)
+        return advance(*now, self.tables, self.constants, action, self.seen)
 
     def play(self, steps: int) -> Any:
-        """Play from the start; return the motion of the drivers and the last price."""
-        motion, drivers, beliefs = (part.copy() for part in self.parts)
-        for step in range(steps):
-            price = advance(
-                self.seeds, step, self.cav, motion, drivers, beliefs, self.table, self.constants
-            )
-        return motion, price
+        """Take so many steps by zero actions from now on; return the motion of all vehicles."""
+        zero = np.zeros(len(self.clock), np.float32)
+        for _ in range(steps):
+            self.step(zero)
+        return self.motion
+
+
+def check_loops(env: TransformedEnv, steps: int) -> None:
+    """Hold the loops against the same physics in torch, whose new episodes get their seeds."""
+    plain, first = PlainLoop(env), env.reset()
+    loops, state, rows = NumbaLoop(plain, first.copy()), plain.start(first), len(first)
+    generator = torch.Generator().manual_seed(0)
+    for step in range(steps):
+        action = torch.rand(rows, 1, generator=generator) * 2.0 - 1.0
+        rewards, ends = loops.step(action.flatten().numpy())
+        seeds = torch.from_numpy(loops.clock[:, :1])
+        state, written, seen = plain.play(state, action, seeds)
+        pairs = {"reward": rewards, "terminated": ends[0], "done": ends[1]}
+        for name, value in pairs.items():
+            agree(f"step {step}: {name} of the loops", value, written[name].flatten(), 2e-3)
+        agree(f"step {step}: observation of the loops", loops.seen, seen, 2e-3)

@@ -15,14 +15,14 @@ from tensordict import TensorDict
 from benchmarks.env import collecting
 from benchmarks.harness import Row, Run, agree, endings, rates
 from benchmarks.plain import PlainLoop, alcc
-from benchmarks.plain_numba import NumbaString
+from benchmarks.plain_numba import NUMBA, NumbaLoop
 from benchmarks.sumo import start
 from lcc_rl.config import load
 from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.evaluation.rollout import Player
 from lcc_rl.interfaces.sumo import load_sumo
 
-SIZE, NUMBA, SUMO = 100, "loops in numba", "libsumo"
+SIZE, SUMO = 100, "libsumo"
 
 
 def string(options: Namespace) -> list[Row]:
@@ -30,7 +30,7 @@ def string(options: Namespace) -> list[Row]:
 
     First a batch behind automated vehicles that keep their speed, with the estimate of every
     driver and the reward, by the training's collector, beside the same physics as one function of
-    tensors, and that of the drivers as loops of numbers that numba compiles. Then a single ring of
+    tensors, and as loops of numbers that numba compiles. Then a single ring of
     human drivers by the evaluation's player, which keeps speeds and gaps, beside SUMO, which
     drives its own IDM and keeps nothing.
     """
@@ -42,8 +42,8 @@ def batch(options: Namespace) -> list[Row]:
     count, steps = (4, 10) if options.quick else (1024, 30)
     env = alcc(options, count, True, SIZE - 1)
     start, zero = env.reset(), torch.zeros(count, 1, 1)
-    plain, loops = PlainLoop(env), NumbaString(PlainLoop(env), start.cpu())
-    runs: dict[str, Run] = {NUMBA: partial(loops.play, steps)}
+    plain, loops = PlainLoop(env), NumbaLoop(PlainLoop(env), start.copy())
+    runs: dict[str, Run] = {}
     against: dict[str, list[str]] = {}
     for ending in endings(options):
         advance = torch.compile(plain.step, dynamic=False) if ending else plain.step
@@ -58,9 +58,10 @@ def batch(options: Namespace) -> list[Row]:
         again = alcc(options, count, True, SIZE - 1)
         runs |= {own: collecting(again, zero, steps, bool(ending)), other: loop}
         against[own] = [other, NUMBA]
-    played, state = loops.play(steps)[0], loop()
+    played, state = loops.play(steps), loop()
     for column, key in enumerate(("speed", "gap")):
-        agree(f"{key} of {NUMBA}", played[..., column], state[key].squeeze(-1))
+        agree(f"{key} of {NUMBA}", played[:, 2:, column], state[key].squeeze(-1))
+    runs[NUMBA] = lambda: NumbaLoop(plain, start.copy()).play(steps)
     counts = dict.fromkeys(runs, count * steps * SIZE)
     return rates(options, runs, "vehicle-steps/s", counts, against, count)
 

@@ -1,4 +1,4 @@
-"""Figures of the ALCC study, with the numbers of their counterparts in the paper."""
+"""Figures of the ALCC study, numbered as in the paper."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ PANELS = {
 
 @paper
 def power_map() -> Figure:
-    """Electric power of the motor over speed and acceleration (A2; Fig. 2)."""
+    """Draw the electric power of the motor over speed and acceleration (A2; Fig. 2)."""
     speed, acceleration = np.linspace(0.0, 30.0, 151), np.linspace(-3.0, 3.0, 121)
     power = motor_power(torch.tensor(speed), torch.tensor(acceleration)[:, None]).numpy() / 1e3
     figure = new_figure(COLUMN_WIDTH, 2.7)
@@ -76,7 +76,7 @@ def power_map() -> Figure:
 
 @paper
 def reward_terms(training: pd.DataFrame) -> Figure:
-    """Learning curves of every reward term (no counterpart; Fig. 6 shows their sum).
+    """Draw learning curves of all reward terms (not in the paper; Fig. 6 shows their sum).
 
     Args:
         training: rows of training.parquet of one or more runs, with ``variant`` and ``seed``.
@@ -105,9 +105,9 @@ def reward_terms(training: pd.DataFrame) -> Figure:
 
 @paper
 def distributions(drivers: pd.DataFrame) -> Figure:
-    """Path energy of the CAV and of the HDV over drivers, by strategy (Fig. 11).
+    """Draw path energies of CAV and HDV over drivers, by strategy (Fig. 11).
 
-    A driver's value is its mean over the held-out windows and seeds. Boxes span the quartiles,
+    A driver's value is its mean over held-out windows and seeds. Boxes span the quartiles,
     whiskers the 5th to 95th percentile; a diamond marks the mean.
     """
     names = list(dict.fromkeys(drivers["strategy"]))
@@ -120,7 +120,7 @@ def distributions(drivers: pd.DataFrame) -> Figure:
             if name in energy:
                 _flat_box(axis, energy[name].to_numpy(float), place, colour(name))
         rows_of(axis, names if vehicle == "cav" else [""] * len(names))
-        axis.use_sticky_edges = False  # a box may be the outermost
+        axis.use_sticky_edges = False  # a box may be at the edge
         axis.margins(x=0.12)
         style(axis, "path energy [kJ per episode]")
         axis.set_title(f"{title}, n = {len(energy)} drivers")
@@ -142,7 +142,7 @@ def _flat_box(axis: Axes, values: np.ndarray, place: int, hue: str) -> None:
 
 @paper
 def generalization_figure(windows: pd.DataFrame) -> Figure:
-    """Path energy of both vehicles on every held-out window, and its saving (Fig. 12)."""
+    """Draw the path energy of both vehicles on all held-out windows, and its saving (Fig. 12)."""
     table = generalization(windows).sort_values("path_saving_pct")
     figure = new_figure(PAGE_WIDTH, 4.4)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 3))
@@ -170,7 +170,7 @@ def generalization_figure(windows: pd.DataFrame) -> Figure:
 def _energies_by_profile(
     axis: Axes, windows: pd.DataFrame, order: list[object], names: tuple[str, str]
 ) -> None:
-    """Draw the path energy of car and human driver on every profile under two strategies."""
+    """Draw the path energy of car and human driver on all profiles for two strategies."""
     places = np.arange(len(order))
     columns = ["cav_path_energy_kj", "hdv_path_energy_kj"]
     for name, offset in zip(names, (-0.21, 0.21), strict=True):
@@ -184,7 +184,7 @@ def _energies_by_profile(
 
 
 def _cut_outliers(axis: Axes, places: np.ndarray, values: np.ndarray) -> None:
-    """Scale an axis by most of its values, and write the outliers at its border."""
+    """Scale an axis by most of its values, and label outliers at its border."""
     limit = 2.0 * max(float(np.percentile(np.abs(values), 85)), max(PAPER_GENERALIZATION))
     axis.set_ylim(-limit, limit)
     look: dict[str, Any] = {
@@ -201,10 +201,10 @@ def _cut_outliers(axis: Axes, places: np.ndarray, values: np.ndarray) -> None:
 
 @paper
 def comparison_figure(windows: pd.DataFrame) -> Figure:
-    """Energy, safety and efficiency under each change of the study (no counterpart).
+    """Draw energy, safety and efficiency for each change of the study (not in the paper).
 
     Args:
-        windows: rows of the evaluations; those of the study itself come first.
+        windows: rows of the evaluations; those of the unchanged study come first.
     """
     table = comparison(windows)
     names, strategies = (list(dict.fromkeys(table[name])) for name in ("ablation", "strategy"))
@@ -230,6 +230,6 @@ def comparison_figure(windows: pd.DataFrame) -> Figure:
 
 
 def _how_many(seeds: pd.Series) -> str:
-    """Return the distinct numbers of seeds in a column, in words."""
+    """Return the different numbers of seeds in a column, in words."""
     counts = sorted({int(count) for count in seeds if str(count).isdigit()})
     return f"{' or '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"

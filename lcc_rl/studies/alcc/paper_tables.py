@@ -1,4 +1,4 @@
-"""Tables of the ALCC study beside the numbers that the paper prints."""
+"""Tables of the ALCC study with the paper's numbers."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from lcc_rl.results.bootstrap import share_saved
 from lcc_rl.results.windows import Means, by_driver, driver_savings, per_seed, savings
 from lcc_rl.studies.alcc.tables import ENERGY_KINDS
 
-PAIR = STRATEGY, BASELINE = "alcc", "reference"  # that are compared
+PAIR = STRATEGY, BASELINE = "alcc", "reference"  # compared strategies
 PAPER_ROW, STUDY_ROW = "paper", "this study"
-ENERGY_WORDS = {"path_": "path energy", "": "as drawn"}  # of the keys of KINDS
+ENERGY_WORDS = {"path_": "path energy", "": "as drawn"}  # by the keys of KINDS
 # Wang et al., arXiv 2210.02147: Table IV, Fig. 9 and the generalization experiment.
 # CAV, HDV and total energy [kJ].
 PAPER_TABLE_IV = {
@@ -38,17 +38,17 @@ PAPER_HUMAN = {
 
 
 def table_iv(drivers: pd.DataFrame) -> pd.DataFrame:
-    """Energies behind the mean, best and worst driver (Table IV of the paper).
+    """Return energies with the mean, best and worst driver (Table IV of the paper).
 
-    The best driver is the one with the largest saving of total energy over profiles and seeds.
+    The best driver has the largest saving of total energy over profiles and seeds.
 
     Args:
-        drivers: of :class:`lcc_rl.results.windows.Means`.
+        drivers: see :class:`lcc_rl.results.windows.Means`.
 
     Returns:
-        Rows for both controllers and each driver, this study's and the paper's: CAV, HDV and
-        total energy [kJ], and the total saved [%], of the path and as drawn. The paper's are as
-        drawn.
+        Rows for both controllers and each driver, of this study and of the paper: CAV, HDV and
+        total energy [kJ], and the total saved [%], as path energy and as drawn. The paper's are
+        as drawn.
     """
     columns = [
         f"{vehicle}_{x}" for vehicle in ("cav", "hdv", "total") for x in ENERGY_KINDS.values()
@@ -77,7 +77,7 @@ def table_iv(drivers: pd.DataFrame) -> pd.DataFrame:
 
 
 def holistic(means: Means) -> pd.DataFrame:
-    """Saving of the total energy per driver beside the paper's (Fig. 10): one row each."""
+    """Return savings of the total energy per driver, for study and paper (Fig. 10)."""
     rows = []
     for kind, column in ENERGY_KINDS.items():
         found = savings(means.windows, f"total_{column}", *PAIR)
@@ -96,10 +96,10 @@ def holistic(means: Means) -> pd.DataFrame:
 
 
 def generalization(windows: pd.DataFrame) -> pd.DataFrame:
-    """Energies and savings on every held-out window (Fig. 12).
+    """Return energies and savings on all held-out windows (Fig. 12).
 
     Returns:
-        One row per profile: path energy of both vehicles under the baseline and the strategy
+        One row per profile: path energy of both vehicles with the baseline and the strategy
         [kJ], ``path_saving_pct`` and, as drawn, ``saving_pct`` of the strategy against the
         baseline, and ``path_saving_against_idm_pct``.
     """
@@ -118,12 +118,12 @@ def generalization(windows: pd.DataFrame) -> pd.DataFrame:
 
 
 def generalization_row(windows: pd.DataFrame) -> pd.DataFrame:
-    """Distribution of the savings over held-out windows, beside the paper's four profiles.
+    """Return the distribution of savings over held-out windows, and over the paper's profiles.
 
     Returns:
-        Rows for this study's path energy and energy as drawn and for the paper:
-        ``together_pct``, the saving of the energy of all profiles, and the least, median and
-        largest of a profile.
+        Rows for this study's path energy, its energy as drawn and the paper:
+        ``together_pct``, the saving over all profiles, and the least, median and largest saving
+        of a profile.
     """
     table = generalization(windows)
     rows = []
@@ -143,7 +143,7 @@ def _spread(values: pd.Series) -> dict[str, float]:
 
 
 def human_energy(means: Means) -> pd.DataFrame:
-    """Human driver's energy behind a controlled car (A) and directly behind the leader (B; Fig. 9).
+    """Return energies of human drivers behind a controlled car (A) and the leader (B; Fig. 9).
 
     Returns:
         One row per strategy and kind of energy: both means [kJ], the saving of A [%] with its
@@ -172,7 +172,7 @@ def human_energy(means: Means) -> pd.DataFrame:
 
 
 def _with_its_decimals(rows: Sequence[dict[str, object]]) -> pd.DataFrame:
-    """Return a table that is shown with as many decimals as the paper prints."""
+    """Return a table with the number of decimals of the paper."""
     table = pd.DataFrame(rows)
     table.attrs["decimals"] = 2
     return table

@@ -1,4 +1,4 @@
-"""Tables and figures of the ALCC study, from the study's parquet files alone."""
+"""Tables and figures of the ALCC study from its parquet files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from lcc_rl.studies.alcc.study import ABLATIONS, DRIVERS_FILE, EVALUATION_FOLDER
 from lcc_rl.studies.results import StudyResults
 
 ALCC_TITLE = "Adaptive Leading Cruise Control: the study"
-CURVES = "training.parquet"  # learning curves of the main trainings, if these are not there
+CURVES = "training.parquet"  # learning curves of the main trainings, if their folders are missing
 ITSELF = "this study"
 SHARE_COLUMNS = [
     f"{which}_{name}"
@@ -36,10 +36,10 @@ SHARE_COLUMNS = [
 def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     """Write tables/*.parquet, figures/*.png and results.md from a study's parquet files.
 
-    Parts whose runs do not exist are left out.
+    Parts without runs are left out.
 
     Args:
-        folder: a study's folder, written by ``lcc-rl reproduce alcc``, or what is kept of it.
+        folder: a study's folder of ``lcc-rl reproduce alcc``, or the stored part of it.
         formats: further formats of the figures.
 
     Raises:
@@ -48,7 +48,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     found = StudyResults(folder, formats)
     if not any(map(_finished, folder.glob(f"**/{EVALUATION_FOLDER}"))):
         raise ResultsError(
-            f"{folder}: no {EVALUATION_FOLDER}/{EPISODES}; lcc-rl reproduce alcc makes it"
+            f"{folder}: no {EVALUATION_FOLDER}/{EPISODES}; run lcc-rl reproduce alcc"
         )
     main = Means.read(folder / EVALUATION_FOLDER) if _finished(folder / EVALUATION_FOLDER) else None
     if main is not None:
@@ -61,7 +61,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
 
 
 def narrow(shown: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
-    """Return tables that fit the width of a page of the documentation, by name."""
+    """Return tables that fit a page of the documentation, by name."""
     energies, human, shares = (
         table[~table.iloc[:, 0].isin(TUNED)]
         for table in (shown["energies"], shown["human_energy"], shown["constraints"])

@@ -1,4 +1,4 @@
-"""The ALCC study: calibration, trainings and evaluations from trajectories to parquet files."""
+"""The ALCC study: calibration, trainings and evaluations."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from lcc_rl.studies.study import Study
 TRAIN, EVALUATION_FOLDER = "train", "evaluation"
 DRIVERS_FILE = Path("calibration/drivers.parquet")
 STUDY_PARTS = ("main", "ablations")
-OF_CALIBRATION = ("data", "calibration")  # overrides that only the calibration takes
-# Overrides that the calibration does not take.
+OF_CALIBRATION = ("data", "calibration")  # overrides of the calibration only
+# Overrides that are not passed to the calibration.
 OF_TRAINING = ("drivers", "split", "scenario", "reward", "agent", "training", "evaluation")
 STUDY_VARIANTS = ("alcc", "reference")
-CONTROL = "own_energy"  # weighs its own energy as much as alcc weighs that of all
+CONTROL = "own_energy"  # weight of its own energy as that of all vehicles in alcc
 GAMMAS = (0.9, 0.95, 0.99, 0.995)
 RECIPES = ("quickstart", "paper_alcc")  # length and batches of DDPG's training
 SMOKE = "smoke"
@@ -43,7 +43,7 @@ class Change:
     recipes: tuple[str, ...] = ()
 
 
-# One profile for training; evaluation is on what the study's own split holds out.
+# One profile for training; evaluation on the profiles that the study's split holds out.
 SINGLE_SPLIT = "split=single"
 ONE_PROFILE = (
     SINGLE_SPLIT,
@@ -67,7 +67,7 @@ ABLATIONS = {
 
 
 def chosen_ablation(item: str) -> tuple[str, Change]:
-    """Return the name and the change of an item of ``--ablations``: a name or ``name:override``."""
+    """Return name and change of an item of ``--ablations``: a name or ``name:override``."""
     name, _, override = item.partition(":")
     if override:
         return name, Change((override,))
@@ -77,12 +77,12 @@ def chosen_ablation(item: str) -> tuple[str, Change]:
 
 
 def default_recipe(overrides: Iterable[str]) -> str | None:
-    """Return the recipe of the study, ``paper_alcc``; None where overrides choose an agent."""
+    """Return the recipe of the study, ``paper_alcc``; None if overrides choose an agent."""
     return None if any(key_of(item) == "agent" for item in overrides) else "paper_alcc"
 
 
 def settings_of_run(study: Study, entry: str, variant: str, change: Change, *own: str) -> Any:
-    """Compose a run: recipe, the study's inputs, the user's overrides, its change, its own."""
+    """Compose a run of recipe, inputs of the study, user's overrides, change and own overrides."""
     given = {top_key(item) for item in study.overrides}
     shared = [
         item
@@ -90,7 +90,7 @@ def settings_of_run(study: Study, entry: str, variant: str, change: Change, *own
         if top_key(item) not in OF_CALIBRATION or key_of(item).startswith("data.plausible")
     ]
     users, changed = known_settings(shared, entry), change.overrides
-    if SINGLE_SPLIT in changed:  # the user's split is then that of ``held_out``
+    if SINGLE_SPLIT in changed:  # the user's split then applies to ``held_out``
         moved = [x for x in users if key_of(x).startswith("split.")]
         users = [x for x in users if x not in moved]
         changed = (*changed, *(x.replace("split.", "split.held_out.", 1) for x in moved))
@@ -109,7 +109,7 @@ def settings_of_run(study: Study, entry: str, variant: str, change: Change, *own
 
 
 def alcc_trainings(study: Study, change: Change) -> dict[str, TrainConfig]:
-    """Return a training per seed and variant, all variants of a seed first, by their folders."""
+    """Return a training per seed and variant by folder, all variants of a seed first."""
     return {
         f"{variant}/seed_{seed}": settings_of_run(study, "train", variant, change, f"seed={seed}")
         for seed in range(study.seeds)
@@ -122,12 +122,12 @@ def run(study: Study, parts: Sequence[str] = STUDY_PARTS, ablations: Sequence[st
 
     Args:
         study: the settings.
-        parts: some of :data:`STUDY_PARTS`.
+        parts: parts of :data:`STUDY_PARTS`.
         ablations: names of :data:`ABLATIONS` or further ones as ``name:override``, e.g.
-            ``early:reward.terms.safety.threshold=6``; empty for all.
+            ``early:reward.terms.safety.threshold=6``; empty: all.
 
     Raises:
-        LccError: one clear error for wrong settings, data or files.
+        LccError: for any error in settings, data or files, in one line.
     """
     series = {
         folder: (change, alcc_trainings(study, change))
@@ -151,7 +151,7 @@ def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dic
             raise unknown_name("part", part, STUDY_PARTS)
     found = {study.folder / TRAIN: MAIN} if "main" in parts else {}
     if "ablations" in parts:
-        # Ablations that change nothing are left out, and of short runs those that train long.
+        # Without ablations that change nothing, and in short runs without long trainings.
         gamma = settings_of_run(study, "train", "alcc", MAIN).agent.made().gamma
         left_out = {f"gamma_{gamma:g}", f"recipe_{study.recipe}"}
         if study.recipe in (None, SMOKE):
@@ -163,7 +163,7 @@ def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dic
 
 
 def _calibration(study: Study, runs: dict[str, TrainConfig]) -> PipelineConfig:
-    """Return the settings of the calibration, whose data are divided as those of a training."""
+    """Return the settings of the calibration, with the data and division of a training."""
     own = [item for item in study.overrides if top_key(item) not in OF_TRAINING]
     cfg: PipelineConfig = load("pipeline", ["~experiment", "calibration=both", *own])
     first = next(iter(runs.values()))

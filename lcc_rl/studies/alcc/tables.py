@@ -1,6 +1,6 @@
 """Tables of energy, safety and learning in the ALCC study, with 95 % intervals.
 
-Their arguments are windows of :class:`lcc_rl.results.windows.Means`, every strategy on the same
+Their arguments are windows of :class:`lcc_rl.results.windows.Means`; all strategies have the same
 windows and drivers. Intervals of savings are over windows and seeds, all others over seeds only.
 """
 
@@ -21,8 +21,8 @@ from lcc_rl.results.windows import LEADER_COLUMNS, SOURCE, by_source, per_seed, 
 ENERGY_PARTS = ("total_steady_energy_kj", "total_acceleration_loss_kj")
 COMPARED_WITH = ("idm", "human", "recorded", "idm_acc_filtered", "idm_acc", "rule", "reference")
 COMPARED = (*COMPARED_WITH, "own_energy")
-# Prefix of a saving, and of which energy: the path's, which excludes what the motion stores and so
-# what ending slower saves; and as drawn (A2).
+# Prefixes of savings and their energies: path energy, net of kinetic energy, which a lower final
+# speed does not lower; and energy as drawn (A2).
 ENERGY_KINDS = {"path_": "path_energy_kj", "": "energy_kj"}
 TERCILES = ("lower", "middle", "upper")
 LONG, MOVING = "long_time_gap_pct", "long_time_gap_above_1_mps_pct"
@@ -31,14 +31,14 @@ SHARES = {
     LONG: "share_time_gap_long",
     MOVING: "share_time_gap_long_moving",
 }
-SHARE_LIMITS = {"unsafe_ttc_pct": 0.1, LONG: 1.0}  # share of time [%], for every seed
+SHARE_LIMITS = {"unsafe_ttc_pct": 0.1, LONG: 1.0}  # largest share of time for every seed [%]
 
 
 def energies(windows: pd.DataFrame) -> pd.DataFrame:
-    """Mean energies of every strategy [kJ].
+    """Return mean energies of all strategies [kJ].
 
-    Path energy of both vehicles and energy as drawn, the path's parts at constant speed and lost
-    by accelerating, and what CAV and HDV draw.
+    These are the path energy of both vehicles and the energy as drawn, the parts of the path energy
+    at constant speed and lost by accelerating, and the energies of CAV and HDV.
     """
     rows = []
     for strategy, part in windows.groupby("strategy", sort=False):
@@ -52,9 +52,9 @@ def energies(windows: pd.DataFrame) -> pd.DataFrame:
 
 
 def headline_rows(windows: pd.DataFrame) -> pd.DataFrame:
-    """Savings of the total energy, of its path and as drawn, by trained strategy and baseline.
+    """Return savings of total path energy and energy as drawn by trained strategy and baseline.
 
-    The share saved [%] and that of the worst seed.
+    These are the share saved [%] and that of the worst seed.
     """
     columns = [f"total_{column}" for column in ENERGY_KINDS.values()]
     seeds = {column: per_seed(windows, column) for column in columns}
@@ -73,13 +73,13 @@ def headline_rows(windows: pd.DataFrame) -> pd.DataFrame:
 
 
 def strata(windows: pd.DataFrame) -> pd.DataFrame:
-    """Savings of path energy in thirds of the windows by what their leader does.
+    """Return savings of path energy in thirds of the windows by properties of their leader.
 
     Returns:
-        For ``alcc``, or every trained strategy without it, against each baseline: a row per
-        property of the leader and third, the lowest first, with its windows, the range of the
-        property and the share saved [%]; and a row per source of leaders, if there are several,
-        by its name in the column ``tercile``, without a range.
+        For ``alcc``, or without it all trained strategies, against each baseline: a row per
+        property of the leader and third, lowest first, with the number of windows, the range of
+        the property and the share saved [%]; and, if there are several sources of leaders, a row
+        per source with its name in the column ``tercile`` and no range.
     """
     names = [name for name in per_seed(windows, PATH) if name not in UNTRAINED]
     parts = list(_thirds(windows))
@@ -122,10 +122,10 @@ def _seeds(rows: pd.DataFrame) -> str:
 
 
 def constraints(windows: pd.DataFrame) -> pd.DataFrame:
-    """Safety and efficiency of every strategy with a controlled car.
+    """Return safety and efficiency of all strategies with a controlled car.
 
-    Collisions in all episodes; shares of time with TTC < 4 s and time gap > 2.5 s [%] in the mean
-    over seeds, of the worst seed and of the worst episode; the least TTC [s] and gap [m]; and
+    These are collisions in all episodes; shares of time with TTC < 4 s and time gap > 2.5 s [%],
+    means over seeds, of the worst seed and of the worst episode; the least TTC [s] and gap [m]; and
     whether every seed is within :data:`SHARE_LIMITS`.
     """
     rows = []
@@ -145,7 +145,7 @@ def constraints(windows: pd.DataFrame) -> pd.DataFrame:
 
 
 def constraints_by_seed(windows: pd.DataFrame) -> pd.DataFrame:
-    """The shares of :func:`constraints` for every trained seed, one row each."""
+    """Return the shares of :func:`constraints` for each trained seed."""
     groups = windows.groupby(["strategy", "training_seed"], sort=True)
     table = groups[["total_energy_kj"]].mean().assign(collisions=groups["collisions"].sum())
     for name, column in SHARES.items():
@@ -156,11 +156,11 @@ def constraints_by_seed(windows: pd.DataFrame) -> pd.DataFrame:
 
 
 def learning(training: pd.DataFrame) -> pd.DataFrame:
-    """Statistics of the learning curves, one row per variant and seed.
+    """Return statistics of the learning curves, one row per variant and seed.
 
-    Mean reward per episode in the first, middle and last tenth of the training, its standard
-    deviation over the batches of the last tenth, and ``drop``: the largest fall of the mean of a
-    tenth below that of an earlier one.
+    These are the mean reward per episode in the first, middle and last tenth of the training, its
+    standard deviation over the batches of the last tenth, and ``drop``: the largest fall of the
+    mean of a tenth below that of an earlier one.
     """
     rows = []
     for (variant, seed), part in training.groupby(["variant", "seed"], sort=True):
@@ -188,7 +188,7 @@ def comparison(windows: pd.DataFrame) -> pd.DataFrame:
     """Compare each change of the study with the baselines of its own scenario.
 
     Args:
-        windows: of the evaluations, with the column ``ablation``, which names the change.
+        windows: windows of the evaluations, with the column ``ablation``, which names the change.
 
     Returns:
         One row per change and trained strategy: path energy [kJ], its savings against each of
@@ -223,14 +223,15 @@ def comparison(windows: pd.DataFrame) -> pd.DataFrame:
 
 
 def series(windows: pd.DataFrame) -> pd.DataFrame:
-    """Savings of the total energy as drawn, the paper's measure, by the series of trainings.
+    """Return savings of the total energy as drawn, the paper's measure, by series of trainings.
 
     Args:
-        windows: of the evaluations, with the column ``ablation``, the series' name.
+        windows: windows of the evaluations, with the column ``ablation``, the series' name.
 
     Returns:
-        One row per series: its trainings of ``alcc``, the share that they save against the
-        reference and against ``idm``, and the control ``own_energy`` against the reference [%].
+        One row per series: the number of trainings of ``alcc``, their saving against the
+        reference and against ``idm``, and that of the control ``own_energy`` against the
+        reference [%].
     """
     rows = []
     for name, part in windows.groupby("ablation", sort=False):

@@ -1,4 +1,4 @@
-"""Tables and figures of the HCFS study, from the study's parquet files alone."""
+"""Tables and figures of the HCFS study from its parquet files."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from lcc_rl.studies.hcfs.study import TRAINING
 from lcc_rl.studies.hcfs.tables import LEARNED
 from lcc_rl.studies.results import StudyResults
 
-LENGTHS = "lengths.parquet"  # rows of the windows of studies with trainings of several lengths
-SOURCES_FILE = "sources.parquet"  # rows of the windows of other sources of leaders
+LENGTHS = "lengths.parquet"  # rows of windows of studies with several lengths of training
+SOURCES_FILE = "sources.parquet"  # rows of windows of other sources of leaders
 HCFS_TITLE = "Hybrid Car-Following Strategy: the study"
 # The paper's table and figures of each case: speeds, jerk, and the controller in use.
 CASES = {
@@ -39,8 +39,8 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     """Write tables/*.parquet, figures/*.png and results.md from a study's parquet files.
 
     Args:
-        folder: holds episodes.parquet, steps.parquet and training.parquet, written by
-            ``lcc-rl reproduce hcfs``.
+        folder: folder of ``lcc-rl reproduce hcfs`` with episodes.parquet, steps.parquet and
+            training.parquet.
         formats: further formats of the figures.
 
     Raises:
@@ -57,12 +57,12 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     found.table("whole", "Σ reward over whole records (least … most of the trainings)", whole)
     gains = tables.whole_gains(episodes, PARENT_ROWS)
     found.table("whole_gains", "HCFS against its parents over whole records", gains)
-    if (folder / SOURCES_FILE).exists():  # only where platoons drove behind other leaders, too
+    if (folder / SOURCES_FILE).exists():  # only with evaluations on other leaders
         runs = read_parquet(folder / SOURCES_FILE)
         shown = tables.sources(runs, ("cacc tuned", "hcfs", "hcfs first"))
         found.table("sources", "Windows of other sources of leaders", shown)
         found.table("sources_in_full", "The same of all strategies", tables.sources(runs))
-    if (folder / LENGTHS).exists():  # only where several studies were put side by side
+    if (folder / LENGTHS).exists():  # only with several studies
         lengths = tables.lengths(read_parquet(folder / LENGTHS))
         found.table("lengths", "Σ reward per window by the length of the training", lengths)
     curve = learning_curve(read_parquet(folder / TRAINING))
@@ -84,12 +84,12 @@ def _windows(found: StudyResults, episodes: pd.DataFrame) -> None:
 
 
 def _case(found: StudyResults, episodes: pd.DataFrame, steps: pd.DataFrame, case: str) -> None:
-    stem, (table, speeds, jerk, who) = case.replace(" ", "_"), CASES[case]
+    stem, (table, speeds, jerk, use) = case.replace(" ", "_"), CASES[case]
     found.table(stem, f"{case} ({table} of the paper)", case_table(episodes, case))
     pictures = {
         ("velocities", f"speeds (Fig. {speeds})"): platoon.velocities(steps, case),
         ("jerk", f"jerk and its bound (Fig. {jerk})"): platoon.jerks(steps, case, 30.0),
-        ("switching_hcfs", f"controller in use, hcfs (Fig. {who})"): platoon.switching(steps, case),
+        ("switching_hcfs", f"controller in use, hcfs (Fig. {use})"): platoon.switching(steps, case),
         ("switching_hcfs_oracle", "controller in use, hcfs oracle"): platoon.switching(
             steps, case, "hcfs oracle"
         ),

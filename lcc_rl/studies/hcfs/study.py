@@ -1,4 +1,4 @@
-"""The HCFS study: trainings and evaluations from drive cycles to parquet files."""
+"""The HCFS study: trainings and evaluations."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ from lcc_rl.studies.study import Study
 log = logging.getLogger("lcc_rl")
 
 RECIPE = "paper_hcfs"
-BASELINES_FOLDER = "baselines"  # folder of the evaluation of what is not trained
+BASELINES_FOLDER = "baselines"  # folder of the evaluation of untrained strategies
 UNTUNED = "paper_like"
 TRAINING = "training.parquet"
-# A second whole record beside the default leader's.
+# A second whole record besides that of the default leader.
 WLTC = "+leader.full_length.wltc={path: wltc_3b, scale: 0.5}"
 
 
 def trainings(study: Study) -> dict[str, TrainConfig]:
-    """Return a training of the DDPG parent per seed, by their folders."""
-    # Only the study's evaluation drives the full-length record.
+    """Return a training of the DDPG parent per seed, by folder."""
+    # Only the study's evaluation uses the full-length record.
     own = (f"experiment={study.recipe}", f"variant={LEARNED}", *study.overrides)
     return {
         f"seed_{seed}": load("train", [*own, "evaluation.full_length=false", f"seed={seed}"])
@@ -60,13 +60,13 @@ def evaluation(study: Study, *own: str) -> StudyConfig:
 
 
 def run(study: Study) -> None:
-    """Train the DDPG parents and evaluate every strategy; finished runs are skipped.
+    """Train the DDPG parents and evaluate all strategies; finished runs are skipped.
 
     Args:
         study: the settings.
 
     Raises:
-        LccError: one clear error for wrong settings or files.
+        LccError: for any error in settings or files, in one line.
     """
     cfg, runs, place = evaluation(study), trainings(study), study.folder / LEARNED
     train_all(runs, place, study.jobs)
@@ -86,7 +86,7 @@ def run(study: Study) -> None:
 
 
 def keep(folder: Path, trainings: Sequence[Path]) -> None:
-    """Write the page's tables: a row per run, the first training's cases over time, and curves."""
+    """Write the tables of the page: a row per run, cases of the first training, and curves."""
     root = folder / "evaluation"
     seeds = [root / path.name for path in trainings]
     found = [read_parquet(path / EPISODES) for path in (root / BASELINES_FOLDER, *seeds)]
@@ -107,11 +107,11 @@ def hybrid_strategies(cfg: StudyConfig, learned: Strategy) -> list[Strategy]:
 
     ``hcfs``: as configured, with the tuned rule; ``hcfs untuned``: with the paper-like rule;
     ``hcfs J=10``: jerk bound of 10 m/s³; ``hcfs literal``: as printed, without the clamp to that
-    bound and without the safe cap; ``hcfs oracle``: knows the leader's next speed.
+    bound and without the safe cap; ``hcfs oracle``: with the leader's true next speed.
 
     Args:
         cfg: configuration of the evaluation of ``hcfs``.
-        learned: the trained policy, driving alone.
+        learned: the trained policy alone.
     """
     hybrid = cfg.deployed
     gains = load("evaluate", ["variant=cacc", f"gains={UNTUNED}"]).gains
@@ -135,10 +135,10 @@ def hybrid_strategies(cfg: StudyConfig, learned: Strategy) -> list[Strategy]:
 def _evaluate(
     strategies: Sequence[Strategy], cfg: StudyConfig, inputs: Inputs, folder: Path
 ) -> None:
-    """Evaluate into a folder, unless that is done."""
+    """Evaluate into a folder, unless this is done."""
     if made_by(folder / EPISODES) == identity(with_inputs(cfg)):
         return
     log.info("evaluating %d strategies into %s", len(strategies), folder)
-    (folder / EPISODES).unlink(missing_ok=True)  # never beside another configuration
+    (folder / EPISODES).unlink(missing_ok=True)  # never with another configuration
     save_config(cfg, folder)
     evaluate_and_write(list(strategies), cfg, inputs, folder, quiet=True)

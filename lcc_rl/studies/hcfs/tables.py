@@ -1,4 +1,4 @@
-"""Tables of the HCFS study: comparison on the same windows, and the numbers of the paper."""
+"""Tables of the HCFS study with the paper's numbers."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from lcc_rl.results import bootstrap
 from lcc_rl.results.platoons import COUNTS, case_table
 from lcc_rl.results.windows import DRIVE
 
-LEARNED = "ddpg"  # the variant whose policy the hybrid builds on
-# What the paper prints in Table IV (case 1): Σ|e_v|, its std, Σ|jerk|, Σ reward.
+LEARNED = "ddpg"  # variant of the hybrid's policy
+# Numbers of Table IV (case 1): Σ|e_v|, its std, Σ|jerk|, Σ reward.
 TABLE_IV = {
     "CACC": (159.39, 0.22, 720.06, -59.70),
     "DDPG": (146.22, 0.16, 2344.60, -56.81),
     "HCFS": (25.26, 0.04, 192.19, -9.64),
 }
 CASE_3 = {"CACC": -4.78, "DDPG": -5.81, "HCFS": -1.90}  # Σ reward in Table VI
-STRATEGY_WORDS = {  # of strategies, for readers
+STRATEGY_WORDS = {  # names of strategies in tables
     "cacc path": "CACC, PATH gains",
     "cacc paper_like": "CACC, fitted to Table IV",
     "cacc tuned": "CACC, tuned",
@@ -36,7 +36,7 @@ STRATEGY_WORDS = {  # of strategies, for readers
     "hcfs untuned": "HCFS of the fitted CACC",
     "deadbeat": "dead-beat, nothing learned",
 }
-# Columns of :func:`win_rates`, for readers.
+# Headings of :func:`win_rates`.
 GAINED = {
     f"{old}{end}": f"{new}{end}"
     for old, new in {"wins_pct": "HCFS wins_pct", "gain_pct": "HCFS gains_pct"}.items()
@@ -46,11 +46,11 @@ RUN = ["strategy", "training_seed", "case", "profile", "run_id"]
 SUMS = ["speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "reward", "frames"]
 SUMS += ["collided", *COUNTS]
 LARGEST_COLUMNS = ["max_gap_error_m", "peak_jerk_mps3", "energy_ratio"]
-# What is kept of runs behind other sources of leaders, and of which strategies.
+# Stored columns and strategies of runs behind other sources of leaders.
 COMPARED_BY = ["reward", "jerk_sum", "min_gap_m", "max_gap_error_m", "energy_ratio"]
 COMPARED_BY += ["energy_kj_per_km"]
 STABLE = ("cacc tuned", "deadbeat", LEARNED, "hcfs", "hcfs between", "hcfs first")
-LEADERS = {  # sources of leaders, for readers
+LEADERS = {  # names of sources of leaders in tables
     "traffic": "I-80",
     "cycles": "cycles at half speed",
     "fast_cycles": "cycles",
@@ -62,7 +62,7 @@ LEADERS = {  # sources of leaders, for readers
 
 
 def per_run(episodes: pd.DataFrame) -> pd.DataFrame:
-    """Sum the rows of the vehicles of each run; :func:`case_table` reads the result alike."""
+    """Sum the rows of each run's vehicles; :func:`case_table` also accepts the result."""
     how = {**dict.fromkeys(SUMS, "sum"), **dict.fromkeys(LARGEST_COLUMNS, "max")}
     how |= {"min_gap_m": "min", "learned_share": "mean", "energy_kj_per_km": "mean"}
     how |= {DRIVE: "first"} if DRIVE in episodes else {}
@@ -70,19 +70,19 @@ def per_run(episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def rounded(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return a table whose numbers have the precision that a figure shows."""
+    """Return a table with the precision of figures."""
     numbers = frame.select_dtypes("number").columns
     return frame.assign(**frame[numbers].astype("float32").round(3))
 
 
 def printed() -> pd.DataFrame:
-    """Return Table IV as the paper prints it."""
+    """Return Table IV of the paper."""
     columns = ["strategy", "speed_error_sum", "speed_error_std", "jerk_sum", "reward"]
     return pd.DataFrame([(name, *row) for name, row in TABLE_IV.items()], columns=columns)
 
 
 def weight_table() -> pd.DataFrame:
-    """Compare the rewards printed in Table IV with those of its sums of errors and jerks."""
+    """Compare the rewards in Table IV with those computed from its sums of errors and jerks."""
     reward = PlatoonReward()
     rows = [
         (name, error, jerk, total, float(reward(torch.tensor(error), torch.tensor(jerk))))
@@ -95,9 +95,9 @@ def weight_table() -> pd.DataFrame:
 def reward_per_seed(
     episodes: pd.DataFrame, strategy: str, case: str, of: str = "reward"
 ) -> pd.DataFrame:
-    """Return a sum of every run, ``[runs × seeds]``; one column where nothing was learned.
+    """Return a sum for every run, ``[runs × seeds]``; one column without training.
 
-    The index names the run's window and its drive; of rows without drives each window is one.
+    The index names the run's window and drive; without drives each window counts as one.
     """
     rows = episodes[(episodes["strategy"] == strategy) & (episodes["case"] == case)]
     seeds, drives = rows["training_seed"].fillna(-1), rows.get(DRIVE, rows["profile"])
@@ -124,9 +124,9 @@ def win_rates(
     """Compare the strategy ``of`` with others, all by default, on the same windows.
 
     Returns:
-        One row per other strategy: share of windows [%] in which ``of`` earns more (a tie counts
-        half), mean difference of Σ reward, and that difference as a share of the other's loss [%],
-        with 95 % intervals over drives and seeds. Trained strategies are compared seed by seed;
+        One row per other strategy: share of windows [%] with a larger reward of ``of`` (ties count
+        half), mean difference of Σ reward, and this difference as a share of the other's cost [%],
+        with 95 % intervals over drives and seeds. Trained strategies are compared by seed;
         ``seeds_ahead`` counts the seeds with a positive difference.
     """
     own = reward_per_seed(episodes, of, case)
@@ -143,7 +143,7 @@ def win_rates(
         row |= {"trainings": len(shared), "windows": len(difference)}
         row |= crossed_rewards(wins).columns("wins_pct", 100.0)
         row |= crossed_rewards(difference).columns("reward_gain")
-        # Rewards are negative: the share of the loss that is saved.
+        # Rewards are negative: the share of the cost that is saved.
         both = -own[shared], -other[shared]
         gain = bootstrap.saving(*both, paired=True, drives=_drives(own))
         row |= gain.columns("gain_pct", 100.0)
@@ -152,9 +152,9 @@ def win_rates(
 
 
 def windows(episodes: pd.DataFrame, strategies: Sequence[str], of: str = "hcfs") -> pd.DataFrame:
-    """Return errors, jerk and reward of strategies on the held-out windows, and what ``of`` gains.
+    """Return errors, jerk and reward of strategies on held-out windows, and gains of ``of``.
 
-    Intervals are over windows and, where something was learned, seeds.
+    Intervals are over windows and, for trained strategies, seeds.
     """
     table = case_table(episodes, WINDOW_CASES).set_index("strategy").loc[list(strategies)]
     against = win_rates(episodes, of, [s for s in strategies if s != of]).set_index("against")
@@ -172,7 +172,7 @@ def windows(episodes: pd.DataFrame, strategies: Sequence[str], of: str = "hcfs")
 
 
 def whole_gains(episodes: pd.DataFrame, parents: Sequence[str]) -> pd.DataFrame:
-    """Return what HCFS gains on its parents over whole records, with intervals over seeds."""
+    """Return gains of HCFS over its parents on whole records, with intervals over seeds."""
     return pd.DataFrame(
         [
             {"record": record, "against": STRATEGY_WORDS[str(row["against"])]}
@@ -185,13 +185,13 @@ def whole_gains(episodes: pd.DataFrame, parents: Sequence[str]) -> pd.DataFrame:
 
 
 def _records(episodes: pd.DataFrame) -> dict[str, str]:
-    """Return the cases that are whole records, and the records' names."""
+    """Return the cases with whole records, and the names of the records."""
     cases = (c for c in map(str, dict.fromkeys(episodes["case"])) if c.startswith(WHOLE_RECORD))
     return {case: case.removeprefix(WHOLE_RECORD).strip().upper() for case in cases}
 
 
 def over_cases(episodes: pd.DataFrame, cases: Sequence[str], like: Sequence[str]) -> pd.DataFrame:
-    """Return Σ reward by strategy and case, with intervals over seeds, beside the printed ones."""
+    """Return Σ reward by strategy and case, with intervals over seeds, and the paper's values."""
     tables = {case: case_table(episodes, case).set_index("strategy") for case in cases}
     rows = []
     for name in like:
@@ -230,12 +230,12 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
 
     Args:
         runs: rows of strategies, seeds and windows, with the ``source`` of the leaders.
-        strategies: those of the table; the first is what energy is compared with.
+        strategies: strategies of the table; the first is the baseline of energy.
 
     Returns:
         A row per source and strategy: Σ reward and the energy saved against CACC, with intervals
-        over windows and seeds; the largest gap error, the worst string ratio and how many runs
-        have one above 1, of all runs.
+        over windows and seeds; the largest gap error, the worst string ratio and the number of
+        runs with a string ratio above 1.
     """
     rows = []
     named = runs["source"].map(LEADERS).fillna(runs["source"])
@@ -258,7 +258,7 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
 
 
 def whole_records(episodes: pd.DataFrame, strategies: Sequence[str]) -> pd.DataFrame:
-    """Return reward, with the least and most of the seeds, and safety over whole records."""
+    """Return reward, with its range over seeds, and safety on whole records."""
     rows = []
     for case, record in _records(episodes).items():
         for name in strategies:
