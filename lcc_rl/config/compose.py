@@ -148,10 +148,9 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
         elif key in ("compare", "policy", "resume"):  # folders of a sweep: seed=0_…
             quoted = "'" in value or '"' in value
             found.append(f"++{key}{equals}{value if quoted else NAMED.sub(QUOTED, value)}")
-        elif key[:1] in "+~" or not equals or _is_choice(item):
-            found.append(item)
         else:
-            found.append(f"++{item}" if key.partition(".")[0] in _top_level() else item)
+            own = key.partition(".")[0] in _top_level() and not _is_choice(item)
+            found.append(f"++{item}" if equals and own else item)
     return found
 
 

@@ -18,7 +18,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
 
@@ -27,7 +26,7 @@ from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.functional.layout import total
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.safety import time_to_collision
-from lcc_rl.pieces.base import REWARD, Entry, RewardPiece, add_specs
+from lcc_rl.pieces.base import REWARD, AfterStep, Entry, RewardPiece, add_specs
 from lcc_rl.pieces.sections import Sections
 from lcc_rl.pieces.views import VEHICLES
 from lcc_rl.pieces.world import World
@@ -191,7 +190,7 @@ class SpacingReward(RewardTerm):
         return -(gap_error / self.gap_scale).square()
 
 
-class TotalReward(RewardPiece):
+class TotalReward(AfterStep, RewardPiece):
     """Writes ``("automated", "reward")``: the sum of all terms (A17, A19), ``[*batch, A, 1]``.
 
     It is the only entry of the environment's reward spec. It exists after a step, not at reset.
@@ -210,14 +209,6 @@ class TotalReward(RewardPiece):
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the sum."""
         return torch.stack(entries).sum(0)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return tensordict_reset
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return observation_spec
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         return add_specs(self, reward_spec)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite
 
-from lcc_rl.pieces.base import Feature
+from lcc_rl.pieces.base import AfterStep
 from lcc_rl.pieces.views import EPISODE
 
 
-class Collision(Feature):
+class Collision(AfterStep):
     """Ends an episode (``"terminated"`` and ``"done"``) when any gap of the string is zero or less.
 
     Without this piece episodes continue after a collision. Gaps may become negative; the evaluation
@@ -25,11 +23,3 @@ class Collision(Feature):
         """Return done and terminated, ``[*batch, 1]``."""
         terminated = terminated | (gap <= 0.0).any(-2)
         return done | terminated, terminated
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return observation_spec
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return tensordict_reset
