@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from numbers import Real
 from typing import Any
@@ -67,6 +68,25 @@ def require_positive(what: str, value: Any) -> None:
     number = isinstance(value, Real) and not isinstance(value, bool)
     if not (number and 0.0 < value <= LARGEST):
         raise ConfigError(f"{what} must be a positive, finite number, got {value!r}")
+
+
+@contextmanager
+def raised_as(kind: type[LccError], words: str, *caught: type[Exception]) -> Iterator[None]:
+    """Raise caught errors as one of this package: the words, then their message in one line."""
+    try:
+        yield
+    except caught as error:
+        text = str(error) if isinstance(error, LccError) else one_line(str(error))[:500]
+        raise kind(f"{words}: {text}") from error
+
+
+@contextmanager
+def needing(extra: str, words: str) -> Iterator[None]:
+    """Raise a ConfigError with the commands that install an extra if an import fails."""
+    try:
+        yield
+    except ImportError as error:
+        raise ConfigError(f"{words}: {how_to_install(extra)} ({error})") from error
 
 
 def how_to_install(extra: str) -> str:

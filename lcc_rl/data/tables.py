@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from itertools import chain
@@ -33,7 +33,7 @@ from lcc_rl.data.text import (
     unended,
 )
 from lcc_rl.data.trajectories import FOOT
-from lcc_rl.errors import ConfigError, DataError, unknown_name
+from lcc_rl.errors import ConfigError, DataError, raised_as, unknown_name
 
 PARQUET = (".parquet", ".pq")
 LARGEST_CELL = 1e12  # in SI: beyond any time or position, and within every type
@@ -178,7 +178,7 @@ class TableFile:
             raise DataError(f"{self.path}: no such file; expected a table, .csv or .parquet")
         self.parquet = self.path.suffix in PARQUET
         if self.parquet:
-            with _readable(self.path):
+            with raised_as(DataError, f"{self.path}: not a readable table", Exception):
                 self.header = [*pq.read_schema(self.path).names]
         else:
             self._open_text(spelled, bare)
@@ -287,7 +287,7 @@ class TableFile:
         return DataError(f"{self.path}: data row {row + 1}, column {name!r} {words}")
 
     def _parquet(self, names: Sequence[str]) -> pa.Table:
-        with _readable(self.path):
+        with raised_as(DataError, f"{self.path}: not a readable table", Exception):
             table = pq.read_table(self.path, columns=[*names])
             table.validate(full=True)  # else damaged text would fail only when used
         return table
@@ -469,12 +469,3 @@ def whole_numbers(texts: NDArray) -> NDArray[np.int64] | None:
     if not (np.abs(values) < LARGEST_ID).all() or (values != np.rint(values)).any():
         return None
     return values.astype(np.int64)
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Convert the errors of a damaged parquet file, which are of many kinds, to a DataError."""
-    try:
-        yield
-    except Exception as error:
-        raise DataError(f"{path}: not a readable table: {error}") from error
