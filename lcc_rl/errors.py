@@ -102,6 +102,14 @@ def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:
     return ConfigError(f"unknown {what} {name!r}; valid: {', '.join(options) or 'none'}.{hint}")
 
 
+def require_known(what: str, names: str | Iterable[Any], valid: Iterable[str]) -> None:
+    """Raise the error of :func:`unknown_name` for a name, or the first of several, if unknown."""
+    valid = list(valid)
+    for name in [names] if isinstance(names, str) else names:
+        if name not in valid:
+            raise unknown_name(what, str(name), valid)
+
+
 def out_of_memory(error: BaseException) -> bool:
     """Whether an allocation failed in NumPy, pyarrow or torch."""
     text = str(error)

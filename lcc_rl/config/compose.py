@@ -38,7 +38,7 @@ from lcc_rl.config.nodes import (
 from lcc_rl.config.schemas import AUTO, KINDS, SECTIONS, parse_config
 from lcc_rl.config.unused import check_used
 from lcc_rl.config.words import key_of
-from lcc_rl.errors import ConfigError, how_to_install, unknown_name
+from lcc_rl.errors import ConfigError, how_to_install, require_known, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
 from lcc_rl.settings import TARGET, find_target
 
@@ -97,8 +97,7 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
     Raises:
         ConfigError: if an override is unknown, of the wrong type or out of range.
     """
-    if entry not in KINDS:
-        raise unknown_name("command", entry, KINDS)
+    require_known("command", entry, KINDS)
     if isinstance(overrides, str):
         raise ConfigError(f"expected a list of settings, got the text {overrides!r}")
     return parsed(composed(entry, overrides), entry, overrides)

@@ -30,7 +30,13 @@ from lcc_rl.data.sources import find_files
 from lcc_rl.data.speed_records import DRIVE_COLUMNS, DRIVE_FIELDS, read_drives, read_speed_record
 from lcc_rl.data.tables import check_map
 from lcc_rl.data.trajectories import FRAME
-from lcc_rl.errors import ConfigError, DataError, raised_as, require_positive, unknown_name
+from lcc_rl.errors import (
+    ConfigError,
+    DataError,
+    raised_as,
+    require_known,
+    require_positive,
+)
 from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, parse
 
 LISTED = 8  # most names in a line
@@ -408,9 +414,8 @@ class Mixture:
                     f"leader.{name} must be a source of leaders, got {source!r}; "
                     f"use +leader@leader.{name}=…"
                 )
+        require_known("source in leader.weights", weights or (), sources)
         for name, weight in (weights or {}).items():
-            if name not in sources:
-                raise unknown_name("source in leader.weights", str(name), sources)
             require_positive(f"leader.weights.{name}", weight)
         self.sources, self.weights = sources, dict(weights or {})
 

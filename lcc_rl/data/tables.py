@@ -33,7 +33,7 @@ from lcc_rl.data.text import (
     unended,
 )
 from lcc_rl.data.trajectories import FOOT
-from lcc_rl.errors import ConfigError, DataError, raised_as, unknown_name
+from lcc_rl.errors import ConfigError, DataError, raised_as, require_known, unknown_name
 
 PARQUET = (".parquet", ".pq")
 LARGEST_CELL = 1e12  # in SI: beyond any time or position, and within every type
@@ -113,16 +113,14 @@ def check_map(columns: Iterable[Column], names: Names, units: Units, at: str) ->
     """
     known = {column.key: column for column in columns}
     measured = {key: UNITS[c.quantity] for key, c in known.items() if c.quantity in UNITS}
+    require_known(f"key of {at}.columns", names, known)
+    require_known(f"key of {at}.units", units, measured)
     for key, name in names.items():
-        if key not in known:
-            raise unknown_name(f"key of {at}.columns", str(key), known)
         if not (isinstance(name, str) or (name is None and not known[key].required)):
             raise ConfigError(f"{at}.columns.{key} must name a column, got {name!r}")
         if name is not None and [*names.values()].count(name) > 1:
             raise ConfigError(f"{at}.columns names the column {name!r} twice")
     for key, unit in units.items():
-        if key not in measured:
-            raise unknown_name(f"key of {at}.units", str(key), measured)
         more = {"frames/<rate>": 1.0} if known[key].quantity == "time" else {}
         if unit_size(known[key].quantity, str(unit)) is None:
             raise unknown_name(f"unit in {at}.units.{key}:", str(unit), {**measured[key], **more})

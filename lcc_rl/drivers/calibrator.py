@@ -28,7 +28,7 @@ from lcc_rl.drivers.parameters import (
     fitted,
 )
 from lcc_rl.drivers.twins import HELD, accelerate, compare_twins, measure_recorded
-from lcc_rl.errors import Concern, ConfigError, DataError, unknown_name
+from lcc_rl.errors import Concern, ConfigError, DataError, require_known
 from lcc_rl.functional.driver_models import (
     INDIVIDUAL,
     PARAMETERS,
@@ -117,14 +117,10 @@ class Calibrator(Settings):
             raise ConfigError("perception chooses a part of the reaction: set reaction=true, too")
         law = find_law(self.model)
         given = {name: x for name, x in self.constants.items() if x is not None}
-        for name in given:
-            if name not in law.shared():
-                raise unknown_name(f"constant of model {self.model}", name, law.shared())
+        require_known(f"constant of model {self.model}", given, law.shared())
         self.shared: DriverConstants = law(**given)
         table = {**PARAMETERS, **law.own}
-        for name in self.bounds:
-            if name not in table:
-                raise unknown_name("parameter", name, table)
+        require_known("parameter", self.bounds, table)
         self.bounds = {**{name: one.bounds for name, one in table.items()}, **self.bounds}
         for name, (lower, upper) in self.bounds.items():
             low, high = table[name].plausible
@@ -246,11 +242,8 @@ class _Fit:
 
         Candidates have the shape ``[1, candidates, constants]``.
         """
-        drivers, shared, start = (
-            self.observed.count,
-            self.settings.shared.shared(),
-            self.settings.shared,
-        )
+        drivers, start = self.observed.count, self.settings.shared
+        shared = start.shared()
 
         def mean_error(candidates: Tensor) -> Tensor:
             count = candidates.shape[1]

@@ -143,10 +143,7 @@ class Clock(EnvBase):
         return self._moment(tensordict.get(SEED), tensordict.get(STEP) + 1)
 
     def _moment(self, seeds: torch.Tensor, step: torch.Tensor) -> TensorDictBase:
-        moment = TensorDict(batch_size=self.batch_size, device=self.device)
-        for key, value in tick(seeds, step, self.horizon).items():
-            moment.set(key, value)
-        return moment
+        return TensorDict(tick(seeds, step, self.horizon), self.batch_size, device=self.device)
 
 
 def option_specs(env: EnvBase) -> dict[Key, Any]:

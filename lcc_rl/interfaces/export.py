@@ -20,7 +20,7 @@ import torch
 
 from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
-from lcc_rl.errors import ConfigError, needing, require, unknown_name
+from lcc_rl.errors import ConfigError, needing, require, require_known
 from lcc_rl.evaluation.foreign import network_of
 from lcc_rl.evaluation.named import is_policy, rules
 from lcc_rl.interfaces.exported import described_input, program
@@ -71,8 +71,7 @@ def export(
         >>> export("pretrained/alcc_limits", "alcc.pt2")  # doctest: +SKIP
     """
     path = new_file(path, "name")
-    if path.suffix not in (*EXPORTERS, PAGE):
-        raise unknown_name("ending", path.suffix, [*EXPORTERS, PAGE])
+    require_known("ending", path.suffix, [*EXPORTERS, PAGE])
     cfg, page = None, path.suffix == PAGE
     if not isinstance(policy, (str, PathLike)):
         given = policy

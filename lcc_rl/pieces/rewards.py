@@ -18,9 +18,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
+from torchrl.envs import Transform
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.hcfs import PlatoonReward
@@ -211,13 +211,8 @@ class TotalReward(RewardPiece):
         """Return the sum."""
         return torch.stack(entries).sum(0)
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return tensordict_reset
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return observation_spec
+    _reset = Transform._reset
+    transform_observation_spec = Transform.transform_observation_spec
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         return add_specs(self, reward_spec)

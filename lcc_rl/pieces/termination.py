@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite
+from torchrl.envs import Transform
 
 from lcc_rl.pieces.base import Feature
 from lcc_rl.pieces.views import EPISODE
@@ -26,10 +25,5 @@ class Collision(Feature):
         terminated = terminated | (gap <= 0.0).any(-2)
         return done | terminated, terminated
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return observation_spec
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return tensordict_reset
+    _reset = Transform._reset
+    transform_observation_spec = Transform.transform_observation_spec
