@@ -57,7 +57,7 @@ LARGEST = 1e9
 LARGEST_SIZE, LAST_SEED = 10**15, 2**32 - 1  # torch uses no more bits of a seed
 
 
-def require(condition: bool, message: str) -> None:
+def require(condition: object, message: str) -> None:
     """Raise a ConfigError with the message unless the condition holds."""
     if not condition:
         raise ConfigError(message)

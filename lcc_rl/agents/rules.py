@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from lcc_rl.agents.actor import Activation, make_actor, seeded_mlp
-from lcc_rl.errors import ConfigError, require_known, unknown_name
+from lcc_rl.errors import ConfigError, require, require_known, unknown_name
 from lcc_rl.pieces.cruise import IDMACC, Cruise, LinearACC
 from lcc_rl.pieces.observation import Observation
 
@@ -123,8 +123,7 @@ def make_policy(
     """
     size = observation.event_shape[-1]
     if kind == NETWORK_ALONE:
-        if constants:
-            raise ConfigError("agent.constants belong to a rule: use agent.policy=idm or acc")
+        require(not constants, "agent.constants belong to a rule: use agent.policy=idm or acc")
         return make_actor(size, 1, hidden, seed, activation)
     name = kind.removeprefix(RESIDUAL)
     if name not in RULE_KINDS:

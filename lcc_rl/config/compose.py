@@ -38,7 +38,7 @@ from lcc_rl.config.nodes import (
 from lcc_rl.config.schemas import AUTO, KINDS, SECTIONS, parse_config
 from lcc_rl.config.unused import check_used
 from lcc_rl.config.words import key_of
-from lcc_rl.errors import ConfigError, how_to_install, require_known, unknown_name
+from lcc_rl.errors import ConfigError, how_to_install, require, require_known, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
 from lcc_rl.settings import TARGET, find_target
 
@@ -190,8 +190,7 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         sweep: allow settings that this run does not use, because the runs of a sweep share them.
     """
     for item in overrides:
-        if item.endswith(f"={MISSING}"):
-            raise ConfigError(f"{item.removeprefix('++')}: expected a value")
+        require(not item.endswith(f"={MISSING}"), f"{item.removeprefix('++')}: expected a value")
     try:
         # Settings may refer to defaults of classes.
         whole = OmegaConf.create(with_defaults(OmegaConf.to_container(cfg, resolve=False)))

@@ -21,7 +21,7 @@ from lcc_rl.drivers.parameters import (
     users,
 )
 from lcc_rl.drivers.tables import PAIR_IDENTITY, check_drivers, load_drivers, models_of, reaction_of
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.driver_models import INDIVIDUAL, PARAMETERS, Reaction
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.laws import LAWS
@@ -61,8 +61,7 @@ class DriverPopulation:
     mode: str | None = None
 
     def __post_init__(self) -> None:
-        if not self.ids:
-            raise ConfigError("driver population: holds no drivers")
+        require(self.ids, "driver population: holds no drivers")
         table = parameters_of(self.models or (DEFAULT_MODEL,))
         for name, values in self.parameters().items():
             low, high = table[name].plausible

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lcc_rl.energy.base import BURNT, EnergyModel
 from lcc_rl.energy.electric import PaperMotor
-from lcc_rl.errors import ConfigError, require_known
+from lcc_rl.errors import ConfigError, require, require_known
 from lcc_rl.functional.guard import unchanged
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.settings import Positive, Settings, values
@@ -69,8 +69,7 @@ class Fleet:
         shares: Mapping[str, float] | None = None,
         roles: Mapping[str, Mapping[str, float]] | None = None,
     ) -> None:
-        if not models:
-            raise ConfigError("energy.models is empty: a mixture needs at least one model")
+        require(models, "energy.models is empty: a mixture needs at least one model")
         self.classes = {x: VehicleClass(energy=own, bounded=False) for x, own in models.items()}
         shares = dict.fromkeys(self.names, 1.0) if shares is None else shares
         self.shares = self._checked(shares, "energy.shares")

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 from unittest.mock import patch
 
-from lcc_rl.errors import ConfigError, Diverged, needing
+from lcc_rl.errors import Diverged, needing, require
 from lcc_rl.interfaces.driver import MEASURED, Driver
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.controllers import Population
@@ -66,8 +66,7 @@ class Bridge:
         drivers: Population | None = None,
     ) -> None:
         self.sumo = load_sumo()
-        if not self.sumo.isLoaded():
-            raise ConfigError("SUMO runs no simulation: call libsumo.start([…]) first")
+        require(self.sumo.isLoaded(), "SUMO runs no simulation: call libsumo.start([…]) first")
         delta = self.sumo.simulation.getDeltaT()
         self.driver = Driver(driver, delta, trust, safety, seed, drivers)
         names = {vehicles} if isinstance(vehicles, str) else vehicles

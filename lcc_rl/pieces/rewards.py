@@ -22,7 +22,7 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import Transform
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require
 from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.functional.layout import total
 from lcc_rl.functional.pattern import AUTOMATED
@@ -203,8 +203,7 @@ class TotalReward(RewardPiece):
 
     def setup(self, world: World) -> None:
         """Read the terms."""
-        if not self.terms:
-            raise ConfigError("reward.terms is empty: an environment needs at least one term")
+        require(self.terms, "reward.terms is empty: an environment needs at least one term")
         self.declare(world, [(*TERMS, name) for name in self.terms])
 
     def compute(self, *entries: Tensor) -> Tensor:

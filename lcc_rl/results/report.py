@@ -11,7 +11,7 @@ import pandas as pd
 
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.energy import Fleet
-from lcc_rl.errors import ConfigError, require_known
+from lcc_rl.errors import require, require_known
 from lcc_rl.io.files import Rows
 from lcc_rl.results import measures
 from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING
@@ -156,8 +156,7 @@ def summary(
     require_known("strategy to compare against", () if against is None else against, parts)
     # Without automated vehicles the values of limits are missing.
     for column in task.limits if task and WAYS[0] in windows else ():
-        if column not in windows:
-            raise ConfigError(f"task.limits.{column}: episodes.parquet has no such column")
+        require(column in windows, f"task.limits.{column}: episodes.parquet has no such column")
     column, *per = task.measure.columns if task else (PATH, DISTANCE)
     rows = []
     for name, part in parts.items():

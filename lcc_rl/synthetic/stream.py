@@ -28,7 +28,7 @@ from lcc_rl.data.trajectories import (
     find_leaders,
 )
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require
 from lcc_rl.settings import Seed, Settings, Share
 from lcc_rl.synthetic.lane import Stream, drive_platoons
 from lcc_rl.synthetic.stop_and_go import StopAndGo
@@ -62,8 +62,7 @@ class StreamSource(Settings):
 
     def validate(self) -> None:
         low, high = self.duration_s
-        if low > high:
-            raise ConfigError(f"data.duration_s must be a range, got {low:g} to {high:g} s")
+        require(low <= high, f"data.duration_s must be a range, got {low:g} to {high:g} s")
 
     def generate(self) -> Stream:
         """Simulate all recordings."""
