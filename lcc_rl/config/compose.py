@@ -170,12 +170,6 @@ def choices(group: str) -> list[str]:
 
 
 @cache
-def _groups() -> frozenset[str]:
-    folder = Path(str(files(CONF)))
-    return frozenset(path.name for path in folder.iterdir() if path.is_dir())
-
-
-@cache
 def _top_level() -> frozenset[str]:
     return frozenset(name for kind in KINDS.values() for name in kind.__dataclass_fields__)
 
@@ -309,7 +303,8 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
 def _unknown_option(name: str) -> ConfigError:
     """Return the error for an unknown option, with its section if there is one."""
     places = {key: at for at, kind in SECTIONS.items() for key in settings_of(kind) or ()}
-    root, known = name.partition(".")[0], _top_level() | _groups()
+    groups = {path.name for path in Path(str(files(CONF))).iterdir() if path.is_dir()}
+    root, known = name.partition(".")[0], _top_level() | groups
     if root in places:
         return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")
     if root in known:

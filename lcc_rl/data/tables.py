@@ -263,7 +263,10 @@ class TableFile:
             if self.header.count(name) > 1:
                 raise DataError(f"{self.path}: has column {name!r} twice; expected it once")
         if self.parquet:
-            yield Block(self, self._parquet(names))
+            with raised_as(DataError, f"{self.path}: not a readable table", Exception):
+                whole = pq.read_table(self.path, columns=[*names])
+                whole.validate(full=True)  # else damaged text would fail only when used
+            yield Block(self, whole)
             return
         places, row = {str(self.header.index(name)): name for name in names}, 0
         for lines in self.lines:
@@ -283,12 +286,6 @@ class TableFile:
         """Return the error about a cell."""
         name = self.names.get(key, key)
         return DataError(f"{self.path}: data row {row + 1}, column {name!r} {words}")
-
-    def _parquet(self, names: Sequence[str]) -> pa.Table:
-        with raised_as(DataError, f"{self.path}: not a readable table", Exception):
-            table = pq.read_table(self.path, columns=[*names])
-            table.validate(full=True)  # else damaged text would fail only when used
-        return table
 
     def _open_text(self, spelled: Callable[[str], str], bare: Sequence[str]) -> None:
         chunks = line_chunks(self.path, self.notes)

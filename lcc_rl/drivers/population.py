@@ -100,18 +100,11 @@ class DriverPopulation:
         )
 
     def summary(self) -> dict[str, float]:
-        """Return means, standard deviations (n − 1), correlation of (v0, T), share at a bound."""
-        speed = self.desired_speed.double().cpu().numpy()
-        gap = self.time_gap.double().cpu().numpy()
-        deviations = [float(pd.Series(x).std()) for x in (speed, gap)]  # NaN for one driver
-        spread = min(deviations) > 0.0
+        """Return the correlation of (v0, T), NaN if one does not vary, and the share at a bound."""
+        speed, gap = (x.double().cpu().numpy() for x in (self.desired_speed, self.time_gap))
+        varies = min(np.ptp(speed), np.ptp(gap)) > 0.0
         return {
-            "drivers": float(len(self)),
-            "desired_speed_mean_mps": float(speed.mean()),
-            "desired_speed_std_mps": deviations[0],
-            "time_gap_mean_s": float(gap.mean()),
-            "time_gap_std_s": deviations[1],
-            "correlation": float(np.corrcoef(speed, gap)[0, 1]) if spread else float("nan"),
+            "correlation": float(np.corrcoef(speed, gap)[0, 1]) if varies else float("nan"),
             "share_at_bound": float(self.at_bound.double().mean()),
         }
 

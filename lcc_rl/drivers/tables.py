@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from lcc_rl.data.sources import ASSETS
 from lcc_rl.drivers.observed import PAIR_IDENTITY
 from lcc_rl.drivers.parameters import DEFAULT_MODEL, MODEL, REACTION, parameters_of, users
 from lcc_rl.errors import DataError, ResultsError
@@ -33,11 +33,7 @@ def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.
         DataError: naming file, row and column, if the table is missing, empty or not valid.
     """
     try:
-        if path is None:
-            with resources.as_file(resources.files("lcc_rl.assets") / SHIPPED_DRIVERS) as file:
-                frame = read_parquet(file)
-        else:
-            frame = read_parquet(path)
+        frame = read_parquet(ASSETS / SHIPPED_DRIVERS if path is None else path)
     except ResultsError as error:
         raise DataError(str(error)) from error
     name = SHIPPED_DRIVERS if path is None else str(path)

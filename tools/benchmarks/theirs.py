@@ -31,7 +31,8 @@ class PlainVector(VecEnv):  # type: ignore[misc,unused-ignore]
     def __init__(self, env: TransformedEnv, compiled: bool) -> None:
         self.env, self.plain = env, PlainLoop(env)
         super().__init__(self.plain.rows, SEEN, ACTS)
-        self.play = self.plain.player(compiled)
+        eager, together = self.plain.play_eagerly, self.plain.play
+        self.play = torch.compile(together, dynamic=False) if compiled else eager
 
     def reset(self) -> Any:
         """Begin new episodes everywhere; return what is seen."""
