@@ -335,29 +335,27 @@ def _findings(
             both = f"RMSPE {100.0 * speed:.2f} %, gap RMSE {gap:.2f} m, {100.0 * share:.1f} %"
             lines.append(f"{part}: {both} of the gap (means)")
     speed, share = drivers["rmspe"].mean(), drivers["gap_nrmse"].mean()
+    concerns = []
     if objective == SPEED_RMSPE and share > max(GAPS_OFF, 3.0 * speed):
-        line = (
+        concerns.append(
             f"gaps are off by {100.0 * share:.0f} %, speeds by {100.0 * speed:.1f} %: "
             "calibration.objective=both fits gaps, too"
         )
-        lines.append(Concern(line))
     for name in names:
         bound = drivers[f"{name}_at_bound"]
         if bound.any():
             low, high = limits[name]
             upper = drivers[table[name].column] > (low + high) / 2
             shares = [100 * (bound & side).mean() for side in (~upper, upper)]
-            line = (
+            concerns.append(
                 f"{100 * bound.mean():.0f} % of the values of {table[name].column} lie on a bound: "
                 f"{shares[0]:.0f} % on {low:g}, {shares[1]:.0f} % on {high:g} "
                 f"(calibration.bounds.{name}){CONGESTED if name == 'desired_speed' else ''}"
             )
-            lines.append(Concern(line))
     off = 100.0 * drivers["gap_nrmse"].median()
     if off > 100.0 * IMPLAUSIBLE:
-        line = (
+        concerns.append(
             f"IMPLAUSIBLE FIT: the gap of the median driver is off by {off:.0f} %; are speeds in "
             "km/h or ft/s, or gaps and positions in feet, in columns of m/s and m (data.units)?"
         )
-        lines.append(Concern(line))
-    return lines
+    return [*lines, *map(Concern, concerns)]

@@ -113,13 +113,8 @@ def agree(what: str, one: Any, other: Any, tolerance: float = TOLERANCE) -> None
 
 def stream(quick: bool) -> StreamSource:
     """Return the default data: the synthetic stream, or a little of it."""
-    small: dict[str, Any] = {
-        "recordings": 2,
-        "platoons": 3,
-        "vehicles": 3,
-        "duration_s": (35.0, 45.0),
-    }
-    return StreamSource(**small) if quick else StreamSource()
+    small = StreamSource(recordings=2, platoons=3, vehicles=3, duration_s=(35.0, 45.0))
+    return small if quick else StreamSource()
 
 
 def installed() -> bool:

@@ -36,12 +36,8 @@ def update(options: Namespace) -> list[Row]:
     rows: list[Row] = []
     for kind, (batch, count) in product(AGENTS, QUICK if options.quick else SIZES):
         agent = kind(batch_size=batch).start(Scene(7))
-        name = kind.__name__
-        own, loss, other = (
-            f"{name}.update",
-            f"TorchRL's {name}Loss",
-            f"{OTHER} {name}",
-        )
+        own, loss = f"{kind.__name__}.update", f"TorchRL's {kind.__name__}Loss"
+        other = f"{OTHER} {kind.__name__}"
         slow = kind(batch_size=batch, fused=False).start(Scene(7))
         runs: dict[str, Run] = {
             own: own_updates(agent, played, count),
