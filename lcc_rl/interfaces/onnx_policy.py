@@ -20,12 +20,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.errors import (
-    ResultsError,
-    needing,
-    raised_as,
-    require,
-)
+from lcc_rl.errors import ResultsError, needing, raised_as, require
 from lcc_rl.pieces.base import Entry, Piece, declared
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, VEHICLES
