@@ -43,15 +43,7 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 from pydantic.fields import FieldInfo
 
-from lcc_rl.errors import (
-    LARGEST,
-    LARGEST_SIZE,
-    LAST_SEED,
-    ConfigError,
-    LccError,
-    require,
-    unknown_name,
-)
+from lcc_rl.errors import LARGEST, LARGEST_SIZE, LAST_SEED, ConfigError, LccError, unknown_name
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
@@ -278,5 +270,6 @@ def find_target(target: str, where: str) -> Any:
         if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("lcc_rl"):
             hint = "; for your own file, export PYTHONPATH=<its folder>"
         raise ConfigError(f"{where}.{TARGET}: cannot find {target!r}: {error}{hint}") from error
-    require(callable(found), f"{where}.{TARGET}: {target!r} is no class or function")
+    if not callable(found):
+        raise ConfigError(f"{where}.{TARGET}: {target!r} is no class or function")
     return found

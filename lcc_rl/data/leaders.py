@@ -30,14 +30,7 @@ from lcc_rl.data.sources import find_files
 from lcc_rl.data.speed_records import DRIVE_COLUMNS, DRIVE_FIELDS, read_drives, read_speed_record
 from lcc_rl.data.tables import check_map
 from lcc_rl.data.trajectories import FRAME
-from lcc_rl.errors import (
-    ConfigError,
-    DataError,
-    raised_as,
-    require,
-    require_known,
-    require_positive,
-)
+from lcc_rl.errors import ConfigError, DataError, raised_as, require_known, require_positive
 from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, parse
 
 LISTED = 8  # most names in a line
@@ -125,7 +118,8 @@ def stretch(
     time, speed = read_speed_record(path, plausible)
     begin = time[0] if from_s is None else float(from_s)
     end = time[-1] if to_s is None else float(to_s)
-    require(begin < end, f"leader: the stretch {begin:g}–{end:g} s of {path} is empty")
+    if not begin < end:
+        raise ConfigError(f"leader: the stretch {begin:g}–{end:g} s of {path} is empty")
     if begin < time[0] or end > time[-1] + 1e-6:
         raise DataError(
             f"{path}: covers {time[0]:g}–{time[-1]:g} s, not the stretch {begin:g}–{end:g} s; "
@@ -169,7 +163,8 @@ class RecordLeaders(Settings):
         parts: dict[str, list[Profiles]] = {}
         for group in ("training", "held_out"):
             parts[group] = self._stretches(group, getattr(self, group), time_step)
-            require(parts[group], f"leader.{group} names no record")
+            if not parts[group]:
+                raise ConfigError(f"leader.{group} names no record")
         windows = varying(joined(parts["held_out"]).windows(horizon), self.least_variation)
         report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s"] + [
             f"{group}: {line}"
@@ -204,7 +199,8 @@ class RecordLeaders(Settings):
         """Return settings of a stretch or case; it or ``self`` has a path."""
         settings: Any = parse(kind, node or {}, where)
         settings.path = settings.path or self.path
-        require(settings.path, f"{where}.path is required: the name of a cycle or a file")
+        if not settings.path:
+            raise ConfigError(f"{where}.path is required: the name of a cycle or a file")
         return settings
 
 
@@ -404,7 +400,8 @@ class Mixture:
     """
 
     def __init__(self, weights: Mapping[str, float] | None = None, **sources: Any) -> None:
-        require(sources, "leader: a mixture names no source of leaders")
+        if not sources:
+            raise ConfigError("leader: a mixture names no source of leaders")
         for name, source in sources.items():
             if not callable(getattr(source, "load", None)):
                 raise ConfigError(
