@@ -77,7 +77,7 @@ def raised_as(kind: type[LccError], words: str, *caught: type[Exception]) -> Ite
         yield
     except caught as error:
         text = str(error) if isinstance(error, LccError) else one_line(str(error))[:500]
-        raise kind(f"{words}: {text}") from error
+        raise kind(f"{words}: {text}".removeprefix(": ")) from error
 
 
 @contextmanager
