@@ -60,7 +60,8 @@ def read_included(app: Any, path: Path, name: str, source: list[str]) -> None:
 def _inside(found: re.Match[str]) -> str:
     text, _, path, _ = found.groups()
     if (ROOT / path).exists() and not (HERE / path).exists():
-        return text if text.startswith("`") else f"{text} (`{path}`)"
+        plain = text.startswith("`") or text.strip("/") == path
+        return text if plain else f"{text} in `{path}`"
     return found[0]
 
 

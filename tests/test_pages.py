@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from functools import cache, partial
+from itertools import chain
 from pathlib import Path
 from types import ModuleType
 
@@ -269,6 +270,21 @@ def folder(tmp_path, monkeypatch) -> Path:
     yield tmp_path
     for path in tmp_path.glob("*.py"):
         sys.modules.pop(path.stem, None)
+
+
+def test_the_pages_stay_short() -> None:
+    """CONTRIBUTING's limits; docs/settings.md is written when the site is built."""
+    lines = {}
+    for page in {ROOT / "README.md", *(ROOT / "docs").glob("*.md")} - {ROOT / "docs/settings.md"}:
+        text = page.read_text().splitlines()
+        lines[page.name] = len(text)
+        ranges = (range(one.line, one.line + one.text.count("\n")) for one in blocks(page))
+        inside = set(chain.from_iterable(ranges))
+        for number, line in enumerate(text, 1):
+            free = number in inside or line.startswith(("|", "!["))
+            assert free or len(line) <= 100, f"{page.name}:{number}"
+    assert sum(lines.values()) <= 4000
+    assert lines["README.md"] <= 90
 
 
 @pytest.mark.parametrize("page", slow_but(PAGES[:1], PAGES), ids=lambda page: page.name)

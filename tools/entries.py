@@ -33,7 +33,9 @@ ENTRIES = declared(Piece, Clock, SingleAgent)
 SIZES = "scenario.string=automated*3 human*5"
 HEAD = """# Entries and equations
 
-## Entries (written by `python tools/entries.py`; do not edit)
+<!-- Written by `python tools/entries.py`; do not edit. -->
+
+## Entries
 
 Keys of the environments' TensorDicts, at the root after a reset and under `"next"` after a step.
 `role` stands for a role of the string, such as `"human"`; `name` for a term of the reward.
@@ -161,7 +163,12 @@ def page(rows: dict[Key, list[str]]) -> str:
     for key, (shape, mark, *names) in rows.items():
         shown = ", ".join(part if part in (ROLE, TERM) else f'"{part}"' for part in key)
         entry = ENTRIES[key]
-        known = (f"`{shown}`", f"`{shape}`", entry.unit, entry.meaning + mark)
+        known = (
+            f"`{shown}`",
+            f"`{shape}`".replace(", ", ",\N{NO-BREAK SPACE}"),
+            entry.unit,
+            entry.meaning + mark,
+        )
         entries.append((*known, ", ".join(names)))
     equations = [("equation", "formula", "symbols and units", "implemented by", "deviation")]
     for number, formula, symbols, functions, deviation in EQUATIONS:

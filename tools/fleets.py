@@ -8,7 +8,17 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from lcc_rl.figures.drawing import INK, PAGE_WIDTH, footnote, new_figure, paper, style
+from lcc_rl.config.words import FILTERED
+from lcc_rl.figures.drawing import (
+    INK,
+    INTERVAL,
+    PAGE_WIDTH,
+    SERIES,
+    colour,
+    footnote,
+    new_figure,
+    paper,
+)
 from lcc_rl.results.bootstrap import Estimate
 from lcc_rl.results.fronts import (
     DISTANCE,
@@ -21,6 +31,7 @@ from lcc_rl.results.fronts import (
     flow_gained,
     saved_at_flow,
 )
+from lcc_rl.results.names import NETWORK, in_words
 from lcc_rl.results.render import markdown_row
 
 SHARE, LEARNED = "penetration", "learned"
@@ -28,27 +39,19 @@ SHOWN = {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean sp
 HUMAN, RULE = "human", "idm_acc"
 SETTINGS = {  # labels of the stored fronts
     "drives": "I-24, whole drives",
-    "drives_taught": "I-24, whole drives, trained so",
+    "drives_taught": "I-24, whole drives, trained over 400 s",
     "drives_wavy": "I-24, wavy half of the drives",
-    "drives_wavy_taught": "I-24, wavy half of the drives, trained so",
+    "drives_wavy_taught": "I-24, wavy half of the drives, trained over 400 s",
     "front": "I-24, 100 s",
     "free": "free driving, 100 s",
     "long": "I-24, 400 s",
-    "long_taught": "I-24, 400 s, trained so",
-    "true": "true drivers, I-24, 100 s",
-    "true_taught": "true drivers, I-24, 100 s, trained so",
+    "long_taught": "I-24, 400 s, trained over 400 s",
+    "true": "drivers with reaction, I-24, 100 s",
+    "true_taught": "drivers with reaction, I-24, 100 s, trained with them",
 }
 DRIVES, PANELS = "drives", ("front", "free", "long", "true")
 TAUGHT = ", trained "  # part of the label of a setting with fleets trained in it
-SHOWN_AS = {
-    LEARNED: ("learned", "#0072b2"),
-    "idm_acc": ("tuned IDM", "#009e73"),
-    "idm_acc_filtered": ("tuned IDM behind the safety filter", "#56b4e9"),
-    "acc": ("tuned linear ACC", "#e69f00"),
-    "follower_stopper": ("FollowerStopper", "#cc79a7"),
-    "pi_saturation": ("PI with saturation", "#d55e00"),
-}
-COLOURS = ("#56b4e9", "#009e73", "#e69f00", "#cc79a7")  # of the shares of a front
+RIVALS = ("idm_acc", "idm_acc_filtered", "acc", "follower_stopper", "pi_saturation")
 
 
 def fronts(rows: pd.DataFrame) -> str:
@@ -58,8 +61,8 @@ def fronts(rows: pd.DataFrame) -> str:
         "automated",
         "saved",
         "flow [1/h]",
-        "against the rule at this flow",
-        "the rule at best",
+        "saved against the rule at equal flow",
+        "largest saving of the rule",
     ]
     lines = [head, ["---"] * len(head)]
     for setting, share, part in by_setting(rows):
@@ -109,27 +112,27 @@ def drawn_fronts(rows: pd.DataFrame) -> Figure:
     rows = rows[~rows["setting"].str.startswith(DRIVES)]
     axes = dict(zip(titles, figure.subplots(2, 2).flat, strict=True))
     shares = 100.0 * np.sort(rows[SHARE].unique())
-    hues = dict(zip(shares.round(), COLOURS, strict=False))
+    hues = dict(zip(shares.round(), SERIES, strict=False))
     for setting, share, part in by_setting(rows):
         axis, hue = axes[setting.partition(TAUGHT)[0]], hues[round(share)]
         look = {"marker": "D"} if TAUGHT in setting else {"label": f"{share:g} % automated"}
         people = curve(part, HUMAN)[1].iloc[0]
         (saving, flow), (own, point) = curve(part, RULE), curve(part, LEARNED)
-        axis.plot(100.0 * (flow / people - 1.0), saving, ".-", color=hue, lw=1.0, ms=4)
+        axis.plot(100.0 * (flow / people - 1.0), saving, ".-", color=hue)
         x, found = 100.0 * (point / people - 1.0), against(part, HUMAN, fleet_saved)
-        axis.vlines(x, 100.0 * found.low, 100.0 * found.high, color=hue, lw=2.5, alpha=0.5)
+        axis.vlines(x, 100.0 * found.low, 100.0 * found.high, color=hue, **INTERVAL)
         axis.plot(x, own, **{"marker": "o"} | look, ls="", color=hue, mec=INK, ms=7, zorder=5)
     for setting, axis in axes.items():
         axis.axhline(0.0, color=INK, lw=0.6)
         axis.axvline(0.0, color=INK, lw=0.6)
         axis.set(xlim=(-15.0, 15.0), ylim=(-2.0, None), title=setting)  # fronts are longer
-        style(axis, "flow against humans only [%]", "fuel saved per km [%]")
+        axis.set(xlabel="flow against human drivers [%]", ylabel="fuel saved per km [%]")
     handles = axes[SETTINGS["front"]].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside upper left", ncols=4, frameon=False)
+    figure.legend(*handles, loc="outside upper left", ncols=4)
     footnote(
         figure,
-        "large: learned, with the 95 % interval; circles trained for the first panel, diamonds for "
-        "theirs;\nsmall: the tuned IDM by its time gap, shorter to the right",
+        "large: network with its 95 % interval (circle: trained on I-24 over 100 s; diamond: "
+        "trained as in the panel);\nsmall: tuned IDM with several time gaps, shorter to the right",
     )
     return figure
 
@@ -142,29 +145,32 @@ def drawn_ring(table: pd.DataFrame) -> Figure:
     humans = table[table["strategy"] == HUMAN]
     for axis, (column, label) in zip(axes, SHOWN.items(), strict=True):
         scale = 100.0 if column == "saving" else 1.0
-        for name, (words, colour) in SHOWN_AS.items():
+        for name in (LEARNED, *RIVALS):
             rows = table[table["strategy"] == name].sort_values(SHARE)
+            shown = NETWORK if name == LEARNED else name
+            hue, dashed = colour(shown), "--" if name.endswith(FILTERED) else "-"
             if rows.empty:
                 continue
             x = 100.0 * rows[SHARE]
             above = 5 if name == LEARNED else 3
-            axis.plot(x, scale * rows[column], color=colour, label=words, zorder=above)
-            face = [colour if kept else "white" for kept in rows["kept"]]
-            axis.scatter(x, scale * rows[column], c=face, edgecolors=colour, s=16, zorder=above)
+            axis.plot(x, scale * rows[column], dashed, color=hue, zorder=above)
+            face = [hue if kept else "white" for kept in rows["kept"]]
+            axis.scatter(x, scale * rows[column], c=face, edgecolors=hue, s=16, zorder=above)
+            axis.plot([], [], "o" + dashed, color=hue, label=in_words(shown))
             if name == LEARNED and column == "saving":
                 ends = (scale * rows[f"saving_{end}"] for end in ("low", "high"))
-                axis.vlines(x, *ends, color=colour, lw=1.5, alpha=0.5, zorder=above)
+                axis.vlines(x, *ends, color=hue, zorder=above, **INTERVAL)
         # The saving is zero; means over the shares average the noise.
-        axis.axhline(scale * humans[column].fillna(0.0).mean(), color=INK, ls="--", lw=0.8)
+        axis.axhline(scale * humans[column].fillna(0.0).mean(), color=INK, ls=":")
         axis.set_xscale("log")
         shares = sorted(100.0 * table[SHARE].unique())
         axis.set_xticks(shares, [f"{float(f'{share:.2g}'):g}" for share in shares])
         axis.minorticks_off()
-        style(axis, "automated vehicles [%]", label)
-    axes[0].plot([], [], color=INK, ls="--", lw=0.8, label="human drivers only")
+        axis.set(xlabel="automated vehicles [%]", ylabel=label)
+    axes[0].plot([], [], color=INK, ls=":", label="human drivers")
     handles = axes[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside upper left", ncols=4, frameon=False)
+    figure.legend(*handles, loc="outside upper left", ncols=4)
     footnote(
-        figure, "filled: keeps all limits of the task; vertical lines: 95 % interval of learned"
+        figure, "filled: keeps all limits of the task; vertical lines: 95 % interval of the network"
     )
     return figure

@@ -12,15 +12,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lcc_rl.figures.drawing import (
-    INK,
-    PAGE_WIDTH,
-    grid,
-    legend_above,
-    new_figure,
-    paper,
-    style,
-)
+from lcc_rl.figures.drawing import INK, PAGE_WIDTH, legend_above, new_figure, paper
 from lcc_rl.io.files import read_parquet
 
 FUELS = {"Compact": "#0072b2", "midBase": "#d55e00", "midSUV": "#999999"}
@@ -58,13 +50,18 @@ def figure_of(table: pd.DataFrame) -> Figure:
         part = trips[trips["setting"] == season]
         model = ELECTRIC if season == "winter" else f"{ELECTRIC}_bare"
         _dots(right, part, model, colour, 1e6, label=LABELS[season])
-    style(left, "measured, Renault 1.3 TCe on a bench [g/km]", "modelled fuel [g/km]")
-    style(right, "measured, BMW i3 on the road [Wh/km]", "modelled energy [Wh/km]")
+    left.set(xlabel="measured, Renault 1.3 TCe on a bench [g/km]", ylabel="modelled fuel [g/km]")
+    right.set(xlabel="measured, BMW i3 on the road [Wh/km]", ylabel="modelled energy [Wh/km]")
     for axis in (left, right):
         ends = [*axis.get_xlim(), *axis.get_ylim()]
-        axis.plot([min(ends), max(ends)], [min(ends), max(ends)], color=INK, lw=0.8, label="equal")
+        axis.plot(
+            [min(ends), max(ends)],
+            [min(ends), max(ends)],
+            color=INK,
+            lw=0.8,
+            label="modelled = measured",
+        )
         legend_above(axis, 1)
-        grid(axis)
     return figure
 
 

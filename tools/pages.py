@@ -30,7 +30,15 @@ from lcc_rl.data.leaders import stretch
 from lcc_rl.energy import AVERAGED, AVERAGES
 from lcc_rl.errors import require
 from lcc_rl.figures.calibration import twins_figure
-from lcc_rl.figures.drawing import COLUMN_WIDTH, footnote, new_figure, paper, save, style
+from lcc_rl.figures.drawing import (
+    COLUMN_WIDTH,
+    OWN_COLOURS,
+    colour,
+    footnote,
+    new_figure,
+    paper,
+    save,
+)
 from lcc_rl.figures.platoon import record_figure
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.atomic import atomic_path
@@ -60,15 +68,15 @@ SHOWN_OF = {
 SHOWN = {
     "human": "all cars: human drivers",
     "pi_saturation": "one car: PI with saturation",
-    "alcc": "one car: learned",
+    "alcc": "one car: network",
 }
-KINDS_SHOWN = {  # label, colour and filled dots by variant and policy
-    ("alcc", "idm"): ("IDM, tuned by search", "#d55e00", True),
-    ("alcc", "idm_gradient"): ("IDM, tuned by gradient", "#cc79a7", True),
-    ("own_energy", "network"): ("network, its own energy", "#0072b2", False),
-    ("alcc", "network"): ("network", "#0072b2", True),
-    ("alcc", "memory"): ("network with memory", "#56b4e9", True),
-    ("alcc", "preview"): ("network with preview", "#009e73", True),
+KINDS_SHOWN = {  # label and colour by variant and policy
+    ("alcc", "idm"): ("IDM, tuned by search", colour("idm_acc")),
+    ("alcc", "idm_gradient"): ("IDM, tuned by gradient", colour("rule")),
+    ("own_energy", "network"): (in_words("own_energy"), colour("own_energy")),
+    ("alcc", "network"): (in_words(NETWORK), colour(NETWORK)),
+    ("alcc", "memory"): ("network with memory", OWN_COLOURS[0]),
+    ("alcc", "preview"): ("network with preview", OWN_COLOURS[1]),
 }
 # Labels of the sources of averaged energies.
 SOURCES = {
@@ -78,6 +86,7 @@ SOURCES = {
     "platoons": "OpenACC, motorways (`data=platoons`)",
 }
 RIVALS = (RECORDED, "idm_acc_filtered")
+LEARNERS = {"ppo": "PPO", "td3": "TD3", "sac": "SAC", "analytic": "gradient (`analytic`)"}
 
 
 def fill(page: Path, tables: Mapping[str, str]) -> None:
@@ -153,7 +162,8 @@ def averaged(rows: pd.DataFrame) -> str:
 
 def learners(reference: Path, docs: Path) -> None:
     """Write the scores of learners: a row per task and learner, with the range of seeds."""
-    rows = worded(read_parquet(reference / "learners.parquet"))
+    rows = worded(read_parquet(reference / "learners.parquet")).replace({"strategy": LEARNERS})
+    rows = rows.rename(columns={"minutes_until_there": "minutes_to_95_%"})
     scores = {"score": "mean", "score_low": "min", "score_high": "max"}
     how = {name: ("score", kind) for name, kind in scores.items()}
     how |= {name: (name, "mean") for name in rows.columns[4:]}
@@ -234,15 +244,15 @@ def figure_of_limits(windows: pd.DataFrame) -> Figure:
     figure = new_figure(COLUMN_WIDTH, 3.2)
     axes = figure.subplots()
     kinds = dict(list(windows.groupby(FRONT_KINDS)))
-    for kind, (label, hue, filled) in KINDS_SHOWN.items():
+    for kind, (label, hue) in KINDS_SHOWN.items():
         line = points(kinds[kind]).sort_values(LONG_SHARE)
-        look: dict[str, Any] = {"color": hue, "mfc": hue if filled else "white", "ms": 3.0}
-        axes.plot(100.0 * line[LONG_SHARE], line[ENERGY], "-" if filled else "--", color=hue)
+        axes.plot(100.0 * line[LONG_SHARE], line[ENERGY], color=hue)
         each = kinds[kind].groupby(["limit", "training_seed"])[[ENERGY, LONG_SHARE]].mean()
-        axes.plot(100.0 * each[LONG_SHARE], each[ENERGY], "o", **look)
-        axes.plot([], [], "o-" if filled else "o--", label=label, **look)
-    figure.legend(loc="outside upper left", ncols=2, frameon=False)
-    style(axes, "time gap > 2.5 s above 1 m/s [% of the time]", "path energy [kJ per episode]")
+        axes.plot(100.0 * each[LONG_SHARE], each[ENERGY], "o", color=hue, ms=3.0)
+        axes.plot([], [], "o-", label=label, color=hue, ms=3.0)
+    figure.legend(loc="outside upper left", ncols=2)
+    axes.set(xlabel="time gap > 2.5 s above 1 m/s [% of the time]")
+    axes.set(ylabel="path energy [kJ per episode]")
     footnote(figure, "dot: one training; line: means at limits of 0.5, 1 and 2 %")
     return figure
 
@@ -251,7 +261,7 @@ def figure_of_ring(reference: Path) -> Figure:
     """Draw the trajectories on the ring."""
     cfg = as_plain(load("evaluate", ["task=ring-22"]))
     steps = read_parquet(reference / "tasks" / "ring_steps.parquet").replace({"strategy": SHOWN})
-    figure = space_time(steps, list(SHOWN.values()), cfg, every=1)
+    figure = space_time(steps, list(SHOWN.values()), cfg, every=2)
     assert figure is not None
     return figure
 
@@ -271,9 +281,7 @@ def figures(reference: Path, folder: Path) -> list[Path]:
         "ring": lambda: figure_of_ring(reference),
         "twins": lambda: twins_figure(kept("twins")),
     }
-    # The ring has thousands of lines: a larger figure exceeds a megabyte.
-    dots = {"ring": 150}
-    return [save(draw(), folder / f"{x}.png", dots.get(x, 200)) for x, draw in drawn.items()]
+    return [save(draw(), folder / f"{x}.png") for x, draw in drawn.items()]
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import logging
 import os
 import sys
@@ -63,8 +62,9 @@ def entry_point(
         def checked(config: DictConfig) -> Any:
             logging.raiseExceptions = False  # a failing log must not end a run
             check_own_files()
-            cfg = parsed(config, config_name, list(HydraConfig.get().overrides.task), is_sweep())
-            with ending_quietly():
+            typed = list(HydraConfig.get().overrides.task)
+            with ending_quietly():  # settings load modules, too
+                cfg = parsed(config, config_name, typed, is_sweep())
                 import_module(work)
             return function(cfg)
 
@@ -83,14 +83,10 @@ def entry_point(
             if HELP.intersection(sys.argv):
                 print(help_text(config_name, sys.argv[1:]))
                 return
-            gc.disable()  # settings load modules, too; see ending_quietly
-            try:
-                if SWEEP.intersection(sys.argv):
-                    with ending_quietly():
-                        import_module(work)
-                start_command(command)
-            finally:
-                gc.enable()
+            if SWEEP.intersection(sys.argv):
+                with ending_quietly():
+                    import_module(work)
+            start_command(command)
 
         return main
 

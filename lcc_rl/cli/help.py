@@ -31,7 +31,7 @@ EXAMPLES = {
     ),
     "evaluate": (
         ("lcc-rl evaluate policy=outputs/train/<run>", "baselines"),
-        ("lcc-rl evaluate 'compare=[my_pieces.PID,mpc,pretrained/alcc]'", "others"),
+        ("lcc-rl evaluate 'compare=[my_pieces.PID,mpc,pretrained/alcc]'", "controllers"),
         ("lcc-rl evaluate task=ring-22 'compare=[pretrained,pid.yaml]'", "a task"),
     ),
     "calibrate": (

@@ -173,7 +173,7 @@ def play_source(entrant: Scored, source: str, cfg: EvaluateConfig, folder: Path)
     check_installed(cfg)
     inputs = load_inputs(cfg)
     check_evaluation(cfg, inputs)
-    against = [] if task.against == strategy.name else [baseline(cfg, task.against)]
+    against = [baseline(cfg, name) for name in task.references if name != strategy.name]
     save_config(cfg, folder)
     evaluate_and_write([*against, strategy], cfg, inputs, folder, quiet=True)
     rows = read_parquet(folder / EPISODES)
@@ -181,7 +181,9 @@ def play_source(entrant: Scored, source: str, cfg: EvaluateConfig, folder: Path)
     unused = ("evaluation.behind_filter", "inputs.data", "inputs.leader")
     settings = identity(cfg, *unused, changed=True)
     hashes = {"data": hash_of(inputs.evaluation), "settings": settings}
-    table = summary(windows_for(rows), task, build_energy(cfg))
+    windows = windows_for(rows)
+    task = task.resolved(windows)
+    table = summary(windows, task, build_energy(cfg))
     drivers = rows["driver_id"].nunique()
     return row_of(table, task, source, strategy.name, drivers) | hashes
 

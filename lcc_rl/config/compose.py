@@ -147,10 +147,9 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
         elif key in ("compare", "policy", "resume"):  # folders of a sweep: seed=0_…
             quoted = "'" in value or '"' in value
             found.append(f"++{key}{equals}{value if quoted else NAMED.sub(QUOTED, value)}")
-        elif key[:1] in "+~" or not equals or _is_choice(item):
-            found.append(item)
         else:
-            found.append(f"++{item}" if key.partition(".")[0] in _top_level() else item)
+            own = key.partition(".")[0] in _top_level() and not _is_choice(item)
+            found.append(f"++{item}" if equals and own else item)
     return found
 
 
@@ -303,7 +302,8 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
 def _unknown_option(name: str) -> ConfigError:
     """Return the error for an unknown option, with its section if there is one."""
     places = {key: at for at, kind in SECTIONS.items() for key in settings_of(kind) or ()}
-    groups = {path.name for path in Path(str(files(CONF))).iterdir() if path.is_dir()}
+    folder = Path(str(files(CONF)))
+    groups = {path.parts[len(folder.parts)] for path in folder.glob("*/**/*.yaml")}
     root, known = name.partition(".")[0], _top_level() | groups
     if root in places:
         return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")

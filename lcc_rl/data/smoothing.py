@@ -20,6 +20,7 @@ from typing import Annotated
 
 import numpy as np
 import pandas as pd
+import scipy  # loads signal and ndimage, which take a second, where they are used
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -109,11 +110,10 @@ class SavitzkyGolay(Settings):
             Position [m], speed [m/s] and acceleration [m/s²], each ``[rows]``; values within
             ``margin`` rows of an end are not used.
         """
-        from scipy.signal import savgol_filter  # here: it loads for a second
-
         settings = {"polyorder": self.order, "delta": FRAME, "mode": "nearest"}
         smoothed, speed, acceleration = (
-            savgol_filter(position, self.window, deriv=order, **settings) for order in range(3)
+            scipy.signal.savgol_filter(position, self.window, deriv=order, **settings)
+            for order in range(3)
         )
         return smoothed, speed, acceleration
 
@@ -138,8 +138,6 @@ def averaged(episodes: pd.DataFrame, seconds: float, source: str) -> tuple[pd.Da
     Raises:
         DataError: if no episode is long enough.
     """
-    from scipy.ndimage import uniform_filter1d  # here: it loads for a second
-
     width = round(seconds / FRAME) | 1
     starts, lengths = stretches(episodes["episode"].to_numpy())
     inner = _within(starts, lengths) >= width // 2
@@ -148,7 +146,8 @@ def averaged(episodes: pd.DataFrame, seconds: float, source: str) -> tuple[pd.Da
         raise DataError(
             f"{source}: the longest episode has {longest:.1f} s, data.average_s={seconds:g}"
         )
-    motion = uniform_filter1d(episodes[MOTION_COLUMNS].to_numpy(np.float64), width, axis=0)[inner]
+    motion = episodes[MOTION_COLUMNS].to_numpy(np.float64)
+    motion = scipy.ndimage.uniform_filter1d(motion, width, axis=0)[inner]
     columns = dict(zip(MOTION_COLUMNS, motion.astype(np.float32).T, strict=True))
     line = (
         f"averaged over {width * FRAME:.1f} s: left out {int((~inner).sum()):,} rows at the ends "

@@ -302,7 +302,11 @@ def ratios(
         f"{name}_{smoothing}s_{unit}"
         for name, unit in (("energy", "j"), ("lost", "j"), ("distance", "m"))
     )
-    by_third = [over(lost, rows) / over(distance, rows) for rows in _thirds(records)]
+    thirds: list[NDArray[np.intp]] = []  # of their leaders, the calmest first
+    if LEADER_LOST in records and len(records) >= 3:
+        calm_first = (records[LEADER_LOST] / records[LEADER_WAY]).to_numpy().argsort()
+        thirds = np.array_split(calm_first, 3)
+    by_third = [over(lost, rows) / over(distance, rows) for rows in thirds]
     own, recorded = (densities(table).to_numpy().sum(0) for table in (twins, records))
     apart = np.log(np.divide(own, recorded, out=np.ones_like(own), where=recorded > 0.0))
     return {
@@ -313,14 +317,6 @@ def ratios(
         "slope": float(np.sqrt(np.mean(np.log(by_third) ** 2))) if by_third else np.nan,
         "spectrum": float(np.sqrt(np.mean(apart**2))),
     }
-
-
-def _thirds(records: pd.DataFrame) -> list[NDArray[np.intp]]:
-    """Return the rows of recorded drivers by thirds of their leaders, the calmest first."""
-    if LEADER_LOST not in records or len(records) < 3:
-        return []
-    calm_first = (records[LEADER_LOST] / records[LEADER_WAY]).to_numpy().argsort()
-    return np.array_split(calm_first, 3)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from PIL import Image  # comes with matplotlib
 
 from lcc_rl.errors import ConfigError, unknown_name
-from lcc_rl.figures.drawing import INK, legend_above, new_figure, style
+from lcc_rl.figures.drawing import INK, PAGE_WIDTH, legend_above, new_figure, paper
 from lcc_rl.figures.ring_picture import ring_picture
 from lcc_rl.figures.unrolled import unroll
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
@@ -30,7 +30,7 @@ ROLE_WORDS = ("human driver", "controlled car")  # in baselines, humans may driv
 LARGEST_PAGE = 50_000  # most samples of a page, each a speed and a gap
 FEW_VEHICLES = 6  # most vehicles for which all lines are thick
 FRAME_RATE, MOST_FRAMES = 10, 150  # frames per second; most frames
-DPI = 80
+DPI = 100
 
 
 def animate(motions: Mapping[str, SampleMotion], path: str | Path) -> Path:
@@ -113,15 +113,15 @@ def frames(motion: SampleMotion, title: str) -> Iterator[Figure]:
     count = min(max(round(FRAME_RATE * float(motion.time[-1] - motion.time[0])), 2), MOST_FRAMES)
     moments = np.linspace(0, len(motion.time) - 1, count).round().astype(int)
     faster = (motion.time[-1] - motion.time[0]) * FRAME_RATE / count
-    figure = new_figure(8.0, 7.4 if motion.circumference else 5.6)
+    figure = new_figure(PAGE_WIDTH, 6.6 if motion.circumference else 5.0)
     road, speeds, gaps = figure.subplots(
         3, 1, height_ratios=(3 if motion.circumference else 1, 2, 2)
     )
-    figure.suptitle(f"{title}\n{faster:.1f} × as fast" if faster > 1.05 else title, fontsize=10)
+    figure.suptitle(f"{title}\n{faster:.1f} × as fast" if faster > 1.05 else title)
     _lines(speeds, motion, motion.speed, "speed [m/s]", motion.leader)
     _lines(gaps, motion, motion.gap, "gap ahead [m]", None)
     for line in legend_above(speeds).get_lines():
-        line.set(linewidth=1.4, alpha=1.0)
+        line.set(linewidth=1.2, alpha=1.0)
     gaps.set_xlabel("time [s]")
     cursors = [axis.axvline(motion.time[0], color="#b00020", lw=0.8) for axis in (speeds, gaps)]
     place = _on_road(road, motion)
@@ -132,15 +132,16 @@ def frames(motion: SampleMotion, title: str) -> Iterator[Figure]:
         place(int(moment))
         for cursor in cursors:
             cursor.set_xdata([motion.time[moment]] * 2)
-        speeds.set_title(f"{motion.time[moment]:.1f} s", loc="right", fontsize=9)
+        speeds.set_title(f"{motion.time[moment]:.1f} s", loc="right")
         yield figure
 
 
+@paper
 def road_picture(motion: SampleMotion) -> Any:
     """Return a picture of the road at the end of a motion, ``[height, width, 3]``, uint8."""
-    figure = new_figure(8.0, 6.4 if motion.circumference else 1.6)
+    figure = new_figure(PAGE_WIDTH, 5.8 if motion.circumference else 1.4)
     road = figure.subplots()
-    road.set_title(f"{motion.time[-1]:.1f} s", loc="right", fontsize=9)
+    road.set_title(f"{motion.time[-1]:.1f} s", loc="right")
     _on_road(road, motion)(len(motion.time) - 1)
     return _pixels(figure)[..., :3].copy()
 
@@ -168,17 +169,17 @@ def _lines(
 ) -> None:
     """Draw an entry of all vehicles over time, automated ones above all others."""
     if leader is not None:
-        axis.plot(motion.time, leader, color=INK, lw=1.4, label="leader")
+        axis.plot(motion.time, leader, color=INK, label="leader")
     named = set()
     for vehicle, (role, hue) in enumerate(zip(motion.roles, _hues(motion), strict=True)):
         bold = role != HUMAN or len(motion.roles) <= FEW_VEHICLES
-        look: dict[str, Any] = {"lw": 1.4, "zorder": 3} if bold else {"lw": 0.6, "alpha": 0.3}
+        look: dict[str, Any] = {"zorder": 3} if bold else {"lw": 0.6, "alpha": 0.3}
         name = None if hue in named else ROLE_WORDS[role != HUMAN]
         named.add(hue)
         axis.plot(motion.time, values[:, vehicle], color=hue, label=name, **look)
     axis.set_xlim(motion.time[0], motion.time[-1])
     axis.set_ylim(0.0, 1.05 * max(float(values.max()), 1.0))
-    style(axis, "", label)
+    axis.set_ylabel(label)
 
 
 def _along(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int) -> None:
@@ -191,7 +192,7 @@ def _along(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int) 
     axis.set_xlim(front - longest - 2 * first, front + first)
     axis.set_ylim(-1.0, 1.0)
     axis.set_yticks([])
-    axis.spines[["left", "right", "top"]].set_visible(False)
+    axis.spines["left"].set_visible(False)
     axis.set_xlabel("position [m]")
 
 
@@ -206,6 +207,7 @@ def _around(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int)
     axis.axis("off")
 
 
+@paper
 def _write_gif(motion: SampleMotion, title: str, path: Path) -> None:
     images = []
     for figure in frames(motion, title):
@@ -215,6 +217,7 @@ def _write_gif(motion: SampleMotion, title: str, path: Path) -> None:
     images[0].save(path, "GIF", save_all=True, append_images=images[1:], **settings)
 
 
+@paper
 def _write_mp4(motion: SampleMotion, title: str, path: Path) -> None:
     writer = FFMpegWriter(fps=FRAME_RATE, extra_args=["-f", "mp4", "-pix_fmt", "yuv420p"])
     for number, figure in enumerate(frames(motion, title)):

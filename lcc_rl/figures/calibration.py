@@ -18,11 +18,8 @@ from lcc_rl.figures.drawing import (
     PAGE_WIDTH,
     SOFT,
     footnote,
-    grid,
     new_figure,
     paper,
-    style,
-    unbox,
 )
 from lcc_rl.results.render import signed
 
@@ -94,12 +91,10 @@ def joint_figure(drivers: pd.DataFrame) -> Figure:
     top = figure.add_subplot(spec[0, 0], sharex=centre)
     side = figure.add_subplot(spec[1, 1], sharey=centre)
     _scatter(centre, speed, gap, bound, colour)
-    figure.legend(loc="outside lower left", ncols=2, frameon=False)
+    figure.legend(loc="outside lower left", ncols=2)
     look: dict[str, Any] = {"bins": 24, "stacked": True, "color": [colour, "#c8c8c8"]}
     top.hist([speed[~bound], speed[bound]], **look)
     side.hist([gap[~bound], gap[bound]], orientation="horizontal", **look)
-    for axis in (top, side):
-        unbox(axis)
     top.tick_params(labelbottom=False)
     side.tick_params(labelleft=False)
     top.set_ylabel("drivers")
@@ -126,7 +121,7 @@ def twins_figure(twins: pd.DataFrame) -> Figure:
         found = {kind: part[part["driver"] == kind] for kind in dict.fromkeys(part["driver"])}
         spectra, share, gaps = row
         for kind, one in found.items():
-            look: dict[str, Any] = {"color": DRIVER_COLOURS[kind], "label": kind, "linewidth": 1.3}
+            look: dict[str, Any] = {"color": DRIVER_COLOURS[kind], "label": kind}
             density = densities(one).mean()
             spectra.semilogy(density.index, density, **look)
             ordered = np.sort(one["gap_m"])
@@ -135,19 +130,17 @@ def twins_figure(twins: pd.DataFrame) -> Figure:
                 near = ratios(one, found[RECORDED_DRIVERS])
                 places = [100.0 * (near[name] - 1.0) for name in RATIOS]
                 share.plot(places, range(len(RATIOS)), "o", color=DRIVER_COLOURS[kind], label=kind)
-        share.axvline(0.0, color=DRIVER_COLOURS[RECORDED_DRIVERS], linewidth=1.0)
+        share.axvline(0.0, color=DRIVER_COLOURS[RECORDED_DRIVERS])
         share.set_yticks(range(len(RATIOS)), list(RATIOS.values()))
         share.set_ylim(len(RATIOS) - 0.5, -0.5)
-        style(spectra, "frequency [Hz]", "acceleration [m²/s⁴/Hz]")
-        style(share, "difference from recorded [%]", "")
-        style(gaps, "mean gap [m]", "share of drivers")
-        spectra.set_title(f"spectrum ({mode} calibration)")
-        share.set_title("sums over all drivers")
-        gaps.set_title("distribution of gaps")
+        spectra.set(xlabel="frequency [Hz]", ylabel="spectral density [m²/s⁴/Hz]")
+        share.set(xlabel="difference from recorded [%]")
+        gaps.set(xlabel="mean gap [m]", ylabel="share of drivers")
+        spectra.set_title(f"acceleration ({mode} calibration)")
+        share.set_title("all drivers together")
+        gaps.set_title("gaps")
         gaps.set_xlim(left=0.0)
-        spectra.legend(frameon=False)
-        for axis in row:
-            grid(axis)
+        spectra.legend()
     return figure
 
 
@@ -198,8 +191,6 @@ def _boxes(axis: Axes, values: dict[str, pd.Series]) -> None:
     axis.set_xticks(range(len(values)), labels)
     axis.set_xlim(-0.6, len(values) - 0.4)
     axis.set_ylim(bottom=0.0)
-    grid(axis, "y")
-    unbox(axis)
 
 
 def _scatter(
@@ -213,8 +204,7 @@ def _scatter(
     if bound.any():
         label = f"$v_0$ on a bound ({bound.sum()}, {100 * bound.mean():.0f} %)"
         axis.scatter(speed[bound], gap[bound], 16, clip_on=False, label=label, **hollow)
-    style(axis, "desired speed $v_0$ [m/s]", "time gap $T$ [s]")
-    grid(axis)
+    axis.set(xlabel="desired speed $v_0$ [m/s]", ylabel="time gap $T$ [s]")
     axis.set_ylim(bottom=0.0)
 
 

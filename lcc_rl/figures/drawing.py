@@ -17,49 +17,65 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 
+from lcc_rl.config.words import FILTERED
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.results.names import in_words
 
 INK, SOFT = "#222222", "#8a8a8a"
 COLUMN_WIDTH, PAGE_WIDTH = 3.5, 7.2  # widths of one and two columns of a journal [in]
 LABEL = 28  # most characters of a name in one line
-# Decorator of drawing functions: print sizes, and text as text in vector formats.
+INTERVAL: dict[str, Any] = {"lw": 1.5, "alpha": 0.6}  # look of the line along an interval
+# Decorator of drawing functions: the look of all figures.
 paper = mpl.rc_context(
     {
         "font.size": 8.0,
         "axes.titlesize": 8.0,
+        "axes.titlelocation": "left",
+        "axes.labelsize": 8.0,
         "figure.titlesize": 8.0,
         "legend.fontsize": 7.0,
+        "legend.frameon": False,
         "legend.handlelength": 1.5,
         "legend.columnspacing": 1.5,
         "xtick.labelsize": 7.0,
         "ytick.labelsize": 7.0,
         "axes.linewidth": 0.6,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": True,
+        "axes.axisbelow": True,
+        "grid.color": "#e6e6e6",
+        "grid.linewidth": 0.6,
         "xtick.major.width": 0.6,
         "ytick.major.width": 0.6,
-        "lines.linewidth": 1.0,
+        "lines.linewidth": 1.2,
         "lines.markersize": 4.0,
         "svg.fonttype": "none",
         "svg.hashsalt": "lcc_rl",  # equal pictures give equal files
         "pdf.fonttype": 42,
     }
 )
-# Distinguishable without colour vision and in grey.
+# Distinguishable without colour vision and in grey. A filtered rule has its colour, dashed.
 COLOURS = {
     "alcc": "#0072b2",
     "reference": "#d55e00",
     "own_energy": "#009e73",
     "rule": "#e69f00",
-    **dict.fromkeys(("idm_acc", "idm_acc_filtered"), "#56b4e9"),
+    "idm_acc": "#56b4e9",
+    "acc": "#999933",
+    "follower_stopper": "#cc6677",
+    "pi_saturation": "#aa4499",
     "idm": "#6b6b6b",
     "human": "#b0a080",
     "direct": INK,
 }
 OWN_COLOURS = ("#cc79a7", "#882255", "#117733")  # of the user's controllers
+SERIES = ("#56b4e9", "#009e73", "#e69f00", "#cc79a7")  # of ordered values, such as shares
 
 
 def colour(strategy: str) -> str:
     """Return the colour of a strategy in all figures."""
+    strategy = strategy.removesuffix(FILTERED)
     return COLOURS.get(strategy) or OWN_COLOURS[sum(strategy.encode()) % len(OWN_COLOURS)]
 
 
@@ -70,24 +86,6 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def unbox(axis: Axes) -> None:
-    """Remove the top and right line of the frame."""
-    axis.spines[["top", "right"]].set_visible(False)
-
-
-def style(axis: Axes, xlabel: str = "", ylabel: str = "") -> None:
-    """Label an axis and remove the top and right line of its frame."""
-    axis.set_xlabel(xlabel)
-    axis.set_ylabel(ylabel)
-    unbox(axis)
-
-
-def grid(axis: Axes, lines: str = "both") -> None:
-    """Draw a light grid behind the data; ``lines`` are ``x``, ``y`` or ``both``."""
-    axis.grid(visible=True, axis=lines, color="#e6e6e6", linewidth=0.8)  # type: ignore[arg-type]
-    axis.set_axisbelow(True)
-
-
 def footnote(figure: Figure, text: str) -> None:
     """Write a note below a figure."""
     figure.supxlabel(text, fontsize=7, color=INK)
@@ -96,7 +94,6 @@ def footnote(figure: Figure, text: str) -> None:
 def legend_above(axis: Axes, columns: int = 3) -> Legend:
     """Put the legend above the frame."""
     return axis.legend(
-        frameon=False,
         ncols=columns,
         loc="lower left",
         bbox_to_anchor=(0.0, 1.0),
@@ -137,7 +134,7 @@ def dots(
     """
     low, high = (table[f"{column}_{end}"].to_numpy(float) for end in ("low", "high"))
     draw = axis.vlines if upright else axis.hlines
-    draw(places, low, high, color=hue, lw=1.5, alpha=0.6)
+    draw(places, low, high, color=hue, **INTERVAL)
     pair = (places, table[column]) if upright else (table[column], places)
     axis.plot(*pair, "o", color=hue, **look)
 

@@ -23,7 +23,6 @@ from lcc_rl.figures.drawing import (
     SOFT,
     colour,
     dots,
-    grid,
     in_file,
     legend_above,
     lines_of,
@@ -31,7 +30,6 @@ from lcc_rl.figures.drawing import (
     paper,
     rows_of,
     save,
-    style,
 )
 from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
@@ -143,9 +141,9 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
     axes = figure.subplots(3, 1, sharex=True)
     for axis, entry in zip(axes, ("speed", "acceleration", "gap"), strict=True):
         _over_time(axis, rows, entry)
-    style(axes[0], "", "speed [m/s]")
-    style(axes[1], "", "acceleration [m/s²]")
-    style(axes[2], "time [s]", "gap ahead [m]")
+    axes[0].set(ylabel="speed [m/s]")
+    axes[1].set(ylabel="acceleration [m/s²]")
+    axes[2].set(xlabel="time [s]", ylabel="gap ahead [m]")
     legend_above(axes[0])
     figure.suptitle(
         f"{fill(in_words(strategy), 45)}\nhuman behind: desired speed "
@@ -162,9 +160,9 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, report:
     figure = new_figure(PAGE_WIDTH, max(2.7, 0.9 + 0.13 * lines * len(table)))
     left, right = figure.subplots(1, 2, width_ratios=(4, 5))
     _over_time(left, _one_episode(steps, strategy), "speed")
-    style(left, "time [s]", "speed [m/s]")
+    left.set(xlabel="time [s]", ylabel="speed [m/s]")
     owner = shorten(in_words(strategy), 40, placeholder="…")
-    left.set_title(f"one episode: {owner}", loc="left", pad=16)
+    left.set_title(f"one episode: {owner}", pad=16)
     legend_above(left)
     against = str(report.against)
     what, _, unit = report.label.removesuffix("]").partition(" [")
@@ -178,9 +176,9 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, report:
     low, high = right.get_xlim()
     right.set_xlim(low, high + 0.3 * (high - low))
     sizes = (episodes[name].nunique() for name in ("profile_id", "driver_id"))
-    style(right, f"{what} saved\nagainst {in_words(against)} [%]")
+    right.set(xlabel=f"{what} saved\nagainst {in_words(against)} [%]")
     size = " × ".join(map(several, sizes, ("window", "driver")))
-    right.set_title(f"{size}; lines: 95 % intervals", loc="right", pad=16)
+    right.set_title(f"{size}; lines: 95 % intervals", pad=16)
     return figure
 
 
@@ -206,8 +204,7 @@ def measures_of(report: Report, seeds: Sequence[Report] = ()) -> Figure:
             axis.plot(own[key], rows, "o", color=SOFT, markersize=2)
         bounds = {f"{key}_{end}": table.get(f"{key}_{end}", table[key]) for end in ("low", "high")}
         dots(axis, range(len(table)), table.assign(**bounds), key, INK)
-        grid(axis, "x")
-        style(axis, head.replace("-\n", ""))
+        axis.set(xlabel=head.replace("-\n", ""))
     axes[0].set_yticks(range(len(labels)), labels)
     axes[0].invert_yaxis()
     return figure
@@ -218,7 +215,7 @@ def _over_time(axis: Axes, rows: pd.DataFrame, entry: str) -> None:
     for vehicle, (name, hue) in VEHICLE_STYLES.items():
         column = f"{vehicle}_{entry}"
         if column in rows and rows[column].notna().any():
-            axis.plot(rows["time_s"], rows[column], color=hue, label=name, lw=1.3)
+            axis.plot(rows["time_s"], rows[column], color=hue, label=name)
 
 
 def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
@@ -264,7 +261,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], owner: str) -> 
     for (name, label), alpha in zip(names.items(), (0.45, 0.6), strict=True):
         mean = f"{label}, mean of drivers {energy[name].mean():.1f}"
         left.hist(energy[name], bins, color=colour(name), alpha=alpha, label=mean)
-    style(left, f"path energy of {owner}\n[kJ per {means.per}]", "drivers")
+    left.set(xlabel=f"path energy of {owner}\n[kJ per {means.per}]", ylabel="drivers")
     left.xaxis.set_major_locator(MaxNLocator(5))
     left.yaxis.set_major_locator(MaxNLocator(integer=True))
     legend_above(left, 1)
@@ -273,7 +270,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], owner: str) -> 
     found = means.saving(column, strategy, baseline)
     _mean_line(right, found, means.windows.loc[means.windows["strategy"] == strategy])
     worse = f"{int((saving < 0).sum())} of {len(saving)} drivers worse off"
-    style(right, f"drivers, sorted ({worse})", f"path energy saved\nper {means.per} [%]")
+    right.set(xlabel=f"drivers, sorted ({worse})", ylabel=f"path energy saved\nper {means.per} [%]")
     return figure
 
 
@@ -297,4 +294,4 @@ def _mean_line(axis: Axes, found: Estimate, rows: pd.DataFrame) -> None:
     else:
         text += " (1 window, 1 training seed: no interval)"
     axis.axhline(value, color=INK, lw=0.8, ls="--")
-    axis.set_title(text, loc="left", fontsize=7)
+    axis.set_title(text, fontsize=7)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from lcc_rl.data.leaders import Case
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.figures.drawing import INK, PAGE_WIDTH, legend_above, new_figure, paper, style, unbox
+from lcc_rl.figures.drawing import INK, PAGE_WIDTH, footnote, legend_above, new_figure, paper
 from lcc_rl.results.names import in_words
 
 # Strategies with a panel.
@@ -53,11 +53,8 @@ def record_figure(record: Profiles, from_s: float, cases: Sequence[Case]) -> Fig
     grid = figure.subplot_mosaic([["record"] * len(cases), [case.name for case in cases]])
     axis, windows = grid.pop("record"), list(grid.values())
     seconds = _speeds(axis, record)
-    axis.axvspan(
-        from_s, seconds[-1], color=WINNER_COLOURS["DDPG"], alpha=0.15, lw=0, label="training"
-    )
-    axis.set_title(_in_record(record), loc="right")
-    legend_above(axis)
+    axis.axvspan(from_s, seconds[-1], color=WINNER_COLOURS["DDPG"], alpha=0.15, lw=0)
+    axis.set_title(f"{_in_record(record)}; blue: training")
     for window, case in zip(windows, cases, strict=True):
         ends = _speeds(window, case.profile)[[0, -1]]
         window.set_ylim(-0.5, 13.0)
@@ -71,7 +68,7 @@ def record_figure(record: Profiles, from_s: float, cases: Sequence[Case]) -> Fig
                 label="first and last speed\nin the paper",
                 clip_on=False,
             )
-            window.legend(frameon=False, loc="upper left")
+            window.legend(loc="upper left")
     for left in (axis, windows[0]):
         left.set_ylabel("speed [m/s]")
     return figure
@@ -80,8 +77,8 @@ def record_figure(record: Profiles, from_s: float, cases: Sequence[Case]) -> Fig
 def _speeds(axis: Axes, profile: Profiles) -> np.ndarray:
     """Draw a record over time; return its times [s]."""
     seconds = profile.time_step * np.arange(int(profile.lengths[0]))
-    axis.plot(seconds, profile.record(0).numpy(), color=INK, lw=1.0)
-    style(axis, "time [s]")
+    axis.plot(seconds, profile.record(0).numpy(), color=INK)
+    axis.set_xlabel("time [s]")
     axis.margins(x=0.01)
     return seconds
 
@@ -96,7 +93,7 @@ def _in_record(profile: Profiles) -> str:
 @paper
 def velocities(steps: pd.DataFrame, case: str) -> Figure:
     """Speeds of leader and followers, a panel per strategy (Figs. 4, 7, 10)."""
-    figure, panels = _panels(steps[steps["case"] == case], f"{case}: speed [m/s]")
+    figure, panels = _panels(steps[steps["case"] == case], case, "speed [m/s]")
     for axis, rows in panels:
         leader = rows[rows["follower"] == 0]
         _lines(axis, rows, "speed_mps")
@@ -111,8 +108,7 @@ def jerks(steps: pd.DataFrame, case: str, bound: float) -> Figure:
 
     Each panel is scaled to its data (Figs. 5, 8, 11).
     """
-    title = f"{case}: jerk [m/s³]; scales differ; bound ±{bound:g}, dotted where it is near"
-    figure, panels = _panels(steps[steps["case"] == case], title, sharey=False)
+    figure, panels = _panels(steps[steps["case"] == case], case, "jerk [m/s³]", sharey=False)
     for axis, rows in panels:
         _lines(axis, rows, "jerk_mps3")
         top = max(float(rows["jerk_mps3"].abs().max()), 0.1)
@@ -121,6 +117,7 @@ def jerks(steps: pd.DataFrame, case: str, bound: float) -> Figure:
             top = max(top, bound)
         axis.set_ylim(-1.1 * top, 1.1 * top)
     legend_above(panels[0][0])
+    footnote(figure, f"scales differ; dotted: bound of ±{bound:g} m/s³, where a jerk is near it")
     return figure
 
 
@@ -131,17 +128,16 @@ def shown(steps: pd.DataFrame) -> list[str]:
 
 
 def _panels(
-    rows: pd.DataFrame, title: str, sharey: bool = True
+    rows: pd.DataFrame, case: str, label: str, sharey: bool = True
 ) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
     """Return a figure with a panel per strategy, and the panels with their rows."""
     names = shown(rows)
     figure = new_figure(PAGE_WIDTH, 0.8 + 1.3 * len(names))
     axes = figure.subplots(len(names), 1, sharex=True, sharey=sharey, squeeze=False)[:, 0]
     for axis, name in zip(axes, names, strict=True):
-        axis.set_title(in_words(name), loc="right")
-        unbox(axis)
+        axis.set_title(f"{case}: {in_words(name)}", loc="right")
+        axis.set_ylabel(label)
     axes[-1].set_xlabel("time [s]")
-    figure.suptitle(title)
     parts = (rows[rows["strategy"] == name] for name in names)
     return figure, list(zip(axes, parts, strict=True))
 
@@ -154,7 +150,7 @@ def _lines(axis: Axes, rows: pd.DataFrame, column: str) -> None:
         label = f"follower {follower}" if follower in (1, followers) else None
         share = (follower - 1) / max(followers - 1, 1)
         hue = tuple((1.0 - share) * NEAR_COLOUR + share * FAR_COLOUR)
-        axis.plot(own["time_s"], own[column], color=hue, lw=1.0, label=label)
+        axis.plot(own["time_s"], own[column], color=hue, label=label)
 
 
 @paper
@@ -178,7 +174,8 @@ def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
     for name, hue in WINNER_COLOURS.items():
         axis.plot([], [], "s", color=hue, label=name)
     axis.set_yticks(raster.index)
-    style(axis, "time [s]", "follower")
+    axis.set(xlabel="time [s]", ylabel="follower")
+    axis.grid(visible=False)
     share = float(np.nanmean(raster.to_numpy()))
     title = f"{case}: controller in use, {in_words(strategy)} (DDPG {100 * share:.0f} %)"
     axis.set_title(title, loc="right")

@@ -13,7 +13,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from lcc_rl.errors import ResultsError
-from lcc_rl.figures.drawing import COLUMN_WIDTH, PAGE_WIDTH, lines_of, new_figure, paper, unbox
+from lcc_rl.figures.drawing import COLUMN_WIDTH, PAGE_WIDTH, lines_of, new_figure, paper
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.results.motion import SampleMotion, most_varied, motion_of, sample_episodes
 
@@ -68,8 +68,8 @@ def side_by_side(motions: Mapping[str, SampleMotion], high: float = 2.6) -> Figu
     for axis, (name, motion) in zip(axes, motions.items(), strict=True):
         lines = _panel(axis, motion, scale)
         axis.set_title(lines_of(name))
-        unbox(axis)
         axis.set_xlabel("time [s]")
+        axis.grid(visible=False)
     axes[0].set_ylabel("position [m]")
     first = next(iter(motions.values()))
     rims = f"\nblack rim: places of {RIMS[_few(first)]}" if len(set(first.roles)) > 1 else ""

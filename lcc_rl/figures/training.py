@@ -16,7 +16,6 @@ from lcc_rl.figures.drawing import (
     legend_above,
     new_figure,
     paper,
-    style,
 )
 from lcc_rl.results.bootstrap import band
 from lcc_rl.results.names import in_words, several
@@ -50,7 +49,7 @@ def training_figure(training: pd.DataFrame) -> Figure:
     figure = new_figure(PAGE_WIDTH if limits else COLUMN_WIDTH, 2.7)
     first, *others = figure.subplots(1, 1 + len(limits), squeeze=False)[0]
     draw_curves(first, training, "loss_actor")
-    style(first, "training episodes", "objective, less is better")
+    first.set(xlabel="training episodes", ylabel="objective, less is better")
     legend_above(first, 1)
     for axis, name in zip(others, limits, strict=True):
         draw_curves(axis, training.assign(percent=100.0 * training[name]), "percent")
@@ -67,7 +66,8 @@ def training_figure(training: pd.DataFrame) -> Figure:
             legend_above(axis)
             top = max(top, percent)
         axis.set_ylim(0.0, max(1.2 * top, 1e-3))
-        style(axis, "training episodes", f"{LIMIT_LABELS.get(what, what)} [% of the time]")
+        axis.set(xlabel="training episodes")
+        axis.set(ylabel=f"{LIMIT_LABELS.get(what, what)} [% of the time]")
     never = [
         LIMIT_LABELS.get(name.removeprefix(LIMIT_PREFIX), name)
         for name in held
@@ -88,9 +88,8 @@ def learning_curve(training: pd.DataFrame) -> Figure:
     axis = figure.subplots()
     floor, _ = draw_curves(axis, training, "episode_reward")
     axis.set_ylim(bottom=1.25 * floor - 0.1)
-    style(
-        axis, "training episodes", f"mean reward per episode\n(rolling mean of {ROLLING} batches)"
-    )
+    axis.set(xlabel="training episodes")
+    axis.set(ylabel=f"mean reward per episode\n(rolling mean of {ROLLING} batches)")
     legend_above(axis, 1)
     footnote(figure, BAND_NOTE)
     return figure

@@ -16,7 +16,6 @@ from pydantic import InstanceOf
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.data import Unbounded
 
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.drivers.population import bootstrap
@@ -95,7 +94,7 @@ class DrivingProgram(nn.Module):
     Attributes:
         names: the inputs, such as ``"self.gap"``.
         inputs: the inputs of each entry.
-        kept: specs of the remembered entries.
+        kept: shapes and types of the remembered entries.
         width: size of the memory, 0 if there is none.
     """
 
@@ -109,11 +108,11 @@ class DrivingProgram(nn.Module):
         inner = sorted(pieces, key=lambda piece: isinstance(piece, ObservationMemory))
         needs = [key for piece in inner for _, key in piece.needs]
         before, clock = read_before(pieces), [key for key in (SEED, STEP) if key in needs]
-        self.kept: dict[Key, Any] = {key: Unbounded((1,), dtype=torch.int64) for key in clock}
+        self.kept: dict[Key, Any] = dict.fromkeys(clock, (torch.Size([1]), torch.int64))
         for piece in pieces:
             own = [key for key in piece.entries if key in before]
-            self.kept |= piece.specs(torch.Size([]), None, own)
-        self.sizes = [spec.shape.numel() for spec in self.kept.values()]
+            self.kept |= piece.layouts(torch.Size([]), own)
+        self.sizes = [shape.numel() for shape, _ in self.kept.values()]
         self.width = 1 + sum(self.sizes) if self.kept else 0
         written = {SEED, STEP}.union(*(piece.entries for piece in pieces))
         self.inputs = {key: self._inputs(".".join(key)) for key in needs if key not in written}
@@ -155,8 +154,8 @@ class DrivingProgram(nn.Module):
         before = dict(reached)
         if memory is not None:
             values = memory[:, 1:].split(self.sizes, -1)
-            for (key, spec), value in zip(self.kept.items(), values, strict=True):
-                before[key] = value.reshape(-1, *spec.shape).to(spec.dtype)
+            for (key, (shape, dtype)), value in zip(self.kept.items(), values, strict=True):
+                before[key] = value.reshape(-1, *shape).to(dtype)
         reached |= {key: before[key] + (key == STEP) for key in (SEED, STEP) if key in before}
         for piece in self.pieces:
             apply(piece, before, reached) if apply else piece.derive(before, reached)
@@ -165,8 +164,8 @@ class DrivingProgram(nn.Module):
 
     def _packed(self, entries: State, like: Tensor) -> Tensor:
         rows = [torch.ones_like(like[:, :1])]
-        for key, spec in self.kept.items():
-            rows.append(entries[key].expand(like.shape[0], *spec.shape).flatten(1).to(like.dtype))
+        for key, (shape, _) in self.kept.items():
+            rows.append(entries[key].expand(like.shape[0], *shape).flatten(1).to(like.dtype))
         return torch.cat(rows, 1)
 
     def measured(self, state: Tensor) -> State:

@@ -197,13 +197,6 @@ class Piece(Part, TensorDictModuleBase, Transform):
         width = self.entries[key].width
         return (*self.rows, *((width,) if isinstance(width, int) else width))
 
-    def specs(
-        self, batch: torch.Size, device: torch.device | None, keys: Sequence[Key] | None = None
-    ) -> dict[Key, Any]:
-        """Return the specs of declared entries, by default of all."""
-        layouts = self.layouts(batch, keys).items()
-        return {key: Unbounded(shape, dtype=x, device=device) for key, (shape, x) in layouts}
-
     def layouts(
         self, batch: torch.Size, keys: Sequence[Key] | None = None
     ) -> dict[Key, tuple[torch.Size, torch.dtype]]:
@@ -281,8 +274,8 @@ class Piece(Part, TensorDictModuleBase, Transform):
 
 def add_specs(piece: Piece, spec: Composite, keys: Sequence[Key] | None = None) -> Composite:
     """Add declared entries of a piece to a spec, by default all of them."""
-    for key, entry in piece.specs(spec.shape, spec.device, keys).items():
-        spec[key] = entry
+    for key, (shape, dtype) in piece.layouts(spec.shape, keys).items():
+        spec[key] = Unbounded(shape, dtype=dtype, device=spec.device)
     return spec
 
 
@@ -296,6 +289,13 @@ class Feature(Piece):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         return self.forward(tensordict_reset)
+
+
+class AfterStep(Feature):
+    """A feature that writes nothing at reset, and what it writes is no observation."""
+
+    _reset = Transform._reset
+    transform_observation_spec = Transform.transform_observation_spec
 
 
 class StepTransform(Piece):

@@ -20,14 +20,13 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 from torchrl.data import Composite
-from torchrl.envs import Transform
 
 from lcc_rl.errors import require
 from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.functional.layout import total
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.safety import time_to_collision
-from lcc_rl.pieces.base import REWARD, Entry, RewardPiece, add_specs
+from lcc_rl.pieces.base import REWARD, AfterStep, Entry, RewardPiece, add_specs
 from lcc_rl.pieces.sections import Sections
 from lcc_rl.pieces.views import VEHICLES
 from lcc_rl.pieces.world import World
@@ -191,7 +190,7 @@ class SpacingReward(RewardTerm):
         return -(gap_error / self.gap_scale).square()
 
 
-class TotalReward(RewardPiece):
+class TotalReward(AfterStep, RewardPiece):
     """Writes ``("automated", "reward")``: the sum of all terms (A17, A19), ``[*batch, A, 1]``.
 
     It is the only entry of the environment's reward spec. It exists after a step, not at reset.
@@ -209,9 +208,6 @@ class TotalReward(RewardPiece):
     def compute(self, *entries: Tensor) -> Tensor:
         """Return the sum."""
         return torch.stack(entries).sum(0)
-
-    _reset = Transform._reset
-    transform_observation_spec = Transform.transform_observation_spec
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         return add_specs(self, reward_spec)

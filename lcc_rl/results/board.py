@@ -81,9 +81,9 @@ def score_table(name: str, rows: Sequence[BoardRow]) -> Table:
             lines[-1] |= {"where": row["task"], "score": unit_of(row), "saved": against}
         lines.append({"where": f"  {row['source']}", **_cells(row)})
     caption = (
-        "saved, distance, flow: against the baseline; 95 % interval over drives, or over "
-        "windows for fewer than five drives, too narrow if one drive has several; "
-        "score.json has every limit and value."
+        "saved, distance, flow: against the baseline; 95 % interval over drives, or over windows "
+        "if there are fewer than five drives (then too narrow); score.json has every limit and "
+        "value."
     )
     return render.as_rich(pd.DataFrame(lines), BOARD_COLUMNS, in_words(name), caption)
 

@@ -8,11 +8,12 @@ at equal cost.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from lcc_rl.arrays import Floats
 from lcc_rl.errors import ResultsError
 from lcc_rl.results.bootstrap import Estimate, Side, estimate, share_saved
 from lcc_rl.results.measures import FLOW, LONG_GAPS, PATH
@@ -23,9 +24,9 @@ ENERGY, LONG_SHARE = PATH, LONG_GAPS
 # Columns of a fleet.
 NET = "total_net_energy_kj"
 FLEET = NET, DISTANCE, FLOW
-# Means of columns of one kind of controller, each ``[limits]``.
-Curve = Mapping[str, NDArray[np.float64]]
-Statistic = Callable[[Curve, Curve], float]
+# Means of columns of one kind of controller, each ``[limits]``, or ``[RESAMPLES, limits]``.
+Curve = Mapping[str, Floats]
+Statistic = Callable[[Curve, Curve], Any]
 
 
 def front(windows: pd.DataFrame, kind: Sequence[str], columns: Sequence[str]) -> Side:
@@ -74,24 +75,24 @@ def compare_fronts(
     fronts = [front(windows, kind, columns) for kind in (one, other)]
     drives = windows.groupby("profile_id")[DRIVE].first().tolist() if DRIVE in windows else None
 
-    def statistic(*sides: Curve) -> NDArray[np.float64]:
-        """Return the measure of means by limit, ``[limits]``, or of each resample of them."""
-        drawn = [{name: np.atleast_2d(x.T) for name, x in side.items()} for side in sides]
-        count = len(next(iter(drawn[0].values())))
-        pairs = ([{name: x[i] for name, x in side.items()} for side in drawn] for i in range(count))
-        return np.squeeze([measure(*pair) for pair in pairs])
+    def statistic(*sides: Curve) -> Any:
+        return measure(*({name: x.T for name, x in side.items()} for side in sides))
 
     return estimate(statistic, *fronts, drives=drives)
 
 
-def energy_at(energy: NDArray[np.float64], share: NDArray[np.float64], at: float) -> float:
-    """Return the energy of a front, ``[limits]`` each, at the share ``at``.
+def energy_at(energy: Floats, share: Floats, at: Any, most: float | None = None) -> Floats:
+    """Return the energy of a front, ``[..., limits]`` each, at the share ``at``.
 
-    It is interpolated linearly between the limits. It is the energy of the largest share if all
-    shares are smaller, and NaN if all are larger.
+    It is interpolated linearly between the limits, and NaN if all shares are larger. If all are
+    smaller, it is ``most``, by default the energy of the largest share.
     """
-    order = np.argsort(share)
-    return float(np.interp(at, share[order], energy[order], left=np.nan))
+
+    def read(at: float, share: Floats, energy: Floats) -> float:
+        order = np.argsort(share)
+        return float(np.interp(at, share[order], energy[order], left=np.nan, right=most))
+
+    return np.asarray(np.vectorize(read, signature="(),(n),(n)->()")(at, share, energy))
 
 
 def saving_at(
@@ -102,36 +103,34 @@ def saving_at(
     Both violate the limit for at most the share ``at`` of the time; see :func:`compare_fronts`.
     """
 
-    def measure(*curves: Curve) -> float:
-        return float(share_saved(*(energy_at(x[ENERGY], x[LONG_SHARE], at) for x in curves)))
+    def measure(*curves: Curve) -> Any:
+        return share_saved(*(energy_at(x[ENERGY], x[LONG_SHARE], at) for x in curves))
 
     return compare_fronts(windows, one, other, (ENERGY, LONG_SHARE), measure)
 
 
-def energy_per_distance(curve: Curve) -> NDArray[np.float64]:
-    """Return the energy per distance, ``[limits]``."""
+def energy_per_distance(curve: Curve) -> Floats:
+    """Return the energy per distance, ``[..., limits]``."""
     return curve[NET] / curve[DISTANCE]
 
 
-def fleet_saved(point: Curve, baseline: Curve) -> float:
+def fleet_saved(point: Curve, baseline: Curve) -> Any:
     """Return the share of a baseline's energy per distance that a fleet saves."""
-    return float(share_saved(energy_per_distance(point)[0], energy_per_distance(baseline)[0]))
+    return share_saved(*(energy_per_distance(x)[..., 0] for x in (point, baseline)))
 
 
-def flow_gained(point: Curve, baseline: Curve) -> float:
+def flow_gained(point: Curve, baseline: Curve) -> Any:
     """Return the share of a baseline's flow that a fleet gains."""
-    return float(point[FLOW][0] / baseline[FLOW][0] - 1.0)
+    return point[FLOW][..., 0] / baseline[FLOW][..., 0] - 1.0
 
 
-def saved_at_flow(point: Curve, rule: Curve) -> float:
+def saved_at_flow(point: Curve, rule: Curve) -> Any:
     """Return the share of energy per distance that a fleet saves against a front at equal flow.
 
     NaN if the front does not reach that flow.
     """
-    order = np.argsort(rule[FLOW])
-    spent, flow = energy_per_distance(rule)[order], rule[FLOW][order]
-    rival = np.interp(point[FLOW][0], flow, spent, left=np.nan, right=np.nan)
-    return float(share_saved(energy_per_distance(point)[0], rival))
+    rival = energy_at(energy_per_distance(rule), rule[FLOW], point[FLOW][..., 0], np.nan)
+    return share_saved(energy_per_distance(point)[..., 0], rival)
 
 
 def points(windows: pd.DataFrame) -> pd.DataFrame:

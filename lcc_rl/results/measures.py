@@ -156,7 +156,7 @@ MEASURES = [
     Measure("share_time_gap_long", "time with time gap > 2.5 s", PERCENT, "long\ngaps\n≤ {:g} %"),
     Measure(LONG_GAPS, "  above 1 m/s", PERCENT, "long\ngaps\n≤ {:g} %", "long\ngap\n[%]"),
     Measure(
-        "share_time_gap_short", "all: time with time gap < 1 s", PERCENT, "gap\n< 1 s\n≤ {:g} %"
+        "share_time_gap_short", "time with time gap < 1 s, all", PERCENT, "gap\n< 1 s\n≤ {:g} %"
     ),
     _per("brakings_below_2_per_100km", "brakings < −2 m/s² [1/100 km]", "brakings_below_2", 1e5),
     _per("brakings_below_3_per_100km", "  < −3 m/s² [1/100 km]", "brakings_below_3", 1e5),

@@ -23,16 +23,16 @@ NETWORK = "alcc"
 FILTER_ALONE = "constant_filtered"
 # Strategies with several variants, which further words of a name specify.
 SEVERAL = {
-    "reference": "network, for itself",
-    "own_energy": "network, for itself, weighted",
-    NETWORK: "network, for all",
+    "reference": "network, own energy",
+    "own_energy": "network, own energy × 2",
+    NETWORK: "network",
     "rule": "IDM, tuned on these data",
     "cacc": "CACC",
     "ddpg": "DDPG",
     "hcfs": "HCFS",
 }
 LABELS = SEVERAL | {
-    "idm": "one driver (IDM)",
+    "idm": "one IDM driver",
     HUMAN: "simulated drivers",
     "recorded": "the recorded drivers",
     FILTER_ALONE: "safety filter alone",
@@ -47,6 +47,15 @@ LABELS = SEVERAL | {
     "ovm": "OVM",
     "constant": "constant speed",
     "direct": "no automated car",
+    "cacc path": "CACC, PATH gains",
+    "cacc paper_like": "CACC, fitted to Table IV",
+    "cacc tuned": "CACC, tuned",
+    "hcfs between": "HCFS, best point between",
+    "hcfs first": "HCFS, the first decides",
+    "hcfs literal": "HCFS, literal",
+    "hcfs oracle": "HCFS, oracle",
+    "hcfs untuned": "HCFS of the fitted CACC",
+    "deadbeat": "dead-beat, nothing learned",
 }
 
 
@@ -57,7 +66,7 @@ def in_words(name: str) -> str:
 
     Examples:
         >>> in_words("alcc"), in_words("alcc ddpg"), in_words("my_idm_1.1")
-        ('network, for all', 'network, for all (ddpg)', 'my_idm_1.1')
+        ('network', 'network (ddpg)', 'my_idm_1.1')
     """
     if name.endswith(FILTERED) and name not in LABELS:
         return f"{in_words(name.removesuffix(FILTERED))}, filtered"

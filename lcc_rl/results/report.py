@@ -332,7 +332,8 @@ def saved_against(found: pd.DataFrame, against: str, always: bool = False) -> st
         up_to = "up to " if found.loc[found["seeds"] > 0, "seeds"].nunique() > 1 else ""
         over += f" and {up_to}{seeds} training seeds"
     if drives < min(LEAST_DRIVES, windows):
-        over += f" (too narrow: too few drives, {drives}, with similar windows)"
+        of = "one drive" if drives == 1 else f"only {drives} drives"
+        over += f" (too narrow: all windows are of {of})"
     return f"{words}, with the 95 % interval over {over}"
 
 
@@ -389,7 +390,7 @@ def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> 
             words.append(_sentence(windows, rows, name, other))
         elif of_few:
             both = (f"{rows[x][PATH_PER_KM]:,.1f} kJ ({in_words(x)})" for x in (name, other))
-            few = f"{counted_windows(count)} allow no finding."
+            few = f"{counted_windows(count)} are too few for a conclusion."
             words.append(f"Per vehicle and km: {', '.join(both)}; {few}")
     least = min(rows, key=lambda name: rows[name][PATH_PER_KM])
     # It may be the user's rule.

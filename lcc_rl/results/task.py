@@ -57,6 +57,11 @@ class Task(Settings):
         names = list(dict.fromkeys(map(str, strategies)))
         return self if self.against in names else replace(self, against=names[0])
 
+    @property
+    def references(self) -> list[str]:
+        """The strategies whose values the saving and the limits refer to."""
+        return [self.against, *([RECORDED] if RECORDED in self.limits.values() else [])]
+
     def resolved(self, windows: pd.DataFrame) -> Task:
         """Return the task with numbers for limits that refer to other strategies."""
         known, found = measures.limit_measures(), dict(self.limits)

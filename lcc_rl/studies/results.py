@@ -38,7 +38,7 @@ class StudyResults:
 
     def figure(self, name: str, caption: str, figure: Figure) -> None:
         """Write a figure with a caption."""
-        place = save(figure, self.folder / "figures" / f"{name}.png", 130, self.formats)
+        place = save(figure, self.folder / "figures" / f"{name}.png", formats=self.formats)
         self.blocks.append(f"![{caption}](figures/{place.name})\n\n{caption}")
 
     def write(self, title: str) -> Path:

@@ -93,7 +93,7 @@ def test_the_command(tmp_path, capsys) -> None:
     starts = ["--policy", "pretrained", "--policy", "pretrained/reference", "--regard"]
     two = ["scenario.horizon=30", "evaluation.profiles=2", "evaluation.drivers=2"]
     assert tool.main([*own, str(tmp_path / "two"), *starts, *two]) == 0
-    assert "take" in capsys.readouterr().out
+    assert "lower than with plans" in capsys.readouterr().out
     rows = pd.read_parquet(tmp_path / "two" / "episodes.parquet")
     names = ["idm", "alcc", "reference", "clairvoyant", "clairvoyant own"]
     assert rows["strategy"].value_counts().to_dict() == dict.fromkeys(names, 4)

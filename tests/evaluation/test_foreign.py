@@ -107,7 +107,7 @@ def test_what_is_no_policy_of_these_keys_is_refused_in_a_line() -> None:
         ({"x": nn.Linear(WIDTH, 2)}, r"x fails .* shape '\[1, 1, 1\]' is invalid"),
         ({"x": TensorDictModule(network, ["obs"], ["action"])}, r"x reads \['obs'\] and writes"),
         ({"x": TensorDictModule(network, ["observation"], ["act"])}, r"writes \['act'\]: expected"),
-        ({"alcc": network}, "a policy alcc, which stands for 'network, for all': choose another"),
+        ({"alcc": network}, "a policy alcc, which stands for 'network': choose another"),
     ]
     check_refused(lambda who: lcc_rl.compare(who, overrides=SMALL), cases, ConfigError)
     with pytest.raises(ConfigError, match="x is a policy, and variant idm has no agent"):

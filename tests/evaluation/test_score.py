@@ -13,7 +13,8 @@ from helpers import check_refused
 from page_blocks import ROOT
 
 import lcc_rl
-from lcc_rl.commands.score import about, main, scored
+from lcc_rl.commands.score import about, main, play_source, scored
+from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.results import board
 from lcc_rl.runs.states import Busy, claim
@@ -133,6 +134,15 @@ def test_a_killed_score_is_played_again_and_a_finished_or_running_one_is_left_al
     with pytest.raises(ResultsError, match=r"already holds .* choose another --out"):
         scores(folder, "acc", *ON)
     assert content(folder) == before
+
+
+def test_a_limit_that_is_a_share_of_the_baseline_counts(tmp_path) -> None:
+    words = ["task=i80-follow", "leader=everyday", "evaluation.drivers=2", *SMALL]
+    cfg = load("evaluate", [*words, "task.limits.flow_vph='200 %'"])
+    row = play_source(scored("idm_acc"), "everyday", cfg, tmp_path)
+    flow = row["limits"]["flow_vph"]
+    assert flow["bound"] > flow["value"] > 0.0
+    assert not row["kept"]
 
 
 def test_a_score_has_the_name_given_and_a_failed_one_says_why_in_its_folder(tmp_path) -> None:

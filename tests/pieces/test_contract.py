@@ -460,11 +460,11 @@ def test_in_a_replay_buffer_of_transitions(road, name) -> None:
 @each_piece
 def test_written_specs_match_what_is_written(road, name) -> None:
     piece, reached = made(road)[name], played(road)[:, 3]["next"]
-    specs = piece.specs(reached.batch_size, None)
-    assert set(specs) >= set(piece.targets)
-    for key, spec in specs.items():
+    layouts = piece.layouts(reached.batch_size)
+    assert set(layouts) >= set(piece.targets)
+    for key, layout in layouts.items():
         if key not in (("done",), ("terminated",)):
-            assert spec.is_in(reached[key]), key
+            assert (reached[key].shape, reached[key].dtype) == layout, key
 
 
 @pytest.mark.parametrize("road", list(STRINGS))

@@ -68,7 +68,7 @@ def drivers() -> pd.DataFrame:
 
 FIGURES = {
     "power_map": (alcc.power_map, ["kW", "speed [m/s]"]),
-    "learning_curve": (lambda: learning_curve(training()), ["for all (2 seeds)", "95 % interval"]),
+    "learning_curve": (lambda: learning_curve(training()), ["network (2 seeds)", "95 % interval"]),
     "limits_never_reached": (
         lambda: training_figure(
             training().assign(loss_actor=1.0, share_efficiency=0.0, limit_efficiency=0.02)
@@ -195,9 +195,9 @@ def test_jerk_has_its_own_scale_and_followers_their_own_colours() -> None:
         figure = jerks(platoon(jerk), "case 1", 30.0)
         assert (figure.axes[0].get_ylim()[1] > 30.0) == (dotted > 0)
         assert [x.get_linestyle() for x in figure.axes[0].lines].count(":") == dotted
-        assert "bound ±30" in texts(figure)
+        assert "bound of ±30" in texts(figure)
     figure = velocities(platoon(1.0), "case 1")
-    assert "CACC (paper like)" in texts(figure)
+    assert "CACC, fitted to Table IV" in texts(figure)
     assert len({line.get_color() for line in figure.axes[0].lines}) == 4  # with the leader
 
 

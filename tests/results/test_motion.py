@@ -204,12 +204,12 @@ def test_the_command_animates_what_is_named(run_folder, capsys) -> None:
     assert command.main([str(run_folder)]) == 0
     name = capsys.readouterr().out.splitlines()[-1]
     assert name == str(run_folder / "figures" / "animation_alcc_0.html")
-    assert "network, for all: profile p, driver 0" in Path(name).read_text()
+    assert "network: profile p, driver 0" in Path(name).read_text()
     out = run_folder.parent / "there.html"
-    words = ["--strategy=one driver (IDM)", "--episode=1", "--start=1", "--duration=0.5"]
+    words = ["--strategy=one IDM driver", "--episode=1", "--start=1", "--duration=0.5"]
     assert command.main([str(run_folder), *words, "--out", str(out)]) == 0
     found = data_of(out.read_text())
-    assert (found["title"], found["time"]) == ("one driver (IDM): profile p, driver 1", [1.0, 1.5])
+    assert (found["title"], found["time"]) == ("one IDM driver: profile p, driver 1", [1.0, 1.5])
     assert found["speed"][0] == [9.0] * 2
     job = run_folder.parent / "job"
     job.mkdir()

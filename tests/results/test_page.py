@@ -149,8 +149,8 @@ def test_every_table_of_strategies_fits_80_columns() -> None:
 
 def test_names_are_words_in_tables_and_figures() -> None:
     words = {
-        "alcc": "network, for all",
-        "alcc analytic": "network, for all (analytic)",
+        "alcc": "network",
+        "alcc analytic": "network (analytic)",
         "idm_acc": "tuned IDM",
         "my_pid_filtered": "my_pid, filtered",
         "idm 1.1": "idm 1.1",
@@ -169,9 +169,7 @@ def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     cars = found.table.set_index("strategy")["path_energy_kj_per_km"]
     saved = 100.0 * (1.0 - cars["alcc"] / cars["rule"])
     words = found.verdict
-    assert words.startswith(
-        f"With the network, for all, energy per vehicle and km is {saved:.1f} % ("
-    )
+    assert words.startswith(f"With the network, energy per vehicle and km is {saved:.1f} % (")
     assert "less than with IDM, tuned on these data; long time gaps: 0.40 % of" in words
     near = frame.copy()  # as much as the rule but for the noise
     near.loc[near["strategy"] == "alcc", "total_path_energy_kj"] *= cars["rule"] / cars["alcc"]
@@ -183,11 +181,11 @@ def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     first, second, least = found.verdict.splitlines()
     most = found.short.iloc[-1]
     assert least == f"Least energy: {most['driver']}, {most['energy_kj_per_km']:,.1f} kJ/km."
-    assert first == words.splitlines()[0].replace("the network, for all", "near", 1)
+    assert first == words.splitlines()[0].replace("the network", "near", 1)
     assert second.startswith("With far, energy")
     assert sample_of(frame) == f"12 held-out windows × {frame['driver_id'].nunique()} drivers"
     few = said(frame[frame["profile_id"] < 4]).verdict
-    assert few.endswith("; 4 windows allow no finding.")
+    assert few.endswith("; 4 windows are too few for a conclusion.")
     assert "%" not in few
 
 
@@ -213,7 +211,7 @@ def test_the_table_of_an_evaluation_ends_with_the_verdict(tmp_path, capsys) -> N
     run = Run(tmp_path, frame, cfg)
     assert " less than with IDM, tuned on these data" in " ".join(run.printed().split())
     few = Run(tmp_path, frame[frame["profile_id"] < 4], cfg)
-    assert "allow no finding" not in few.printed()
+    assert "too few for a conclusion" not in few.printed()
 
 
 def test_one_strategy_is_compared_with_nobody_and_one_window_has_no_interval() -> None:

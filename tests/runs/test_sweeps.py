@@ -92,7 +92,7 @@ def test_a_sweep_is_read_as_one_table(tmp_path, capsys) -> None:
     assert len(rows) == 4 * 2
     assert rows.groupby("seed")["episode_reward"].first().nunique() == 2
     # Rows are named by what differs, seeds share one: in its table and figure, beside others.
-    names = [f"network, for all (safety.weight={weight})" for weight in (0, 2)]
+    names = [f"network (safety.weight={weight})" for weight in (0, 2)]
     table_main([str(folder), "--format=csv", "--figure", str(tmp_path / "sweep.pdf")])
     lines = capsys.readouterr().out.splitlines()[1:]
     assert {line.split(",")[0] for line in lines} == {

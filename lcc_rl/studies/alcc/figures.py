@@ -18,12 +18,10 @@ from lcc_rl.figures.drawing import (
     colour,
     dots,
     footnote,
-    grid,
     legend_above,
     new_figure,
     paper,
     rows_of,
-    style,
 )
 from lcc_rl.figures.training import BAND_NOTE, draw_curves
 from lcc_rl.functional.power import motor_power
@@ -48,7 +46,7 @@ REWARD_LABELS = {
     "reward_collision": "collision",
 }
 PANELS = {
-    "path_saving_against_idm_pct": ("path energy saved against\none driver (IDM) [%]", 0.0),
+    "path_saving_against_idm_pct": ("path energy saved against\none IDM driver [%]", 0.0),
     "unsafe_ttc_pct": ("time with TTC < 4 s [%]", 0.1),
     "long_time_gap_pct": ("time with time gap\n> 2.5 s [%]", 1.0),
 }
@@ -70,7 +68,7 @@ def power_map() -> Figure:
     axis.clabel(lines, fmt=lambda kw: signed(kw, ".0f"), fontsize=6)
     ticks = [-200, -100, 0, 100, 200]
     figure.colorbar(filled, label="electric power [kW]\n(below 0: recuperated)", ticks=ticks)
-    style(axis, "speed [m/s]", "acceleration [m/s²]")
+    axis.set(xlabel="speed [m/s]", ylabel="acceleration [m/s²]")
     return figure
 
 
@@ -88,14 +86,12 @@ def reward_terms(training: pd.DataFrame) -> Figure:
     for axis, (name, label) in zip(axes, shown.items(), strict=False):
         floor, top = draw_curves(axis, training, name)
         axis.set_ylim(1.5 * floor - 0.2, top + 0.05 * (top - floor) + 0.05)
-        style(axis)
         axis.set_title(label)
     for axis in axes[len(shown) :]:
         axis.remove()
     look: dict[str, Any] = {
         "loc": "outside upper center",
         "ncols": 2,
-        "frameon": False,
     }
     figure.legend(handles=axes[0].get_lines(), **look)
     figure.supxlabel(f"training episodes\n{BAND_NOTE}", fontsize=8)
@@ -122,7 +118,7 @@ def distributions(drivers: pd.DataFrame) -> Figure:
         rows_of(axis, names if vehicle == "cav" else [""] * len(names))
         axis.use_sticky_edges = False  # a box may be at the edge
         axis.margins(x=0.12)
-        style(axis, "path energy [kJ per episode]")
+        axis.set(xlabel="path energy [kJ per episode]")
         axis.set_title(f"{title}, n = {len(energy)} drivers")
     footnote(figure, "box: quartiles; whiskers: 5th to 95th percentile; diamond and number: mean")
     return figure
@@ -131,7 +127,7 @@ def distributions(drivers: pd.DataFrame) -> Figure:
 def _flat_box(axis: Axes, values: np.ndarray, place: int, hue: str) -> None:
     """Draw a horizontal box with its mean beside it."""
     lowest, low, median, high, highest = np.percentile(values, [5, 25, 50, 75, 95])
-    axis.hlines(place, lowest, highest, color=hue, lw=1.2)
+    axis.hlines(place, lowest, highest, color=hue)
     axis.barh(place, high - low, 0.5, low, color=hue, alpha=0.35, edgecolor=hue)
     axis.vlines(median, place - 0.25, place + 0.25, color=hue, lw=2.0)
     mean = values.mean()
@@ -162,7 +158,8 @@ def generalization_figure(windows: pd.DataFrame) -> Figure:
     _cut_outliers(below, places, values)
     below.set_xticks([])
     words = f"held-out windows, sorted by the saving (n = {len(table)}); right: the paper's"
-    style(below, words, f"saved by {in_words(STRATEGY)}\nagainst {in_words(BASELINE)} [%]")
+    saved = f"saved by {in_words(STRATEGY)}\nagainst {in_words(BASELINE)} [%]"
+    below.set(xlabel=words, ylabel=saved)
     legend_above(below, 2)
     return figure
 
@@ -180,7 +177,7 @@ def _energies_by_profile(
         label = f"{in_words(name)}: human driver"
         axis.bar(places + offset, human, 0.4, car, color=colour(name), alpha=0.45, label=label)
     legend_above(axis, 2)
-    style(axis, "", "path energy\n[kJ per episode]")
+    axis.set_ylabel("path energy\n[kJ per episode]")
 
 
 def _cut_outliers(axis: Axes, places: np.ndarray, values: np.ndarray) -> None:
@@ -218,12 +215,11 @@ def comparison_figure(windows: pd.DataFrame) -> Figure:
             dots(axis, rows, part, column, hue, label=in_words(strategy))
         axis.axvline(line, color=SOFT, lw=0.8, ls="-" if line == 0.0 else "--")
         axis.axhline(0.5, color=SOFT, lw=0.6)
-        grid(axis, "x")
-        style(axis, label)
+        axis.set_xlabel(label)
         axis.tick_params(axis="y", length=0)
     rows_of(axes[0], [str(name).replace("_", " ") for name in names])
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
+    figure.legend(handles, labels, loc="outside upper right", ncols=3)
     seeds = _how_many(table["seeds"])
     footnote(figure, f"n = {seeds}; lines: 95 % interval; dashed: the study's limit")
     return figure

@@ -79,7 +79,7 @@ def narrow(shown: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
 def add_main(found: StudyResults, means: Means) -> None:
     """Add the tables and figures of the main evaluation."""
     windows, size = means.windows, sample_of(means.windows, means.drivers)
-    found.table("headline", f"Energy of both saved, {size}", tables.headline_rows(windows))
+    found.table("headline", f"Savings of the total energy, {size}", tables.headline_rows(windows))
     found.table("energies", f"Energy per episode, {size}", tables.energies(windows))
     if set(LEADER_COLUMNS) <= set(windows):
         caption = "Path energy saved in thirds of the windows, by the leader's energy and speed"
@@ -88,7 +88,7 @@ def add_main(found: StudyResults, means: Means) -> None:
     found.figure("distributions", caption, figures.distributions(means.drivers))
     path = found.folder / EVALUATION_FOLDER / STEPS
     if path.exists() and ((steps := read_parquet(path))["strategy"] == "alcc").any():
-        caption = "One held-out episode of the network for all, first seed (Fig. 7)"
+        caption = "One held-out episode of the network, first seed (Fig. 7)"
         found.figure("sample_episode", caption, run_figures.sample_episode(steps, "alcc"))
     found.table("constraints", f"Safety and efficiency, {size}", tables.constraints(windows))
     found.table("constraints_by_seed", "Every seed", tables.constraints_by_seed(windows))
@@ -103,7 +103,7 @@ def add_main(found: StudyResults, means: Means) -> None:
 
 
 def _awareness(found: StudyResults, means: Means) -> None:
-    caption = f"Table IV beside this study, {sample_of(means.windows, means.drivers)}"
+    caption = f"Table IV and this study, {sample_of(means.windows, means.drivers)}"
     found.table("table_iv", caption, paper_tables.table_iv(means.drivers))
     found.table("holistic", "Saving per driver", paper_tables.holistic(means))
     caption = "Path energy of both vehicles and its saving, by driver behind (Fig. 10)"
@@ -112,7 +112,7 @@ def _awareness(found: StudyResults, means: Means) -> None:
 
 
 def _generalization(found: StudyResults, windows: pd.DataFrame) -> None:
-    caption = "Saving of alcc against reference over profiles, beside the paper's 4"
+    caption = "Saving of alcc against reference over profiles and on the 4 of the paper"
     found.table("generalization_row", caption, paper_tables.generalization_row(windows))
     found.table("generalization", "Every held-out window", paper_tables.generalization(windows))
     caption = "Energies and saving on every held-out window (Fig. 12)"

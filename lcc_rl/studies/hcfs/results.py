@@ -54,14 +54,14 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     found.table("table_iv", "Table IV as printed, on another record", tables.printed())
     found.table("weights", "Σ reward from Σ|e_v| and Σ|jerk| of Table IV", tables.weight_table())
     whole = tables.whole_records(episodes, WHOLE_ROWS)
-    found.table("whole", "Σ reward over whole records (least … most of the trainings)", whole)
+    found.table("whole", "Σ reward over whole records (range of the trainings)", whole)
     gains = tables.whole_gains(episodes, PARENT_ROWS)
     found.table("whole_gains", "HCFS against its parents over whole records", gains)
     if (folder / SOURCES_FILE).exists():  # only with evaluations on other leaders
         runs = read_parquet(folder / SOURCES_FILE)
         shown = tables.sources(runs, ("cacc tuned", "hcfs", "hcfs first"))
         found.table("sources", "Windows of other sources of leaders", shown)
-        found.table("sources_in_full", "The same of all strategies", tables.sources(runs))
+        found.table("sources_in_full", "The same for all strategies", tables.sources(runs))
     if (folder / LENGTHS).exists():  # only with several studies
         lengths = tables.lengths(read_parquet(folder / LENGTHS))
         found.table("lengths", "Σ reward per window by the length of the training", lengths)

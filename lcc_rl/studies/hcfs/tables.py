@@ -12,6 +12,7 @@ from lcc_rl.data.leaders import WHOLE_RECORD
 from lcc_rl.evaluation.cases import WINDOW_CASES
 from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.results import bootstrap
+from lcc_rl.results.names import in_words
 from lcc_rl.results.platoons import COUNTS, case_table
 from lcc_rl.results.windows import DRIVE
 
@@ -23,19 +24,6 @@ TABLE_IV = {
     "HCFS": (25.26, 0.04, 192.19, -9.64),
 }
 CASE_3 = {"CACC": -4.78, "DDPG": -5.81, "HCFS": -1.90}  # Σ reward in Table VI
-STRATEGY_WORDS = {  # names of strategies in tables
-    "cacc path": "CACC, PATH gains",
-    "cacc paper_like": "CACC, fitted to Table IV",
-    "cacc tuned": "CACC, tuned",
-    "ddpg": "DDPG",
-    "hcfs": "HCFS",
-    "hcfs between": "HCFS, best point between",
-    "hcfs first": "HCFS, the first decides",
-    "hcfs literal": "HCFS, literal",
-    "hcfs oracle": "HCFS, oracle",
-    "hcfs untuned": "HCFS of the fitted CACC",
-    "deadbeat": "dead-beat, nothing learned",
-}
 # Headings of :func:`win_rates`.
 GAINED = {
     f"{old}{end}": f"{new}{end}"
@@ -160,9 +148,9 @@ def windows(episodes: pd.DataFrame, strategies: Sequence[str], of: str = "hcfs")
     against = win_rates(episodes, of, [s for s in strategies if s != of]).set_index("against")
     rows = [
         {
-            "strategy": STRATEGY_WORDS[name],
-            "Σ abs e_v_mps": table.at[name, "speed_error_sum_mps"],
-            "Σ abs jerk_mps3": table.at[name, "jerk_sum_mps3"],
+            "strategy": in_words(name),
+            "sum of speed errors_mps": table.at[name, "speed_error_sum_mps"],
+            "sum of jerks_mps3": table.at[name, "jerk_sum_mps3"],
             **crossed_rewards(reward_per_seed(episodes, name, WINDOW_CASES)).columns("Σ reward"),
         }
         for name in strategies
@@ -175,7 +163,7 @@ def whole_gains(episodes: pd.DataFrame, parents: Sequence[str]) -> pd.DataFrame:
     """Return gains of HCFS over its parents on whole records, with intervals over seeds."""
     return pd.DataFrame(
         [
-            {"record": record, "against": STRATEGY_WORDS[str(row["against"])]}
+            {"record": record, "against": in_words(str(row["against"]))}
             | {new: row[old] for old, new in GAINED.items() if old.startswith("gain")}
             | {"seeds ahead": row["seeds_ahead"]}
             for case, record in _records(episodes).items()
@@ -195,7 +183,7 @@ def over_cases(episodes: pd.DataFrame, cases: Sequence[str], like: Sequence[str]
     tables = {case: case_table(episodes, case).set_index("strategy") for case in cases}
     rows = []
     for name in like:
-        row: dict[str, object] = {"strategy": STRATEGY_WORDS[name]}
+        row: dict[str, object] = {"strategy": in_words(name)}
         for case, table in tables.items():
             row |= {f"{case}{end}": table.at[name, f"reward{end}"] for end in ("", "_low", "_high")}
         rows.append(row)
@@ -249,7 +237,7 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
             own = group[group["strategy"] == name]
             saved = bootstrap.saving(energy, spent[strategies[0]], drives=_drives(energy))
             above = f"{(own['energy_ratio'] > 1.0).sum()} of {len(own)}"
-            row: dict[str, object] = {"leaders": source, "strategy": STRATEGY_WORDS[name]}
+            row: dict[str, object] = {"leaders": source, "strategy": in_words(name)}
             row |= crossed_rewards(reward_per_seed(group, name, WINDOW_CASES)).columns("Σ reward")
             row |= {"gap error_m": own["max_gap_error_m"].max()}
             row |= {"string ratio, above 1": f"{own['energy_ratio'].max():.2f}, {above}"}
@@ -268,7 +256,7 @@ def whole_records(episodes: pd.DataFrame, strategies: Sequence[str]) -> pd.DataF
                 rows.append(
                     {
                         "record": record,
-                        "strategy": STRATEGY_WORDS[name],
+                        "strategy": in_words(name),
                         "Σ reward": runs["reward"].mean(),
                         "Σ reward_low": runs["reward"].min() if many else np.nan,
                         "Σ reward_high": runs["reward"].max() if many else np.nan,
