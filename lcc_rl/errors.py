@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from numbers import Real
 from typing import Any
@@ -56,7 +57,7 @@ LARGEST = 1e9
 LARGEST_SIZE, LAST_SEED = 10**15, 2**32 - 1  # torch uses no more bits of a seed
 
 
-def require(condition: bool, message: str) -> None:
+def require(condition: object, message: str) -> None:
     """Raise a ConfigError with the message unless the condition holds."""
     if not condition:
         raise ConfigError(message)
@@ -67,6 +68,25 @@ def require_positive(what: str, value: Any) -> None:
     number = isinstance(value, Real) and not isinstance(value, bool)
     if not (number and 0.0 < value <= LARGEST):
         raise ConfigError(f"{what} must be a positive, finite number, got {value!r}")
+
+
+@contextmanager
+def raised_as(kind: type[LccError], words: str, *caught: type[Exception]) -> Iterator[None]:
+    """Raise caught errors as one of this package: the words, then their message in one line."""
+    try:
+        yield
+    except caught as error:
+        text = str(error) if isinstance(error, LccError) else one_line(str(error))[:500]
+        raise kind(f"{words}: {text}".removeprefix(": ")) from error
+
+
+@contextmanager
+def needing(extra: str, words: str) -> Iterator[None]:
+    """Raise a ConfigError with the commands that install an extra if an import fails."""
+    try:
+        yield
+    except ImportError as error:
+        raise ConfigError(f"{words}: {how_to_install(extra)} ({error})") from error
 
 
 def how_to_install(extra: str) -> str:
@@ -80,6 +100,14 @@ def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:
     near = get_close_matches(name, options, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     return ConfigError(f"unknown {what} {name!r}; valid: {', '.join(options) or 'none'}.{hint}")
+
+
+def require_known(what: str, names: str | Iterable[Any], valid: Iterable[str]) -> None:
+    """Raise the error of :func:`unknown_name` for a name, or the first of several, if unknown."""
+    valid = list(valid)
+    for name in [names] if isinstance(names, str) else names:
+        if name not in valid:
+            raise unknown_name(what, str(name), valid)
 
 
 def out_of_memory(error: BaseException) -> bool:

@@ -7,21 +7,14 @@ of commit a07c1fcb wrote the runs from the tables of samples.
 
 from __future__ import annotations
 
-import argparse
-import sys
-from collections.abc import Sequence
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lcc_rl.cli.guard import main_guard
 from lcc_rl.figures.drawing import INK, PAGE_WIDTH, legend_above, new_figure, paper
 from lcc_rl.io.files import read_parquet
 
-KEPT = Path("outputs/reference/measured_energy.parquet")
 FUELS = {"Compact": "#0072b2", "midBase": "#d55e00", "midSUV": "#999999"}
 ELECTRIC = "electric"
 SEASONS = {"summer": "#d55e00", "winter": "#0072b2"}
@@ -98,15 +91,5 @@ def lines(table: pd.DataFrame) -> list[str]:
     return found
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Print the agreement, and draw the figure."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kept", type=Path, default=KEPT, help="table of runs")
-    options = parser.parse_args(words)
-    table = read_parquet(options.kept)
-    print(*lines(table), sep="\n")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main_guard(main)())
+    print(*lines(read_parquet("outputs/reference/measured_energy.parquet")), sep="\n")

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
+from lcc_rl.results.render import markdown_row
 from lcc_rl.settings import Settings, defaults
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -86,11 +87,9 @@ def page() -> str:
         )
         summary = (kind.__doc__ or "").partition("\n")[0]
         parts.append(f"## {kind.__module__}.{kind.__name__}\n\n{summary}{also}\n")
-        table = ["| setting | type | default | |", "|---|---|---|---|"]
-        for name, kind_of, value, text in rows:
-            cells = (f"`{name}`", f"`{kind_of}`", f"`{value}`", text)
-            table.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-        parts.append("\n".join(table) + "\n")
+        cells = ((*(f"`{x}`" for x in coded), text) for *coded, text in rows)
+        table = [("setting", "type", "default", ""), ("---",) * 4, *cells]
+        parts.append("\n".join(map(markdown_row, table)) + "\n")
     return "\n".join(parts)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, SupportsFloat
 
 import torch
@@ -14,23 +14,16 @@ from torch import Tensor
 from lcc_rl.errors import Diverged, require
 from lcc_rl.functional.finite import nonfinite_weight, require_finite
 from lcc_rl.pieces.base import ACTION, NEXT, as_key, root_key
+from lcc_rl.results.runs import flatten
 
 
 def check_state(policy: TensorDictModule, state: Mapping[str, Any]) -> None:
     """Check that the state of an agent contains the policy's weights."""
-    held = list(_tensors(state))
+    held = [value for _, value in flatten(state) if isinstance(value, Tensor)]
     for name, weight in policy.state_dict().items():
         same = any(x.shape == weight.shape and torch.equal(x, weight) for x in held)
         words = "an agent's state_dict lacks the policy's weight"
         require(same, f"{words} {name}; extend super().state_dict() and load_state_dict, too")
-
-
-def _tensors(state: Any) -> Iterator[Tensor]:
-    if isinstance(state, Mapping):
-        for value in state.values():
-            yield from _tensors(value)
-    elif isinstance(state, Tensor):
-        yield state
 
 
 def check_learner(

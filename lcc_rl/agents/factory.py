@@ -15,7 +15,7 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import after_humans, world_of
-from lcc_rl.errors import ConfigError, require
+from lcc_rl.errors import require
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import Observation
 from lcc_rl.pieces.controllers import Population
@@ -32,8 +32,7 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
     Raises:
         ConfigError: if there is no agent, or naming the option at fault.
     """
-    if not learns(cfg):
-        raise ConfigError(f"variant {cfg.variant} has no agent")
+    require(learns(cfg), f"variant {cfg.variant} has no agent")
     world = world_of(cfg, population=population)
     observation = cfg.observation.made(Observation).bind(world)
     driver = cfg.scenario.controllers.get(AUTOMATED)

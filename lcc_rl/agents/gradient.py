@@ -49,19 +49,16 @@ class GradientLoop(TrainingLoop[Any]):
             )
 
     def _source(self) -> DifferentiableRollout:
-        compiled = self.agent.compiled
-        if compiled is None:
-            compiled = self.settings.compiled
-        if compiled is None:
-            # Of the whole training, so that resuming changes nothing.
-            compiled = self.iterations >= COMPILED_ITERATIONS
+        # The iterations are those of the whole training, so that resuming changes nothing.
+        long = self.iterations >= COMPILED_ITERATIONS
+        chosen = (self.agent.compiled, self.settings.compiled, long)
         known = set(map(as_key, self.env.full_observation_spec.keys(True, True)))
         return DifferentiableRollout(
             self.env,
             self.agent.policy.module,
             wanted=self.objective.wanted(known),
             observed=[REWARD, *(term.targets[0] for term in self.terms)],
-            compiled=compiled,
+            compiled=next(x for x in chosen if x is not None),
         )
 
     def _limits_row(self, shares: Mapping[str, float]) -> dict[str, float]:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lcc_rl.config.words import RECORDED
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 
 log = logging.getLogger("lcc_rl")
 LEAST = 1e-3  # smaller limits count as this share
@@ -42,8 +42,7 @@ class Limits:
     ) -> None:
         given = {name: share for name, share in largest.items() if share is not None}
         for name in given:
-            if name not in known:
-                raise ConfigError(f"agent.limits.{name}: there is no agent.surrogates.{name}")
+            require(name in known, f"agent.limits.{name}: there is no agent.surrogates.{name}")
             if not hasattr(known[name], "missed"):
                 kind = type(known[name]).__name__
                 raise ConfigError(f"agent.limits.{name}: {kind} has no limit to keep")

@@ -8,16 +8,15 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from lcc_rl.agents.actor import Activation, make_actor, seeded_mlp
 from lcc_rl.agents.agent import Agent, Fraction, Scene, Schedule, anneal, derived_seed
 from lcc_rl.agents.collecting import CollectingLoop, transitions
-from lcc_rl.agents.sac import SampledAction
+from lcc_rl.agents.sac import SampledAction, tanh_gaussian
 from lcc_rl.pieces.base import REWARD
 from lcc_rl.settings import Count, NonNegative, Positive, Share
 
@@ -77,12 +76,7 @@ class PPO(Agent):
         self.policy = make_actor(size, 1, self.hidden, scene.seed, kind).to(device)
         self.head = head = Gaussian(self.policy.module[0], self.sigma).to(device)
         self.noise = SampledAction(head)
-        self.actor = ProbabilisticActor(
-            TensorDictModule(head, in_keys=["observation"], out_keys=["loc", "scale"]),
-            in_keys=["loc", "scale"],
-            distribution_class=TanhNormal,
-            return_log_prob=True,
-        )
+        self.actor = tanh_gaussian(head)
         value = ValueOperator(seeded_mlp(size, 1, self.hidden, scene.seed + 1, kind)).to(device)
         self.advantage = GAE(gamma=self.gamma, lmbda=self.td_lambda, value_network=value)
         self.loss = ClipPPOLoss(

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from lcc_rl.agents.actor import Activation, make_actor, seeded_mlp
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import ConfigError, require, require_known, unknown_name
 from lcc_rl.pieces.cruise import IDMACC, Cruise, LinearACC
 from lcc_rl.pieces.observation import Observation
 
@@ -43,9 +43,7 @@ class Rule(nn.Module):
     ) -> None:
         super().__init__()
         start, given = kind.constants_of_rule(), dict(constants or {})
-        for name in given:
-            if name not in start:
-                raise unknown_name("constant of the rule", name, start)
+        require_known("constant of the rule", given, start)
         values = {**start, **given}
         self.law, self.names = kind.law, tuple(values)
         self.logarithms = nn.Parameter(torch.tensor([math.log(x) for x in values.values()]))
@@ -125,8 +123,7 @@ def make_policy(
     """
     size = observation.event_shape[-1]
     if kind == NETWORK_ALONE:
-        if constants:
-            raise ConfigError("agent.constants belong to a rule: use agent.policy=idm or acc")
+        require(not constants, "agent.constants belong to a rule: use agent.policy=idm or acc")
         return make_actor(size, 1, hidden, seed, activation)
     name = kind.removeprefix(RESIDUAL)
     if name not in RULE_KINDS:

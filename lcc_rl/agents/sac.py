@@ -68,6 +68,16 @@ class SampledAction(TensorDictModuleBase):
         return tensordict.set(ACTION, (mean + self.sigma * spread * noise).tanh().clamp(-ONE, ONE))
 
 
+def tanh_gaussian(head: nn.Module) -> ProbabilisticActor:
+    """Return TorchRL's actor of a Gaussian before the tanh; the head returns mean and deviation."""
+    return ProbabilisticActor(
+        TensorDictModule(head, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
+
+
 class Sample(NamedTuple):
     """Actions drawn by :meth:`SAC._sample`; every entry ``[batch, 1]``."""
 
@@ -99,14 +109,8 @@ class SAC(OffPolicy):
         spread = seeded_mlp(size, 1, self.hidden[-1:], seed + 2, self.activation).to(device)
         head = Head(self.policy.module[0], spread)
         self.noise = SampledAction(head)
-        actor = ProbabilisticActor(
-            TensorDictModule(head, in_keys=["observation"], out_keys=["loc", "scale"]),
-            in_keys=["loc", "scale"],
-            distribution_class=TanhNormal,
-            return_log_prob=True,
-        )
         loss = SACLoss(
-            actor,
+            tanh_gaussian(head),
             self.values,
             alpha_init=self.alpha_init,
             target_entropy=-1.0 if self.target_entropy is None else self.target_entropy,

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from lcc_rl.cli.guard import main_guard
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.overview import EVERY, counts, left, live, overview_line, progress, states_table
 from lcc_rl.runs.states import clean, survey
@@ -45,8 +45,7 @@ def watch_folder(root: Path, console: Console) -> None:
 
 def look(folder: str, console: Console, watching: bool) -> None:
     """Show a folder once or continuously."""
-    if not folder:
-        raise ConfigError("the name of the folder is empty; use, e.g., outputs")
+    require(folder, "the name of the folder is empty; use, e.g., outputs")
     if watching and console.is_terminal:
         watch_folder(Path(folder), console)
     else:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from lcc_rl.errors import ConfigError, ResultsError, unknown_name
+from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
 from lcc_rl.figures.animation import ANIMATION_FORMATS, animate, check_ending
 from lcc_rl.figures.drawing import in_file
 from lcc_rl.io.atomic import new_file
@@ -60,8 +60,7 @@ def run(
     if out is not None:
         check_ending(new_file(out, "--out"), len(strategies))
     steps = read_parquet(folder / STEPS)
-    if steps.empty:
-        raise ConfigError(f"{folder}: holds no sample episode; evaluate with {SAMPLES_KEPT}")
+    require(not steps.empty, f"{folder}: holds no sample episode; evaluate with {SAMPLES_KEPT}")
     motions = {}
     with naming_run(folder):
         known = list(dict.fromkeys(map(str, steps["strategy"])))

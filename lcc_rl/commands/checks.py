@@ -20,7 +20,7 @@ from lcc_rl.envs.inputs import (
     constant_profiles,
 )
 from lcc_rl.envs.rollout import OBSERVATION
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.episodes import any_leader, plan_of
 from lcc_rl.evaluation.named import DIRECT, controller_of
 from lcc_rl.evaluation.strategies import Strategy, applies, deployed
@@ -167,5 +167,4 @@ def check_measured(cfg: StudyConfig) -> None:
     """Check that the scenario has the pieces that an evaluation needs."""
     needed = MEASURED[cfg.evaluation.rows]
     lacking = [name for name in needed if cfg.scenario.pieces.get(name) is None]
-    if lacking:
-        raise ConfigError(f"scenario.pieces lacks {lacking}, which the evaluation measures")
+    require(not lacking, f"scenario.pieces lacks {lacking}, which the evaluation measures")

@@ -19,7 +19,6 @@ import logging
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -71,20 +70,17 @@ def plan(options: Namespace, cfg: EvaluateConfig, inputs: Inputs, folder: Path) 
     work = len(parts) * len(learned) * (1 + options.regard) * options.iterations
     made, done = [], count(1)
     with ProgressReporter("clairvoyant", work, folder=folder) as progress:
+
+        def update(_: int, values: dict[str, float]) -> None:
+            progress.update(next(done), values)
+
         for first, block in parts:
-            update = partial(_update, progress, done)
             rows = pd.concat(block_rows(cfg, learned, block, options, update))
             rows["profile_id"] += first
             made.append(rows)
     episodes = pd.concat(made, ignore_index=True)
     write_parquet(episodes, folder / EPISODES)
     return episodes
-
-
-def _update(
-    progress: ProgressReporter, done: Iterator[int], _: int, values: dict[str, float]
-) -> None:
-    progress.update(next(done), values)
 
 
 def initial_strategy(cfg: EvaluateConfig, path: str, inputs: Inputs) -> Strategy:

@@ -38,7 +38,7 @@ from lcc_rl.config.nodes import (
 from lcc_rl.config.schemas import AUTO, KINDS, SECTIONS, parse_config
 from lcc_rl.config.unused import check_used
 from lcc_rl.config.words import key_of
-from lcc_rl.errors import ConfigError, how_to_install, unknown_name
+from lcc_rl.errors import ConfigError, how_to_install, require, require_known, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
 from lcc_rl.settings import TARGET, find_target
 
@@ -97,8 +97,7 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
     Raises:
         ConfigError: if an override is unknown, of the wrong type or out of range.
     """
-    if entry not in KINDS:
-        raise unknown_name("command", entry, KINDS)
+    require_known("command", entry, KINDS)
     if isinstance(overrides, str):
         raise ConfigError(f"expected a list of settings, got the text {overrides!r}")
     return parsed(composed(entry, overrides), entry, overrides)
@@ -170,12 +169,6 @@ def choices(group: str) -> list[str]:
 
 
 @cache
-def _groups() -> frozenset[str]:
-    folder = Path(str(files(CONF)))
-    return frozenset(path.parts[len(folder.parts)] for path in folder.glob("*/**/*.yaml"))
-
-
-@cache
 def _top_level() -> frozenset[str]:
     return frozenset(name for kind in KINDS.values() for name in kind.__dataclass_fields__)
 
@@ -190,8 +183,7 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         sweep: allow settings that this run does not use, because the runs of a sweep share them.
     """
     for item in overrides:
-        if item.endswith(f"={MISSING}"):
-            raise ConfigError(f"{item.removeprefix('++')}: expected a value")
+        require(not item.endswith(f"={MISSING}"), f"{item.removeprefix('++')}: expected a value")
     try:
         # Settings may refer to defaults of classes.
         whole = OmegaConf.create(with_defaults(OmegaConf.to_container(cfg, resolve=False)))
@@ -310,7 +302,9 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
 def _unknown_option(name: str) -> ConfigError:
     """Return the error for an unknown option, with its section if there is one."""
     places = {key: at for at, kind in SECTIONS.items() for key in settings_of(kind) or ()}
-    root, known = name.partition(".")[0], _top_level() | _groups()
+    folder = Path(str(files(CONF)))
+    groups = {path.parts[len(folder.parts)] for path in folder.glob("*/**/*.yaml")}
+    root, known = name.partition(".")[0], _top_level() | groups
     if root in places:
         return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")
     if root in known:

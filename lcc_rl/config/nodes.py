@@ -7,7 +7,7 @@ A stored node is a mapping with the class under ``_target_``.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Self
@@ -181,12 +181,17 @@ def as_nodes(value: Any, where: str = "") -> Any:
         value: a setting as plain containers, or with nodes in them.
         where: its place in the configuration.
     """
+    return _mapped(value, where, lambda found, at: Node(found, at) if TARGET in found else found)
+
+
+def _mapped(value: Any, where: str, change: Callable[[dict[str, Any], str], Any]) -> Any:
+    """Change every mapping, the inner ones first, by itself and its place."""
     if isinstance(value, list):
-        return [as_nodes(item, f"{where}[{place}]") for place, item in enumerate(value)]
+        return [_mapped(item, f"{where}[{place}]", change) for place, item in enumerate(value)]
     if not isinstance(value, Mapping):
         return value
-    found = {key: as_nodes(x, f"{where}.{key}".removeprefix(".")) for key, x in value.items()}
-    return Node(found, where) if TARGET in found else found
+    places = {key: f"{where}.{key}".removeprefix(".") for key in value}
+    return change({key: _mapped(x, places[key], change) for key, x in value.items()}, where)
 
 
 def without_defaults(value: Any) -> Any:
@@ -253,13 +258,10 @@ def with_defaults(value: Any, where: str = "") -> Any:
         value: a setting as plain containers; references to other settings may be unresolved.
         where: its place in the configuration, for messages.
     """
-    if isinstance(value, list):
-        return [with_defaults(item, f"{where}[{place}]") for place, item in enumerate(value)]
-    if not isinstance(value, Mapping):
-        return value
-    found = {
-        key: with_defaults(item, f"{where}.{key}".removeprefix(".")) for key, item in value.items()
-    }
+    return _mapped(value, where, _completed)
+
+
+def _completed(found: dict[str, Any], where: str) -> dict[str, Any]:
     kind: Any = find_target(str(found[TARGET]), where) if TARGET in found else None
     for key in found if kind is not None else ():
         if str(key).startswith("_") and key != TARGET:

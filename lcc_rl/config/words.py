@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 
 YAML = (".yaml", ".yml")  # endings of files of controllers
 DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")  # a class or function: my_pieces.PID
@@ -43,7 +43,5 @@ def check_overrides(words: Sequence[str], given: Collection[str], reason: str) -
     if any(word.startswith("-") or ("=" not in word and word[:1] != "~") for word in words):
         raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")
     for word in words:
-        if top_key(word) in given:
-            raise ConfigError(f"{word}: {reason}")
-        if top_key(word) == "hydra":
-            raise ConfigError(f"{word} has no effect: this command chooses the folders")
+        require(top_key(word) not in given, f"{word}: {reason}")
+        require(top_key(word) != "hydra", f"{word} has no effect: this command chooses the folders")

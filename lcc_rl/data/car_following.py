@@ -242,9 +242,6 @@ def _criteria(
     """Yield the name of each criterion and the candidates that pass it, in order."""
     lengths = np.diff(np.append(starts, len(follower)))
 
-    def both(holds: Mask) -> Mask:
-        return always(holds[follower] & holds[leader])
-
     def always(holds: Mask) -> Mask:
         return np.logical_and.reduceat(holds, starts)
 
@@ -259,7 +256,8 @@ def _criteria(
     if longest is not None:
         yield f"max_duration_s: {longest:g}", duration < longest + FRAME / 2
     if criteria.passenger_cars_only and samples["vehicle_class"].any():
-        yield "passenger_cars_only", both(samples["vehicle_class"] == PASSENGER_CAR)
+        cars = samples["vehicle_class"] == PASSENGER_CAR
+        yield "passenger_cars_only", always(cars[follower] & cars[leader])
     elif criteria.passenger_cars_only:
         report.notes.append(
             "passenger_cars_only: no vehicle has a class (v_Class is all zero or blank), so "

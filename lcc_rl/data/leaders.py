@@ -30,7 +30,7 @@ from lcc_rl.data.sources import find_files
 from lcc_rl.data.speed_records import DRIVE_COLUMNS, DRIVE_FIELDS, read_drives, read_speed_record
 from lcc_rl.data.tables import check_map
 from lcc_rl.data.trajectories import FRAME
-from lcc_rl.errors import ConfigError, DataError, require_positive, unknown_name
+from lcc_rl.errors import ConfigError, DataError, raised_as, require_known, require_positive
 from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, parse
 
 LISTED = 8  # most names in a line
@@ -277,10 +277,8 @@ class DriveLeaders(Settings):
             raise ConfigError("leader.tuning=true leaves nothing to tune on: evaluation_share is 1")
         if self.together and self.columns["drive"] is None:
             raise ConfigError("leader.together divides drives by name; the table holds one record")
-        try:
+        with raised_as(ConfigError, f"leader.together={self.together}", re.error):
             re.compile(self.together or "")
-        except re.error as error:
-            raise ConfigError(f"leader.together={self.together}: {error}") from error
 
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
         """Read all records; see :meth:`RecordLeaders.load`."""
@@ -410,9 +408,8 @@ class Mixture:
                     f"leader.{name} must be a source of leaders, got {source!r}; "
                     f"use +leader@leader.{name}=…"
                 )
+        require_known("source in leader.weights", weights or (), sources)
         for name, weight in (weights or {}).items():
-            if name not in sources:
-                raise unknown_name("source in leader.weights", str(name), sources)
             require_positive(f"leader.weights.{name}", weight)
         self.sources, self.weights = sources, dict(weights or {})
 
@@ -420,10 +417,8 @@ class Mixture:
         """Read all records; see :meth:`RecordLeaders.load`."""
         found: dict[str, Leaders] = {}
         for name, source in self.sources.items():
-            try:
+            with raised_as(DataError, f"leader.{name}", DataError):
                 found[name] = source.load(time_step, horizon, followers)
-            except DataError as error:
-                raise DataError(f"leader.{name}: {error}") from error
         # A source for evaluation only has no training records.
         learned = {name: one for name, one in found.items() if len(one.training)}
         parts = [one.training.at_least(horizon) for one in learned.values()]

@@ -295,11 +295,8 @@ def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> Non
         lengths = lengths[lengths > 0]
         headways = part.loc[part["space_headway_m"] > 0, "space_headway_m"]
         if len(lengths):
-            what, found, (low, high) = (
-                "the median length of vehicles",
-                float(lengths.median()),
-                CAR_LENGTH,
-            )
+            what, found = "the median length of vehicles", float(lengths.median())
+            low, high = CAR_LENGTH
         elif len(headways):
             what, found = "the least headway (1 % quantile)", float(headways.quantile(0.01))
             low, high = JAM, float("inf")

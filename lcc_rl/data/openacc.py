@@ -80,9 +80,11 @@ def _cars(table: TableFile, driver: str | None, report: ReadReport) -> pd.DataFr
         report.notes.append(f"{table.path}: {unknown:,} samples with a blank gap follow no vehicle")
     if driver is not None:
         none = np.full(rows, "")
-        drivers = np.concatenate([read.get(f"Driver{n}", none) for n in numbers])
-        cars["gap"], note = _driven_by(driver, cars.gap, drivers)
-        report.notes.append(f"{table.path}: {note}")
+        drivers = np.concatenate([read.get(f"Driver{n}", none) for n in numbers]).astype(str)
+        other = cars.gap.notna() & (np.char.lower(drivers) != driver)
+        cars["gap"] = cars.gap.mask(other)
+        note = f"{int(cars.gap.notna().sum()):,} samples of followers driven by {driver}"
+        report.notes.append(f"{table.path}: {note}, {int(other.sum()):,} of others")
     cars["leader"] = (cars.vehicle - 1).where(cars.gap.notna(), 0)
     return cars[seen]
 
@@ -102,14 +104,6 @@ def _columns(table: TableFile) -> tuple[list[int], list[int], list[Column]]:
         *(Column(f"Driver{n}", "text", blank=True) for n in numbers),
     ]
     return numbers, followers, [x for x in columns if x.key == "Time" or x.key in table.header]
-
-
-def _driven_by(driver: str, gap: pd.Series, drivers: NDArray) -> tuple[pd.Series, str]:
-    """Return the gaps of samples with a kind of driver, and a line on both kinds."""
-    other = gap.notna() & (np.char.lower(drivers.astype(str)) != driver)
-    own = gap.mask(other)
-    words = f"{int(own.notna().sum()):,} samples of followers driven by {driver}"
-    return own, f"{words}, {int(other.sum()):,} of others"
 
 
 def _marked(table: TableFile, followers: Iterable[int], read: Mapping[str, NDArray]) -> str:

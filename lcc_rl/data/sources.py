@@ -28,7 +28,7 @@ from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.smoothing import averaged
 from lcc_rl.data.tables import SI, Column, Names, Units, check_map
 from lcc_rl.data.trajectories import Trajectories
-from lcc_rl.errors import DataError
+from lcc_rl.errors import DataError, raised_as
 from lcc_rl.settings import Settings
 
 ASSETS = Path(lcc_rl.assets.__file__).parent
@@ -106,10 +106,8 @@ class TrajectorySource(Source):
             DataError: naming the files, if there is no episode, or too many are implausible.
         """
         report, source = trajectories.report, trajectories.report.source
-        try:
+        with raised_as(DataError, source, DataError):
             episodes, extraction = extract(trajectories, self.criteria or Criteria(), place)
-        except DataError as error:
-            raise DataError(f"{source}: {error}") from error
         lines = [*report.lines(), *extraction.lines()]
         if not trajectories.samples["position_m"].to_numpy().any():
             derive_positions(episodes)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from itertools import chain
@@ -33,7 +33,7 @@ from lcc_rl.data.text import (
     unended,
 )
 from lcc_rl.data.trajectories import FOOT
-from lcc_rl.errors import ConfigError, DataError, unknown_name
+from lcc_rl.errors import ConfigError, DataError, raised_as, require_known, unknown_name
 
 PARQUET = (".parquet", ".pq")
 LARGEST_CELL = 1e12  # in SI: beyond any time or position, and within every type
@@ -113,16 +113,14 @@ def check_map(columns: Iterable[Column], names: Names, units: Units, at: str) ->
     """
     known = {column.key: column for column in columns}
     measured = {key: UNITS[c.quantity] for key, c in known.items() if c.quantity in UNITS}
+    require_known(f"key of {at}.columns", names, known)
+    require_known(f"key of {at}.units", units, measured)
     for key, name in names.items():
-        if key not in known:
-            raise unknown_name(f"key of {at}.columns", str(key), known)
         if not (isinstance(name, str) or (name is None and not known[key].required)):
             raise ConfigError(f"{at}.columns.{key} must name a column, got {name!r}")
         if name is not None and [*names.values()].count(name) > 1:
             raise ConfigError(f"{at}.columns names the column {name!r} twice")
     for key, unit in units.items():
-        if key not in measured:
-            raise unknown_name(f"key of {at}.units", str(key), measured)
         more = {"frames/<rate>": 1.0} if known[key].quantity == "time" else {}
         if unit_size(known[key].quantity, str(unit)) is None:
             raise unknown_name(f"unit in {at}.units.{key}:", str(unit), {**measured[key], **more})
@@ -178,7 +176,7 @@ class TableFile:
             raise DataError(f"{self.path}: no such file; expected a table, .csv or .parquet")
         self.parquet = self.path.suffix in PARQUET
         if self.parquet:
-            with _readable(self.path):
+            with raised_as(DataError, f"{self.path}: not a readable table", Exception):
                 self.header = [*pq.read_schema(self.path).names]
         else:
             self._open_text(spelled, bare)
@@ -265,7 +263,10 @@ class TableFile:
             if self.header.count(name) > 1:
                 raise DataError(f"{self.path}: has column {name!r} twice; expected it once")
         if self.parquet:
-            yield Block(self, self._parquet(names))
+            with raised_as(DataError, f"{self.path}: not a readable table", Exception):
+                whole = pq.read_table(self.path, columns=[*names])
+                whole.validate(full=True)  # else damaged text would fail only when used
+            yield Block(self, whole)
             return
         places, row = {str(self.header.index(name)): name for name in names}, 0
         for lines in self.lines:
@@ -285,12 +286,6 @@ class TableFile:
         """Return the error about a cell."""
         name = self.names.get(key, key)
         return DataError(f"{self.path}: data row {row + 1}, column {name!r} {words}")
-
-    def _parquet(self, names: Sequence[str]) -> pa.Table:
-        with _readable(self.path):
-            table = pq.read_table(self.path, columns=[*names])
-            table.validate(full=True)  # else damaged text would fail only when used
-        return table
 
     def _open_text(self, spelled: Callable[[str], str], bare: Sequence[str]) -> None:
         chunks = line_chunks(self.path, self.notes)
@@ -469,12 +464,3 @@ def whole_numbers(texts: NDArray) -> NDArray[np.int64] | None:
     if not (np.abs(values) < LARGEST_ID).all() or (values != np.rint(values)).any():
         return None
     return values.astype(np.int64)
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Convert the errors of a damaged parquet file, which are of many kinds, to a DataError."""
-    try:
-        yield
-    except Exception as error:
-        raise DataError(f"{path}: not a readable table: {error}") from error

@@ -28,7 +28,7 @@ from lcc_rl.drivers.parameters import (
     fitted,
 )
 from lcc_rl.drivers.twins import HELD, accelerate, compare_twins, measure_recorded
-from lcc_rl.errors import Concern, ConfigError, DataError, unknown_name
+from lcc_rl.errors import Concern, ConfigError, DataError, require_known
 from lcc_rl.functional.driver_models import (
     INDIVIDUAL,
     PARAMETERS,
@@ -117,14 +117,10 @@ class Calibrator(Settings):
             raise ConfigError("perception chooses a part of the reaction: set reaction=true, too")
         law = find_law(self.model)
         given = {name: x for name, x in self.constants.items() if x is not None}
-        for name in given:
-            if name not in law.shared():
-                raise unknown_name(f"constant of model {self.model}", name, law.shared())
+        require_known(f"constant of model {self.model}", given, law.shared())
         self.shared: DriverConstants = law(**given)
         table = {**PARAMETERS, **law.own}
-        for name in self.bounds:
-            if name not in table:
-                raise unknown_name("parameter", name, table)
+        require_known("parameter", self.bounds, table)
         self.bounds = {**{name: one.bounds for name, one in table.items()}, **self.bounds}
         for name, (lower, upper) in self.bounds.items():
             low, high = table[name].plausible
@@ -246,11 +242,8 @@ class _Fit:
 
         Candidates have the shape ``[1, candidates, constants]``.
         """
-        drivers, shared, start = (
-            self.observed.count,
-            self.settings.shared.shared(),
-            self.settings.shared,
-        )
+        drivers, start = self.observed.count, self.settings.shared
+        shared = start.shared()
 
         def mean_error(candidates: Tensor) -> Tensor:
             count = candidates.shape[1]
@@ -342,29 +335,27 @@ def _findings(
             both = f"RMSPE {100.0 * speed:.2f} %, gap RMSE {gap:.2f} m, {100.0 * share:.1f} %"
             lines.append(f"{part}: {both} of the gap (means)")
     speed, share = drivers["rmspe"].mean(), drivers["gap_nrmse"].mean()
+    concerns = []
     if objective == SPEED_RMSPE and share > max(GAPS_OFF, 3.0 * speed):
-        line = (
+        concerns.append(
             f"gaps are off by {100.0 * share:.0f} %, speeds by {100.0 * speed:.1f} %: "
             "calibration.objective=both fits gaps, too"
         )
-        lines.append(Concern(line))
     for name in names:
         bound = drivers[f"{name}_at_bound"]
         if bound.any():
             low, high = limits[name]
             upper = drivers[table[name].column] > (low + high) / 2
             shares = [100 * (bound & side).mean() for side in (~upper, upper)]
-            line = (
+            concerns.append(
                 f"{100 * bound.mean():.0f} % of the values of {table[name].column} lie on a bound: "
                 f"{shares[0]:.0f} % on {low:g}, {shares[1]:.0f} % on {high:g} "
                 f"(calibration.bounds.{name}){CONGESTED if name == 'desired_speed' else ''}"
             )
-            lines.append(Concern(line))
     off = 100.0 * drivers["gap_nrmse"].median()
     if off > 100.0 * IMPLAUSIBLE:
-        line = (
+        concerns.append(
             f"IMPLAUSIBLE FIT: the gap of the median driver is off by {off:.0f} %; are speeds in "
             "km/h or ft/s, or gaps and positions in feet, in columns of m/s and m (data.units)?"
         )
-        lines.append(Concern(line))
-    return lines
+    return [*lines, *map(Concern, concerns)]

@@ -46,14 +46,10 @@ class Evolution:
     Args:
         best: fittest individual of every problem, ``[problems, dims]``, in the bounds' units.
         fitness: its objective, ``[problems]``; infinite if no individual was valid.
-        generations: number of generations.
-        evaluations: objective evaluations per problem.
     """
 
     best: Tensor
     fitness: Tensor
-    generations: int
-    evaluations: int
 
 
 def minimise(
@@ -102,7 +98,7 @@ def _evolve(
     genes = _latin_hypercube(random, settings.founders * settings.population)
     genes = genes.expand(problems, -1, -1).contiguous()
     genes, fitness = _fittest(genes, evaluate(genes), settings.population)
-    best, stale, generation = fitness[:, 0], 0, 0
+    best, stale = fitness[:, 0], 0
     for generation in range(1, settings.generations + 1):
         children = _children(genes, fitness, random, settings, generation)
         genes, fitness = _survivors(genes, fitness, children, evaluate(children), settings)
@@ -112,8 +108,7 @@ def _evolve(
             progress(generation, settings.generations, f"mean best {best.mean().item():.5g}")
         if stale >= settings.patience:
             break
-    evaluations = settings.population * (settings.founders + generation)
-    return Evolution(genes[:, 0], fitness[:, 0], generation, evaluations)
+    return Evolution(genes[:, 0], fitness[:, 0])
 
 
 class _Random:

@@ -67,11 +67,6 @@ class Observed:
         """Number of episodes."""
         return len(self.samples)
 
-    @property
-    def gap(self) -> Tensor:
-        """Initial gap, ``[episodes]`` [m]."""
-        return self.gaps[0]
-
     def split(self, share: float) -> tuple[Observed, Observed]:
         """Cut off the end of every episode; the sample at the cut belongs to both parts.
 

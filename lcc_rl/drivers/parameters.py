@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcc_rl.config.nodes import find_target
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import ConfigError, require_known
 from lcc_rl.functional.driver_models import PARAMETERS, DriverConstants, Parameter
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.settings import Number
@@ -45,8 +45,7 @@ def find_law(name: str) -> type[DriverConstants]:
         if not (isinstance(found, type) and issubclass(found, DriverConstants)):
             raise ConfigError(f"model: expected a class derived from DriverConstants, got {name!r}")
         LAWS[name] = found
-    if name not in LAWS:
-        raise unknown_name("model of drivers", name, LAWS)
+    require_known("model of drivers", name, LAWS)
     return LAWS[name]
 
 

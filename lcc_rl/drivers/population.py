@@ -21,7 +21,7 @@ from lcc_rl.drivers.parameters import (
     users,
 )
 from lcc_rl.drivers.tables import PAIR_IDENTITY, check_drivers, load_drivers, models_of, reaction_of
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.driver_models import INDIVIDUAL, PARAMETERS, Reaction
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.laws import LAWS
@@ -61,8 +61,7 @@ class DriverPopulation:
     mode: str | None = None
 
     def __post_init__(self) -> None:
-        if not self.ids:
-            raise ConfigError("driver population: holds no drivers")
+        require(self.ids, "driver population: holds no drivers")
         table = parameters_of(self.models or (DEFAULT_MODEL,))
         for name, values in self.parameters().items():
             low, high = table[name].plausible
@@ -101,18 +100,11 @@ class DriverPopulation:
         )
 
     def summary(self) -> dict[str, float]:
-        """Return means, standard deviations (n − 1), correlation of (v0, T), share at a bound."""
-        speed = self.desired_speed.double().cpu().numpy()
-        gap = self.time_gap.double().cpu().numpy()
-        deviations = [float(pd.Series(x).std()) for x in (speed, gap)]  # NaN for one driver
-        spread = min(deviations) > 0.0
+        """Return the correlation of (v0, T), NaN if one does not vary, and the share at a bound."""
+        speed, gap = (x.double().cpu().numpy() for x in (self.desired_speed, self.time_gap))
+        varies = min(np.ptp(speed), np.ptp(gap)) > 0.0
         return {
-            "drivers": float(len(self)),
-            "desired_speed_mean_mps": float(speed.mean()),
-            "desired_speed_std_mps": deviations[0],
-            "time_gap_mean_s": float(gap.mean()),
-            "time_gap_std_s": deviations[1],
-            "correlation": float(np.corrcoef(speed, gap)[0, 1]) if spread else float("nan"),
+            "correlation": float(np.corrcoef(speed, gap)[0, 1]) if varies else float("nan"),
             "share_at_bound": float(self.at_bound.double().mean()),
         }
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from lcc_rl.data.sources import ASSETS
 from lcc_rl.drivers.observed import PAIR_IDENTITY
 from lcc_rl.drivers.parameters import DEFAULT_MODEL, MODEL, REACTION, parameters_of, users
-from lcc_rl.errors import DataError, ResultsError
+from lcc_rl.errors import DataError, ResultsError, raised_as
 from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import read_parquet
@@ -32,14 +32,8 @@ def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.
     Raises:
         DataError: naming file, row and column, if the table is missing, empty or not valid.
     """
-    try:
-        if path is None:
-            with resources.as_file(resources.files("lcc_rl.assets") / SHIPPED_DRIVERS) as file:
-                frame = read_parquet(file)
-        else:
-            frame = read_parquet(path)
-    except ResultsError as error:
-        raise DataError(str(error)) from error
+    with raised_as(DataError, "", ResultsError):
+        frame = read_parquet(ASSETS / SHIPPED_DRIVERS if path is None else path)
     name = SHIPPED_DRIVERS if path is None else str(path)
     check_drivers(frame, name)
     return _of_mode(frame, mode, name)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lcc_rl.energy.base import BURNT, EnergyModel
 from lcc_rl.energy.electric import PaperMotor
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import ConfigError, require, require_known
 from lcc_rl.functional.guard import unchanged
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.settings import Positive, Settings, values
@@ -69,8 +69,7 @@ class Fleet:
         shares: Mapping[str, float] | None = None,
         roles: Mapping[str, Mapping[str, float]] | None = None,
     ) -> None:
-        if not models:
-            raise ConfigError("energy.models is empty: a mixture needs at least one model")
+        require(models, "energy.models is empty: a mixture needs at least one model")
         self.classes = {x: VehicleClass(energy=own, bounded=False) for x, own in models.items()}
         shares = dict.fromkeys(self.names, 1.0) if shares is None else shares
         self.shares = self._checked(shares, "energy.shares")
@@ -80,9 +79,7 @@ class Fleet:
 
     def _checked(self, shares: Mapping[str, float], where: str) -> list[float]:
         """Return the shares of all classes, which add up to one."""
-        for name in shares:
-            if name not in self.names:
-                raise unknown_name(f"class of {where}", name, self.names)
+        require_known(f"class of {where}", shares, self.names)
         total = sum(shares.values())
         if not total > 0.0 or min(shares.values()) < 0.0:
             raise ConfigError(f"{where}: shares must not be negative, and one must be above 0")

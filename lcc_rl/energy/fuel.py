@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.energy.base import EnergyModel, Grade
-from lcc_rl.errors import unknown_name
+from lcc_rl.errors import require_known
 from lcc_rl.settings import Positive
 
 FUEL = "circles_fuel.csv"
@@ -51,8 +51,7 @@ class CirclesFuel(EnergyModel):
     width: Positive = 0.1  # range over which the cut of the fuel is smoothed [m/s²]
 
     def validate(self) -> None:
-        if self.vehicle not in coefficients():
-            raise unknown_name("vehicle (energy.vehicle)", self.vehicle, coefficients())
+        require_known("vehicle (energy.vehicle)", self.vehicle, coefficients())
         self.own = coefficients()[self.vehicle]
         self.heating_value = self.own["gs2kW"] * KILOWATT
         self.truck = self.vehicle in TRUCKS

@@ -130,10 +130,8 @@ class ArrayEpisodes:
             every = torch.zeros(self.count, 1, dtype=torch.int64)
             every[places] = torch.cat(drawn)
             moment = entries_of(self.env.reset(self._given(every, options)))
-            state, seen = (
-                self._packed(moment)[places].numpy(),
-                moment[OBSERVATION[1:]][places].numpy(),
-            )
+            state = self._packed(moment)[places].numpy()
+            seen = moment[OBSERVATION[1:]][places].numpy()
         else:
             state, seen = self.begin(torch.cat(drawn).numpy())
         for place, generator in zip(places, generators, strict=True):

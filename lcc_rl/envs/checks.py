@@ -51,9 +51,7 @@ def _play(
     episodes: Tensor,
 ) -> None:
     """Reset episodes by their seeds, take a step, and compare written entries with the specs."""
-    moment = TensorDict(batch_size=[BATCH])
-    for key, value in tick(episodes, torch.zeros_like(episodes), horizon).items():
-        moment.set(key, value)
+    moment = TensorDict(tick(episodes, torch.zeros_like(episodes), horizon), [BATCH])
     given = TensorDict(batch_size=[BATCH])
     for piece in pieces:
         _attempt(piece, lambda piece=piece: piece._reset(given, moment))

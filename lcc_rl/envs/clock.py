@@ -15,7 +15,7 @@ from torchrl.envs import AsyncEnvPool, EnvBase, TransformedEnv
 
 from lcc_rl.envs.compiled import compile_settings
 from lcc_rl.envs.step import tick
-from lcc_rl.errors import LAST_SEED, ConfigError
+from lcc_rl.errors import LAST_SEED, ConfigError, require
 from lcc_rl.pieces.base import SEED, STEP, Entry, Key, as_key, require_option
 
 
@@ -89,8 +89,7 @@ class Clock(EnvBase):
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        if horizon < 1:
-            raise ConfigError(f"horizon must be at least 1 step, got {horizon}")
+        require(horizon >= 1, f"horizon must be at least 1 step, got {horizon}")
         batch = batch_shape(batch_size)
         super().__init__(device=device, batch_size=batch)
         self.horizon = horizon
@@ -143,10 +142,7 @@ class Clock(EnvBase):
         return self._moment(tensordict.get(SEED), tensordict.get(STEP) + 1)
 
     def _moment(self, seeds: torch.Tensor, step: torch.Tensor) -> TensorDictBase:
-        moment = TensorDict(batch_size=self.batch_size, device=self.device)
-        for key, value in tick(seeds, step, self.horizon).items():
-            moment.set(key, value)
-        return moment
+        return TensorDict(tick(seeds, step, self.horizon), self.batch_size, device=self.device)
 
 
 def option_specs(env: EnvBase) -> dict[Key, Any]:
@@ -228,8 +224,7 @@ class Traffic(TransformedEnv):
             keys &= set(options)
         for key in sorted(keys):
             name, value = ".".join(key), given.get(key)
-            if key not in options:
-                raise ConfigError(f"reset: {name} is no reset option; those that exist: {names}")
+            require(key in options, f"reset: {name} is no reset option; those that exist: {names}")
             spec = options[key]
             wanted = f"reset: {name} must be {list(spec.shape)} {spec.dtype}"
             if not isinstance(value, torch.Tensor):

@@ -79,7 +79,10 @@ class StringCollector(BaseCollector):
         # Pieces on which none of these entries depend are left out.
         self.step = Step(closure(pieces_of(env), wanted), env.base_env.horizon)
         self.first = Step(pieces_of(env), env.base_env.horizon)  # a reset may read more
-        self.carried = self._needed()
+        # What the next step reads or a batch contains.
+        self.carried = read_before(piece for piece, _ in self.step.pieces)
+        self.carried |= {DONE, *map(self._inner, self.reads)}
+        self.carried |= {self._inner(key) for key in self.keys if key[0] != NEXT}
         self.state = {key: value for key, value in state.items() if key in self.carried}
         self.advance = Compiled(self._advance, "the environment", compiled, env.device)
         self.renew = Compiled(self._renewed, "its resets", compiled, env.device)
@@ -103,12 +106,6 @@ class StringCollector(BaseCollector):
         """Return the key of an entry of the pieces in the environment."""
         inner = self.single and key[:1] == ("automated",) and group_key(key[1:]) == key
         return key[1:] if inner else key
-
-    def _needed(self) -> set[Key]:
-        """Return the entries of a state that the next step reads or a batch contains."""
-        read = {DONE, *map(self._inner, self.reads)}
-        read |= {self._inner(key) for key in self.keys if key[0] != NEXT}
-        return read | read_before(piece for piece, _ in self.step.pieces)
 
     def reset(self) -> None:
         """Begin new episodes in all places."""

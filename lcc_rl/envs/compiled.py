@@ -44,6 +44,8 @@ class Compiled:
         device: of its tensors; None: the CPU.
     """
 
+    errors: tuple[type[Exception], ...] = COMPILER_ERRORS  # for which the plain function is used
+
     def __init__(
         self,
         function: Callable[..., Any],
@@ -51,9 +53,12 @@ class Compiled:
         compiled: bool,
         device: torch.device | None = None,
     ) -> None:
-        self.plain, self.what, self.function = function, what, function
-        if compiled:  # one graph for each size: a graph for any size would be slower
-            self.function = compile(function, dynamic=False, **compile_settings(device))
+        self.plain, self.what = function, what
+        self.function = self._made(device) if compiled else function
+
+    def _made(self, device: torch.device | None) -> Callable[..., Any]:
+        # One graph for each size: a graph for any size would be slower.
+        return compile(self.plain, dynamic=False, **compile_settings(device))
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the function."""
@@ -61,13 +66,13 @@ class Compiled:
             return self.plain(*arguments)
         try:
             return self.function(*arguments)
-        except COMPILER_ERRORS as error:
+        except self.errors as error:
             log.info("not compiling %s: %s", self.what, str(error).strip().splitlines()[0])
             self.function = self.plain
             return self.plain(*arguments)
 
 
-class Traced:
+class Traced(Compiled):
     """A function of tensors alone, compiled at its first call for their shapes and strides.
 
     Nothing is checked before later calls, which takes four times as long as a step of 128 episodes:
@@ -79,41 +84,32 @@ class Traced:
         compiled: False for the plain function.
     """
 
-    def __init__(
-        self, function: Callable[..., Sequence[Tensor]], what: str, compiled: bool
-    ) -> None:
-        self.plain, self.what = function, what
-        self.function = self._compiled if compiled else function
+    # Of many kinds; the plain function raises its own anew.
+    errors: tuple[type[Exception], ...] = (Exception,)
 
-    def __call__(self, *tensors: Tensor) -> Sequence[Tensor]:
-        """Call the function."""
-        return self.function(*tensors)
+    def _made(self, device: torch.device | None) -> Callable[..., Any]:
+        return self._first_call
 
-    def _compiled(self, *tensors: Tensor) -> Sequence[Tensor]:
-        try:
-            # Here, since a later torch may lack some.
-            from torch._guards import TracingContext, tracing
-            from torch._subclasses import FakeTensorMode
-            from torch.fx.experimental.proxy_tensor import make_fx
-            from torch.fx.experimental.symbolic_shapes import ShapeEnv
+    def _first_call(self, *tensors: Tensor) -> Sequence[Tensor]:
+        # Here, since a later torch may lack some.
+        from torch._guards import TracingContext, tracing
+        from torch._subclasses import FakeTensorMode
+        from torch.fx.experimental.proxy_tensor import make_fx
+        from torch.fx.experimental.symbolic_shapes import ShapeEnv
 
-            # Graphs traced without symbols of shapes are not kept for later processes.
-            context = TracingContext(FakeTensorMode(shape_env=ShapeEnv()))
-            with torch.no_grad(), tracing(context):
-                with TensorsOnly():
-                    graph = make_fx(self.plain)(*tensors)
-                for node in graph.graph.nodes:  # other strides than in this trace may need a copy
-                    if node.target is torch.ops.aten.view.default:
-                        node.target = torch.ops.aten.reshape.default
-                graph.recompile()
-                self.function = torch._inductor.compile(
-                    graph, list(tensors), options(tensors[0].device)
-                )
-            return self.function(*tensors)
-        except Exception as error:  # of many kinds; the plain function raises its own anew
-            log.info("not compiling %s: %s", self.what, str(error).strip().splitlines()[0])
-            self.function = self.plain
-        return self.plain(*tensors)
+        # Graphs traced without symbols of shapes are not kept for later processes.
+        context = TracingContext(FakeTensorMode(shape_env=ShapeEnv()))
+        with torch.no_grad(), tracing(context):
+            with TensorsOnly():
+                graph = make_fx(self.plain)(*tensors)
+            for node in graph.graph.nodes:  # other strides than in this trace may need a copy
+                if node.target is torch.ops.aten.view.default:
+                    node.target = torch.ops.aten.reshape.default
+            graph.recompile()
+            made = torch._inductor.compile(graph, list(tensors), options(tensors[0].device))
+        found: Sequence[Tensor] = made(*tensors)
+        self.function, self.errors = made, ()  # errors of later calls are no compiler's
+        return found
 
 
 def _checked(guards: Sequence[Any]) -> list[bool]:

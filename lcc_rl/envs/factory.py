@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any
@@ -21,7 +21,7 @@ from lcc_rl.envs.clock import Clock, Traffic, batch_shape
 from lcc_rl.envs.inputs import build_energy, shared_inputs
 from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import Pieces
-from lcc_rl.errors import ConfigError, require, unknown_name
+from lcc_rl.errors import ConfigError, require, require_known
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.io.memory import require_memory, torch_device
 from lcc_rl.pieces import (
@@ -155,14 +155,8 @@ def _by_role(scenario: ScenarioConfig, group: str) -> list[tuple[str, Node]]:
         ConfigError: if it names a role that has no controller.
     """
     nodes = getattr(scenario, group)
-    _check_roles(nodes, f"scenario.{group}", scenario)
+    require_known(f"role (scenario.{group})", nodes, scenario.controllers)
     return [(role, nodes[role]) for role in scenario.vehicles.names if nodes.get(role) is not None]
-
-
-def _check_roles(roles: Iterable[str], where: str, scenario: ScenarioConfig) -> None:
-    for role in roles:
-        if role not in scenario.controllers:
-            raise unknown_name(f"role ({where})", role, list(scenario.controllers))
 
 
 def _size(pieces: Sequence[Piece], batch_size: Sequence[int] | int) -> int:
@@ -191,8 +185,9 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
     pieces = _leader(scenario, named.pop("leader", None), world)
     drivers = _drivers(scenario, world)
     for name, one in energy.classes.items():
-        _check_roles(one.roles if one.share else (), f"scenario.fleet.{name}.roles", scenario)
-    _check_roles(energy.roles, "energy.roles", scenario)
+        roles = one.roles if one.share else ()
+        require_known(f"role (scenario.fleet.{name}.roles)", roles, scenario.controllers)
+    require_known("role (energy.roles)", energy.roles, scenario.controllers)
     classes = [EnergyClasses().bind(world)] if len(energy.models) > 1 else []
     actuators, sensors = (
         [own.bind(world, role) for role, own in group.items()]

@@ -164,12 +164,10 @@ def path_energy(
     """
     now, then = data.get((VEHICLES, "speed")), data.get(("next", VEHICLES, "speed"))
     if string is not None:
-        views = Views(string, AUTOMATED, ["self.speed", "next.self.speed"])
-        now, then = views(*(data.get(key) for key in views.keys))
+        now, then = Views(string, AUTOMATED, ["self.speed", "next.self.speed"]).of(data)
     kind = data.get(CLASS, None)
     if string is not None and kind is not None:
-        views = Views(string, AUTOMATED, ["self.energy_class"])
-        (kind,) = views(*(data.get(key) for key in views.keys))
+        (kind,) = Views(string, AUTOMATED, ["self.energy_class"]).of(data)
     fleet, motion = as_fleet(energy), (now, (then - now) / time_step)
     if exact:
         stored = fleet.stored_energy(then, kind) - fleet.stored_energy(now, kind)
@@ -222,7 +220,7 @@ class Goal:
 def misses(data: TensorDictBase, string: VehicleString) -> Tensor:
     """Return the price of missed limits in each episode, ``[batch]``; zero if they are kept."""
     views = Views(string, AUTOMATED, [f"next.self.{name}" for name in CONSTRAINED])
-    gap, relative_speed, time_gap, _ = views(*(data.get(key) for key in views.keys))
+    gap, relative_speed, time_gap, _ = views.of(data)
     closing = -relative_speed
     longest = LONG_TIME_GAP / MARGIN * gap / time_gap.clamp(min=1e-3)
     over = torch.stack([MARGIN * UNSAFE_TTC * closing - gap, gap - longest]).clamp(0.0, FAR_GAP)

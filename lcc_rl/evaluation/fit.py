@@ -103,8 +103,7 @@ def check_action(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
 def _check_same(path: str, own: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
     one, other = dict(flatten(own)), dict(flatten(asked))
     changes = [f"{key}={one.get(key)}, got {other.get(key)}" for key in differing(one, other)]
-    if changes:
-        raise ConfigError(f"{path} was trained with {'; '.join(changes)}")
+    require(not changes, f"{path} was trained with {'; '.join(changes)}")
 
 
 def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:

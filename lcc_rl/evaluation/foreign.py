@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torchrl.envs.transforms import CatFrames, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from lcc_rl.errors import ConfigError, one_line, require
+from lcc_rl.errors import ConfigError, raised_as, require
 from lcc_rl.pieces.base import ACTION, OBSERVATION, STEP, StepTransform
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import NEXT
@@ -91,11 +91,9 @@ class GivenPolicy(TensorDictModuleBase):
             ConfigError: with the error in one line.
         """
         width = moment.get(OBSERVATION).shape[-1]
-        try:
+        words = f"{self.name} fails for observations of {width} numbers"
+        with raised_as(ConfigError, words, Exception):  # any error of the user's module
             self(moment)
-        except Exception as error:  # any error of the user's module
-            words = f"{self.name} fails for observations of {width} numbers"
-            raise ConfigError(f"{words}: {one_line(str(error))[:300]}") from error
 
 
 def _anew(head: Transform) -> Transform:

@@ -22,7 +22,7 @@ from lcc_rl.config import NOT_IDENTITY, load
 from lcc_rl.config.nodes import Node, as_plain
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import FILTERED, RECORDED
-from lcc_rl.errors import ConfigError, ResultsError, require
+from lcc_rl.errors import ConfigError, ResultsError, raised_as, require
 from lcc_rl.evaluation.fit import check_action, check_scenario, check_width
 from lcc_rl.evaluation.named import (
     DIRECT,
@@ -296,16 +296,12 @@ def with_weights(
     Raises:
         ResultsError: if the agent cannot be built, or the weights do not fit its network.
     """
-    try:
+    with raised_as(ResultsError, f"{path}: its agent cannot be built", ConfigError):
         agent = build_agent(cfg, population, cfg.device)
-    except ConfigError as error:
-        raise ResultsError(f"{path}: its agent cannot be built: {error}") from error
     check_width(agent.policy, weights, path)
-    try:
+    words = f"{path}: the weights do not fit the policy network"
+    with raised_as(ResultsError, words, RuntimeError):
         agent.policy.load_state_dict(dict(weights))
-    except RuntimeError as error:
-        words = f"the weights do not fit the policy network: {' '.join(str(error).split())}"
-        raise ResultsError(f"{path}: {words}") from error
     return Strategy(cfg.variant, cfg, shared_policy(agent.policy), seed, path)
 
 

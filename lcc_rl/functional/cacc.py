@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require
 from lcc_rl.functional.kinematics import advance_speed
 from lcc_rl.functional.string import gather
 
@@ -127,8 +127,7 @@ class Gains:
             f"kv = k2 + k4 = {kv:g} must be below 2": kv < 2,
         }
         failed = [text for text, holds in conditions.items() if not holds]
-        if failed:
-            raise ConfigError(f"{where}: this CACC is unstable: {'; '.join(failed)}")
+        require(not failed, f"{where}: this CACC is unstable: {'; '.join(failed)}")
 
 
 def cacc_acceleration(

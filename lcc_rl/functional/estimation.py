@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require
 from lcc_rl.functional.idm import IDMConstants, power
 from lcc_rl.functional.layout import join, reverse
 
@@ -163,8 +163,7 @@ class PopulationMean(torch.nn.Module):
 
     def __init__(self, desired_speed: Tensor, time_gap: Tensor, constants: IDMConstants) -> None:
         super().__init__()
-        if len(time_gap) == 0:
-            raise ConfigError("the driver population is empty")
+        require(len(time_gap) > 0, "the driver population is empty")
         ordered = time_gap.double().sort().values
         moments = torch.stack([torch.ones_like(ordered), ordered, ordered**2], dim=-1)
         above = moments.flip(0).cumsum(0).flip(0) / len(ordered)

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 
 AUTOMATED, HUMAN = "automated", "human"
 OPEN, RING = "open", "ring"
@@ -70,8 +70,7 @@ def parse_string(pattern: Any, road: str = OPEN) -> VehicleString:
         >>> parse_string({"size": 10, "penetration": 0.04}).count("automated")
         1
     """
-    if road not in (OPEN, RING):
-        raise ConfigError(f"scenario.road must be {OPEN!r} or {RING!r}, got {road!r}")
+    require(road in (OPEN, RING), f"scenario.road must be {OPEN!r} or {RING!r}, got {road!r}")
     if isinstance(pattern, str):
         return VehicleString(tuple(_Parser(pattern).parse()), ring=road == RING)
     if not isinstance(pattern, Mapping) or set(pattern) != {"size", "penetration"}:

@@ -112,12 +112,8 @@ def brought_up(
         then = found.after(past[..., number : number + 1], ahead_acceleration, time_step)
         passed = number < age
         speed, gap, ahead = (
-            torch.where(passed, new, old)
-            for new, old in (
-                (then.speed, found.speed),
-                (then.gap, found.gap),
-                (then.ahead, found.ahead),
-            )
+            torch.where(passed, getattr(then, name), getattr(found, name))
+            for name in ("speed", "gap", "ahead")
         )
         found = PairState(speed, gap, ahead, measured.acceleration)
     return found

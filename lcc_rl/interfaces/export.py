@@ -20,7 +20,7 @@ import torch
 
 from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
-from lcc_rl.errors import ConfigError, how_to_install, require, unknown_name
+from lcc_rl.errors import ConfigError, needing, require, require_known
 from lcc_rl.evaluation.foreign import network_of
 from lcc_rl.evaluation.named import is_policy, rules
 from lcc_rl.interfaces.exported import described_input, program
@@ -71,8 +71,7 @@ def export(
         >>> export("pretrained/alcc_limits", "alcc.pt2")  # doctest: +SKIP
     """
     path = new_file(path, "name")
-    if path.suffix not in (*EXPORTERS, PAGE):
-        raise unknown_name("ending", path.suffix, [*EXPORTERS, PAGE])
+    require_known("ending", path.suffix, [*EXPORTERS, PAGE])
     cfg, page = None, path.suffix == PAGE
     if not isinstance(policy, (str, PathLike)):
         given = policy
@@ -123,13 +122,9 @@ def _as_pt2(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> bytes
 def _as_onnx(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> bytes:
     exported, about = _program(policy, trust, cfg)
     count = len(exported.graph_signature.user_inputs)
-    try:
+    with needing("interfaces", "write a .pt2, or install what .onnx needs"):
         import onnx
         import onnxscript  # noqa: F401 - torch needs it
-    except ImportError as error:
-        raise ConfigError(
-            f"{error.name} is not installed: {how_to_install('interfaces')}; or write a .pt2"
-        ) from error
     registry = logging.getLogger("torch.onnx._internal.exporter._registration")
     registry.setLevel(logging.ERROR)  # warnings about the missing torchvision
     with warnings.catch_warnings():

@@ -22,7 +22,7 @@ from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.envs.step import pieces_of, read_before
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.strategies import with_weights
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.pieces import Action, CBFFilter, Controller, Observation
@@ -231,8 +231,7 @@ def program(
     leader = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["constant"])
     pieces = pieces_of(build_env(cfg, leader, population))
     found = {kind: [p for p in pieces if isinstance(p, kind)] for kind in (Observation, Action)}
-    if not all(found.values()):
-        raise ConfigError(f"{policy}: no network drives its vehicles; nothing to export")
+    require(all(found.values()), f"{policy}: no network drives its vehicles; nothing to export")
     for name, node in scenario.fleet.items():
         if node is not None and AUTOMATED in node.settings["roles"]:
             raise ConfigError(

@@ -21,7 +21,7 @@ from lcc_rl.envs.arrays import ArrayEpisodes
 from lcc_rl.envs.clock import checked_seed
 from lcc_rl.envs.factory import make_env
 from lcc_rl.envs.rowwise import Array
-from lcc_rl.errors import ConfigError, require, unknown_name
+from lcc_rl.errors import ConfigError, require, require_known
 
 GYM_VARIANTS = ("alcc", "reference", "own_energy")
 TERMS_INFO, MASK_OPTION = "reward_terms", "reset_mask"
@@ -200,8 +200,7 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
             f'use overrides=["scenario.horizon={max_episode_steps}"]',
         )
         given = getattr(autoreset_mode, "value", autoreset_mode)
-        if given not in (names := [mode.value for mode in AutoresetMode]):
-            raise unknown_name("autoreset_mode", str(given), names)
+        require_known("autoreset_mode", [given], [mode.value for mode in AutoresetMode])
         self.mode = AutoresetMode(given)
         self.metadata = {**self.metadata, "autoreset_mode": self.mode}
         self.episodes = _episodes(variant, num_envs, overrides, held_out, render_mode)

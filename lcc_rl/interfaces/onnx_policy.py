@@ -20,7 +20,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError, ResultsError, how_to_install, one_line, require
+from lcc_rl.errors import ResultsError, needing, raised_as, require
 from lcc_rl.pieces.base import Entry, Piece, declared
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, VEHICLES
@@ -83,20 +83,14 @@ class Program:
         self.path = path
         if not Path(path).is_file():
             raise ResultsError(f"{path}: no such file")
-        try:
+        with needing("interfaces", f"{path} needs onnxruntime"):
             import onnxruntime as ort
-        except ImportError as error:
-            raise ConfigError(
-                f"{path} needs onnxruntime: {how_to_install('interfaces')}"
-            ) from error
         options = ort.SessionOptions()
         options.intra_op_num_threads, options.log_severity_level = torch.get_num_threads(), 4
-        try:
-            # From memory, so that a program cannot name other files for its weights.
+        # From memory, so that a program cannot name other files for its weights.
+        with raised_as(ResultsError, path, Exception):  # onnxruntime's have no common class
             content = Path(path).read_bytes()
             self.session = ort.InferenceSession(content, options, ["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime's errors have no common class
-            raise ResultsError(f"{path}: {_line(error)}") from error
         given = self.session.get_modelmeta().custom_metadata_map.get(ABOUT, "{}")
         self.names = tuple(one.name for one in _facts(given, path).inputs)
         self.memory = self._check_shapes()
@@ -130,10 +124,8 @@ class Program:
         """
         named = zip(TAKES, given, strict=False)
         feed = {name: value.detach().cpu().float().numpy() for name, value in named}
-        try:
+        with raised_as(ResultsError, self.path, Exception):
             found = self.session.run(None, feed)
-        except Exception as error:
-            raise ResultsError(f"{self.path}: {_line(error)}") from error
         widths = [1, self.memory][: len(found)]
         for value, width in zip(found, widths, strict=True):
             require(
@@ -145,10 +137,8 @@ class Program:
 
 def _facts(text: str, path: str) -> ProgramFacts:
     """Read the metadata of a program."""
-    try:
+    with raised_as(ResultsError, f"{path}: its metadata {ABOUT} are no JSON", ValueError):
         about = json.loads(text)
-    except ValueError as error:
-        raise ResultsError(f"{path}: its metadata {ABOUT} are no JSON: {_line(error)}") from error
     require(
         about != {},
         f"{path}: it lacks the metadata {ABOUT}, which name its inputs; docs/interfaces.md "
@@ -157,11 +147,6 @@ def _facts(text: str, path: str) -> ProgramFacts:
     require(isinstance(about, dict), f"{path}: its metadata {ABOUT} must be a JSON object")
     own = {key: about[key] for key in ("inputs", "output") if key in about}
     return parse(ProgramFacts, own, f"{path}, metadata {ABOUT}")
-
-
-def _line(error: Exception) -> str:
-    """Return an error of another library as one line of limited length."""
-    return one_line(str(error))[:300]
 
 
 class OnnxPolicy(Controller):

@@ -23,7 +23,7 @@ from lcc_rl.energy.fuel import STANDSTILL, STILL, CirclesFuel
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import build_energy, load_inputs
 from lcc_rl.envs.step import pieces_of
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.functional.random import stream_id
 from lcc_rl.interfaces.driver import Driver
@@ -149,8 +149,7 @@ def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict
     strange += [name for name in seen if name.partition(".")[0] not in VIEWS]
     strange += ["stacked memory"] if any(x.stacked for x in memory) else []
     strange += ["late filter"] if program.safety is not None and program.safety.late else []
-    if strange:
-        raise ConfigError(f"{policy}: the page does not support its {', '.join(strange)}")
+    require(not strange, f"{policy}: the page does not support its {', '.join(strange)}")
     return {
         "layers": [_layer(layer) for layer in layers],
         "columns": columns,

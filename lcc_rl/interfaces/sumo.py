@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 from unittest.mock import patch
 
-from lcc_rl.errors import ConfigError, Diverged, how_to_install
+from lcc_rl.errors import Diverged, needing, require
 from lcc_rl.interfaces.driver import MEASURED, Driver
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.controllers import Population
@@ -30,12 +30,10 @@ def load_sumo() -> Any:
     Raises:
         ConfigError: if it is not installed.
     """
-    try:
-        # Only during the import: otherwise it would replace SUMO's module traci, too.
-        with patch.dict(os.environ, {"LIBSUMO_AS_TRACI": "quiet"}):
-            import libsumo
-    except ImportError as error:
-        raise ConfigError(f"libsumo is not installed: {how_to_install('sumo')}") from error
+    # Only during the import: otherwise it would replace SUMO's module traci, too.
+    quiet = patch.dict(os.environ, {"LIBSUMO_AS_TRACI": "quiet"})
+    with needing("sumo", "libsumo is not installed"), quiet:
+        import libsumo
     return libsumo
 
 
@@ -68,8 +66,7 @@ class Bridge:
         drivers: Population | None = None,
     ) -> None:
         self.sumo = load_sumo()
-        if not self.sumo.isLoaded():
-            raise ConfigError("SUMO runs no simulation: call libsumo.start([…]) first")
+        require(self.sumo.isLoaded(), "SUMO runs no simulation: call libsumo.start([…]) first")
         delta = self.sumo.simulation.getDeltaT()
         self.driver = Driver(driver, delta, trust, safety, seed, drivers)
         names = {vehicles} if isinstance(vehicles, str) else vehicles

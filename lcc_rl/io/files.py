@@ -16,7 +16,7 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 from pyarrow import fs
 
-from lcc_rl.errors import ResultsError, one_line
+from lcc_rl.errors import ResultsError, raised_as
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.version import __version__
 
@@ -24,6 +24,7 @@ SCHEMA_VERSION = "1"
 PROCESSOR = "lcc_rl.processor"  # key in a table's metadata
 # The rows of a table, or, for many rows, a dataset that is read on demand.
 Rows: TypeAlias = pd.DataFrame | ds.Dataset
+NO_FRAME = "damaged, no data frame"
 FEW = 200_000  # most rows that are read at once
 TEXT = pa.dictionary(pa.int32(), pa.string())
 
@@ -95,10 +96,8 @@ def read_parquet(path: str | Path) -> pd.DataFrame:
     """
     schema_of(path)
     table = read_table(path)
-    try:
+    with raised_as(ResultsError, f"{path}: {NO_FRAME}", Exception):  # of pandas' own metadata
         frame: pd.DataFrame = table.to_pandas()
-    except Exception as error:  # pandas' own metadata may be damaged
-        raise _no_frame(path, error) from error
     return frame
 
 
@@ -162,10 +161,8 @@ def schema_of(path: str | Path, needed: Iterable[str] = ()) -> pa.Schema:
     version = _decoded((found.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()))
     if version != SCHEMA_VERSION:
         raise ResultsError(f"{path}: schema version {version[:20]!r}; expected {SCHEMA_VERSION}")
-    try:
+    with raised_as(ResultsError, f"{path}: {NO_FRAME}", ValueError):
         _ = found.pandas_metadata
-    except ValueError as error:
-        raise _no_frame(path, error) from error
     for name in needed:
         if name not in found.names:
             raise ResultsError(f"{path}: not written by a run: it has no column {name}")
@@ -178,10 +175,8 @@ def unified(schema: pa.Schema, other: pa.Schema, path: Path) -> pa.Schema:
     Raises:
         ResultsError: if the type of a column differs; ``path`` is the file of ``other``.
     """
-    try:
+    with raised_as(ResultsError, str(path), pa.ArrowException):
         return pa.unify_schemas([schema, other], promote_options="permissive")
-    except pa.ArrowException as error:
-        raise ResultsError(f"{path}: {one_line(str(error))}") from error
 
 
 def texts_of(schema: pa.Schema) -> list[str]:
@@ -209,16 +204,10 @@ def _constants(columns: Mapping[str, Any]) -> ds.Expression:
 def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:
     """Read a parquet file, or raise a ResultsError of one line."""
     path = Path(path)
-    try:
+    with raised_as(ResultsError, f"{path}: not readable as parquet", pa.ArrowException, OSError):
         if not path.is_file():  # reading a pipe would block
             raise ResultsError(f"{path}: no such file")
         return reader(path)
-    except (pa.ArrowException, OSError) as error:
-        raise ResultsError(f"{path}: not readable as parquet: {one_line(str(error))}") from error
-
-
-def _no_frame(path: str | Path, error: Exception) -> ResultsError:
-    return ResultsError(f"{path}: damaged, no data frame: {one_line(str(error))}")
 
 
 def _decoded(text: bytes) -> str:

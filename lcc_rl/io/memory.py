@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, raised_as
 
 if TYPE_CHECKING:
     import torch
@@ -46,13 +46,10 @@ def torch_device(name: torch.device | str) -> torch.device:
     """Return a device by its name; raise a ConfigError if this machine does not have it."""
     import torch  # here, because reading a table needs no torch
 
-    try:
+    kinds = (RuntimeError, AssertionError, TypeError)  # depends on the build of torch
+    with raised_as(ConfigError, f"device {str(name)!r} is not available", *kinds):
         device = torch.device(name)
         torch.empty(0, device=device)
-    # The type of error depends on the build of torch.
-    except (RuntimeError, AssertionError, TypeError) as error:
-        reason = str(error).strip().partition("\n")[0]
-        raise ConfigError(f"device {str(name)!r} is not available: {reason}") from error
     return device
 
 

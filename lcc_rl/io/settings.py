@@ -8,9 +8,10 @@ from typing import Any
 
 import yaml
 
-from lcc_rl.errors import ResultsError
+from lcc_rl.errors import ResultsError, raised_as
 
 LARGEST_FILE = 2**20  # bytes; a configuration has thousands
+DAMAGED = (ValueError, TypeError, RecursionError)  # errors of parsers of damaged texts
 NESTED = 2000  # most characters that open a nested level, for the C loader
 # The C loader is five times faster than Python's.
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -23,14 +24,12 @@ def read_text(path: Path) -> str:
         ResultsError: if it is missing, no regular file (reading a pipe would block), too large or
             not text.
     """
-    try:
+    with raised_as(ResultsError, f"{path}: cannot be read", OSError, ValueError):
         if not path.is_file():
             raise ResultsError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
         with path.open("rb") as file:
             content = file.read(LARGEST_FILE + 1)
         text = content.decode()
-    except (OSError, ValueError) as error:
-        raise ResultsError(f"{path}: cannot be read: {error}") from error
     if len(content) > LARGEST_FILE:
         raise ResultsError(f"{path}: larger than {LARGEST_FILE} bytes, the limit of such files")
     return text
@@ -44,10 +43,8 @@ def parse_yaml(text: str, where: str) -> dict[str, Any]:
     """
     # The C loader would crash at deep nesting, which settings never have.
     loader = LOADER if sum(map(text.count, "[{-")) < NESTED else yaml.SafeLoader
-    try:
+    with raised_as(ResultsError, f"{where}: damaged", yaml.YAMLError, *DAMAGED):
         content = yaml.load(text, Loader=loader)  # safe: plain values only
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise ResultsError(f"{where}: damaged: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
         raise ResultsError(f"{where}: damaged: expected settings, got {type(content).__name__}")
     return content
@@ -59,7 +56,5 @@ def read_json(path: Path) -> Any:
     Raises:
         ResultsError: if it is missing or damaged.
     """
-    try:
+    with raised_as(ResultsError, f"{path}: damaged", *DAMAGED):
         return json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise ResultsError(f"{path}: damaged: {error}") from error

@@ -252,20 +252,18 @@ class Piece(Part, TensorDictModuleBase, Transform):
         return tensordict
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        # TorchRL's own version requires the out_keys in the specs, where keys under "next" are
-        # missing. TransformedEnv passes a copy; one per piece would be slow.
-        for part, transform in (
-            ("full_observation_spec", self.transform_observation_spec),
-            ("full_reward_spec", self.transform_reward_spec),
-            ("full_done_spec", self.transform_done_spec),
-        ):
-            output_spec[part] = transform(output_spec[part])
-        return output_spec
+        return self._extended(output_spec, "observation", "reward", "done")
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
-        part = "full_state_spec"
-        input_spec[part] = self.transform_state_spec(input_spec[part])
-        return input_spec
+        return self._extended(input_spec, "state")
+
+    def _extended(self, spec: Composite, *parts: str) -> Composite:
+        # TorchRL's own version requires the out_keys in the specs, where keys under "next" are
+        # missing. TransformedEnv passes a copy; one per piece would be slow.
+        for part in parts:
+            whole = f"full_{part}_spec"
+            spec[whole] = getattr(self, f"transform_{part}_spec")(spec[whole])
+        return spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         return add_specs(self, observation_spec)
@@ -296,13 +294,8 @@ class Feature(Piece):
 class AfterStep(Feature):
     """A feature that writes nothing at reset, and what it writes is no observation."""
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return tensordict_reset
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return observation_spec
+    _reset = Transform._reset
+    transform_observation_spec = Transform.transform_observation_spec
 
 
 class StepTransform(Piece):

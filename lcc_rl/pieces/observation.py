@@ -9,7 +9,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces.base import OBSERVATION, Entry, Feature
 from lcc_rl.pieces.views import BEHIND, PRESENT, Views
@@ -97,8 +97,7 @@ class Observation(Feature):
         Raises:
             ConfigError: if it is not observed, or only as a difference.
         """
-        if name not in self.layout:
-            raise ConfigError(f"a rule needs {name}, which observation.scales does not name")
+        require(name in self.layout, f"a rule needs {name}, which observation.scales does not name")
         return self.layout[name]
 
     def columns(self) -> list[list[str]]:

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torchrl.data import Composite
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require
 from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.functional.layout import total
 from lcc_rl.functional.pattern import AUTOMATED
@@ -202,8 +202,7 @@ class TotalReward(AfterStep, RewardPiece):
 
     def setup(self, world: World) -> None:
         """Read the terms."""
-        if not self.terms:
-            raise ConfigError("reward.terms is empty: an environment needs at least one term")
+        require(self.terms, "reward.terms is empty: an environment needs at least one term")
         self.declare(world, [(*TERMS, name) for name in self.terms])
 
     def compute(self, *entries: Tensor) -> Tensor:

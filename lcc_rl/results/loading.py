@@ -19,7 +19,7 @@ from pandas.api.types import is_numeric_dtype
 from pyarrow.dataset import Dataset
 
 from lcc_rl.config import NOT_IDENTITY
-from lcc_rl.errors import ResultsError, require, unknown_name
+from lcc_rl.errors import ResultsError, require, require_known, unknown_name
 from lcc_rl.io.atomic import SUBFOLDERS
 from lcc_rl.io.files import (
     Rows,
@@ -135,8 +135,7 @@ def load(
         ConfigError: if the table or a setting is unknown.
         ResultsError: if no such table below ``root`` can be read.
     """
-    if table not in TABLES:
-        raise unknown_name("table", table, TABLES)
+    require_known("table", table, TABLES)
     root = Path(root)
     damaged = Damaged(root, strict)
     runs, schema = _surveyed(root, table, damaged)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from lcc_rl.errors import unknown_name
+from lcc_rl.errors import require_known
 from lcc_rl.results import bootstrap
 from lcc_rl.results.measures import Measure, Shown
 from lcc_rl.results.report import ALL, Report, shortened
@@ -30,8 +30,7 @@ def case_table(episodes: pd.DataFrame, case: str) -> pd.DataFrame:
     Raises:
         ConfigError: if there is no such case.
     """
-    if case not in set(episodes["case"]):
-        raise unknown_name("case", case, set(episodes["case"]))
+    require_known("case", case, set(episodes["case"]))
     rows = episodes[episodes["case"] == case]
     return pd.DataFrame(
         [_row(str(name), group) for name, group in rows.groupby("strategy", sort=False)]

@@ -12,7 +12,7 @@ import torch
 from pydantic import AfterValidator, Field
 
 from lcc_rl.config.schemas import StudyConfig, as_text
-from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.errors import ConfigError, ResultsError, raised_as
 from lcc_rl.io.settings import parse_yaml
 from lcc_rl.io.tensors import check_like, read_torch, write_torch
 from lcc_rl.results.trust import trusted
@@ -39,10 +39,8 @@ def read_checked(path: str | Path, kind: type[S], what: str) -> S:
     content = read_torch(path)
     if not isinstance(content, dict):
         raise ResultsError(f"{path}: not a {what}: it holds {type(content).__name__}")
-    try:
+    with raised_as(ResultsError, f"{path}: not a {what}", ConfigError):
         return parse(kind, {str(key): value for key, value in content.items()}, "")
-    except ConfigError as error:
-        raise ResultsError(f"{path}: not a {what}: {error}") from error
 
 
 def check_weights(weights: dict[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from lcc_rl.errors import unknown_name
+from lcc_rl.errors import require_known
 from lcc_rl.results.measures import Shown
 from lcc_rl.results.names import heading, in_words
 from lcc_rl.results.report import Report
@@ -222,9 +222,7 @@ def chosen(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
         ConfigError: for an unknown column, naming the nearest.
     """
     known = [str(key) for key in table]
-    for name in names:
-        if name not in known:
-            raise unknown_name("column", name, known)
+    require_known("column", names, known)
     keys = names or known
     kept = [name for key in keys for name in (key, f"{key}_low", f"{key}_high") if name in known]
     return table[list(dict.fromkeys(kept))]

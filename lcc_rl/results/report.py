@@ -11,7 +11,7 @@ import pandas as pd
 
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.energy import Fleet
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import require, require_known
 from lcc_rl.io.files import Rows
 from lcc_rl.results import measures
 from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING
@@ -153,12 +153,10 @@ def summary(
     """
     parts = {str(name): part for name, part in windows.groupby("strategy", sort=False)}
     against = task.against if task else against or baseline_of(parts)
-    if against is not None and against not in parts:
-        raise unknown_name("strategy to compare against", against, parts)
+    require_known("strategy to compare against", () if against is None else against, parts)
     # Without automated vehicles the values of limits are missing.
     for column in task.limits if task and WAYS[0] in windows else ():
-        if column not in windows:
-            raise ConfigError(f"task.limits.{column}: episodes.parquet has no such column")
+        require(column in windows, f"task.limits.{column}: episodes.parquet has no such column")
     column, *per = task.measure.columns if task else (PATH, DISTANCE)
     rows = []
     for name, part in parts.items():

@@ -11,7 +11,7 @@ import pandas as pd
 from pydantic import BeforeValidator
 
 from lcc_rl.config.words import RECORDED
-from lcc_rl.errors import unknown_name
+from lcc_rl.errors import require_known
 from lcc_rl.results import measures
 from lcc_rl.results.measures import Measure
 from lcc_rl.results.names import HUMAN, heading
@@ -46,11 +46,8 @@ class Task(Settings):
     limits: Mapping[str, Bound] = field(default_factory=dict)
 
     def validate(self) -> None:
-        if self.score not in measures.score_measures():
-            raise unknown_name("score (task.score)", self.score, measures.score_measures())
-        for column in self.limits:
-            if column not in measures.limit_measures():
-                raise unknown_name("column of task.limits", column, measures.limit_measures())
+        require_known("score (task.score)", self.score, measures.score_measures())
+        require_known("column of task.limits", self.limits, measures.limit_measures())
 
     def among(self, strategies: Iterable[str]) -> Task:
         """Return the task for an evaluation of these strategies.

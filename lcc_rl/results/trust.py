@@ -10,7 +10,7 @@ from typing import Any
 from lcc_rl.config.nodes import as_nodes, as_plain, nodes_in, settings_at, with_defaults
 from lcc_rl.config.schemas import parse_config
 from lcc_rl.config.words import DOTTED, FILTERED, YAML
-from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.errors import ConfigError, ResultsError, raised_as
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.settings import TARGET, find_target
 
@@ -45,7 +45,7 @@ def trusted(
     content = {key: value for key, value in content.items() if key not in RETIRED}
     if "trust" in content:
         content["trust"] = list(trust)
-    try:
+    with raised_as(ResultsError, f"{where}: not the configuration of a run", ConfigError):
         nodes = as_nodes(with_defaults(content))
         places = [
             f"{node.where}.{name}={node.settings[name]}"
@@ -53,8 +53,6 @@ def trusted(
             for name in node.places
         ]
         return parse_config(as_plain(nodes, places=False)), places
-    except ConfigError as error:
-        raise ResultsError(f"{where}: not the configuration of a run: {error}") from error
 
 
 def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] = ()) -> None:

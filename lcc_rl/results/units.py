@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lcc_rl.energy import Fleet
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import ConfigError, require_known
 
 KJ_PER_WH = 3.6
 MPG = 235.215  # miles per US gallon times litres per 100 km
@@ -36,8 +36,7 @@ def in_unit(kj_per_km: float, unit: str, energy: Fleet) -> float:
 
 def check_unit(unit: str, energy: Fleet) -> None:
     """Check that a unit is known and valid for all vehicles, see :func:`in_unit`."""
-    if unit not in ENERGY_UNITS:
-        raise unknown_name("unit (task.unit)", unit, ENERGY_UNITS)
+    require_known("unit (task.unit)", unit, ENERGY_UNITS)
     if unit in OF_FUEL and not burns_one_fuel(energy):
         raise ConfigError(
             f"task.unit={unit} needs vehicles that all burn one fuel; here they burn several or "

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import yaml
 
 from lcc_rl.config import NOT_IDENTITY, config_hash
-from lcc_rl.errors import ConfigError, how_to_install
+from lcc_rl.errors import needing
 from lcc_rl.results.runs import CONFIG, flatten, read_settings
 from lcc_rl.settings import Settings
 
@@ -63,7 +63,7 @@ class RowLogger(Settings):
         stored = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else {}
         settings = {key: value for key, value in stored.items() if key not in NOT_IDENTITY}
         run_id = config_hash([str(folder.resolve()), settings])
-        try:
+        with needing(self.kind, f"logger={self.kind} is not installed"):
             if self.kind == "tensorboard":
                 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
@@ -80,10 +80,6 @@ class RowLogger(Settings):
             else:
                 address = self.where or f"sqlite:///{folder.resolve() / 'mlflow.db'}"
                 send, close = _of_mlflow(address, self.project, name, run_id, settings)
-        except ImportError as error:
-            raise ConfigError(
-                f"logger={self.kind} is not installed: {how_to_install(self.kind)} ({error})"
-            ) from error
         try:
             yield send
         finally:

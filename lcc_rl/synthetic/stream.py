@@ -28,13 +28,12 @@ from lcc_rl.data.trajectories import (
     find_leaders,
 )
 from lcc_rl.drivers.population import DriverPopulation, bootstrap
-from lcc_rl.errors import ConfigError
-from lcc_rl.settings import Seed, Settings, Share
+from lcc_rl.settings import Increasing, Seed, Settings, Share
 from lcc_rl.synthetic.lane import Stream, drive_platoons
 from lcc_rl.synthetic.stop_and_go import StopAndGo
 
 Duration = Annotated[float, Field(ge=1.0, le=36_000.0)]
-Range = tuple[Duration, Duration]
+Range = Annotated[tuple[Duration, Duration], Increasing]
 FIRST_START = datetime(2005, 1, 1, 12, tzinfo=UTC)
 
 
@@ -59,11 +58,6 @@ class StreamSource(Settings):
     # Criteria of car following; the default is that of real files.
     criteria: Criteria = field(default_factory=Criteria)
     keep: None = None  # no file is written; the setting remains in the hashes of runs
-
-    def validate(self) -> None:
-        low, high = self.duration_s
-        if low > high:
-            raise ConfigError(f"data.duration_s must be a range, got {low:g} to {high:g} s")
 
     def generate(self) -> Stream:
         """Simulate all recordings."""

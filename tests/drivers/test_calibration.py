@@ -254,7 +254,7 @@ def test_unfit_episodes_are_dropped_and_counted(make_episodes):
     whole = observe(episodes, Selection(max_duration_s=None))
     assert not any("fits the first" in line for line in whole.report)
     assert dict(zip(cut.identity["episode"], cut.samples, strict=True)) == {0: 151, 1: 150}
-    assert cut.gap[1] == episodes["gap_m"][at[1][51]]
+    assert cut.gaps[0, 1] == episodes["gap_m"][at[1][51]]
     assert "1 of 6 episodes cut where the gap is below 1 m, the first: recording" in cut.report[0]
 
 

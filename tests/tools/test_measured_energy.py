@@ -31,11 +31,9 @@ def test_levels_are_of_totals_and_correlations_per_km() -> None:
     assert np.isnan(tool.agreement(bench()[:2], "Compact")[1])
 
 
-def test_what_is_kept_is_printed(tmp_path, capsys) -> None:
+def test_lines_name_every_kind() -> None:
     electric = {tool.ELECTRIC: 1.0, f"{tool.ELECTRIC}_bare": 0.9}
     kinds = (bench().assign(kind=kind, **electric) for kind in ("bench", "dynamometer", "battery"))
-    pd.concat(kinds).to_parquet(tmp_path / "kept.parquet")
-    assert tool.main(["--kept", str(tmp_path / "kept.parquet")]) == 0
-    said = capsys.readouterr().out
+    said = "\n".join(tool.lines(pd.concat(kinds)))
     assert "bench, all, Compact: 3 runs, level 0.909, r 1.000" in said
     assert "last over first car, humans: measured 0.980" in said

@@ -66,7 +66,7 @@ def objective(observed: Observed, index: int, compiled: Any = None) -> Objective
         speeds = [speed.tolist() for speed in speeds]
     settings: tuple[Any, ...] = (
         *speeds,
-        float(observed.gap[index]),
+        float(observed.gaps[0, index]),
         observed.time_step,
         tuple(getattr(IDMConstants(), name) for name in KNOWN),
     )

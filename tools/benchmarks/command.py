@@ -33,7 +33,7 @@ from benchmarks.string import string
 from benchmarks.train import train
 from benchmarks.update import update
 from lcc_rl.data.tables import TableFile
-from lcc_rl.errors import how_to_install, unknown_name
+from lcc_rl.errors import how_to_install, require_known
 from lcc_rl.io.atomic import new_file
 from lcc_rl.io.files import processor, read_parquet, write_parquet
 from lcc_rl.runs.arguments import Arguments, typed
@@ -83,9 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.page:
         print(page(pd.concat(map(read_parquet, options.page), ignore_index=True)))
         return 0
-    for name in options.names:
-        if name not in BENCHMARKS:
-            raise unknown_name("benchmark", name, BENCHMARKS)
+    require_known("benchmark", options.names, BENCHMARKS)
     out = new_file(options.out, "--out", lambda path: "benchmark" in TableFile(path).header)
     torch.set_num_threads(options.threads)
     harness.timer = options.clock

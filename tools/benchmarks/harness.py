@@ -15,12 +15,14 @@ import pandas as pd
 import torch
 from rich.table import Table
 
+from lcc_rl.results.render import markdown_row
 from lcc_rl.synthetic.stream import StreamSource
 
 TOLERANCE = 1e-4  # within which two ways to the same result must agree before they are timed
 EXTRA = ("stable_baselines3", "gymnasium")  # alternatives of the extra bench
 TIMERS = {"wall": time.perf_counter, "processor": time.process_time}
 timer = "wall"  # which of them is read
+HEADINGS = ("case", "batch", "median", "smallest … largest", "unit", "ratio", "to")
 Row = dict[str, Any]
 Run = Callable[[], Any]
 Against = Mapping[str, Sequence[str]]  # names of a case's alternatives
@@ -111,13 +113,8 @@ def agree(what: str, one: Any, other: Any, tolerance: float = TOLERANCE) -> None
 
 def stream(quick: bool) -> StreamSource:
     """Return the default data: the synthetic stream, or a little of it."""
-    small: dict[str, Any] = {
-        "recordings": 2,
-        "platoons": 3,
-        "vehicles": 3,
-        "duration_s": (35.0, 45.0),
-    }
-    return StreamSource(**small) if quick else StreamSource()
+    small = StreamSource(recordings=2, platoons=3, vehicles=3, duration_s=(35.0, 45.0))
+    return small if quick else StreamSource()
 
 
 def installed() -> bool:
@@ -133,37 +130,28 @@ def endings(options: Namespace) -> tuple[str, ...]:
 def drawn(name: str, rows: list[Row]) -> Table:
     """Return the rows of one benchmark as a table for the terminal."""
     table = Table(title=name, caption=f"load average {os.getloadavg()[0]:.1f}")
-    for heading in ("case", "batch", "median", "smallest … largest", "unit", "ratio", "to"):
+    for heading in HEADINGS:
         table.add_column(heading, justify="left" if heading in ("case", "unit", "to") else "right")
     for row in rows:
-        value, spread = numbers_of(row)
-        batch, other = row["batch"] or "", row["alternative"]
-        ratio = f"{row['ratio']:.3g}" if other else ""
-        table.add_row(row["case"], str(batch), value, spread, row["unit"], ratio, other or "")
+        table.add_row(*cells_of(row))
     return table
 
 
-def numbers_of(row: Any) -> tuple[str, str]:
-    """Return the median of a row, and the smallest and largest of its repeats."""
+def cells_of(row: Any) -> list[str]:
+    """Return the cells of a row below :data:`HEADINGS`."""
     numbers = (row["value"], row["spread_low"], row["spread_high"])
     value, low, high = (f"{x:,.0f}" if x >= 1000 else f"{x:.3g}" for x in numbers)
-    return value, f"{low} … {high}"
+    batch = "" if pd.isna(row["batch"]) else f"{row['batch']:,}"
+    compared = pd.notna(row["alternative"])
+    ratio, other = (f"{row['ratio']:.3g}", row["alternative"]) if compared else ("", "")
+    return [row["case"], batch, value, f"{low} … {high}", row["unit"], ratio, other]
 
 
 def page(rows: pd.DataFrame) -> str:
     """Return rows as a table in Markdown, below a line on where and when they were measured."""
     kinds = ("machine", "torch", "threads", "clock", "repeats", "date")
     where = (f"{kind} {', '.join(map(str, rows[kind].unique()))}" for kind in kinds)
-    lines = [
-        f"{'; '.join(where)}; load average {rows['load'].min():.1f} to {rows['load'].max():.1f}."
-    ]
-    lines += ["", "| case | batch | median | smallest … largest | unit | ratio | to |"]
-    lines += ["|---" * 7 + "|"]
-    for _, row in rows.iterrows():
-        batch = "" if pd.isna(row["batch"]) else f"{row['batch']:,}"
-        compared = pd.notna(row["alternative"])
-        ratio, other = (f"{row['ratio']:.2f}", row["alternative"]) if compared else ("", "")
-        case = f"{row['benchmark']}: {row['case']}"
-        cells = (case, batch, *numbers_of(row), row["unit"], ratio, other)
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    load = f"load average {rows['load'].min():.1f} to {rows['load'].max():.1f}."
+    cases = rows.assign(case=rows["benchmark"] + ": " + rows["case"])
+    table = [HEADINGS, ["---"] * len(HEADINGS), *map(cells_of, cases.to_dict("records"))]
+    return "\n".join([f"{'; '.join(where)}; {load}", "", *map(markdown_row, table)])

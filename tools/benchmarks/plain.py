@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable
 from copy import deepcopy
 from functools import cache
 from typing import Any
@@ -198,10 +197,6 @@ class PlainLoop:
             seen = seen.index_put((rows,), self.observe(new))
             after = {name: value.index_put((rows,), new[name]) for name, value in after.items()}
         return after, written, seen
-
-    def player(self, compiled: bool) -> Callable[..., Any]:
-        """Return the faster of the two ways to play, compiled or not."""
-        return torch.compile(self.play, dynamic=False) if compiled else self.play_eagerly
 
     def seeds(self) -> Tensor:
         """Draw the seeds of new episodes."""

@@ -31,7 +31,8 @@ class PlainVector(VecEnv):  # type: ignore[misc,unused-ignore]
     def __init__(self, env: TransformedEnv, compiled: bool) -> None:
         self.env, self.plain = env, PlainLoop(env)
         super().__init__(self.plain.rows, SEEN, ACTS)
-        self.play = self.plain.player(compiled)
+        eager, together = self.plain.play_eagerly, self.plain.play
+        self.play = torch.compile(together, dynamic=False) if compiled else eager
 
     def reset(self) -> Any:
         """Begin new episodes everywhere; return what is seen."""
@@ -55,23 +56,11 @@ class PlainVector(VecEnv):  # type: ignore[misc,unused-ignore]
         ends = (written[name].flatten().numpy() for name in ("reward", "done"))
         return seen.numpy(), *ends, infos
 
-    def close(self) -> None:
-        """Nothing is open."""
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """No environment has attributes of its own."""
+    def _nothing(self, *_: Any, **__: Any) -> list[Any]:
+        """Return that no environment has attributes, methods or wrappers of its own."""
         return [None] * self.num_envs
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """No environment has attributes of its own."""
-
-    def env_method(self, method_name: str, *_: Any, **__: Any) -> list[Any]:
-        """No environment has methods of its own."""
-        return [None] * self.num_envs
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """No environment is wrapped."""
-        return [False] * self.num_envs
+    close = get_attr = set_attr = env_method = env_is_wrapped = _nothing
 
 
 def their_agent(options: Namespace, vector: VecEnv, kind: str, **how: Any) -> Any:

@@ -36,16 +36,12 @@ def update(options: Namespace) -> list[Row]:
     rows: list[Row] = []
     for kind, (batch, count) in product(AGENTS, QUICK if options.quick else SIZES):
         agent = kind(batch_size=batch).start(Scene(7))
-        name = kind.__name__
-        own, loss, other = (
-            f"{name}.update",
-            f"TorchRL's {name}Loss",
-            f"{OTHER} {name}",
-        )
+        own, loss = f"{kind.__name__}.update", f"TorchRL's {kind.__name__}Loss"
+        other = f"{OTHER} {kind.__name__}"
         slow = kind(batch_size=batch, fused=False).start(Scene(7))
         runs: dict[str, Run] = {
-            own: times(count, own_update(agent, played)),
-            loss: times(count, own_update(slow, played)),
+            own: own_updates(agent, played, count),
+            loss: own_updates(slow, played, count),
         }
         if installed():
             model = their_update(options, agent, played)
@@ -56,23 +52,13 @@ def update(options: Namespace) -> list[Row]:
     return rows
 
 
-def times(count: int, function: Run) -> Run:
-    """Return so many calls of a function."""
-
-    def run() -> None:
-        for _ in range(count):
-            function()
-
-    return run
-
-
-def own_update(agent: OffPolicy, played: TensorDictBase) -> Run:
-    """Return the agent's update with batches from a buffer of its size."""
+def own_updates(agent: OffPolicy, played: TensorDictBase, count: int) -> Run:
+    """Return so many of the agent's updates with batches from a buffer of its size."""
     storage = LazyTensorStorage(agent.buffer_size, device=agent.device)
     buffer = ReplayBuffer(storage=storage, batch_size=agent.batch_size)
     buffer.extend(played)
     draw = draws(buffer, torch.Generator().manual_seed(0))
-    return lambda: agent.update(next(draw))
+    return lambda: [agent.update(next(draw)) for _ in range(count)]
 
 
 def their_update(options: Namespace, agent: OffPolicy, played: TensorDictBase) -> Any:

@@ -17,7 +17,7 @@ from lcc_rl.commands.pipeline import (
 )
 from lcc_rl.config import key_of, load, quoted, top_key, with_inputs
 from lcc_rl.config.schemas import EvaluateConfig, PipelineConfig, TrainConfig
-from lcc_rl.errors import unknown_name
+from lcc_rl.errors import require_known
 from lcc_rl.studies.study import Study
 
 TRAIN, EVALUATION_FOLDER = "train", "evaluation"
@@ -71,8 +71,7 @@ def chosen_ablation(item: str) -> tuple[str, Change]:
     name, _, override = item.partition(":")
     if override:
         return name, Change((override,))
-    if name not in ABLATIONS:
-        raise unknown_name("ablation", name, ABLATIONS)
+    require_known("ablation", name, ABLATIONS)
     return name, ABLATIONS[name]
 
 
@@ -146,9 +145,7 @@ def run(study: Study, parts: Sequence[str] = STUDY_PARTS, ablations: Sequence[st
 
 def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dict[Path, Change]:
     """Return the series of trainings of the parts by their folders."""
-    for part in parts:
-        if part not in STUDY_PARTS:
-            raise unknown_name("part", part, STUDY_PARTS)
+    require_known("part", parts, STUDY_PARTS)
     found = {study.folder / TRAIN: MAIN} if "main" in parts else {}
     if "ablations" in parts:
         # Without ablations that change nothing, and in short runs without long trainings.
