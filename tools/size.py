@@ -27,7 +27,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 40_300, "code": 26_350},
+    "lcc_rl + tools": {"lines": 40_100, "code": 26_150},
     "tests": {"lines": 21_500},
     "conf": {"yaml": 147},
 }
