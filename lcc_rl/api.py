@@ -14,7 +14,7 @@ import pandas as pd
 from rich.console import Console
 
 from lcc_rl.commands import evaluation, training
-from lcc_rl.config import load
+from lcc_rl.config import load, with_variant
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.evaluation.foreign import as_given
 from lcc_rl.evaluation.named import setting_of
@@ -111,7 +111,7 @@ def learn(
         >>> run.table[["strategy", "total_path_energy_kj"]]  # doctest: +SKIP
     """
     target = _folder("train", variant, folder)
-    cfg = load("train", _words(variant, overrides))
+    cfg = load("train", with_variant(variant, overrides))
     return Run(target, training.run(cfg, target, quiet=True, resume=True), cfg)
 
 
@@ -145,7 +145,7 @@ def compare(
         >>> found = compare({"slow": PID(gain=0.1), "fast": PID(gain=0.4)})  # doctest: +SKIP
     """
     target = _folder("evaluate", variant, folder)
-    cfg = load("evaluate", _words(variant, overrides))
+    cfg = load("evaluate", with_variant(variant, overrides))
     if isinstance(strategies, (str, PathLike)) or not isinstance(strategies, Iterable):
         strategies = [strategies]
     named = isinstance(strategies, Mapping)
@@ -161,11 +161,6 @@ def compare(
     if folder is not None:
         evaluation.draw(rows, cfg, target)
     return Run(target, rows, cfg)
-
-
-def _words(variant: str, overrides: Sequence[str]) -> list[str]:
-    """Return the words of a command; a text is one setting."""
-    return [f"variant={variant}", *([overrides] if isinstance(overrides, str) else overrides)]
 
 
 def _folder(kind: str, variant: str, folder: str | Path | None) -> Path:

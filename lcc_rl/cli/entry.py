@@ -135,7 +135,7 @@ def flags_first(words: Sequence[str]) -> list[str]:
     if unknown:
         raise ConfigError(
             f"unknown flag {unknown[0]}: settings are written key=value, without dashes; flags "
-            "are --help, --cfg job, --info and, for a sweep, -m"
+            "are --help, --cfg job, --info, --config-dir and, for a sweep, -m"
         )
     flags = list(words)
     for item in known.overrides:

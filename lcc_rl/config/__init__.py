@@ -16,7 +16,7 @@ from lcc_rl.config.compose import (
     parsed,
     with_inputs,
 )
-from lcc_rl.config.words import check_overrides, key_of, quoted, top_key
+from lcc_rl.config.words import check_overrides, key_of, quoted, top_key, with_variant
 
 __all__ = [
     "HYDRA_ERRORS",
@@ -37,4 +37,5 @@ __all__ = [
     "quoted",
     "top_key",
     "with_inputs",
+    "with_variant",
 ]

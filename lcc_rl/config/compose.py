@@ -59,6 +59,7 @@ NAMES_HINT = (
     "; names before a colon consist of letters, digits, spaces and _-+./%*@?|, begin with a letter "
     "and have no quotes; lcc_rl.compare accepts any name"
 )
+ADDED = ("faults", "filter", "fleet", "knowledge")  # groups that no file of the package chooses
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
 
@@ -98,8 +99,8 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
         ConfigError: if an override is unknown, of the wrong type or out of range.
     """
     require_known("command", entry, KINDS)
-    if isinstance(overrides, str):
-        raise ConfigError(f"expected a list of settings, got the text {overrides!r}")
+    if isinstance(overrides, str) or not all(isinstance(word, str) for word in overrides):
+        raise ConfigError(f"expected a list of settings, such as ['seed=1'], got {overrides!r}")
     return parsed(composed(entry, overrides), entry, overrides)
 
 
@@ -280,7 +281,7 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         return ConfigError(f"{error} {own_file(group, name)}")
     if isinstance(error, OverrideParseException):
         key, equals, value = str(error.override).lstrip("+").partition("=")
-        if not equals:
+        if not equals or key.startswith("-"):
             return ConfigError(f"{key}: settings are written key=value; -h shows the help")
         typed = next((word for word in overrides if key_of(word) == key), f"{key}={value}")
         names = NAMES_HINT if key == "compare" and "{" in value else ""
@@ -289,10 +290,12 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
             f"with spaces, commas or signs needs quotes within quotes: \"{key}='…'\"{names}"
         )
     found = re.search(
-        r"Could not (?:override|append to config|delete from config)\S* '([^']+)'", str(error)
+        r"Could not (override|append to config|delete from config)\S* '([^']+)'", str(error)
     )
+    if found is not None and found.group(1).startswith("delete"):
+        return ConfigError(f"~{found.group(2)}: no file sets it: there is nothing to leave out")
     if found is not None:
-        return _unknown_option(found.group(1))
+        return _unknown_option(found.group(2))
     cause = error.__cause__
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)
     words = [*overrides, *text.partition("See https://")[0].split()]
@@ -307,6 +310,8 @@ def _unknown_option(name: str) -> ConfigError:
     root, known = name.partition(".")[0], _top_level() | groups
     if root in places:
         return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")
+    if root in ADDED:
+        return ConfigError(f"{root} is added: write +{root}=…")
     if root in known:
         return ConfigError(f"this command has no option {root!r}, as others have: -h shows its own")
     error = unknown_name("option", name, known)

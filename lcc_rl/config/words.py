@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from lcc_rl.errors import ConfigError, require
 
@@ -17,6 +18,12 @@ RECORDED = "recorded"  # the recorded driver as a controller, or its value as a 
 def key_of(override: str) -> str:
     """Return the dotted key that an override changes."""
     return override.lstrip("+~").split("=")[0]
+
+
+def with_variant(variant: str, overrides: Any) -> list[Any]:
+    """Return the words of a command from what a program gives; a text is one setting."""
+    single = isinstance(overrides, str) or not isinstance(overrides, Iterable)
+    return [f"variant={variant}", *([overrides] if single else overrides)]
 
 
 def quoted(path: str | Path) -> str:

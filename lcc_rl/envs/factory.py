@@ -12,7 +12,7 @@ import torch
 from tensordict.utils import NestedKey
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.config import load
+from lcc_rl.config import load, with_variant
 from lcc_rl.config.nodes import CALLED, Node
 from lcc_rl.config.schemas import AUTO, ScenarioConfig, StudyConfig
 from lcc_rl.data.profiles import Profiles
@@ -283,7 +283,7 @@ def make_env(
         >>> env.rollout(300)["next", "reward"].shape  # doctest: +SKIP
         torch.Size([1024, 300, 1])
     """
-    cfg = load("train", [f"variant={variant}", *overrides])
+    cfg = load("train", with_variant(variant, overrides))
     inputs = shared_inputs(cfg)
     profiles = inputs.evaluation if held_out else inputs.to_learn_from()
     env = build_env(cfg, profiles, inputs.population, batch_size, seed, device, held_out)

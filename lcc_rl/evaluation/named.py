@@ -84,7 +84,7 @@ def setting_of(spec: Any, where: str = "compare") -> str | Node:
 
 def is_policy(spec: Any) -> TypeGuard[str]:
     """Whether a name is that of a trained policy's file or folder."""
-    if not isinstance(spec, str) or spec.endswith((*YAML, ONNX, MODULE)):
+    if not isinstance(spec, str) or not spec or spec.endswith((*YAML, ONNX, MODULE)):
         return False
     path = Path(spec)
     return path.exists() or path.parts[:1] == (PRETRAINED,) or path.suffix == ".pt"

@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 
-from lcc_rl.config import load
+from lcc_rl.config import load, with_variant
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.errors import ConfigError, needing, require, require_known
 from lcc_rl.evaluation.foreign import network_of
@@ -78,7 +78,7 @@ def export(
         if (policy := network_of(given, normalize)) is None:
             kind = type(given).__name__
             raise ConfigError(f"expected a run, a file, a torch module or a model, got {kind}")
-        cfg = load("train", [f"variant={variant}", *overrides])
+        cfg = load("train", with_variant(variant, overrides))
     require(
         cfg is not None or is_policy(str(policy)) or str(policy) not in rules(),
         f"{policy} is a rule; only a trained policy can be exported: give a run folder, a policy "
@@ -154,7 +154,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("policy", help="run folder, policy.pt or pretrained/<name>")
     parser.add_argument("path", help="file to write: a program (.onnx, .pt2) or a page (.html)")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
-    parser.add_argument("settings", nargs="*", help="of a page's ring, such as drivers=i80")
+    parser.add_argument("settings", nargs="*", default=[], help="of a page's ring: drivers=i80")
     options = parser.parse_args(words)
     path = export(options.policy, options.path, options.trust, overrides=options.settings)
     if path.suffix == PAGE:

@@ -95,9 +95,10 @@ def test_seeds_that_would_play_the_same_episodes_are_refused(envs) -> None:
 
 
 def test_a_wrong_setting_is_one_traceback() -> None:
-    for typed in ("wrong.option=1", "seed", "agent=dddpg", "scenario.horizon=0"):
+    wrong = ("wrong.option=1", "seed", "agent=dddpg", "scenario.horizon=0", "--config-dir=x")
+    for typed in (*wrong, None, 3, [3]):
         with pytest.raises(ConfigError) as caught:
-            make_env(overrides=[typed])
+            make_env(overrides=typed)
         text = "".join(traceback.format_exception(caught.value))
         assert text.count("Traceback") == 1, typed
 
