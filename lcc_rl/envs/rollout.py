@@ -119,6 +119,8 @@ class DifferentiableRollout:
                 taken.append(action)
             rows, actions = torch.stack(passed), torch.stack(taken)
         if torch.is_grad_enabled():
+            if self.drive.function is self.drive.plain:  # nor can its gradient be compiled
+                self.pull.function = self.pull.plain
             weights = self.learned.values()
             rows, actions = _Motion.apply(self.pull, rows, actions, held, shifts, *weights)
         moments = self._entries(rows)
