@@ -14,6 +14,7 @@ import lcc_rl
 from lcc_rl import api
 from lcc_rl.commands import evaluation, training
 from lcc_rl.commands.pipeline import calibrate_once, read_once
+from lcc_rl.config.words import with_variant
 from lcc_rl.errors import LccError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.policies import load_policy
@@ -173,7 +174,7 @@ def test_a_training_that_changed_nothing_says_so(trained, tmp_path, caplog) -> N
     assert "changed nothing" in caplog.text
     folders = [api._folder("evaluate", "alcc", None) for _ in range(2)]
     assert folders[0] != folders[1]  # within one second
-    assert api._words("alcc", "seed=3") == ["variant=alcc", "seed=3"]  # not letters
+    assert with_variant("alcc", "seed=3") == ["variant=alcc", "seed=3"]  # not letters
 
 
 @pytest.mark.slow
