@@ -34,6 +34,10 @@ def export(run: str | Path, origin: str, folder: Path = FOLDER, name: str | None
     weights, cfg = load_policy(run)
     for key in LOCAL:
         setattr(cfg, key, None)
+    cfg.inputs = {
+        kind: {Path(file).name: found for file, found in files.items()}
+        for kind, files in cfg.inputs.items()
+    }
     path = folder / f"{name or cfg.variant}.pt"
     provenance = f"{origin}; lcc_rl {version('lcc_rl')}"
     content = {"weights": weights, "config": as_text(cfg), "provenance": provenance}
