@@ -7,6 +7,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ARGS ?=
+# Recordings with stops and waves, then motorways; with ARGS only what they say.
+BOTH := -m data=stop_and_go,platoons
 
 # One thread per process: two trainings run side by side, and results depend on the number.
 export OMP_NUM_THREADS ?= 1
@@ -16,7 +18,7 @@ export OMP_NUM_THREADS ?= 1
 install: $(STAMP)
 
 run: $(STAMP)
-	$(BIN)/python -m lcc_rl run $(ARGS)
+	$(BIN)/python -m lcc_rl run $(or $(ARGS),$(BOTH))
 
 test: lint
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(ARGS)

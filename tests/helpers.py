@@ -99,7 +99,8 @@ def composed(*overrides: str) -> TrainConfig:
 
 def compose(variant: str = "alcc", *overrides: str) -> TrainConfig:
     """Compose the configuration of a training with short episodes."""
-    return composed(f"variant={variant}", "scenario.horizon=20", *overrides)
+    short = ("scenario.horizon=20", "evaluation.warm_up=0")
+    return composed(f"variant={variant}", *short, *overrides)
 
 
 def small_env(

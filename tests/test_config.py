@@ -106,7 +106,13 @@ def test_a_choice_that_is_there_cannot_be_added() -> None:
 
 
 def test_the_papers_recipes_are_the_defaults() -> None:
-    assert identity(load("train", ["experiment=paper_alcc"])) == identity(load("train"))
+    paper, usual = load("train", ["experiment=paper_alcc"]), load("train")
+    lengths = [x.training.episodes * x.scenario.horizon for x in (paper, usual)]
+    assert lengths == [900_000, 900_000]
+    for name in ("scenario", "evaluation", "training"):
+        setattr(usual, name, getattr(paper, name))
+    assert identity(paper) == identity(usual)  # it differs in its windows only
+    assert (paper.scenario.horizon, paper.evaluation.warm_up) == (300, 0.0)
     plain, recipe = ["variant=ddpg"], ["variant=ddpg", "experiment=paper_hcfs"]
     assert identity(load("train", recipe)) == identity(load("train", plain))
 

@@ -68,10 +68,13 @@ class Analytic(Agent):
     # Time in which humans drive before every episode, without gradient: the policy takes over in
     # developed traffic [s].
     humans_first: NonNegative = 0.0
+    # First seconds of every episode, which have no gradient and do not count, as in an evaluation:
+    # a car may save there by opening its gap [s].
+    warm_up: NonNegative = 0.0
     # Compile the step of the simulator; None: if the training is long enough to pay for it.
     compiled: bool | None = None
 
-    LATER = ("activation", "schedule")
+    LATER = ("activation", "schedule", "warm_up")
     loop = GradientLoop
 
     def validate(self) -> None:
@@ -92,6 +95,7 @@ class Analytic(Agent):
         self.policy = module.to(scene.device)
         size, seed = scene.observation_size, scene.seed + 1
         self.burn_in = scene.world.steps(self.humans_first, "agent.humans_first")
+        self.uncounted = scene.world.steps(self.warm_up, "agent.warm_up")
         self.value, self.target = (
             seeded_mlp(size, 1, self.hidden, seed, self.activation).to(scene.device)
             for _ in range(2)

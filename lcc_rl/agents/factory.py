@@ -75,14 +75,17 @@ def check_lengths(cfg: StudyConfig) -> None:
         ConfigError: naming two that are not.
     """
     settings, horizon = cfg.training, cfg.scenario.horizon
+    warm_up = cfg.agent.settings.get("warm_up") or 0.0
+    counted = horizon - round(warm_up / cfg.scenario.time_step)
     require(
         settings.episodes % settings.environments == 0,
         f"training.episodes ({settings.episodes}) must be a multiple of training.environments "
         f"({settings.environments})",
     )
     require(
-        horizon % settings.segment == 0,
-        f"training.segment ({settings.segment}) must divide scenario.horizon ({horizon})",
+        counted > 0 and counted % settings.segment == 0,
+        f"training.segment ({settings.segment}) must divide scenario.horizon ({horizon})"
+        + f" without the steps of agent.warm_up ({counted})" * (counted < horizon),
     )
     window = getattr(cfg.agent.made(), "best_window", None) or 0
     count = settings.environments

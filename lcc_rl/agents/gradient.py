@@ -39,7 +39,7 @@ class GradientLoop(TrainingLoop[Any]):
         self.terms = [piece for piece in pieces_of(self.env) if isinstance(piece, RewardTerm)]
         self.objective: Objective = self.agent.objective
         self.objective.replace(self.terms)
-        self.horizon -= self.agent.burn_in
+        self.horizon -= self.agent.burn_in + self.agent.uncounted
         if not self.agent.bootstrap and self.settings.segment < self.horizon:
             log.warning(
                 "agent.bootstrap=false with training.segment=%d: nothing after a segment counts; "
@@ -76,6 +76,11 @@ class GradientLoop(TrainingLoop[Any]):
         self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
         state = source.skip(source.start(), self.agent.burn_in)
         running = torch.ones(self.env.batch_size[0], 1, 1, device=self.env.device)
+        if self.agent.uncounted:
+            with torch.no_grad():
+                state, record = source.play(state, self.agent.uncounted)
+                crashed = source.assemble(record)["next", "terminated"]
+            running = (~crashed.any(1, keepdim=True)).to(running)
         played, losses, spent = [], [], [0.0, 0.0]
         missed: list[dict[str, float]] = []
         for _ in range(self.horizon // self.settings.segment):

@@ -3,7 +3,10 @@
 A limit is a largest share of the time. A multiplier prices its smooth surrogate, which has a
 gradient; the multiplier follows the true share (a proxy Lagrangian: Cotter, Jiang and Sridharan,
 "Two-player games for efficient non-convex constrained optimization", ALT 2019). If a safety filter
-keeps the limit, its price falls towards zero.
+keeps the limit, its price falls towards zero. The limit of an average, such as the spacing, can be
+missed on both sides; its price also depends on the latest miss, which damps oscillations (Stooke,
+Achiam and Abbeel, "Responsive safety in reinforcement learning by PID Lagrangian methods", ICML
+2020).
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError, require
 
 log = logging.getLogger("lcc_rl")
+DAMPING = 2.0  # share of the latest miss in the price of an average, against oscillations
 LEAST = 1e-3  # smaller limits count as this share
 
 
@@ -55,6 +59,10 @@ class Limits:
         self.largest = {name: 0.0 if x == RECORDED else float(x) for name, x in given.items()}
         self.rate = rate
         self.logarithms = dict.fromkeys(self.largest, 0.0)
+        self.widths = {
+            name: known[name].limit_width for name in given if hasattr(known[name], "limit_width")
+        }
+        self.latest = dict.fromkeys(self.widths, 0.0)  # last miss of each average
 
     def take(self, profiles: Profiles) -> None:
         """Set the limits that are ``recorded`` to the share of the recorded drivers.
@@ -80,7 +88,7 @@ class Limits:
 
     def price(self, name: str) -> float:
         """Return the multiplier of a limit; 1 for other terms."""
-        return math.exp(self.logarithms.get(name, 0.0))
+        return math.exp(self.logarithms.get(name, 0.0) + DAMPING * self.latest.get(name, 0.0))
 
     def update(self, shares: Mapping[str, float]) -> None:
         """Raise the multipliers of missed limits and lower the others.
@@ -89,16 +97,26 @@ class Limits:
             shares: share of the time in which each limit was missed.
         """
         for name, share in shares.items():
-            over = share / max(self.largest[name], LEAST) - 1.0
-            self.logarithms[name] += self.rate * min(max(over, -1.0), 1.0)
+            largest = self.largest[name]
+            if name in self.widths:
+                over = (share - largest) / max(abs(largest), self.widths[name])
+            else:
+                over = share / max(largest, LEAST) - 1.0
+            over = min(max(over, -1.0), 1.0)
+            self.logarithms[name] += self.rate * over
+            if name in self.widths:
+                self.latest[name] = over
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the multipliers."""
-        names = sorted(self.logarithms)
-        values = [self.logarithms[name] for name in names]
+        values = [kept[name] for kept in self._kept() for name in sorted(kept)]
         return {"logarithms": torch.tensor(values, dtype=torch.float64)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Restore the result of :meth:`state_dict`."""
-        names = sorted(self.logarithms)
-        self.logarithms = dict(zip(names, state["logarithms"].tolist(), strict=True))
+        values = iter(state["logarithms"].tolist())
+        for kept in self._kept():
+            kept.update({name: next(values) for name in sorted(kept)})
+
+    def _kept(self) -> tuple[dict[str, float], dict[str, float]]:
+        return self.logarithms, self.latest

@@ -24,7 +24,7 @@ from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.envs import Inputs, build_env, load_inputs
-from lcc_rl.envs.inputs import build_energy
+from lcc_rl.envs.inputs import build_energy, second_energy
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation import cases, episodes
 from lcc_rl.evaluation.blocks import Store
@@ -39,6 +39,7 @@ from lcc_rl.evaluation.strategies import (
     baselines,
     beside_filtered,
     check_distinct,
+    front_of,
     named_apart,
     no_policy,
     studied,
@@ -49,12 +50,10 @@ from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
 from lcc_rl.results.names import counted_windows, in_words, several
 from lcc_rl.results.platoons import case_report
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
+from lcc_rl.results.remarks import few_windows, leader_too_fast, remarks
 from lcc_rl.results.render import print_table, terminal
 from lcc_rl.results.report import (
     Report,
-    few_windows,
-    leader_too_fast,
-    remarks,
     report,
     windows_for,
 )
@@ -297,6 +296,7 @@ def strategies_of(
         cases.check_cases(strategy.cfg, inputs)
     strategies = named_apart(strategies)
     check_distinct(strategies)
+    strategies += front_of(strategies, cfg.evaluation.front)
     for strategy in (s for s in strategies if s.source):
         log.info("%s: the policy of %s", in_words(strategy.name), strategy.source)
     return strategies, inputs
@@ -439,7 +439,15 @@ def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterato
     filtered = cfg.scenario.filters.get(AUTOMATED) is not None
     words = list(filter(None, [other_drivers(cfg), classes(cfg)]))
     for source, part in by_source(windows_for(rows)):
-        one = report(part, task_of(cfg), build_energy(cfg), filtered, source, against=against)
+        one = report(
+            part,
+            task_of(cfg),
+            build_energy(cfg),
+            filtered,
+            source,
+            against=against,
+            second=second_energy(cfg),
+        )
         yield dataclasses.replace(one, remarks=[*one.remarks, *words])
 
 

@@ -33,7 +33,7 @@ from lcc_rl.data.episodes import SCHEMA
 from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.drivers.calibrator import count_records
 from lcc_rl.drivers.population import bootstrap
-from lcc_rl.envs.inputs import LOADS, build_energy, load_inputs
+from lcc_rl.envs.inputs import LOADS, build_energy, load_inputs, second_energy
 from lcc_rl.errors import Concern, ConfigError, Interrupted, ResultsError
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
@@ -43,8 +43,10 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows, parquet_metadata, write_parquet
 from lcc_rl.io.settings import read_text
+from lcc_rl.results.names import RULE
+from lcc_rl.results.remarks import sample_of
 from lcc_rl.results.render import print_table, terminal
-from lcc_rl.results.report import RULE, report, sample_of, windows_for
+from lcc_rl.results.report import report, windows_for
 from lcc_rl.results.runs import (
     EPISODES,
     FINAL,
@@ -172,7 +174,8 @@ def _run(
     if paged and isinstance(rows, pd.DataFrame):
         size = sample_of(rows)
         filtered = final.scenario.filters.get(AUTOMATED) is not None
-        one = report(windows_for(rows), None, build_energy(final), filtered, few=True)
+        models = build_energy(final), second_energy(final)
+        one = report(windows_for(rows), None, models[0], filtered, few=True, second=models[1])
         one = replace(one, remarks=[*filter(None, [held_to(trainings.values())]), *one.remarks])
         write_figures(folder / FINAL, reports=[one])
         page = write_page(folder, [command], one, size)

@@ -51,7 +51,10 @@ NOT_IDENTITY = (
 # Extras that install launchers.
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
 # Settings of later versions, which older runs lack.
-LATER = ("evaluation.warm_up", "scenario.fleet")
+LATER = (
+    *("evaluation.warm_up", "evaluation.front", "evaluation.second_energy"),
+    "scenario.fleet",
+)
 NEEDED = ("data", "split", "drivers", "observation", "calibration")  # required nodes of commands
 NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =
 # Hint on Hydra's keys, which have no quotes.

@@ -1,6 +1,6 @@
 """Energy models and their assignment to vehicles."""
 
-from lcc_rl.energy.base import AVERAGED, AVERAGES, BURNT, EnergyModel
+from lcc_rl.energy.base import AVERAGED, AVERAGES, BURNT, SECOND, EnergyModel
 from lcc_rl.energy.electric import ElectricCar, PaperMotor
 from lcc_rl.energy.fleet import Fleet, VehicleClass, as_fleet
 from lcc_rl.energy.fuel import CirclesFuel
@@ -9,6 +9,7 @@ __all__ = [
     "AVERAGED",
     "AVERAGES",
     "BURNT",
+    "SECOND",
     "CirclesFuel",
     "ElectricCar",
     "EnergyModel",

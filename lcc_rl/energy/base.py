@@ -16,6 +16,7 @@ from lcc_rl.settings import Settings
 # noise of records; longer ones remove the drivers' own accelerations.
 AVERAGES = (1.1, 3.1)
 AVERAGED = tuple(f"path_energy_{seconds:g}s_kj" for seconds in AVERAGES)  # their energies [kJ]
+SECOND = "second_path_energy_kj"  # path energy by evaluation.second_energy
 BURNT = ("fuel_l", "co2_g")  # fuel of an energy [L] and its carbon dioxide [g]
 
 Grade = Annotated[float, Field(ge=-0.3, le=0.3)]  # grade of the road [rad]

@@ -86,6 +86,16 @@ def build_energy(cfg: StudyConfig) -> Fleet:
     return fleet.extended(classes, cfg.scenario.vehicle_length)
 
 
+def second_energy(cfg: StudyConfig) -> Fleet | None:
+    """Build the energy model of the second saving, ``evaluation.second_energy``, if there is one.
+
+    Raises:
+        ConfigError: naming the option at fault.
+    """
+    node = cfg.evaluation.second_energy
+    return None if node is None else as_fleet(node.made(MEANT))
+
+
 def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
     """Read the leaders' records, split them and build the population.
 

@@ -16,7 +16,7 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import RECORDED
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import after_uncounted
-from lcc_rl.envs.inputs import Inputs, build_energy
+from lcc_rl.envs.inputs import Inputs, build_energy, second_energy
 from lcc_rl.errors import require
 from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.rows import (
@@ -24,6 +24,7 @@ from lcc_rl.evaluation.rows import (
     INDEX,
     ROW_KEYS,
     as_frame,
+    brakings,
     describe,
     desired_speeds,
     grouped,
@@ -170,7 +171,7 @@ class Episodes:
         env = build_env(
             self.cfg, inputs.evaluation, inputs.population, plan.size, 0, device, nominal=True
         )
-        self.energy = build_energy(self.cfg)
+        self.energy, self.second = build_energy(self.cfg), second_energy(self.cfg)
         filtered = self.cfg.scenario.filters.get(AUTOMATED) is not None
         keys = [*ROW_KEYS, INDEX, CLASS, *(FILTER_ENTRIES if filtered else ())]
         self.player = Player(env, strategy.policy, keys, strategy.title, compiled)
@@ -195,6 +196,7 @@ class Episodes:
 
         record, alive = self.player.play(options, named)
         crashed = (alive.unsqueeze(-2) & (record["vehicles", "gap"] <= 0.0)).any(0).any(-2)
+        braked = brakings(record, alive, self.cfg.scenario.vehicles)
         record, alive = {key: x[self.begun :] for key, x in record.items()}, alive[self.begun :]
         if self.cfg.scenario.fleet:
             record["vehicles", "length"] = self.energy.lengths(record[CLASS])
@@ -215,10 +217,10 @@ class Episodes:
             leader[:] = np.nan
         # The noise of sensors adds energy to the motion of recorded drivers.
         recorded = RECORDED in self.cfg.evaluation.baselines
-        measured = measures(groups, alive, time_step, self.energy, recorded)
+        measured = measures(groups, alive, time_step, self.energy, recorded, self.second)
         length, free = self.cfg.scenario.vehicle_length, inputs.population.desired_speed[driver]
         measured |= traffic(record, alive, length, time_step, free, self.energy)
-        rows = pd.concat([described, leader, as_frame(measured, crashed)], axis=1)
+        rows = pd.concat([described, leader, braked, as_frame(measured, crashed)], axis=1)
         rows = rows.iloc[:count]
         inside = [index - block * plan.size for index in sorted(self.samples)]
         inside = [index for index in inside if 0 <= index < count]

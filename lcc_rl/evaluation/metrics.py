@@ -153,6 +153,11 @@ class Reductions:
             recent[back:] |= state[:-back]
         return (state & ~recent).sum(0).sum(-2)
 
+    def change(self, entry: Tensor) -> Tensor:
+        """Difference of the last and the first value, averaged over vehicles."""
+        last = (self.alive.sum(0) - 1).clamp(min=0).expand(entry.shape[1:]).unsqueeze(0)
+        return (entry.gather(0, last).squeeze(0) - entry[0]).mean(-2)
+
     def lowest(self, entry: Tensor) -> Tensor:
         """Minimum over time and vehicles."""
         return torch.where(self.alive, entry, torch.inf).amin(0).amin(-2)
@@ -174,6 +179,7 @@ def _turned(over: Reductions, safe: Tensor) -> Tensor:
 METRICS: dict[str, Callable[..., Tensor]] = {
     "min_gap_m": lambda over, gap: over.lowest(gap),
     "mean_gap_m": lambda over, gap: over.mean(gap),
+    "gap_opened_m": lambda over, gap: over.change(gap),
     "max_gap_m": lambda over, gap: over.highest(gap),
     "min_time_gap_s": lambda over, time_gap: over.lowest(time_gap),
     "min_ttc_s": lambda over, ttc: measured_ttc(over.lowest(ttc)),

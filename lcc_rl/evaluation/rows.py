@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lcc_rl.config.words import RECORDED
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.energy import AVERAGED, BURNT, Fleet, as_fleet
+from lcc_rl.energy import AVERAGED, BURNT, SECOND, Fleet, as_fleet
 from lcc_rl.evaluation.metrics import (
     KILO,
     ROAD_METRICS,
@@ -43,6 +43,7 @@ SUMMED = (
     "path_energy_kj",
     *AVERAGED,
     *BURNT,
+    SECOND,
 )
 # Columns of an episode that are repeated in the steps of a sample episode.
 SAMPLED = (
@@ -109,6 +110,7 @@ def measures(
     time_step: float,
     energy: Fleet | None = None,
     averaged: bool = True,
+    second: Fleet | None = None,
 ) -> dict[str, Tensor]:
     """Return the measures of a batch, each ``[batch, 1]``; energies are sums over vehicles (A20).
 
@@ -118,6 +120,7 @@ def measures(
         time_step: duration of a step [s].
         energy: the energy models; None: that of the ALCC paper.
         averaged: include energies of averaged speeds.
+        second: a further energy model, for :data:`lcc_rl.energy.SECOND`.
     """
     columns: dict[str, Tensor] = {}
     for group in ("cav", "hdv"):
@@ -127,6 +130,10 @@ def measures(
         kinds = series.get(CLASS[1])
         how = alive.unsqueeze(-2), time_step, energy, None if kinds is None else kinds[0]
         found = energy_measures(series["power"], series["speed"], *how)
+        if second is not None:
+            speed = series["speed"]
+            power = second.power(speed[:-1], speed.diff(dim=0) / time_step)
+            found[SECOND] = energy_measures(power, speed, *how[:2], second)["path_energy_kj"]
         found |= averaged_energies(series["speed"], *how) if averaged else {}
         for name, value in found.items():
             added = value.mean(-2) if name.startswith("share_") else value.sum(-2)
@@ -155,6 +162,19 @@ def as_frame(columns: dict[str, Tensor], collided: Tensor) -> pd.DataFrame:
         frame = frame.where(frame["steps"] > 0).assign(steps=frame["steps"])
     frame.insert(len(frame.columns) - 1, "collided", collided.squeeze(-1).cpu().numpy())
     return frame
+
+
+def brakings(record: Record, alive: Tensor, string: VehicleString) -> pd.DataFrame:
+    """Return the hardest braking of the leader and of the automated vehicles by episode [m/s²].
+
+    The uncounted time is included, since collisions count there, too.
+    """
+    groups, found = grouped(record, string), {}
+    for name, group in (("max_leader_braking_mps2", "leader"), ("max_braking_mps2", "cav")):
+        if (motion := groups[group].get("acceleration")) is not None:
+            hardest = torch.where(alive.unsqueeze(-2), -motion[-len(alive) :], -torch.inf)
+            found[name] = hardest.amax((0, -2)).squeeze(-1).clamp(min=0.0).cpu().numpy()
+    return pd.DataFrame(found)
 
 
 def traffic(

@@ -36,9 +36,9 @@ from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.bootstrap import Estimate, share_saved
 from lcc_rl.results.motion import most_varied
-from lcc_rl.results.names import in_words, several
+from lcc_rl.results.names import RULE, in_words, several
 from lcc_rl.results.render import column_cells, signed
-from lcc_rl.results.report import AGAINST, RULE, Report
+from lcc_rl.results.report import AGAINST, Report
 from lcc_rl.results.runs import stored_config
 from lcc_rl.results.windows import Means, by_driver
 

@@ -11,6 +11,7 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import RECORDED
 from lcc_rl.figures.drawing import in_file
 from lcc_rl.figures.page import Page
+from lcc_rl.pieces import ExcessSpacing
 from lcc_rl.results.names import in_words
 from lcc_rl.results.render import for_print, full_rows
 from lcc_rl.results.report import AGAINST, UNTRAINED, Report
@@ -22,8 +23,8 @@ HELD_TO = (
     "time; rows above this limit save by falling behind."
 )
 AS_RECORDED = (
-    "The networks and the IDM tuned on these data are trained with the recorded drivers' share of "
-    "long time gaps as a limit; rows above this limit save by falling behind."
+    "The networks and the IDM tuned on these data are trained with the recorded drivers' {} as a "
+    "limit."
 )
 # Files of figures in the job's folder, without ending, and their captions.
 RESULT_FIGURES = {
@@ -42,12 +43,16 @@ def held_to(trainings: Iterable[StudyConfig]) -> str:
     Args:
         trainings: configurations of the trainings.
     """
-    agents = (cfg.agent.settings for cfg in trainings if cfg.agent is not None)
+    agents = [cfg.agent.settings for cfg in trainings if cfg.agent is not None]
     found = [(agent.get("limits") or {}).get(LIMIT) for agent in agents]
+    terms = [(agent.get("surrogates") or {}).get(LIMIT) for agent in agents]
+    spacing = all(term is not None and term.kind is ExcessSpacing for term in terms)
     limits = sorted({f"{limit:.2g}" if limit != RECORDED else limit for limit in found if limit})
     if not limits:
         return ""
-    return AS_RECORDED if limits == [RECORDED] else HELD_TO.format(limit=", ".join(limits))
+    what = "spacing, and so their flow," if spacing else "share of long time gaps"
+    held = limits == [RECORDED]
+    return AS_RECORDED.format(what) if held else HELD_TO.format(limit=", ".join(limits))
 
 
 def write_page(folder: str | Path, commands: Sequence[str], report: Report, size: str) -> Path:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -11,9 +13,11 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.controllers import stream_name
+from lcc_rl.pieces.leader import PROFILE, PROFILE_START
 from lcc_rl.pieces.world import Part, World
 from lcc_rl.settings import Factors, NonNegative, Positive
 
+DEFAULT_TIME_GAP = 1.5  # [s]
 GAP_STREAM, SPEED_STREAM = stream_id("platoon.gap"), stream_id("platoon.speed")
 
 
@@ -24,10 +28,16 @@ def draw_uniform(start: TensorDictBase, stream: int, like: Tensor) -> Tensor:
 
 
 class TimeGapStart(Part):
-    """A gap that grows with the speed: standstill gap + time gap · speed, at the leader's speed."""
+    """Speed and gap of the driver that was recorded behind the leader, or a given time gap.
 
-    standstill_gap: Positive = 2.0  # gap at standstill [m]
-    time_gap: NonNegative = 1.5  # time gap beyond it; not given in the ALCC paper [s]
+    A given time gap T starts a vehicle at the leader's speed v and the gap s0 + T v. So start
+    vehicles behind which no driver was recorded: those that do not follow the leader directly, and
+    those behind other leaders.
+    """
+
+    standstill_gap: Positive = 2.0  # s0, gap at standstill [m]
+    # T, not given in the ALCC paper [s]; recorded: 1.5 s where no driver was recorded.
+    time_gap: NonNegative | Literal["recorded"] = "recorded"
     # Range of a factor on the gap, drawn uniformly by the episode's seed; 1 in evaluation. Training
     # thus includes gaps that good driving never reaches.
     gap_range: Factors = (0.1, 1.5)
@@ -38,12 +48,23 @@ class TimeGapStart(Part):
         """Choose the range and the random stream of the role."""
         self.stream = stream_id(f"{stream_name(self.name)}.gap_factor")
         self.lowest, self.highest = world.deviations(self.gap_range)
+        self.given = DEFAULT_TIME_GAP if self.time_gap == "recorded" else float(self.time_gap)
+        profiles, first = world.profiles, world.string.places(self.name)[:1] == (0,)
+        known = first and not world.string.drawn and profiles is not None
+        known = known and profiles.followers is not None and self.time_gap == "recorded"
+        self.records = (profiles.followers, profiles.offsets) if known else None
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
         uniformly = draw_uniform(start, self.stream, speed)
         factor = self.lowest + (self.highest - self.lowest) * uniformly
-        return speed, factor * (self.standstill_gap + self.time_gap * speed)
+        gap = self.standstill_gap + self.given * speed
+        if self.records is not None:
+            followers, offsets = (x.to(speed.device) for x in self.records)
+            found = followers[offsets[start.get(PROFILE)] + start.get(PROFILE_START)]
+            pairs = zip(found.split(1, -1), (speed, gap), strict=True)
+            speed, gap = (torch.cat([x.to(y), y[..., 1:, :]], -2) for x, y in pairs)
+        return speed, factor * gap
 
 
 class EquilibriumStart(Part):

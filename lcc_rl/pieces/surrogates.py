@@ -8,7 +8,7 @@ term's, and a ``width`` over which it bends. ``missed`` marks the steps that vio
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import ClassVar, Literal
 
 from torch import Tensor
 from torch.nn.functional import softplus
@@ -136,10 +136,11 @@ class ExcessSpacing(RewardTerm):
     """
 
     standstill_gap: Positive = 2.0  # of the human driver [m]
-    time_gap: Positive = 1.05  # of the human driver at equilibrium [s]
+    time_gap: NonNegative = 1.05  # of the human driver at equilibrium [s]
     vehicle_length: Positive = 5.0  # [m]
 
     reads = ("self.gap", "self.speed")
+    limit_width: ClassVar = 0.1  # least miss of a limit at which its price changes fastest
 
     def reward(self, gap: Tensor, speed: Tensor) -> Tensor:
         """Return the unweighted term."""

@@ -15,8 +15,8 @@ from lcc_rl.results import measures, render
 from lcc_rl.results.bootstrap import LEAST_DRIVES
 from lcc_rl.results.measures import FINAL_SPREAD, FLOW, MEASURES, Shown
 from lcc_rl.results.names import in_words
+from lcc_rl.results.remarks import FLOW_LOST, FLOW_NAMED
 from lcc_rl.results.render import DASH, markdown_row, saved_text, signed
-from lcc_rl.results.report import FLOW_LOST, FLOW_NAMED
 from lcc_rl.results.task import Task
 
 BoardRow = Mapping[str, Any]

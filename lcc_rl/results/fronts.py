@@ -15,9 +15,9 @@ import pandas as pd
 
 from lcc_rl.arrays import Floats
 from lcc_rl.errors import ResultsError
-from lcc_rl.results.bootstrap import Estimate, Side, estimate, share_saved
+from lcc_rl.results.bootstrap import NOTHING, Estimate, Side, estimate, share_saved
 from lcc_rl.results.measures import FLOW, LONG_GAPS, PATH
-from lcc_rl.results.windows import DISTANCE, DRIVE
+from lcc_rl.results.windows import DISTANCE, DRIVE, STRATEGY, TRAINED
 
 FRONT_KINDS = ["variant", "policy"]
 ENERGY, LONG_SHARE = PATH, LONG_GAPS
@@ -110,8 +110,8 @@ def saving_at(
 
 
 def energy_per_distance(curve: Curve) -> Floats:
-    """Return the energy per distance, ``[..., limits]``."""
-    return curve[NET] / curve[DISTANCE]
+    """Return the energy, the first column, per distance, ``[..., limits]``."""
+    return next(iter(curve.values())) / curve[DISTANCE]
 
 
 def fleet_saved(point: Curve, baseline: Curve) -> Any:
@@ -131,6 +131,30 @@ def saved_at_flow(point: Curve, rule: Curve) -> Any:
     """
     rival = energy_at(energy_per_distance(rule), rule[FLOW], point[FLOW][..., 0], np.nan)
     return share_saved(energy_per_distance(point)[..., 0], rival)
+
+
+def at_equal_flow(windows: pd.DataFrame, name: str, rules: Sequence[str], energy: str) -> Estimate:
+    """Return the share of energy per distance that a strategy saves against a front of rules.
+
+    Args:
+        windows: result of :func:`lcc_rl.results.windows.windows_of`.
+        name: the strategy: one car, a platoon or a fleet.
+        rules: strategies along the front, such as a rule with several time gaps.
+        energy: column of the energy.
+
+    Returns:
+        The share at the flow of the strategy with its interval; NaN if the front does not reach
+        that flow, or without fronts.
+    """
+    chosen = windows[windows[STRATEGY].isin([name, *rules])]
+    if not rules or not {energy, FLOW} <= set(chosen) or name not in set(chosen[STRATEGY]):
+        return NOTHING
+    kind = np.where(chosen[STRATEGY] == name, "point", "front")
+    number = {rule: place for place, rule in enumerate(rules)}
+    rows = chosen.assign(variant=kind, policy="", limit=chosen[STRATEGY].map(number).fillna(0))
+    rows[TRAINED] = rows[TRAINED].astype(object).fillna(-1)
+    columns = (energy, DISTANCE, FLOW)
+    return compare_fronts(rows, ("point", ""), ("front", ""), columns, saved_at_flow)
 
 
 def points(windows: pd.DataFrame) -> pd.DataFrame:

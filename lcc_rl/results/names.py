@@ -21,12 +21,15 @@ SUFFIX_UNITS |= {"l_per_100km": "L/100 km", "per_100km": "1/100 km"}
 INITIALS = ("cav", "hdv", "ttc", "sd")
 NETWORK = "alcc"
 FILTER_ALONE = "constant_filtered"
+RULE = "rule"  # the IDM, tuned on the same data by the gradient
+RULE_ROWS = (RULE, "idm_acc_filtered", "idm_acc")
+ON_FRONT = " T="  # between the name of a rule and its time gap [s]
 # Strategies with several variants, which further words of a name specify.
 SEVERAL = {
     "reference": "network, own energy",
     "own_energy": "network, own energy × 2",
     NETWORK: "network",
-    "rule": "IDM, tuned on these data",
+    RULE: "IDM, tuned on these data",
     "cacc": "CACC",
     "ddpg": "DDPG",
     "hcfs": "HCFS",

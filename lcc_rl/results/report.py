@@ -9,58 +9,73 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lcc_rl.config.words import FILTERED, RECORDED
-from lcc_rl.energy import Fleet
+from lcc_rl.config.words import RECORDED
+from lcc_rl.energy import SECOND, Fleet
 from lcc_rl.errors import require, require_known
 from lcc_rl.io.files import Rows
 from lcc_rl.results import measures
 from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING
+from lcc_rl.results.fronts import at_equal_flow
 from lcc_rl.results.measures import (
-    BROKEN,
-    FASTER,
     FLOW,
     LONG_GAPS,
     MEASURES,
     PATH,
     PATH_PER_KM,
-    REACH,
     SHARE,
     Measure,
     Shown,
 )
-from lcc_rl.results.names import HUMAN, NETWORK, counted_windows, in_words, several
+from lcc_rl.results.names import (
+    HUMAN,
+    NETWORK,
+    ON_FRONT,
+    RULE,
+    RULE_ROWS,
+    counted_windows,
+    in_words,
+)
+from lcc_rl.results.remarks import (
+    FEW_DRIVES,
+    FEW_WINDOWS,
+    FLOW_LOST,
+    FLOW_NAMED,
+    MARK,
+    by_ends,
+    crashes,
+    few_drives,
+    flow_note,
+    remarks,
+)
 from lcc_rl.results.task import Task
 from lcc_rl.results.units import burns_one_fuel, check_unit, in_unit
 from lcc_rl.results.windows import DISTANCE, DRIVE, TRAINED, WAYS, savings, windows_of
 
 # Baselines of tables and verdicts; the first one that was evaluated is used.
-AGAINST = (HUMAN, "idm", "idm_acc_filtered", "idm_acc", "rule", "reference")
-RULE = "rule"  # the IDM, tuned on the same data by the gradient
-RULE_ROWS = (RULE, "idm_acc_filtered", "idm_acc")
+AGAINST = (RECORDED, HUMAN, "idm", "idm_acc_filtered", "idm_acc", "rule", "reference")
 # Strategies with which networks are compared. Only the rule is trained.
 UNTRAINED = (
     *("direct", "idm", HUMAN, RECORDED, "constant_filtered", RULE),
     *("idm_acc_filtered", "acc_filtered", "idm_acc", "acc"),
 )
-FEW_WINDOWS, SHORT = 5, 150.0  # least number of windows; length of short ones [s]
-SCORE, FLOW_LOST = "score", "flow_lost"
-FEW_DRIVES = ("saving_drives_low", "saving_drives_high")  # t-interval over fewer than five drives
+SCORE = "score"
 SAVED = Shown("saved_pct", "saved\n[%]")
+AT_FLOW = Shown("rule_pct", "saved against\nthe rule at\nequal flow [%]")
+SAVINGS = {  # columns of short tables by estimate
+    "saving": "saved_pct",
+    "second_saving": "second_pct",
+    "rule_saving": AT_FLOW.key,
+}
 WAY, FLOW_SHARE = Shown("distance_pct", "dis-\ntance\n[%]"), Shown("flow_pct", "flow\n[%]")
 COLLISIONS, KEEPS = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
-FLOW_NAMED = 0.05  # loss of flow that tables mention, as a share
-MUCH = 0.01  # share of time with infeasible accelerations that tables and log mention
-MOSTLY = 0.2  # share of time; I-80's drivers behind its leaders have 0.02, the stream's 0.06
 ALL = "all measures: table=all or --all."
-CAPTION = (
-    "Energy per vehicle and km, net of kinetic energy; {}shares of the time: "
-    f"TTC < 4 s; time gap > 2.5 s above 1 m/s; {ALL}"
-)
+CAPTION = f"Path energy per vehicle and km; {{}}{ALL}"
+SHARES = "shares of the time: TTC < 4 s; time gap > 2.5 s above 1 m/s; "
 BEHIND_FILTER = "networks and strategies called filtered drive behind the safety filter; "
 FULL = (
-    "energies: mean per episode; path energy: net of kinetic energy; saved: of path energy per "
-    "km, or of a task's score; intervals: over held-out windows, or drives if there are five or "
-    "more, and training seeds"
+    "energies: mean per episode; path energy: of the speeds without acceleration, and the loss by "
+    "accelerating; saved: of path energy per km, or of a task's score; intervals: over held-out "
+    "windows, or drives if there are five or more, and training seeds"
 )
 
 
@@ -132,7 +147,7 @@ def summary(
     energy: Fleet | None = None,
     against: str | None = None,
 ) -> pd.DataFrame:
-    """Summarise every strategy.
+    """Summarise every strategy but those along the front of a rule.
 
     Args:
         windows: result of :func:`windows_for`; all strategies have the same windows and drivers.
@@ -143,15 +158,20 @@ def summary(
 
     Returns:
         One row per strategy: :data:`lcc_rl.results.measures.MEASURES`; ``saving``, the share of
-        the score saved ``against`` the baseline, and ``drawn_saving``, that of the energy drawn
-        in an episode, with their intervals; the shares of distance and flow lost; numbers of
-        windows, drives and training seeds; and for a task score, limits and whether they are kept
-        without a collision. Missing values are NaN.
+        the score saved ``against`` the baseline, ``second_saving``, that of the second energy
+        model, ``rule_saving``, that against the front of a rule at equal flow, and
+        ``drawn_saving``, that of the energy drawn in an episode, with their intervals;
+        ``end_saving``, the difference of the drawn and the first saving; the shares of distance
+        and flow lost; numbers of windows, drives and training seeds; and for a task score, limits
+        and whether they are kept without a collision. Missing values are NaN, as are savings and
+        losses of a strategy with collisions.
 
     Raises:
         ConfigError: if the column of a limit, or the baseline, is missing.
     """
-    parts = {str(name): part for name, part in windows.groupby("strategy", sort=False)}
+    every = {str(name): part for name, part in windows.groupby("strategy", sort=False)}
+    front = [name for name in every if ON_FRONT in name]
+    parts = {name: part for name, part in every.items() if name not in front}
     against = task.against if task else against or baseline_of(parts)
     require_known("strategy to compare against", () if against is None else against, parts)
     # Without automated vehicles the values of limits are missing.
@@ -165,12 +185,9 @@ def summary(
         row |= {key: part.get(of, part["profile_id"]).nunique() for key, of in kinds.items()}
         if task:
             row |= {SCORE: score_of(task, part, energy)}
-        for key, of in {"saving": (column, per), "drawn_saving": ("total_energy_kj", [])}.items():
-            known = against not in (None, name) and of[0] in windows
-            share = savings(windows, of[0], name, str(against), of[1]) if known else NOTHING
-            row |= share.columns(key)
-            if key == "saving":
-                row |= dict(zip(FEW_DRIVES, share.over_drives or (np.nan, np.nan), strict=True))
+        crashed = bool(part.get("collisions", pd.Series(dtype=float)).sum())
+        found = (None, ()) if crashed else (against, front)
+        row |= _savings(windows, name, (column, per), *found)
         row |= {measure.key: measure.value(part) for measure in MEASURES}
         rows.append(row)
     table = pd.DataFrame(rows)
@@ -178,12 +195,37 @@ def summary(
     whole = table[table["strategy"] == against]
     for key, lost in {"distance_lost": DISTANCE, FLOW_LOST: FLOW}.items():
         table[key] = 1.0 - table[lost] / (whole[lost].iloc[0] if len(whole) else np.nan)
+    hit = (table["collisions"] > 0) & (table["strategy"] != against)
+    table.loc[hit, ["distance_lost", FLOW_LOST, FLOW]] = np.nan
     if task:
         table["kept"] = table["collisions"] == 0
         for one, bound in task.bounds.items():
             table[f"limit_{one.key}"] = bound
             table["kept"] &= pd.Series([one.keeps(x, bound) for x in table[one.key]])
     return table
+
+
+def _savings(
+    windows: pd.DataFrame,
+    name: str,
+    of: tuple[str, Sequence[str]],
+    against: str | None,
+    front: Sequence[str],
+) -> dict[str, float]:
+    """Return the savings of a strategy, see :func:`summary`; ``of``: energy and distances."""
+    found: dict[str, float] = {}
+    for key, energy, per in (
+        ("saving", *of),
+        ("second_saving", f"total_{SECOND}", [DISTANCE]),
+        ("drawn_saving", "total_energy_kj", []),
+    ):
+        known = against not in (None, name) and energy in windows
+        share = savings(windows, energy, name, str(against), per) if known else NOTHING
+        found |= share.columns(key)
+        if key == "saving":
+            found |= dict(zip(FEW_DRIVES, share.over_drives or (np.nan, np.nan), strict=True))
+    found["end_saving"] = found["drawn_saving"] - found["saving"]
+    return found | at_equal_flow(windows, name, front, of[0]).columns("rule_saving")
 
 
 def score_of(task: Task, part: pd.DataFrame, energy: Fleet | None) -> float:
@@ -203,6 +245,7 @@ def report(
     of: str = "",
     few: bool = False,
     against: str | None = None,
+    second: Fleet | None = None,
 ) -> Report:
     """Return the report of an evaluation.
 
@@ -214,19 +257,25 @@ def report(
         of: name of the source.
         few: whether the verdict mentions too few windows.
         against: the baseline; by default that of the task, or the first of :data:`AGAINST`.
+        second: the second energy model, if any, for a heading.
     """
     if task:
         task = replace(task, against=against) if against else task.among(windows["strategy"])
         task = task.resolved(windows)
     table, notes = summary(windows, task, energy, against), remarks(windows)
-    percent = {f"saved_pct{end}": 100.0 * table[f"saving{end}"] for end in ("", "_low", "_high")}
+    percent = {
+        f"{shown}{end}": 100.0 * table[f"{key}{end}"]
+        for key, shown in SAVINGS.items()
+        for end in ("", "_low", "_high")
+    }
     percent["distance_pct"] = -100.0 * table["distance_lost"] + 0.0  # no negative zero
     every = table.assign(**percent)
-    made = _of_task(every, task) if task else _of_energy(every, energy, filtered)
+    made = _of_task(every, task) if task else _of_energy(every, energy, filtered, second)
     short, shown = made.pop("short")
     rows = _rows(task, table["against"].iloc[0])
     words = "" if task else verdict(windows, table, few)
     words = "\n".join(filter(None, [words, few_drives(table)]))
+    notes += [*crashes(table), *filter(None, [flow_note(table), by_ends(table)])]
     made |= {"full_caption": FULL, "verdict": words, "remarks": notes}
     return Report(of, table, short, shown, rows, **made)
 
@@ -243,7 +292,10 @@ def _rows(task: Task | None, against: str | None) -> list[Measure]:
         Measure("saving_high", "    high", "{:+.2%}"),
         Measure(FEW_DRIVES[0], "  over its few drives (t), low", "{:+.2%}"),
         Measure(FEW_DRIVES[1], "    high", "{:+.2%}"),
+        Measure("second_saving", "  second energy model", "{:+.2%}"),
+        Measure("rule_saving", "  against the rule at equal flow", "{:+.2%}"),
         Measure("drawn_saving", "  as drawn, per episode", "{:+.1%}"),
+        Measure("end_saving", "    of it by start and end of episodes", "{:+.1%}"),
         Measure("distance_lost", "distance lost", "{:+.2%}"),
         Measure(FLOW_LOST, "flow lost", "{:+.2%}"),
         *(one for one in MEASURES if one.label),
@@ -256,7 +308,9 @@ def _rows(task: Task | None, against: str | None) -> list[Measure]:
     ]
 
 
-def _of_energy(table: pd.DataFrame, energy: Fleet | None, filtered: bool) -> dict[str, Any]:
+def _of_energy(
+    table: pd.DataFrame, energy: Fleet | None, filtered: bool, second: Fleet | None
+) -> dict[str, Any]:
     """Return the parts of a report that are specific to one without a task.
 
     The short table has rows for strategies with an automated vehicle, largest energy first.
@@ -275,8 +329,14 @@ def _of_energy(table: pd.DataFrame, energy: Fleet | None, filtered: bool) -> dic
     if energy is not None and burns_one_fuel(energy):
         columns["fuel_g_per_km"] = cars[PATH_PER_KM] * in_unit(1.0, "g/km", energy)
         shown.append(Shown("fuel_g_per_km", "fuel\n[g/km]"))
-    shown += [] if against is None else [SAVED, way]
-    shown += [*(one.shown for one in short), COLLISIONS]
+    shown += [] if against is None else [SAVED]
+    if second is not None and cars["second_pct"].notna().any():
+        of = "fuel" if burns_one_fuel(second) else "second\nmodel"
+        shown.append(Shown("second_pct", f"saved,\n{of}\n[%]"))
+    fronts = cars[AT_FLOW.key].notna().any()
+    shown += [AT_FLOW] * bool(fronts) + ([] if against is None else [way])
+    shown += [*(() if fronts else (one.shown for one in short)), COLLISIONS]
+    note += SHARES * (not fronts)
     return {
         "short": shortened(cars.assign(**columns), shown),
         "caption": CAPTION.format(note + BEHIND_FILTER * filtered),
@@ -300,7 +360,7 @@ def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
     ]
     columns = {one.key: one.scale * table[one.key] for one in task.bounds}
     saved = f"{saved_against(table, task.against, always=True)}; " * (len(table) > 1)
-    caption = f"{saved}kept: all limits, without a collision; {ALL} {flow_note(table)}".strip()
+    caption = f"{saved}kept: all limits, without a collision; {ALL}"
     short = shortened(table.assign(**columns), shown)
     return {"short": short, "caption": caption, "against": task.against, "label": task.label}
 
@@ -308,8 +368,13 @@ def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
 def shortened(
     table: pd.DataFrame, shown: Sequence[Shown]
 ) -> tuple[pd.DataFrame, tuple[Shown, ...]]:
-    """Return columns of a table with intervals and strategies in words, and the columns."""
-    table = table.assign(driver=[in_words(str(name)) for name in table["strategy"]])
+    """Return columns of a table with intervals and strategies in words, and the columns.
+
+    Strategies that lose more than 2 % of the flow are marked.
+    """
+    lost = table.get(FLOW_LOST, pd.Series(np.nan, table.index)) > FLOW_NAMED
+    words = [in_words(str(name)) for name in table["strategy"]]
+    table = table.assign(driver=[x + MARK * y for x, y in zip(words, lost, strict=True)])
     shown = (Shown("driver", "driven by"), *shown)
     names = [f"{one.key}{end}" for one in shown for end in ("", "_low", "_high")]
     return table[["strategy", *(x for x in names if x in table)]], shown
@@ -337,15 +402,6 @@ def saved_against(found: pd.DataFrame, against: str, always: bool = False) -> st
     return f"{words}, with the 95 % interval over {over}"
 
 
-def few_drives(table: pd.DataFrame) -> str:
-    """Return a sentence with the intervals over fewer than five drives; empty without any."""
-    found = table[table[FEW_DRIVES[0]].notna()]
-    rows = zip(found["strategy"], *(100.0 * found[name] for name in FEW_DRIVES), strict=True)
-    words = (f"{in_words(str(name))} {low:.1f} … {high:.1f}" for name, low, high in rows)
-    text = "; ".join(words).replace("-", "−")
-    return f"Saved [%], t-interval over {table['drives'].max()} drives: {text}." if text else ""
-
-
 def flow_against(table: pd.DataFrame) -> tuple[str, pd.Series]:
     """Return the caption of the flow's baseline, and the differences to it [%].
 
@@ -356,15 +412,6 @@ def flow_against(table: pd.DataFrame) -> tuple[str, pd.Series]:
     whole = table.loc[table["strategy"] == name, FLOW]
     share = table[FLOW] / (whole.iloc[0] if len(whole) else np.nan) - 1.0
     return f"flow against {in_words(str(name))}", 100.0 * share
-
-
-def flow_note(table: pd.DataFrame) -> str:
-    """Return a sentence on strategies that lose much flow; empty if none does."""
-    lost = table[table[FLOW_LOST] > FLOW_NAMED]
-    named = zip(lost["strategy"], lost[FLOW_LOST], strict=True)
-    parts = (f"{in_words(str(name))} {100.0 * share:.0f} %" for name, share in named)
-    against = in_words(str(table["against"].iloc[0]))
-    return f"Flow lost against {against}: {'; '.join(parts)}." if len(lost) else ""
 
 
 def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> str:
@@ -419,76 +466,3 @@ def _sentence(windows: pd.DataFrame, rows: Mapping[str, Any], name: str, other: 
         f"{less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of "
         f"the time against {theirs:.2f} %{flow}."
     )
-
-
-def remarks(windows: pd.DataFrame) -> list[str]:
-    """Return sentences on limitations of the numbers of an evaluation."""
-    means, found = measures.means(windows, (*REACH, BROKEN)), []
-
-    def named(shares: pd.Series, least: float) -> str:
-        large = shares[shares > least].items()
-        return ", ".join(f"{in_words(str(name))} {share:.2%}" for name, share in large)
-
-    if names := named(means[list(REACH)].max(axis=1), MUCH):
-        found.append(
-            "Vehicles accelerate harder, or hold a higher speed, than their energy model allows "
-            f"for more than {MUCH:.0%} of the time ({names}): their energies are lower bounds."
-        )
-    if names := named(means[BROKEN], 0.0):
-        found.append(
-            f"Steps that the filter's guarantee covers turn unsafe ({names}): brakes, delays or "
-            "sensors differ from scenario.actuators and scenario.sensors."
-        )
-    return found
-
-
-def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
-    """Return a warning for every driver with a desired speed that leaders mostly exceed.
-
-    Such a driver falls behind with any strategy, so energies reflect distances. There is no warning
-    for strategies behind a safety filter, or for networks, whose share is that of drivers behind.
-
-    Args:
-        windows: result of :func:`windows_for`.
-        of_task: whether a task is evaluated, which defines the strategies.
-    """
-    remedies = {
-        "direct": "drivers=highway, or drivers calibrated on such traffic",
-        "idm": "variant=idm scenario.controllers.automated.desired_speed=45 'compare=[<run>]'",
-    }
-    remedies[HUMAN] = remedies["direct"]
-    if of_task:
-        remedies["idm"] = "compare with human, which has the v0 of drivers=…"
-    shares = measures.means(windows, (FASTER,))[FASTER]
-    people = [shares[name] for name in (HUMAN, "direct") if name in shares]
-    for name in shares.index if people else ():
-        if not name.endswith(FILTERED) and not np.isclose(shares[name], people).any():
-            kind = "lcc_rl.pieces.LinearACC" if name == "acc" else "<its class>"
-            option = f"'compare={{faster: {{_target_: {kind}, desired_speed: 45}}}}'"
-            remedies.setdefault(name, option)
-    return [
-        f"the leaders drive faster than the desired speed of {name} for {shares[name]:.0%} of the "
-        f"time (more than {MOSTLY:.0%}): savings against it are not valid. Raise v0: {remedy}"
-        for name, remedy in remedies.items()
-        if shares.get(name, 0.0) > MOSTLY
-    ]
-
-
-def sample_of(rows: pd.DataFrame, drivers: pd.DataFrame | None = None) -> str:
-    """Return the numbers of windows and drivers of rows, for a title."""
-    windows, people = rows["profile_id"].nunique(), (rows if drivers is None else drivers)
-    size = several(people["driver_id"].nunique(), "driver")
-    return f"{counted_windows(windows, 'held-out ')} × {size}"
-
-
-def few_windows(windows: int, seconds: float | None = None) -> str:
-    """Return a warning on few windows; empty for enough or long ones.
-
-    Args:
-        windows: number of windows.
-        seconds: length of each, if it is known.
-    """
-    if windows >= FEW_WINDOWS or windows * (seconds or 0.0) >= SHORT:
-        return ""
-    found = counted_windows(windows) + (f" of {seconds:g} s" if seconds else "")
-    return f"{found} are too few for conclusions: these numbers only show that everything runs"

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from lcc_rl.energy import AVERAGED, BURNT
+from lcc_rl.energy import AVERAGED, BURNT, SECOND
 from lcc_rl.io.files import Rows, read_parquet
 from lcc_rl.results.bootstrap import NOTHING, Estimate, saving, share_saved
 from lcc_rl.results.runs import EPISODES
@@ -27,7 +27,7 @@ WINDOW_KEYS = [STRATEGY, TRAINED, "profile_id"]
 PER_WINDOW = ["profile", SOURCE, DRIVE]  # constant within a window
 WAYS = ("cav_distance_m", "hdv_distance_m")  # their sum is the distance of all vehicles
 DISTANCE, DAMPING = "distance_m", "damping_time_s"
-ENERGIES = ("energy_kj", "net_energy_kj", "path_energy_kj", *AVERAGED, *BURNT)
+ENERGIES = ("energy_kj", "net_energy_kj", "path_energy_kj", *AVERAGED, *BURNT, SECOND)
 FOLDED = 100_000  # most rows of partial sums before they are added
 PER_KM = "vehicle and km"
 # Distances by which the energies of each group of vehicles are divided.

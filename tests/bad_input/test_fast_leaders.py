@@ -18,7 +18,8 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.rows import leader_faster
 from lcc_rl.results.measures import FASTER, REACH
 from lcc_rl.results.names import in_words
-from lcc_rl.results.report import leader_too_fast, remarks, windows_for
+from lcc_rl.results.remarks import leader_too_fast, remarks
+from lcc_rl.results.report import windows_for
 
 
 def test_the_share_of_time_by_hand() -> None:

@@ -82,7 +82,6 @@ from lcc_rl.pieces import (
     PISaturation,
     RangeReward,
     RecordedDriver,
-    RecordedStart,
     RewardPiece,
     RewardTerm,
     RolePlaces,
@@ -146,7 +145,7 @@ SCALES = {
 DRIVEN = ("human", "handover", "late", "optimal", "difference", "gipps", "calibrated")
 ACTIONS = {ACTION: (2, 1), ("plain", "action"): (1, 1), ("hybrid", "action"): (2, 1)}
 BASES = (Piece, Feature, StepTransform, RewardPiece, RewardTerm, Controller, DriverModel)
-STARTS = (HeadwayStart, TimeGapStart, EquilibriumStart, RecordedStart)
+STARTS = (HeadwayStart, TimeGapStart, EquilibriumStart)
 
 
 def leading() -> dict[str, Piece]:
@@ -202,7 +201,6 @@ def motion(string: VehicleString) -> StringMotion:
     start = {role: TimeGapStart() for role in string.names}
     start |= {role: EquilibriumStart() for role in DRIVEN}
     start |= {role: HeadwayStart() for role in CONNECTED}
-    start |= {} if string.ring else {"recorded": RecordedStart()}
     length = 30.0 * len(string) if string.ring else None
     return StringMotion(start=start, circumference=length, initial_speed=8.0)
 

@@ -32,7 +32,7 @@ def drive(*overrides: str):
 
 
 def test_every_recorded_speed_is_reached() -> None:
-    data, profiles = drive("scenario.start.automated={_target_: lcc_rl.pieces.RecordedStart}")
+    data, profiles = drive("scenario.start.automated={_target_: lcc_rl.pieces.TimeGapStart}")
     for episode in range(4):
         own = profiles.follower(int(data["leader", "profile"][episode, 0]))
         torch.testing.assert_close(
@@ -48,7 +48,7 @@ def test_a_speedometer_that_errs_leads_nobody_away() -> None:
     cfg = compose(
         "idm",
         "controller@scenario.controllers.automated=recorded",
-        "scenario.start.automated={_target_: lcc_rl.pieces.RecordedStart}",
+        "scenario.start.automated={_target_: lcc_rl.pieces.TimeGapStart}",
     )
     node = cfg.scenario.pieces["leader"].changed(start="first")
     cfg.scenario.pieces["leader"] = node
@@ -61,7 +61,7 @@ def test_a_speedometer_that_errs_leads_nobody_away() -> None:
 
 
 def test_vehicles_start_as_recorded() -> None:
-    data, profiles = drive("scenario.start.automated={_target_: lcc_rl.pieces.RecordedStart}")
+    data, profiles = drive("scenario.start.automated={_target_: lcc_rl.pieces.TimeGapStart}")
     for episode in range(4):
         own = profiles.follower(int(data["leader", "profile"][episode, 0]))
         assert data["vehicles", "speed"][episode, 0, 0, 0] == own[0, 0]
@@ -89,7 +89,7 @@ def test_the_strategy_starts_and_drives_as_recorded() -> None:
     ("what", "overrides"),
     [
         ("controllers", ["controller@scenario.controllers.automated=recorded"]),
-        ("start", ["scenario.start.automated={_target_: lcc_rl.pieces.RecordedStart}"]),
+        ("start", ["scenario.start.automated={_target_: lcc_rl.pieces.TimeGapStart}"]),
     ],
 )
 def test_leaders_without_followers_are_refused(what, overrides) -> None:

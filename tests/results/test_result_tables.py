@@ -204,14 +204,16 @@ def test_a_table_in_a_pipe_is_as_wide_as_its_content_or_as_columns(monkeypatch, 
     assert widths["80"] == 80 < widths[""]
 
 
-def test_a_table_says_who_loses_more_than_5_percent_of_the_flow() -> None:
+def test_a_table_marks_strategies_that_lose_more_than_2_percent_of_the_flow() -> None:
     flows = {"human": 2000.0, "idm_acc": 1920.0, "pi_saturation": 1600.0}
     rows = pd.concat(driven(name, 1.0, flow_vph=flow) for name, flow in flows.items())
     one = report(windows_for(rows), TASK, MOTOR)
     found = one.table
     assert found["flow_lost"].tolist() == pytest.approx([0.0, 0.04, 0.2])
-    said = one.caption
-    assert said.endswith(" Flow lost against simulated drivers: PI with saturation 20 %.")
+    lost = "†: flow lost against simulated drivers: tuned IDM 4 %; PI with saturation 20 %."
+    assert lost in one.remarks
+    marked = ["simulated drivers", "tuned IDM †", "PI with saturation †"]
+    assert one.short["driver"].tolist() == marked
     assert found["kept"].all()
 
 

@@ -15,7 +15,7 @@ from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.names import in_words
-from lcc_rl.results.report import sample_of
+from lcc_rl.results.remarks import sample_of
 from lcc_rl.results.runs import EPISODES, STEPS
 from lcc_rl.results.windows import LEADER_COLUMNS, WINDOWS, Means
 from lcc_rl.studies.alcc import figures, paper_tables, tables
