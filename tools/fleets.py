@@ -95,7 +95,8 @@ def curve(part: pd.DataFrame, name: str) -> tuple[pd.Series, pd.Series]:
 
 def against(part: pd.DataFrame, name: str, measure: Statistic) -> Estimate:
     """Return a measure of the learned fleet against another."""
-    return compare_fronts(part, (LEARNED, "fleet"), (name, "fleet"), FLEET, measure)
+    kinds = (LEARNED, "fleet"), (name, "fleet")
+    return compare_fronts(part, *kinds, columns=FLEET, measure=measure)
 
 
 def percent(found: Estimate) -> str:

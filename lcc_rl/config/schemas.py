@@ -129,7 +129,8 @@ class EvaluationConfig(Settings):
     full_length: bool = False
     humans_first: NonNegative = 0.0  # time with human drivers only, on a ring, not measured [s]
     warm_up: NonNegative = 0.0  # first seconds of an episode, in which only collisions count [s]
-    front: list[Positive] = dataclasses.field(default_factory=list)  # time gaps of a rule [s]
+    # Further longest time gaps of the safety filter, for savings at equal flow [s].
+    front: list[Positive] = dataclasses.field(default_factory=list)
     second_energy: Described = None  # energy model of a second saving
 
     def validate(self) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import re
 from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
@@ -17,11 +16,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torch import nn
-
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
-from lcc_rl.agents.rules import Rule
 from lcc_rl.config import NOT_IDENTITY, load
 from lcc_rl.config.nodes import Node, as_plain
 from lcc_rl.config.schemas import StudyConfig
@@ -156,23 +152,26 @@ def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[St
 
 
 def front_of(strategies: Sequence[Strategy], time_gaps: Sequence[float]) -> list[Strategy]:
-    """Build the first of :data:`RULE_ROWS` with other time gaps [s], for savings at equal flow."""
-    names = {one.name for one in strategies}
-    name = next((rule for rule in RULE_ROWS if rule in names), None)
-    rules = [one for one in strategies if one.name == name]
-    return [_with_time_gap(one, time_gap) for one in rules for time_gap in time_gaps]
+    """Build policies and the tuned rule behind filters with other longest time gaps [s].
 
+    These are the points at which :func:`lcc_rl.results.fronts.at_equal_flow` compares.
 
-def _with_time_gap(rule: Strategy, time_gap: float) -> Strategy:
-    name, policy, cfg = f"{rule.name}{ON_FRONT}{time_gap:g}", deepcopy(rule.policy), rule.cfg
-    if policy is None:
-        controller = cfg.scenario.controllers[AUTOMATED].changed(time_gap=time_gap)
-        return replace(rule, name=name, cfg=driven_by(cfg, controller))
-    for module in policy.modules() if isinstance(policy, nn.Module) else ():
-        if isinstance(module, Rule):
-            place = module.names.index("time_gap")
-            module.logarithms.data[place] = math.log(time_gap)
-    return replace(rule, name=name, policy=policy)
+    Raises:
+        ConfigError: if there is no safety filter.
+    """
+    rule = next((x for x in RULE_ROWS for one in strategies if one.name == x), None)
+    found = []
+    for one in strategies if time_gaps else ():
+        if one.policy is None and one.name != rule:
+            continue
+        node = one.cfg.scenario.filters.get(AUTOMATED)
+        if node is None:
+            raise ConfigError("evaluation.front needs the safety filter (+filter=cbf adds one)")
+        for time_gap in time_gaps:
+            cfg = deepcopy(one.cfg)
+            cfg.scenario.filters[AUTOMATED] = node.changed(time_gap=time_gap)
+            found.append(replace(one, name=f"{one.name}{ON_FRONT}{time_gap:g}", cfg=cfg))
+    return found
 
 
 def without_filter(cfg: StudyConfig) -> StudyConfig:

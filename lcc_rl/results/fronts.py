@@ -57,22 +57,18 @@ def front(windows: pd.DataFrame, kind: Sequence[str], columns: Sequence[str]) ->
 
 
 def compare_fronts(
-    windows: pd.DataFrame,
-    one: Sequence[str],
-    other: Sequence[str],
-    columns: Sequence[str],
-    measure: Statistic,
+    windows: pd.DataFrame, *kinds: Sequence[str], columns: Sequence[str], measure: Statistic
 ) -> Estimate:
-    """Return a measure of two kinds of controllers with its interval.
+    """Return a measure of kinds of controllers with its interval.
 
     It is resampled as in :func:`lcc_rl.results.bootstrap.estimate`.
 
     Args:
         windows, columns: see :func:`front`.
-        one, other: variant and policy of each.
-        measure: function of the means by limit of both.
+        kinds: variant and policy of each.
+        measure: function of the means by limit of each.
     """
-    fronts = [front(windows, kind, columns) for kind in (one, other)]
+    fronts = [front(windows, kind, columns) for kind in kinds]
     drives = windows.groupby("profile_id")[DRIVE].first().tolist() if DRIVE in windows else None
 
     def statistic(*sides: Curve) -> Any:
@@ -81,16 +77,22 @@ def compare_fronts(
     return estimate(statistic, *fronts, drives=drives)
 
 
-def energy_at(energy: Floats, share: Floats, at: Any, most: float | None = None) -> Floats:
+def energy_at(
+    energy: Floats,
+    share: Floats,
+    at: Any,
+    least: float | None = np.nan,
+    most: float | None = None,
+) -> Floats:
     """Return the energy of a front, ``[..., limits]`` each, at the share ``at``.
 
-    It is interpolated linearly between the limits, and NaN if all shares are larger. If all are
-    smaller, it is ``most``, by default the energy of the largest share.
+    It is interpolated linearly between the limits. If all shares are larger, it is ``least``; if
+    all are smaller, ``most``; None: the energy of the nearest share.
     """
 
     def read(at: float, share: Floats, energy: Floats) -> float:
         order = np.argsort(share)
-        return float(np.interp(at, share[order], energy[order], left=np.nan, right=most))
+        return float(np.interp(at, share[order], energy[order], left=least, right=most))
 
     return np.asarray(np.vectorize(read, signature="(),(n),(n)->()")(at, share, energy))
 
@@ -106,7 +108,7 @@ def saving_at(
     def measure(*curves: Curve) -> Any:
         return share_saved(*(energy_at(x[ENERGY], x[LONG_SHARE], at) for x in curves))
 
-    return compare_fronts(windows, one, other, (ENERGY, LONG_SHARE), measure)
+    return compare_fronts(windows, one, other, columns=(ENERGY, LONG_SHARE), measure=measure)
 
 
 def energy_per_distance(curve: Curve) -> Floats:
@@ -124,37 +126,50 @@ def flow_gained(point: Curve, baseline: Curve) -> Any:
     return point[FLOW][..., 0] / baseline[FLOW][..., 0] - 1.0
 
 
-def saved_at_flow(point: Curve, rule: Curve) -> Any:
-    """Return the share of energy per distance that a fleet saves against a front at equal flow.
+def saved_at_flow(own: Curve, other: Curve, reference: Curve | None = None) -> Any:
+    """Return the share of energy per distance that one front saves against another at equal flow.
 
-    NaN if the front does not reach that flow.
+    The flow is that of the reference, by default of ``own``; a car, a platoon or a fleet is a front
+    of one point. The share is NaN if a front has less flow everywhere, or the other one more. If
+    ``own`` has more everywhere, the energy is that of its least flow.
     """
-    rival = energy_at(energy_per_distance(rule), rule[FLOW], point[FLOW][..., 0], np.nan)
-    return share_saved(energy_per_distance(point)[..., 0], rival)
+    flow = (own if reference is None else reference)[FLOW][..., 0]
+    mine, rival = (
+        energy_at(energy_per_distance(x), x[FLOW], flow, least, np.nan)
+        for x, least in ((own, None), (other, np.nan))
+    )
+    return share_saved(mine, rival)
 
 
-def at_equal_flow(windows: pd.DataFrame, name: str, rules: Sequence[str], energy: str) -> Estimate:
-    """Return the share of energy per distance that a strategy saves against a front of rules.
+def at_equal_flow(
+    windows: pd.DataFrame, own: Sequence[str], other: Sequence[str], energy: str, reference: str
+) -> Estimate:
+    """Return the share of energy per distance saved at the flow of a reference.
 
     Args:
         windows: result of :func:`lcc_rl.results.windows.windows_of`.
-        name: the strategy: one car, a platoon or a fleet.
-        rules: strategies along the front, such as a rule with several time gaps.
+        own: strategies along the front of one kind, such as a network behind filters with several
+            longest time gaps.
+        other: likewise, of the kind with which it is compared.
         energy: column of the energy.
+        reference: strategy with the flow.
 
     Returns:
-        The share at the flow of the strategy with its interval; NaN if the front does not reach
-        that flow, or without fronts.
+        The share with its interval; NaN if a front does not reach the flow, or one is missing.
     """
-    chosen = windows[windows[STRATEGY].isin([name, *rules])]
-    if not rules or not {energy, FLOW} <= set(chosen) or name not in set(chosen[STRATEGY]):
-        return NOTHING
-    kind = np.where(chosen[STRATEGY] == name, "point", "front")
-    number = {rule: place for place, rule in enumerate(rules)}
-    rows = chosen.assign(variant=kind, policy="", limit=chosen[STRATEGY].map(number).fillna(0))
-    rows[TRAINED] = rows[TRAINED].astype(object).fillna(-1)
     columns = (energy, DISTANCE, FLOW)
-    return compare_fronts(rows, ("point", ""), ("front", ""), columns, saved_at_flow)
+    sides = {"own": own, "other": other, "reference": [reference]}
+    known = {*own, *other, reference} <= set(windows[STRATEGY]) and {*columns} <= set(windows)
+    if not known or not own or not other:
+        return NOTHING
+    rows = pd.concat(
+        windows[windows[STRATEGY] == name].assign(variant=side, policy="", limit=place)
+        for side, names in sides.items()
+        for place, name in enumerate(names)
+    )
+    rows[TRAINED] = rows[TRAINED].astype(object).fillna(-1)
+    kinds = ((side, "") for side in sides)
+    return compare_fronts(rows, *kinds, columns=columns, measure=saved_at_flow)
 
 
 def points(windows: pd.DataFrame) -> pd.DataFrame:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from lcc_rl.energy import AVERAGED, AVERAGES
+from lcc_rl.energy import AVERAGED, AVERAGES, SECOND
 from lcc_rl.results.windows import DAMPING, DISTANCE, WAYS, episode_mean, how
 
 PATH = "total_path_energy_kj"
@@ -131,6 +131,7 @@ MEASURES = [
     _energy("", "  as drawn, per vehicle and km [kJ]", "energy"),
     _energy("net_energy_", score="net_energy"),
     *(Measure(f"{group}_net_energy_kj") for group in ("cav", "hdv", "total")),
+    Measure(f"total_{SECOND}"),
     _energy("second_path_energy_", "path energy, second model, per vehicle and km [kJ]"),
     _per("fuel_l_per_100km", "fuel [L/100 km]", "all_fuel_l", 1e5),
     _per("co2_g_per_km", "carbon dioxide of it [g/km]", "all_co2_g", 1e3, "{:.1f}"),

@@ -23,7 +23,7 @@ NETWORK = "alcc"
 FILTER_ALONE = "constant_filtered"
 RULE = "rule"  # the IDM, tuned on the same data by the gradient
 RULE_ROWS = (RULE, "idm_acc_filtered", "idm_acc")
-ON_FRONT = " T="  # between the name of a rule and its time gap [s]
+ON_FRONT = " X="  # between the name of a strategy and the longest time gap of its filter [s]
 # Strategies with several variants, which further words of a name specify.
 SEVERAL = {
     "reference": "network, own energy",

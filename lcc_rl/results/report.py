@@ -60,11 +60,23 @@ UNTRAINED = (
 )
 SCORE = "score"
 SAVED = Shown("saved_pct", "saved\n[%]")
-AT_FLOW = Shown("rule_pct", "saved against\nthe rule at\nequal flow [%]")
+SECOND_SAVED = Shown("second_pct", "saved,\n{}\n[%]")
+# Savings at the flow of the recorded drivers.
+AT_FLOW = (
+    Shown("flow_saved_pct", "saved at\ntheir flow\n[%]"),
+    Shown("second_flow_saved_pct", "of {}\n[%]"),
+    Shown("rule_pct", "against\nthe rule\n[%]"),
+)
 SAVINGS = {  # columns of short tables by estimate
-    "saving": "saved_pct",
-    "second_saving": "second_pct",
-    "rule_saving": AT_FLOW.key,
+    "saving": SAVED.key,
+    "second_saving": SECOND_SAVED.key,
+    **dict(
+        zip(
+            ("flow_saving", "second_flow_saving", "rule_saving"),
+            (x.key for x in AT_FLOW),
+            strict=True,
+        )
+    ),
 }
 WAY, FLOW_SHARE = Shown("distance_pct", "dis-\ntance\n[%]"), Shown("flow_pct", "flow\n[%]")
 COLLISIONS, KEEPS = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
@@ -159,8 +171,9 @@ def summary(
     Returns:
         One row per strategy: :data:`lcc_rl.results.measures.MEASURES`; ``saving``, the share of
         the score saved ``against`` the baseline, ``second_saving``, that of the second energy
-        model, ``rule_saving``, that against the front of a rule at equal flow, and
-        ``drawn_saving``, that of the energy drawn in an episode, with their intervals;
+        model, ``flow_saving`` and ``second_flow_saving``, those against the recorded drivers at
+        their flow, ``rule_saving``, that against the rule at this flow, and ``drawn_saving``, that
+        of the energy drawn in an episode, with their intervals;
         ``end_saving``, the difference of the drawn and the first saving; the shares of distance
         and flow lost; numbers of windows, drives and training seeds; and for a task score, limits
         and whether they are kept without a collision. Missing values are NaN, as are savings and
@@ -170,8 +183,7 @@ def summary(
         ConfigError: if the column of a limit, or the baseline, is missing.
     """
     every = {str(name): part for name, part in windows.groupby("strategy", sort=False)}
-    front = [name for name in every if ON_FRONT in name]
-    parts = {name: part for name, part in every.items() if name not in front}
+    parts = {name: part for name, part in every.items() if ON_FRONT not in name}
     against = task.against if task else against or baseline_of(parts)
     require_known("strategy to compare against", () if against is None else against, parts)
     # Without automated vehicles the values of limits are missing.
@@ -186,8 +198,7 @@ def summary(
         if task:
             row |= {SCORE: score_of(task, part, energy)}
         crashed = bool(part.get("collisions", pd.Series(dtype=float)).sum())
-        found = (None, ()) if crashed else (against, front)
-        row |= _savings(windows, name, (column, per), *found)
+        row |= _savings(windows, name, (column, per), None if crashed else against)
         row |= {measure.key: measure.value(part) for measure in MEASURES}
         rows.append(row)
     table = pd.DataFrame(rows)
@@ -206,17 +217,14 @@ def summary(
 
 
 def _savings(
-    windows: pd.DataFrame,
-    name: str,
-    of: tuple[str, Sequence[str]],
-    against: str | None,
-    front: Sequence[str],
+    windows: pd.DataFrame, name: str, of: tuple[str, Sequence[str]], against: str | None
 ) -> dict[str, float]:
     """Return the savings of a strategy, see :func:`summary`; ``of``: energy and distances."""
     found: dict[str, float] = {}
+    second = f"total_{SECOND}"
     for key, energy, per in (
         ("saving", *of),
-        ("second_saving", f"total_{SECOND}", [DISTANCE]),
+        ("second_saving", second, [DISTANCE]),
         ("drawn_saving", "total_energy_kj", []),
     ):
         known = against not in (None, name) and energy in windows
@@ -225,7 +233,19 @@ def _savings(
         if key == "saving":
             found |= dict(zip(FEW_DRIVES, share.over_drives or (np.nan, np.nan), strict=True))
     found["end_saving"] = found["drawn_saving"] - found["saving"]
-    return found | at_equal_flow(windows, name, front, of[0]).columns("rule_saving")
+    names = windows["strategy"].unique()
+    rule = next((one for one in RULE_ROWS if one in names), "")
+    own, rules = (
+        [x for x in names if x == one or x.startswith(f"{one}{ON_FRONT}")] for one in (name, rule)
+    )
+    for key, other, energy in (
+        ("flow_saving", [RECORDED], of[0]),
+        ("second_flow_saving", [RECORDED], second),
+        ("rule_saving", rules if name != rule else [], of[0]),
+    ):
+        fronts = own if len(own) > 1 and against is not None else []
+        found |= at_equal_flow(windows, fronts, other, energy, RECORDED).columns(key)
+    return found
 
 
 def score_of(task: Task, part: pd.DataFrame, energy: Fleet | None) -> float:
@@ -293,7 +313,8 @@ def _rows(task: Task | None, against: str | None) -> list[Measure]:
         Measure(FEW_DRIVES[0], "  over its few drives (t), low", "{:+.2%}"),
         Measure(FEW_DRIVES[1], "    high", "{:+.2%}"),
         Measure("second_saving", "  second energy model", "{:+.2%}"),
-        Measure("rule_saving", "  against the rule at equal flow", "{:+.2%}"),
+        Measure("flow_saving", "  at the recorded drivers' flow, against them", "{:+.2%}"),
+        Measure("rule_saving", "    against the rule", "{:+.2%}"),
         Measure("drawn_saving", "  as drawn, per episode", "{:+.1%}"),
         Measure("end_saving", "    of it by start and end of episodes", "{:+.1%}"),
         Measure("distance_lost", "distance lost", "{:+.2%}"),
@@ -329,13 +350,12 @@ def _of_energy(
     if energy is not None and burns_one_fuel(energy):
         columns["fuel_g_per_km"] = cars[PATH_PER_KM] * in_unit(1.0, "g/km", energy)
         shown.append(Shown("fuel_g_per_km", "fuel\n[g/km]"))
-    shown += [] if against is None else [SAVED]
-    if second is not None and cars["second_pct"].notna().any():
-        of = "fuel" if burns_one_fuel(second) else "second\nmodel"
-        shown.append(Shown("second_pct", f"saved,\n{of}\n[%]"))
-    fronts = cars[AT_FLOW.key].notna().any()
-    shown += [AT_FLOW] * bool(fronts) + ([] if against is None else [way])
-    shown += [*(() if fronts else (one.shown for one in short)), COLLISIONS]
+    fronts = [one for one in AT_FLOW if cars[one.key].notna().any()]
+    seconds = [SECOND_SAVED] * bool(cars[SECOND_SAVED.key].notna().any() and not fronts)
+    shown += [] if against is None else [SAVED, *seconds, way]
+    shown += fronts or [one.shown for one in short]
+    of = "fuel" if second is not None and burns_one_fuel(second) else "second model"
+    shown = [Shown(key, words.format(of)) for key, words in [*shown, COLLISIONS]]
     note += SHARES * (not fronts)
     return {
         "short": shortened(cars.assign(**columns), shown),

@@ -11,7 +11,7 @@ from lcc_rl.agents.limits import Limits
 from lcc_rl.energy import as_fleet
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.power import acceleration_loss, steady_power
-from lcc_rl.pieces import PathEnergy, SmoothEfficiency, Smoothness, SmoothSafety
+from lcc_rl.pieces import ExcessSpacing, PathEnergy, SmoothEfficiency, Smoothness, SmoothSafety
 from lcc_rl.pieces.world import World
 
 KNOWN = {"safety": SmoothSafety(), "efficiency": SmoothEfficiency(), "smoothness": Smoothness()}
@@ -29,6 +29,28 @@ def test_a_price_rises_until_its_limit_is_kept() -> None:
     # Kept by something else: its price falls.
     assert limits.price("safety") == pytest.approx(2.718281828**-0.4)
     assert limits.price("cav_energy") == 1.0
+
+
+def test_the_price_of_an_average_answers_on_both_sides() -> None:
+    limits = Limits({"spacing": "recorded"}, 0.1, {"spacing": ExcessSpacing(time_gap=2.4)})
+    profiles = followed_profiles()
+    limits.take(profiles)
+    gap, own = profiles.followers[:, 1].double(), 2.0 + 2.4 * profiles.followers[:, 0].double()
+    largest = float(((gap - own) / (own + 5.0)).mean())
+    assert limits.largest["spacing"] == pytest.approx(largest, abs=1e-5)
+    assert largest < 0.0
+    prices = []
+    for miss in (0.02, 0.02, -0.02, 0.0):
+        limits.update({"spacing": limits.largest["spacing"] + miss})
+        prices.append(limits.price("spacing"))
+    # The sum of the misses, and twice the latest one, as shares of the least or the limit's size.
+    width = max(0.1, abs(largest))
+    sums, latest = torch.tensor([2.0, 4.0, 2.0, 2.0]), torch.tensor([2.0, 2.0, -2.0, 0.0])
+    expected = (0.1 * sums + 2.0 * latest) * 0.01 / width
+    assert torch.allclose(torch.tensor(prices).log(), expected, atol=1e-5)
+    other = Limits({"spacing": 0.0}, 0.1, {"spacing": ExcessSpacing()})
+    other.load_state_dict(limits.state_dict())
+    assert other.price("spacing") == limits.price("spacing")
 
 
 def test_a_limit_is_that_of_the_recorded_drivers() -> None:

@@ -69,7 +69,7 @@ def test_vehicles_start_as_recorded() -> None:
 
 
 def test_the_strategy_starts_and_drives_as_recorded() -> None:
-    cfg = composed("variant=idm", "scenario.horizon=30")
+    cfg = composed("variant=idm", "scenario.horizon=30", "evaluation.warm_up=0")
     windows = followed_profiles().windows(30)
     inputs = Inputs(windows, windows, POPULATION)
     rows, _ = evaluate(baseline(cfg, "recorded"), inputs, 2, 64, seed=0)
@@ -85,17 +85,37 @@ def test_the_strategy_starts_and_drives_as_recorded() -> None:
     assert [one.name for one in baselines(cfg)] == ["direct", "recorded"]
 
 
+def test_leaders_without_followers_are_refused() -> None:
+    cfg = compose("idm", "controller@scenario.controllers.automated=recorded")
+    with pytest.raises(ConfigError, match=r"controllers\.automated: no driver was recorded"):
+        build_env(cfg, wavy_profiles(), POPULATION, 2)
+
+
 @pytest.mark.parametrize(
-    ("what", "overrides"),
+    ("string", "profiles", "words", "first"),
     [
-        ("controllers", ["controller@scenario.controllers.automated=recorded"]),
-        ("start", ["scenario.start.automated={_target_: lcc_rl.pieces.TimeGapStart}"]),
+        ("automated*2 human", followed_profiles(), [], None),
+        ("automated*2 human", followed_profiles(), ["scenario.start.automated.time_gap=1.0"], 1.0),
+        ("human automated", followed_profiles(), [], 1.5),
+        ("automated human", wavy_profiles(), [], 1.5),
     ],
 )
-def test_leaders_without_followers_are_refused(what, overrides) -> None:
-    cfg = compose("idm", *overrides)
-    with pytest.raises(ConfigError, match=rf"scenario\.{what}\.automated: no driver was recorded"):
-        build_env(cfg, wavy_profiles(), POPULATION, 2)
+def test_a_start_is_recorded_directly_behind_the_leader_only(
+    string, profiles, words, first
+) -> None:
+    cfg = compose("reference", f"scenario.string={string}", *words)
+    env = build_env(cfg, profiles, POPULATION, 4, 0, nominal=True)
+    start = env.reset()
+    place = cfg.scenario.vehicles.places("automated")
+    speed, gap = (start["vehicles", x][:, list(place), 0] for x in ("speed", "gap"))
+    assert torch.allclose(gap[:, 1:], 2.0 + (first or 1.5) * speed[:, 1:])
+    if first is not None:
+        assert torch.allclose(gap, 2.0 + first * speed)
+        return
+    for episode, own in enumerate(start["leader", "profile"][:, 0].tolist()):
+        sample = int(start["leader", "start"][episode, 0])
+        found = profiles.follower(own)[sample]
+        assert torch.equal(torch.stack([speed[episode, 0], gap[episode, 0]]), found)
 
 
 def test_followers_stay_beside_their_leaders() -> None:
@@ -141,7 +161,8 @@ def test_followers_stay_beside_their_leaders() -> None:
     ],
 )
 def test_a_recorded_driver_that_cannot_be_played_is_never_silent(words, message, caplog) -> None:
-    small = ["scenario.horizon=40", "evaluation.profiles=2", "evaluation.drivers=2"]
+    small = ["scenario.horizon=40", "evaluation.warm_up=0", "evaluation.profiles=2"]
+    small += ["evaluation.drivers=2"]
     cfg = load("evaluate", ["variant=idm", "compare=[recorded]", *words, *small])
     with pytest.raises(ConfigError, match=message):
         strategies_of(cfg)
