@@ -159,17 +159,18 @@ def front_of(strategies: Sequence[Strategy], time_gaps: Sequence[float]) -> list
     Raises:
         ConfigError: if there is no safety filter.
     """
-    rule = next((x for x in RULE_ROWS for one in strategies if one.name == x), None)
+    behind = [one for one in strategies if one.cfg.scenario.filters.get(AUTOMATED) is not None]
+    require(
+        behind or not time_gaps, "evaluation.front needs the safety filter (+filter=cbf adds one)"
+    )
+    rule = next((name for name in RULE_ROWS if name in {one.name for one in behind}), None)
     found = []
-    for one in strategies if time_gaps else ():
-        if one.policy is None and one.name != rule:
-            continue
-        node = one.cfg.scenario.filters.get(AUTOMATED)
-        if node is None:
-            raise ConfigError("evaluation.front needs the safety filter (+filter=cbf adds one)")
-        for time_gap in time_gaps:
+    for one in behind:
+        for time_gap in time_gaps if one.policy is not None or one.name == rule else ():
             cfg = deepcopy(one.cfg)
-            cfg.scenario.filters[AUTOMATED] = node.changed(time_gap=time_gap)
+            cfg.scenario.filters[AUTOMATED] = cfg.scenario.filters[AUTOMATED].changed(
+                time_gap=time_gap
+            )
             found.append(replace(one, name=f"{one.name}{ON_FRONT}{time_gap:g}", cfg=cfg))
     return found
 

@@ -234,17 +234,15 @@ def _savings(
             found |= dict(zip(FEW_DRIVES, share.over_drives or (np.nan, np.nan), strict=True))
     found["end_saving"] = found["drawn_saving"] - found["saving"]
     names = windows["strategy"].unique()
-    rule = next((one for one in RULE_ROWS if one in names), "")
-    own, rules = (
-        [x for x in names if x == one or x.startswith(f"{one}{ON_FRONT}")] for one in (name, rule)
-    )
+    fronts = {x: [y for y in names if y.partition(ON_FRONT)[0] == x] for x in (*RULE_ROWS, name)}
+    rule = next((x for x in RULE_ROWS if len(fronts[x]) > 1), "")
     for key, other, energy in (
         ("flow_saving", [RECORDED], of[0]),
         ("second_flow_saving", [RECORDED], second),
-        ("rule_saving", rules if name != rule else [], of[0]),
+        ("rule_saving", fronts.get(rule, []) if name != rule else [], of[0]),
     ):
-        fronts = own if len(own) > 1 and against is not None else []
-        found |= at_equal_flow(windows, fronts, other, energy, RECORDED).columns(key)
+        own = fronts[name] if len(fronts[name]) > 1 and against is not None else []
+        found |= at_equal_flow(windows, own, other, energy, RECORDED).columns(key)
     return found
 
 

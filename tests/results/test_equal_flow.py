@@ -9,12 +9,14 @@ import pytest
 from lcc_rl.commands import evaluation
 from lcc_rl.config import load
 from lcc_rl.energy import SECOND
+from lcc_rl.errors import ConfigError
 from lcc_rl.results.fronts import at_equal_flow
 from lcc_rl.results.report import report, summary, windows_for
 
 WINDOWS = 8
-FLOWS = {"rule": 1000.0, "rule T=1": 1100.0, "rule T=2": 900.0, "alcc": 1040.0, "recorded": 1050.0}
-ENERGIES = {"rule": 100.0, "rule T=1": 110.0, "rule T=2": 96.0, "alcc": 99.0, "recorded": 120.0}
+NAMES = ("rule", "rule X=1", "rule X=2", "alcc", "alcc X=1", "recorded")
+FLOWS = dict(zip(NAMES, (1000.0, 1100.0, 900.0, 940.0, 1060.0, 1040.0), strict=True))
+ENERGIES = dict(zip(NAMES, (100.0, 110.0, 96.0, 90.0, 102.0, 120.0), strict=True))
 
 
 def rows(**changed: dict[str, float]) -> pd.DataFrame:
@@ -44,24 +46,40 @@ def rows(**changed: dict[str, float]) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def test_a_strategy_is_compared_with_the_front_at_its_flow() -> None:
-    table = summary(windows_for(rows())).set_index("strategy")
+def test_a_strategy_is_compared_at_the_flow_of_the_recorded_drivers() -> None:
+    windows = windows_for(rows())
+    table = summary(windows).set_index("strategy")
     assert list(table.index) == ["rule", "alcc", "recorded"]  # not the points of the front
-    # Between T = 1 and 2 s at 1,040 vehicles per hour: 96 + 0.7 (110 - 96) = 105.8 kJ.
+    # At 1,040 vehicles per hour: 90 + 12 · 100/120 = 100 kJ, and 100 + 10 · 40/100 = 104 kJ.
     found = table.loc["alcc"]
-    assert found["rule_saving"] == pytest.approx(1.0 - 99.0 / 105.8)
-    assert found["rule_saving_low"] <= found["rule_saving"] <= found["rule_saving_high"]
+    for key, expected in (
+        ("saving", 1.0 - 90.0 / 120.0),
+        ("second_saving", 1.0 - 90.0 / 120.0),
+        ("flow_saving", 1.0 - 100.0 / 120.0),
+        ("second_flow_saving", 1.0 - 100.0 / 120.0),
+        ("rule_saving", 1.0 - 100.0 / 104.0),
+    ):
+        assert found[key] == pytest.approx(expected), key
+        assert found[f"{key}_low"] - 1e-9 <= found[key] <= found[f"{key}_high"] + 1e-9
     assert found["against"] == "recorded"
-    assert found["saving"] == pytest.approx(1.0 - 99.0 / 120.0)
-    assert found["second_saving"] == pytest.approx(found["saving"])
-    fast = at_equal_flow(windows_for(rows()), "recorded", ["rule T=2"], "total_path_energy_kj")
-    assert np.isnan(fast.value)  # beyond the front
+    assert table.loc["rule", "flow_saving"] == pytest.approx(1.0 - 104.0 / 120.0)
+    assert np.isnan(table.loc["rule", "rule_saving"])
+    energy = "total_path_energy_kj"
+
+    def saved(own: list[str], other: list[str]) -> float:
+        return at_equal_flow(windows, own, other, energy, "recorded").value
+
+    # A front with more flow everywhere counts with its least flow; the rival must reach the flow.
+    assert saved(["rule X=1"], ["recorded"]) == pytest.approx(1.0 - 110.0 / 120.0)
+    assert np.isnan(saved(["rule X=2"], ["recorded"]))
+    assert np.isnan(saved(["alcc", "alcc X=1"], ["rule X=1"]))
 
 
 def test_a_strategy_that_collides_has_no_saving_and_no_flow() -> None:
     one = report(windows_for(rows(collided={"alcc": True})))
     row = one.table.set_index("strategy").loc["alcc"]
-    names = ["saving", "second_saving", "rule_saving", "drawn_saving", "flow_lost", "flow_vph"]
+    names = ["saving", "second_saving", "flow_saving", "rule_saving", "drawn_saving"]
+    names += ["flow_lost", "flow_vph"]
     assert row[names].isna().all()
     assert one.short.set_index("strategy").loc["alcc", ["saved_pct", "flow_pct"]].isna().all()
     sentence = (
@@ -72,30 +90,35 @@ def test_a_strategy_that_collides_has_no_saving_and_no_flow() -> None:
 
 
 def test_what_episodes_end_with_is_told_from_steady_driving() -> None:
-    slower = rows(total_energy_kj={"alcc": 60.0, "rule": 100.0, "recorded": 120.0})
+    slower = rows(total_energy_kj={"alcc": 48.0, "rule": 100.0, "recorded": 120.0})
     one = report(windows_for(slower))
     row = one.table.set_index("strategy").loc["alcc"]
-    assert row["end_saving"] == pytest.approx(0.5 - (1.0 - 99.0 / 120.0))
+    assert row["end_saving"] == pytest.approx(0.6 - (1.0 - 90.0 / 120.0))
     said = [line for line in one.remarks if "begins and ends with" in line]
     assert len(said) == 1
-    assert "network +17.5 and +32.5 %" in said[0]
+    assert "network +25.0 and +35.0 %" in said[0]
     assert not any("begins and ends" in x for x in report(windows_for(rows())).remarks)
 
 
 @pytest.mark.usefixtures("blank_figures")
 def test_a_front_and_a_second_energy_are_evaluated(tmp_path) -> None:
     words = [
-        *("variant=idm", "+filter=cbf", "scenario.horizon=60", "evaluation.warm_up=1"),
-        *("evaluation.profiles=2", "evaluation.drivers=2", "evaluation.front=[1.0,2.5]"),
-        "evaluation.baselines=[human,idm_acc]",
+        *("variant=idm", "+filter=cbf", "scenario.horizon=300", "evaluation.warm_up=10"),
+        *("evaluation.profiles=2", "evaluation.drivers=2", "evaluation.front=[0.8,2.5]"),
+        "evaluation.baselines=[human,idm_acc,idm_acc_filtered]",
     ]
     second = "+energy@evaluation.second_energy=compact"
     found = evaluation.run(load("evaluate", [*words, second]), tmp_path / "a")
     fuel = evaluation.run(load("evaluate", [*words, "energy=compact"]), tmp_path / "b")
     column = f"total_{SECOND}"
+    rule = "idm_acc_filtered"
     assert found["strategy"].unique().tolist() == [
-        *("human", "idm_acc", "idm", "idm_acc T=1", "idm_acc T=2.5")
+        *("human", "idm_acc", rule, "idm", f"{rule} X=0.8", f"{rule} X=2.5")
     ]
-    near, far = (found[found["strategy"] == f"idm_acc T={x}"] for x in ("1", "2.5"))
+    near, far = (found[found["strategy"] == f"{rule} X={x}"] for x in ("0.8", "2.5"))
     assert (far["mean_gap_m"].to_numpy() > near["mean_gap_m"].to_numpy()).all()
+    words.remove("+filter=cbf")
+    bare = [*words, "evaluation.baselines=[human]"]
+    with pytest.raises(ConfigError, match=r"evaluation\.front needs the safety filter"):
+        evaluation.strategies_of(load("evaluate", bare))
     np.testing.assert_allclose(found[column], fuel["total_path_energy_kj"], rtol=1e-5)

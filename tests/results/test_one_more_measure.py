@@ -14,7 +14,12 @@ from lcc_rl.config import load
 from lcc_rl.evaluation.metrics import METRICS
 from lcc_rl.results.measures import MEASURES, Measure
 
-SMALL = ["scenario.horizon=60", "evaluation.warm_up=0", "evaluation.profiles=3", "evaluation.drivers=2"]
+SMALL = [
+    "scenario.horizon=60",
+    "evaluation.warm_up=0",
+    "evaluation.profiles=3",
+    "evaluation.drivers=2",
+]
 MINE = Measure(
     "max_jerk_mps3",
     "largest jerk [m/s³]",

@@ -31,6 +31,7 @@ CONTROL = "own_energy"  # weight of its own energy as that of all vehicles in al
 GAMMAS = (0.9, 0.95, 0.99, 0.995)
 RECIPES = ("quickstart", "paper_alcc")  # length and batches of DDPG's training
 SMOKE = "smoke"
+WINDOWS = "paper_windows"  # recipe with the paper's windows only
 OF_DDPG = ("short_training", *(f"recipe_{name}" for name in RECIPES))
 
 
@@ -76,8 +77,9 @@ def chosen_ablation(item: str) -> tuple[str, Change]:
 
 
 def default_recipe(overrides: Iterable[str]) -> str | None:
-    """Return the recipe of the study, ``paper_alcc``; None if overrides choose an agent."""
-    return None if any(key_of(item) == "agent" for item in overrides) else "paper_alcc"
+    """Return the recipe of the study: the paper's windows, and its learner without another."""
+    own = any(key_of(item) == "agent" for item in overrides)
+    return WINDOWS if own else "paper_alcc"
 
 
 def settings_of_run(study: Study, entry: str, variant: str, change: Change, *own: str) -> Any:
@@ -151,7 +153,7 @@ def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dic
         # Without ablations that change nothing, and in short runs without long trainings.
         gamma = settings_of_run(study, "train", "alcc", MAIN).agent.made().gamma
         left_out = {f"gamma_{gamma:g}", f"recipe_{study.recipe}"}
-        if study.recipe in (None, SMOKE):
+        if study.recipe in (WINDOWS, SMOKE):
             left_out |= set(OF_DDPG)
         chosen = ablations or tuple(name for name in ABLATIONS if name not in left_out)
         named = map(chosen_ablation, chosen)
