@@ -36,7 +36,7 @@ from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.bootstrap import Estimate, share_saved
 from lcc_rl.results.motion import most_varied
-from lcc_rl.results.names import RULE, in_words, several
+from lcc_rl.results.names import ON_FRONT, RULE, in_words, several
 from lcc_rl.results.render import column_cells, signed
 from lcc_rl.results.report import AGAINST, Report
 from lcc_rl.results.runs import stored_config
@@ -105,6 +105,7 @@ def study_figures(
         cfg: the evaluation's configuration.
         reports, own: as for :func:`write_figures`.
     """
+    episodes = episodes[~episodes["strategy"].str.contains(ON_FRONT)]
     means, names = Means.of(episodes).per_km(), list(dict.fromkeys(episodes["strategy"]))
     many = episodes["driver_id"].nunique() > 2
     cars = [name for name in names if name != "direct"]
@@ -126,7 +127,7 @@ def study_figures(
             yield f"human_energy {name}", human_energy_figure(means, name)
         # After a collision the rest of an episode is not driven, which is no saving.
         whole = not episodes.loc[episodes["strategy"] == name, "collided"].any()
-        for baseline in (*AGAINST, "recorded") if many and whole else ():
+        for baseline in AGAINST if many and whole else ():
             if baseline in names and baseline != name:
                 figure = paired_improvement(means, name, baseline)
                 yield f"improvement {name} vs {baseline}", figure

@@ -129,22 +129,25 @@ def flow_gained(point: Curve, baseline: Curve) -> Any:
 def saved_at_flow(own: Curve, other: Curve, reference: Curve | None = None) -> Any:
     """Return the share of energy per distance that one front saves against another at equal flow.
 
-    The flow is that of the reference, by default of ``own``; a car, a platoon or a fleet is a front
-    of one point. The share is NaN if a front has less flow everywhere, or the other one more. If
-    ``own`` has more everywhere, the energy is that of its least flow.
+    A car, a platoon or a fleet is a front of one point. The flow is that of ``own``, or with a
+    reference that of the reference, or the least one that both fronts have if that is more. The
+    share is NaN if a front has less flow everywhere.
     """
-    flow = (own if reference is None else reference)[FLOW][..., 0]
-    mine, rival = (
-        energy_at(energy_per_distance(x), x[FLOW], flow, least, np.nan)
-        for x, least in ((own, None), (other, np.nan))
-    )
-    return share_saved(mine, rival)
+    flow, most = own[FLOW][..., 0], np.nan
+    if reference is not None:
+        flow = np.maximum(reference[FLOW][..., 0], own[FLOW].min(-1))
+        flow = np.maximum(flow, other[FLOW].min(-1))
+        most = None if other[FLOW].shape[-1] == 1 else np.nan
+    mine = energy_at(energy_per_distance(own), own[FLOW], flow, np.nan, np.nan)
+    return share_saved(mine, energy_at(energy_per_distance(other), other[FLOW], flow, np.nan, most))
 
 
 def at_equal_flow(
     windows: pd.DataFrame, own: Sequence[str], other: Sequence[str], energy: str, reference: str
 ) -> Estimate:
     """Return the share of energy per distance saved at the flow of a reference.
+
+    See :func:`saved_at_flow`.
 
     Args:
         windows: result of :func:`lcc_rl.results.windows.windows_of`.

@@ -167,22 +167,29 @@ def test_fleets_are_compared_at_equal_flow() -> None:
         rows.append({**own, "policy": "learned", "limit": 0.0, NET: energy, FLOW: 1900.0})
     frame = pd.DataFrame(rows).assign(variant="fleet")
     sides = ("fleet", "learned"), ("fleet", "rule")
-    saved = compare_fronts(frame, *sides, FLEET, saved_at_flow)
+    saved = compare_fronts(frame, *sides, columns=FLEET, measure=saved_at_flow)
     assert saved.value == pytest.approx(
         1.0 / (9.0 + frame[frame.policy == "learned"][NET].mean() / 50.0 - 8.0)
     )
     assert saved.high - saved.low < 0.03  # what drives differ by is on both sides
     # At a flow that the rule does not reach there is nothing to compare with.
     fast = frame[FLOW].where(frame.policy == "rule", 3000.0)
-    none = compare_fronts(frame.assign(**{FLOW: fast}), *sides, FLEET, saved_at_flow)
+    none = compare_fronts(
+        frame.assign(**{FLOW: fast}), *sides, columns=FLEET, measure=saved_at_flow
+    )
     assert np.isnan([none.value, none.low, none.high]).all()
     # Drives that the fleet saves unlike are resampled as wholes.
     unlike = frame[NET] * np.where(
         frame.policy == "rule", 1.0, 1.0 + 0.1 * frame.drive.astype(float)
     )
-    whole = compare_fronts(frame.assign(**{NET: unlike}), *sides, FLEET, saved_at_flow)
+    whole = compare_fronts(
+        frame.assign(**{NET: unlike}), *sides, columns=FLEET, measure=saved_at_flow
+    )
     alone = compare_fronts(
-        frame.drop(columns="drive").assign(**{NET: unlike}), *sides, FLEET, saved_at_flow
+        frame.drop(columns="drive").assign(**{NET: unlike}),
+        *sides,
+        columns=FLEET,
+        measure=saved_at_flow,
     )
     assert whole.value == alone.value
     assert whole.high - whole.low > 1.5 * (alone.high - alone.low)
