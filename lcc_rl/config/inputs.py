@@ -10,7 +10,6 @@ import sysconfig
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import lru_cache
-from glob import glob
 from importlib.util import resolve_name
 from os.path import expanduser
 from pathlib import Path
@@ -21,6 +20,7 @@ from hydra.core.hydra_config import HydraConfig
 from lcc_rl.config.nodes import settings_at
 from lcc_rl.config.words import FILTERED, YAML
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.io.paths import matching
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.settings import TARGET, find_target
 
@@ -71,8 +71,7 @@ def _files(last: str, named: bool, holder: Any, name: str) -> Iterator[Path]:
     elif named:
         yield from compared_files(name)
     elif last == "path" or not _ours(holder):
-        found = [path] if path.exists() else map(Path, sorted(glob(str(path), recursive=True)))
-        yield from sorted(path.iterdir()) if path.is_dir() else found
+        yield from map(Path, matching(str(path), deep=last == "path"))
 
 
 def _ours(holder: Any) -> bool:

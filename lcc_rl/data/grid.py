@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lcc_rl.arrays import Floats, Integers, Mask
 from lcc_rl.data.trajectories import FRAME, ReadReport, starts_of
-from lcc_rl.errors import DataError
+from lcc_rl.errors import Concern, DataError
 
 HOLE = 1.75  # steps longer than this multiple of the usual one are holes
 HOLE_S, MANY_HOLES = 2.0, 0.1  # least hole [s] if more than this share of steps would be holes
@@ -38,7 +38,8 @@ def places(
 ) -> Place:
     """Return a function that describes a sample: file, recording, episode, row, vehicle, column.
 
-    Unknown parts are left out. Without a row number, the time is given.
+    Unknown parts are left out. Without a row number, the time is given. A single file is left out,
+    because the messages begin with it.
 
     Args:
         table: table of vehicles, pairs or drives.
@@ -68,7 +69,7 @@ def places(
             words.append(f"vehicle {name}" + f" ({role})" * (at is None))
         words.append(f"{known['time_s']:g} s" if at is None else "")
         words.append(f"column {own!r}" if column else "")
-        file = f"{files[known['file']]}: " if files and "file" in known else ""
+        file = f"{files[known['file']]}: " if len(files) > 1 and "file" in known else ""
         return file + ", ".join(filter(None, words))
 
     return place
@@ -140,7 +141,7 @@ def _first_of_moments(
     where = place(samples)(int(rows[samples["row"].to_numpy()[rows].argmin()]), "time_s")
     if others.sum() > MOST_TWICE * len(samples):
         raise DataError(
-            f"{where} repeats a time of its {what} with other values, as do "
+            f"{report.source}: {where} repeats a time of its {what} with other values, as do "
             f"{100 * others.mean():.0f} % of the rows; does a column name the {what}?"
         )
     words = f"rows that repeat a time of their {what}, {int(others.sum()):,} of them with"
@@ -210,6 +211,26 @@ def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return starts, np.diff(np.append(starts, len(values)))
 
 
+def cut_by_files(samples: pd.DataFrame, key: str, files: Sequence[str]) -> list[Concern]:
+    """Return a warning on records that continue in another file and are read as two.
+
+    Args:
+        samples: rows with ``file``, ``time_s`` and the names of records.
+        key: the column of these names.
+        files: the files, by number.
+    """
+    times = samples.groupby([key, "file"])["time_s"].agg(["min", "max", "size"]).reset_index()
+    times = times.sort_values([key, "min"], ignore_index=True)
+    usual = (times["max"] - times["min"]) / (times["size"] - 1)
+    step = (times["min"] - times["max"].shift()).where(times[key] == times[key].shift())
+    found = np.flatnonzero((step > 0) & (step < HOLE * usual))
+    if not len(found):
+        return []
+    before, after = (files[times["file"][row]] for row in (found[0] - 1, found[0]))
+    words = f"{len(found):,} records continue in another file and are read as two, the first from"
+    return [Concern(f"{words} {before} in {after}; join the files")]
+
+
 # -- every 0.1 s -----------------------------------------------------------------------------------
 
 
@@ -235,8 +256,8 @@ def on_grid(
     if at.max() > LAST_FRAME:
         row = int(np.argmax(at > LAST_FRAME))
         raise DataError(
-            f"{place(samples)(row, '')} is {FRAME * at[row]:g} s after the first; is the time in "
-            "another unit?"
+            f"{report.source}: {place(samples)(row, '')} is {FRAME * at[row]:g} s after the first; "
+            "is the time in another unit?"
         )
     frame, episode = np.rint(at).astype(np.int64), samples["episode"].to_numpy()
     same = np.diff(episode) == 0
@@ -245,12 +266,24 @@ def on_grid(
     samples = samples.assign(origin=origin)
     uneven = abs(step - FRAME) > UNEVEN * FRAME or np.abs(at - frame).max() > REGULAR
     if uneven or skipped:
-        odd = int((np.abs(steps - step) > UNEVEN * step).sum())
-        irregular = f", {odd:,} of them irregular," * bool(odd)
-        report.notes.append(f"samples {step:g} s apart{irregular} were interpolated to {FRAME:g} s")
+        report.notes += interpolated(steps, FRAME, always=True)
         samples, frame = _interpolated(samples, at, [*smooth], report)
     samples["time_s"] = samples.pop("origin") + frame / round(1 / FRAME)
     return samples, frame
+
+
+def interpolated(steps: Floats, to: float, always: bool = False) -> list[str]:
+    """Return a line on samples that are interpolated to another step, or if ``always``.
+
+    Args:
+        steps: the steps within records [s].
+        to: the step to which they are interpolated [s].
+    """
+    step = float(np.median(steps))
+    odd = int((np.abs(steps - step) > UNEVEN * step).sum())
+    irregular = f", {odd:,} of them irregular," * bool(odd)
+    line = f"samples {step:g} s apart{irregular} were interpolated to {to:g} s"
+    return [line] * (always or bool(odd) or abs(step - to) > UNEVEN * to)
 
 
 def _interpolated(

@@ -12,6 +12,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from lcc_rl.data.trajectories import listed
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Settings
 
@@ -217,6 +218,23 @@ def described_records(profiles: Profiles) -> list[str]:
         lines.append((-most, line))
     more = [f"… and {len(lines) - MOST_LINES:,} slower records"] if len(lines) > MOST_LINES else []
     return [line for _, line in (sorted(lines)[:MOST_LINES] if more else lines)] + more
+
+
+def left_out_short(profiles: Profiles, horizon: int) -> list[str]:
+    """Return a line on the records that are shorter than an episode, if there are any.
+
+    Args:
+        profiles: the records.
+        horizon: steps of an episode.
+    """
+    short = [
+        f"{name} ({(length - 1) * profiles.time_step:g} s)"
+        for name, length in zip(profiles.names, profiles.lengths.tolist(), strict=True)
+        if length <= horizon
+    ]
+    words = f"of {len(profiles):,} record(s) are shorter than an episode of"
+    line = f"left out {len(short):,} {words} {horizon * profiles.time_step:g} s: {listed(short)}"
+    return [line] * bool(short)
 
 
 def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:

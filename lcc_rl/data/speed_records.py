@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lcc_rl.data.grid import continuous, places
+from lcc_rl.data.grid import continuous, interpolated, places
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
 from lcc_rl.data.sources import SHIPPED_FILES, find_files
 from lcc_rl.data.tables import Column, Names, TableFile, Units
-from lcc_rl.data.text import stem
+from lcc_rl.data.text import labels, stem
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
 
@@ -57,7 +57,7 @@ def read_speed_record(
         known = ", ".join(sorted(SHIPPED_FILES))
         raise DataError(f"{path}: no such file, and none of the package ({known})")
     samples, _ = _read(
-        TableFile(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {}, divide=False
+        TableFile(file), stem(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {}
     )
     return samples[TIME_COLUMN].to_numpy(), samples[SPEED_COLUMN].to_numpy()
 
@@ -88,7 +88,10 @@ def read_drives(
     files = find_files(path)
     if len(files) > 1 and columns["drive"] is None:
         raise DataError(f"{path}: {len(files)} files; leader=record drives one, see leader=drives")
-    read = [_read(TableFile(name), columns, plausible, units or {}) for name in files]
+    read = [
+        _read(TableFile(name), label, columns, plausible, units or {}, time_step)
+        for name, label in zip(files, labels(files), strict=True)
+    ]
     table = pd.concat([samples for samples, _ in read], keys=files, names=["file"]).reset_index(0)
     own = table.groupby("name")["file"].nunique()
     if (own > 1).any():
@@ -100,16 +103,30 @@ def read_drives(
     ]
     names, drives = map(str, records.groups), map(str, records["drive"].first())
     profiles = from_records(speeds, [*names], [*drives], time_step)
-    return profiles, [line for _, lines in read for line in lines]
+    return profiles, list(dict.fromkeys(line for _, lines in read for line in lines))
 
 
 def _read(
-    table: TableFile, columns: Names, plausible: Plausible | None, units: Units, divide: bool = True
+    table: TableFile,
+    label: str,
+    columns: Names,
+    plausible: Plausible | None,
+    units: Units,
+    time_step: float | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Return name, drive, time and speed of the plausible samples of a file, and the report."""
-    samples, report = _samples(table, columns, units), ReadReport([str(table.path)])
+    """Return name, drive, time and speed of the plausible samples of a file, and the report.
+
+    Args:
+        table: the file.
+        label: name of a drive without one.
+        columns, plausible, units: see :class:`lcc_rl.data.leaders.DriveLeaders`.
+        time_step: step to which the record is interpolated [s]; None: holes do not divide it.
+    """
+    samples, report = _samples(table, label, columns, units), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
-    samples = continuous(samples, "drive", place, report, divide)
+    samples = continuous(samples, "drive", place, report, time_step is not None)
+    steps = np.diff(samples[TIME_COLUMN])[np.diff(samples["episode"]) == 0]
+    report.notes += interpolated(steps, time_step or float(np.median(steps)))
     kept, lines = (plausible or Plausible()).select(
         samples, str(table.path), place, "leader.plausible"
     )
@@ -123,7 +140,7 @@ def _read(
     return kept, [line, *table.notes, *report.left_out(), *report.notes, *lines]
 
 
-def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:
+def _samples(table: TableFile, label: str, columns: Names, units: Units) -> pd.DataFrame:
     """Return drive (as recording), time and speed of every row with a speed."""
     fields: Sequence[Column] = DRIVE_FIELDS
     if table.preamble:
@@ -138,6 +155,6 @@ def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:
     samples = pd.DataFrame(
         {TIME_COLUMN: read["time"], SPEED_COLUMN: read["speed"], "file": 0, "row": read["row"]}
     )
-    samples["recording"] = read.get("drive", stem(table.path))
+    samples["recording"] = read.get("drive", label)
     samples["episode"] = np.unique(samples["recording"], return_inverse=True)[1]
     return samples

@@ -7,9 +7,11 @@ import gzip
 import re
 import zlib
 from codecs import EncodedFile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import BufferedReader
+from os.path import commonprefix
 from pathlib import Path
 from typing import Any
 
@@ -152,6 +154,23 @@ def separator_of(content: bytes) -> str:
 def stem(file: str | Path) -> str:
     """Return the name of a file without folder and endings, ``a`` for ``x/a.csv.gz``."""
     return Path(Path(file).name.removesuffix(".gz")).stem
+
+
+def labels(files: Sequence[str]) -> list[str]:
+    """Return the names of files' recordings: the stems, with folders and endings where they repeat.
+
+    Examples:
+        >>> labels(["d/day=1/part-0.csv", "d/day=2/part-0.csv", "d/rest.csv"])
+        ['day=1/part-0.csv', 'day=2/part-0.csv', 'rest']
+    """
+    stems = [stem(name) for name in files]
+    counts = Counter(stems)
+    folders = [Path(name).parent.parts for name in files if counts[stem(name)] > 1]
+    same = len(commonprefix(folders))
+    return [
+        x if counts[x] == 1 else "/".join(Path(name).parts[same:])
+        for x, name in zip(stems, files, strict=True)
+    ]
 
 
 def parse_text(
