@@ -74,7 +74,7 @@ def read_episodes(
     tables: list[pd.DataFrame] = []
     notes: list[str] = []
     place = partial(places, columns=columns)
-    for number, (path, label) in enumerate(zip(paths, labels(paths), strict=True)):
+    for path, label in zip(paths, labels(paths), strict=True):
         table, lines = _table(path, label, columns or {}, units or {}, place, tables)
         if tables:
             table["episode"] += tables[-1]["episode"].max() + 1 - table["episode"].min()
@@ -156,16 +156,13 @@ def _numbered(episode: NDArray, numbers: NDArray[np.int64]) -> NDArray[np.int64]
 
 def _names(file: TableFile, columns: Names) -> dict[str, str | None]:
     """Return the file's names of columns by the keys of ``FIELDS``."""
-    names: dict[str, str | None] = {
-        key: own for key, own in EPISODE_NAMES.items() if own in file.header
-    }
-    names |= {
-        new: old for old, new in EPISODE_ALIASES.items() if old in file.header and new not in names
-    }
+    known = [*file.header, *file.folders]
+    names: dict[str, str | None] = {key: own for key, own in EPISODE_NAMES.items() if own in known}
+    names |= {new: old for old, new in EPISODE_ALIASES.items() if old in known and new not in names}
     names |= columns
     missing = [EPISODE_NAMES[x.key] for x in PAIR_FIELDS if x.required and x.key not in names]
     if missing:
-        raise lacking(str(file.path), missing, file.header, "data.columns")
+        raise lacking(str(file.path), missing, known, "data.columns")
     return names
 
 

@@ -232,7 +232,7 @@ def left_out_short(profiles: Profiles, horizon: int) -> list[str]:
         for name, length in zip(profiles.names, profiles.lengths.tolist(), strict=True)
         if length <= horizon
     ]
-    words = f"of {len(profiles):,} record(s) are shorter than an episode of"
+    words = f"of {len(profiles):,} record(s), shorter than an episode of"
     line = f"left out {len(short):,} {words} {horizon * profiles.time_step:g} s: {listed(short)}"
     return [line] * bool(short)
 

@@ -56,9 +56,7 @@ def read_speed_record(
     if not Path(expanduser(file)).is_file():
         known = ", ".join(sorted(SHIPPED_FILES))
         raise DataError(f"{path}: no such file, and none of the package ({known})")
-    samples, _ = _read(
-        TableFile(file), stem(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {}
-    )
+    samples, _ = _read(TableFile(file), stem(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {})
     return samples[TIME_COLUMN].to_numpy(), samples[SPEED_COLUMN].to_numpy()
 
 
@@ -147,7 +145,10 @@ def _samples(table: TableFile, label: str, columns: Names, units: Units) -> pd.D
         fields = DRIVE_FIELDS if columns["drive"] is None else NATIVE
         native = {TIME_COLUMN: "Time", SPEED_COLUMN: "Speed1"}
         columns = {key: native.get(str(columns[key]), columns[key]) for key in ("time", "speed")}
-    elif columns["drive"] == DRIVE_COLUMNS["drive"] and columns["drive"] not in table.header:
+    elif columns["drive"] == DRIVE_COLUMNS["drive"] and columns["drive"] not in (
+        *table.header,
+        *table.folders,
+    ):
         columns = {**columns, "drive": None}  # each file is one drive
     read = table.read(fields, columns, units, "leader.columns", ["speed"])
     if not len(read["time"]):

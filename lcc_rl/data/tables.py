@@ -149,7 +149,8 @@ class TableFile:
 
     The separator of text is the one that divides the header and the next row equally: comma,
     semicolon, tab, bar or spaces. With semicolons, numbers may have a decimal comma. ``preamble``
-    holds the lines before the header of a native OpenACC file.
+    holds the lines before the header of a native OpenACC file, ``folders`` the columns that
+    folders such as ``day=3`` add to the header.
 
     Args:
         path: a .csv or other text file, gzipped or not, or a .parquet file.
@@ -180,6 +181,8 @@ class TableFile:
                 self.header = [*pq.read_schema(self.path).names]
         else:
             self._open_text(spelled, bare)
+        keys = dict(part.split("=", 1) for part in self.path.parent.parts if "=" in part)
+        self.folders = {key: keys[key] for key in keys if key not in self.header}
 
     def read(
         self,
@@ -206,9 +209,10 @@ class TableFile:
                 if every row has a blank cell.
         """
         self.names = {c.key: name for c in columns if (name := names.get(c.key)) is not None}
-        missing = [name for name in self.names.values() if name not in self.header]
+        known = [*self.header, *self.folders]
+        missing = [name for name in self.names.values() if name not in known]
         if missing:
-            raise lacking(str(self.path), missing, self.header, option)
+            raise lacking(str(self.path), missing, known, option)
         wanted = {
             column: self._scale(column, units or {}, option)
             for column in columns
@@ -262,11 +266,19 @@ class TableFile:
         for name in names:
             if self.header.count(name) > 1:
                 raise DataError(f"{self.path}: has column {name!r} twice; expected it once")
+        for rows, before in self._rows([name for name in names if name in self.header]):
+            for name in (name for name in names if name not in self.header):
+                cells = pa.array([self.folders[name]] * rows.num_rows, pa.string())
+                rows = rows.append_column(name, cells)
+            yield Block(self, rows, before)
+
+    def _rows(self, names: Sequence[str]) -> Iterator[tuple[pa.Table, int]]:
+        """Yield rows of the file, and the number of rows before them."""
         if self.parquet:
             with raised_as(DataError, f"{self.path}: not a readable table", Exception):
                 whole = pq.read_table(self.path, columns=[*names])
                 whole.validate(full=True)  # else damaged text would fail only when used
-            yield Block(self, whole)
+            yield whole, 0
             return
         places, row = {str(self.header.index(name)): name for name in names}, 0
         for lines in self.lines:
@@ -276,11 +288,11 @@ class TableFile:
                 continue
             width, source = len(self.header), str(self.path)
             table = parse_text(lines, width, self.separator, [*places], source, row)
-            yield Block(self, table.rename_columns([places[x] for x in table.column_names]), row)
+            yield table.rename_columns([places[x] for x in table.column_names]), row
             row += table.num_rows
             self.notes += unended(lines, f"{self.path}: data row {row}")
         if not row:
-            yield Block(self, pa.table({name: pa.array([], pa.string()) for name in names}))
+            yield pa.table({name: pa.array([], pa.string()) for name in names}), 0
 
     def fault(self, row: int, key: str, words: str) -> DataError:
         """Return the error about a cell."""

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import BufferedReader
-from os.path import commonprefix
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -166,7 +166,7 @@ def labels(files: Sequence[str]) -> list[str]:
     stems = [stem(name) for name in files]
     counts = Counter(stems)
     folders = [Path(name).parent.parts for name in files if counts[stem(name)] > 1]
-    same = len(commonprefix(folders))
+    same = len([*takewhile(lambda parts: len({*parts}) == 1, zip(*folders, strict=False))])
     return [
         x if counts[x] == 1 else "/".join(Path(name).parts[same:])
         for x, name in zip(stems, files, strict=True)
