@@ -60,6 +60,7 @@ NAMES_HINT = (
     "and have no quotes; lcc_rl.compare accepts any name"
 )
 ADDED = ("faults", "filter", "fleet", "knowledge")  # groups that no file of the package chooses
+OWN_FILES = re.compile(r"path=(?!pkg://|structured://)")  # in Hydra's search path
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
 
@@ -109,8 +110,10 @@ def composed(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
     hydra, meant = GlobalHydra.instance(), as_meant(overrides)
     try:
         where = str(hydra.config_loader().get_search_path()) if hydra.is_initialized() else ""
-        made = _composed.__wrapped__ if "command-line" in where else _composed  # own files change
-        cfg = deepcopy(made(entry, tuple(filter(_is_choice, meant)), where))
+        chosen = tuple(filter(_is_choice, meant))
+        own = OWN_FILES.search(where) or any("searchpath" in word for word in chosen)
+        made = _composed.__wrapped__ if own else _composed  # own files change
+        cfg = deepcopy(made(entry, chosen, where))
         read = OverridesParser.create().parse_overrides([x for x in meant if not _is_choice(x)])
         ConfigLoaderImpl.validate_sweep_overrides_legal(read, RunMode.RUN, from_shell=False)
         ConfigLoaderImpl._apply_overrides_to_config(read, cfg)

@@ -212,13 +212,7 @@ def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def cut_by_files(samples: pd.DataFrame, key: str, files: Sequence[str]) -> list[Concern]:
-    """Return a warning on records that continue in another file and are read as two.
-
-    Args:
-        samples: rows with ``file``, ``time_s`` and the names of records.
-        key: the column of these names.
-        files: the files, by number.
-    """
+    """Return a warning on records, named in the column ``key``, that continue in another file."""
     times = samples.groupby([key, "file"])["time_s"].agg(["min", "max", "size"]).reset_index()
     times = times.sort_values([key, "min"], ignore_index=True)
     usual = (times["max"] - times["min"]) / (times["size"] - 1)
@@ -261,29 +255,24 @@ def on_grid(
         )
     frame, episode = np.rint(at).astype(np.int64), samples["episode"].to_numpy()
     same = np.diff(episode) == 0
-    steps, skipped = np.diff(samples["time_s"])[same], (np.diff(frame)[same] > 1).any()
-    step = float(np.median(steps))
+    skipped = (np.diff(frame)[same] > 1).any() or np.abs(at - frame).max() > REGULAR
+    line = interpolated(samples, FRAME, skipped)
     samples = samples.assign(origin=origin)
-    uneven = abs(step - FRAME) > UNEVEN * FRAME or np.abs(at - frame).max() > REGULAR
-    if uneven or skipped:
-        report.notes += interpolated(steps, FRAME, always=True)
+    if line:
+        report.notes += line
         samples, frame = _interpolated(samples, at, [*smooth], report)
     samples["time_s"] = samples.pop("origin") + frame / round(1 / FRAME)
     return samples, frame
 
 
-def interpolated(steps: Floats, to: float, always: bool = False) -> list[str]:
-    """Return a line on samples that are interpolated to another step, or if ``always``.
-
-    Args:
-        steps: the steps within records [s].
-        to: the step to which they are interpolated [s].
-    """
-    step = float(np.median(steps))
-    odd = int((np.abs(steps - step) > UNEVEN * step).sum())
+def interpolated(samples: pd.DataFrame, step: float, skipped: bool = False) -> list[str]:
+    """Return a line on samples that are not ``step`` seconds apart, or with ``skipped`` frames."""
+    steps = np.diff(samples["time_s"])[np.diff(samples["episode"]) == 0]
+    usual = float(np.median(steps))
+    odd = int((np.abs(steps - usual) > UNEVEN * usual).sum())
     irregular = f", {odd:,} of them irregular," * bool(odd)
-    line = f"samples {step:g} s apart{irregular} were interpolated to {to:g} s"
-    return [line] * (always or bool(odd) or abs(step - to) > UNEVEN * to)
+    line = f"samples {usual:g} s apart{irregular} were interpolated to {step:g} s"
+    return [line] * (skipped or odd > 0 or abs(usual - step) > UNEVEN * step)
 
 
 def _interpolated(

@@ -221,12 +221,7 @@ def described_records(profiles: Profiles) -> list[str]:
 
 
 def left_out_short(profiles: Profiles, horizon: int) -> list[str]:
-    """Return a line on the records that are shorter than an episode, if there are any.
-
-    Args:
-        profiles: the records.
-        horizon: steps of an episode.
-    """
+    """Return a line on the records that are shorter than ``horizon`` steps, if there are any."""
     short = [
         f"{name} ({(length - 1) * profiles.time_step:g} s)"
         for name, length in zip(profiles.names, profiles.lengths.tolist(), strict=True)

@@ -114,17 +114,13 @@ def _read(
 ) -> tuple[pd.DataFrame, list[str]]:
     """Return name, drive, time and speed of the plausible samples of a file, and the report.
 
-    Args:
-        table: the file.
-        label: name of a drive without one.
-        columns, plausible, units: see :class:`lcc_rl.data.leaders.DriveLeaders`.
-        time_step: step to which the record is interpolated [s]; None: holes do not divide it.
+    Without ``time_step``, to which they will be interpolated, holes do not divide a record.
     """
     samples, report = _samples(table, label, columns, units), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
     samples = continuous(samples, "drive", place, report, time_step is not None)
-    steps = np.diff(samples[TIME_COLUMN])[np.diff(samples["episode"]) == 0]
-    report.notes += interpolated(steps, time_step or float(np.median(steps)))
+    if time_step is not None:
+        report.notes += interpolated(samples, time_step)
     kept, lines = (plausible or Plausible()).select(
         samples, str(table.path), place, "leader.plausible"
     )

@@ -157,12 +157,7 @@ def stem(file: str | Path) -> str:
 
 
 def labels(files: Sequence[str]) -> list[str]:
-    """Return the names of files' recordings: the stems, with folders and endings where they repeat.
-
-    Examples:
-        >>> labels(["d/day=1/part-0.csv", "d/day=2/part-0.csv", "d/rest.csv"])
-        ['day=1/part-0.csv', 'day=2/part-0.csv', 'rest']
-    """
+    """Return the names of files' recordings: the stems, or folder and file where these repeat."""
     stems = [stem(name) for name in files]
     counts = Counter(stems)
     folders = [Path(name).parent.parts for name in files if counts[stem(name)] > 1]

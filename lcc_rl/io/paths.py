@@ -9,12 +9,8 @@ from pathlib import Path
 def matching(name: str, deep: bool = True) -> list[str]:
     """Return the files of a path, sorted; none if there is no such file.
 
-    A folder stands for its files. Files without ending that begin with ``_``, such as Spark's
-    ``_SUCCESS``, are passed over.
-
-    Args:
-        name: a file, a folder or a pattern.
-        deep: whether a folder without files stands for the files of its folders.
+    A folder stands for its files; with ``deep``, one without files for those of its folders. Files
+    without ending that begin with ``_``, such as Spark's ``_SUCCESS``, are passed over.
     """
     path, patterns = Path(name), [name]
     if path.is_dir():
