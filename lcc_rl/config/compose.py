@@ -130,7 +130,7 @@ def _composed(entry: str, chosen: tuple[str, ...], where: str) -> DictConfig:
 
 
 def as_meant(overrides: Sequence[str]) -> list[str]:
-    """Return overrides in the form for Hydra.
+    """Return overrides in the form for Hydra; a list of choices of a group with one is refused.
 
     Hydra accepts only settings of a file, so ``++`` is added; the typed tree checks names. Names of
     variants, which papers write in capitals, are converted to lower case.
@@ -146,6 +146,12 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
     found = []
     for item in overrides:
         key, equals, value = item.partition("=")
+        group = key.lstrip("+").partition("@")[0]
+        one = group not in (*ADDED, "experiment") and (Path(str(files(CONF))) / group).is_dir()
+        if one and re.match(r"\[.+,", value):
+            raise ConfigError(
+                f"{item}: {group} takes one choice; for a run of each: -m {key}={value.strip('[]')}"
+            )
         if key.lstrip("+") in ("variant", "variants"):
             found.append(f"{key}{equals}{value.lower()}")
         elif key in ("compare", "policy", "resume"):  # folders of a sweep: seed=0_…

@@ -75,7 +75,8 @@ def read_episodes(
     notes: list[str] = []
     place = partial(places, columns=columns)
     for path, label in zip(paths, labels(paths), strict=True):
-        table, lines = _table(path, label, columns or {}, units or {}, place, tables)
+        file = TableFile(path, label=label)
+        table, lines = _table(file, columns or {}, units or {}, place, tables)
         if tables:
             table["episode"] += tables[-1]["episode"].max() + 1 - table["episode"].min()
         tables.append(table)
@@ -86,17 +87,11 @@ def read_episodes(
 
 
 def _table(
-    path: str,
-    label: str,
-    columns: Names,
-    units: Units,
-    place: Places,
-    tables: Sequence[pd.DataFrame],
+    file: TableFile, columns: Names, units: Units, place: Places, tables: Sequence[pd.DataFrame]
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Read a file, by default of recording ``label``, after ``tables``; resample it to the grid."""
-    file = TableFile(path)
+    """Read a file after others, ``tables``, and resample it to the grid."""
     names = _names(file, columns)
-    table, numbers = _rows(file, label, names, units, tables)
+    table, numbers = _rows(file, names, units, tables)
     notes = list(file.notes)
     for name, words in (
         ("recording", "no column recording: each file is one recording"),
@@ -104,7 +99,7 @@ def _table(
     ):
         if names.get(name) is None:
             notes.append(words)
-    report = ReadReport([path])
+    report = ReadReport([str(file.path)])
     table = continuous(table, "episode", place, report)
     start = table.groupby("episode")["time_s"].transform("min").to_numpy()
     table, _ = on_grid(table, start, MOTION_COLUMNS, place, report)
@@ -114,11 +109,14 @@ def _table(
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
         notes.append(DERIVED_POSITIONS)
-    return table, [*notes, *(f"{path}: {line}" for line in (*report.left_out(), *report.notes))]
+    return table, [
+        *notes,
+        *(f"{file.path}: {line}" for line in (*report.left_out(), *report.notes)),
+    ]
 
 
 def _rows(
-    file: TableFile, label: str, names: Names, units: Units, tables: Sequence[pd.DataFrame]
+    file: TableFile, names: Names, units: Units, tables: Sequence[pd.DataFrame]
 ) -> tuple[pd.DataFrame, NDArray[np.int64]]:
     """Return rows of a file with episodes numbered from 0, and the file's own numbers."""
     read = file.read(PAIR_FIELDS, names, units, "data.columns", PAIR_MEASURED)
@@ -131,7 +129,7 @@ def _rows(
     numbers = whole_numbers(np.asarray(found))
     if numbers is None or (np.abs(numbers) >= 2**31).any():
         numbers = np.arange(len(found))
-    recording = read.get("recording", np.full(rows, label))
+    recording = read.get("recording", np.full(rows, file.label))
     shared = any({*table["recording"].unique()} & {*np.unique(recording)} for table in tables)
     before = shared * sum(table["episode"].nunique() for table in tables)
     follower = 2 * (codes + before) + 2  # unknown vehicles of several files are different ones
@@ -156,13 +154,16 @@ def _numbered(episode: NDArray, numbers: NDArray[np.int64]) -> NDArray[np.int64]
 
 def _names(file: TableFile, columns: Names) -> dict[str, str | None]:
     """Return the file's names of columns by the keys of ``FIELDS``."""
-    known = [*file.header, *file.folders]
-    names: dict[str, str | None] = {key: own for key, own in EPISODE_NAMES.items() if own in known}
-    names |= {new: old for old, new in EPISODE_ALIASES.items() if old in known and new not in names}
+    names: dict[str, str | None] = {
+        key: own for key, own in EPISODE_NAMES.items() if own in file.header
+    }
+    names |= {
+        new: old for old, new in EPISODE_ALIASES.items() if old in file.header and new not in names
+    }
     names |= columns
     missing = [EPISODE_NAMES[x.key] for x in PAIR_FIELDS if x.required and x.key not in names]
     if missing:
-        raise lacking(str(file.path), missing, known, "data.columns")
+        raise lacking(str(file.path), missing, file.header, "data.columns")
     return names
 
 

@@ -272,7 +272,7 @@ def interpolated(samples: pd.DataFrame, step: float, skipped: bool = False) -> l
     odd = int((np.abs(steps - usual) > UNEVEN * usual).sum())
     irregular = f", {odd:,} of them irregular," * bool(odd)
     line = f"samples {usual:g} s apart{irregular} were interpolated to {step:g} s"
-    return [line] * (skipped or odd > 0 or abs(usual - step) > UNEVEN * step)
+    return [line] * bool(skipped or odd or abs(usual - step) > UNEVEN * step)
 
 
 def _interpolated(

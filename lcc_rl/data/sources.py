@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -205,16 +206,12 @@ def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     for entry in [path] if isinstance(path, (str, Path)) else path:
         name = str(expanduser(entry))
         found = [SHIPPED_FILES[name]] if name in SHIPPED_FILES else matching(name)
-        if not found and Path(name).is_dir():
-            raise DataError(f"{name}: the folder has no files")
-        if not found and has_magic(name):
+        if not found and (has_magic(name) or Path(name).is_dir()):
             raise DataError(f"{name}: no file matches this pattern")
         files += found or [name]  # the reader refuses a missing file
     if not files:
         raise DataError("no file is named; expected at least one path")
-    seen: set[str] = set()
-    for name in files:
-        if abspath(name) in seen:
-            raise DataError(f"{name}: is named twice; expected every file once")
-        seen.add(abspath(name))
+    twice = [name for name, count in Counter(map(abspath, files)).items() if count > 1]
+    if twice:
+        raise DataError(f"{twice[0]}: is named twice; expected every file once")
     return files

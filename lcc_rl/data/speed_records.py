@@ -15,7 +15,7 @@ from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
 from lcc_rl.data.sources import SHIPPED_FILES, find_files
 from lcc_rl.data.tables import Column, Names, TableFile, Units
-from lcc_rl.data.text import labels, stem
+from lcc_rl.data.text import labels
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
 
@@ -23,11 +23,9 @@ TIME_COLUMN, SPEED_COLUMN = "time_s", "speed_mps"
 # Columns of a table of drives, and their default names.
 DRIVE_FIELDS = (
     Column("drive", "text", required=False),
-    Column("time", "time"),
-    Column("speed", "speed"),
+    Column("time", "time", blank=True),
+    Column("speed", "speed", blank=True),
 )
-# Columns of the first car of a native OpenACC file; blank cells divide a record.
-NATIVE = (Column("time", "time"), Column("speed", "speed", blank=True))
 DRIVE_COLUMNS: dict[str, str | None] = {
     "drive": "drive",
     "time": TIME_COLUMN,
@@ -56,7 +54,9 @@ def read_speed_record(
     if not Path(expanduser(file)).is_file():
         known = ", ".join(sorted(SHIPPED_FILES))
         raise DataError(f"{path}: no such file, and none of the package ({known})")
-    samples, _ = _read(TableFile(file), stem(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {})
+    samples, _ = _read(
+        TableFile(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {}, divide=False
+    )
     return samples[TIME_COLUMN].to_numpy(), samples[SPEED_COLUMN].to_numpy()
 
 
@@ -86,10 +86,10 @@ def read_drives(
     files = find_files(path)
     if len(files) > 1 and columns["drive"] is None:
         raise DataError(f"{path}: {len(files)} files; leader=record drives one, see leader=drives")
-    read = [
-        _read(TableFile(name), label, columns, plausible, units or {}, time_step)
-        for name, label in zip(files, labels(files), strict=True)
+    tables = [
+        TableFile(name, label=label) for name, label in zip(files, labels(files), strict=True)
     ]
+    read = [_read(table, columns, plausible, units or {}) for table in tables]
     table = pd.concat([samples for samples, _ in read], keys=files, names=["file"]).reset_index(0)
     own = table.groupby("name")["file"].nunique()
     if (own > 1).any():
@@ -101,26 +101,17 @@ def read_drives(
     ]
     names, drives = map(str, records.groups), map(str, records["drive"].first())
     profiles = from_records(speeds, [*names], [*drives], time_step)
-    return profiles, list(dict.fromkeys(line for _, lines in read for line in lines))
+    lines = [line for x, own in read for line in (*own, *interpolated(x, time_step))]
+    return profiles, list(dict.fromkeys(lines))
 
 
 def _read(
-    table: TableFile,
-    label: str,
-    columns: Names,
-    plausible: Plausible | None,
-    units: Units,
-    time_step: float | None = None,
+    table: TableFile, columns: Names, plausible: Plausible | None, units: Units, divide: bool = True
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Return name, drive, time and speed of the plausible samples of a file, and the report.
-
-    Without ``time_step``, to which they will be interpolated, holes do not divide a record.
-    """
-    samples, report = _samples(table, label, columns, units), ReadReport([str(table.path)])
+    """Return name, drive, time and speed of the plausible samples of a file, and the report."""
+    samples, report = _samples(table, columns, units), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
-    samples = continuous(samples, "drive", place, report, time_step is not None)
-    if time_step is not None:
-        report.notes += interpolated(samples, time_step)
+    samples = continuous(samples, "drive", place, report, divide)
     kept, lines = (plausible or Plausible()).select(
         samples, str(table.path), place, "leader.plausible"
     )
@@ -134,24 +125,24 @@ def _read(
     return kept, [line, *table.notes, *report.left_out(), *report.notes, *lines]
 
 
-def _samples(table: TableFile, label: str, columns: Names, units: Units) -> pd.DataFrame:
+def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:
     """Return drive (as recording), time and speed of every row with a speed."""
-    fields: Sequence[Column] = DRIVE_FIELDS
+    single = columns["drive"] is None
     if table.preamble:
-        fields = DRIVE_FIELDS if columns["drive"] is None else NATIVE
         native = {TIME_COLUMN: "Time", SPEED_COLUMN: "Speed1"}
         columns = {key: native.get(str(columns[key]), columns[key]) for key in ("time", "speed")}
-    elif columns["drive"] == DRIVE_COLUMNS["drive"] and columns["drive"] not in (
-        *table.header,
-        *table.folders,
-    ):
+    elif columns["drive"] == DRIVE_COLUMNS["drive"] and columns["drive"] not in table.header:
         columns = {**columns, "drive": None}  # each file is one drive
-    read = table.read(fields, columns, units, "leader.columns", ["speed"])
-    if not len(read["time"]):
+    read = table.read(DRIVE_FIELDS, columns, units, "leader.columns", ["time", "speed"])
+    rows = read["row"]
+    if not len(rows):
         raise DataError(f"{table.path}: holds 0 samples, at least 2 are needed")
+    # A record may end before the table; in native files, blank cells divide it.
+    if rows[-1] >= len(rows) and (single or not table.preamble):
+        raise table.fault(int(np.argmax(rows != np.arange(len(rows)))), "speed", "is blank")
     samples = pd.DataFrame(
-        {TIME_COLUMN: read["time"], SPEED_COLUMN: read["speed"], "file": 0, "row": read["row"]}
+        {TIME_COLUMN: read["time"], SPEED_COLUMN: read["speed"], "file": 0, "row": rows}
     )
-    samples["recording"] = read.get("drive", label)
+    samples["recording"] = read.get("drive", table.label)
     samples["episode"] = np.unique(samples["recording"], return_inverse=True)[1]
     return samples

@@ -34,6 +34,10 @@ OTHER_FORMATS = {
     b"PAR1": " but a parquet file; name it .parquet",
     **dict.fromkeys(UTF16, " but in UTF-16; save it in UTF-8"),
 }
+NO_TABLE = {
+    b"version https://git-lfs": "a Git LFS pointer in place of the file: run git lfs pull",
+    b"<?xml": "XML; save the table as CSV (SUMO: --fcd-output fcd.csv)",
+}
 
 
 @contextmanager

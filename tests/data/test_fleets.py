@@ -67,7 +67,7 @@ def test_a_folder_stands_for_the_files_that_are_hashed(tmp_path) -> None:
     (tmp_path / "none" / "empty").mkdir(parents=True)
     twice = ["days/day=0/part-0.csv", "days/../days/day=0/part-0.csv"]
     cases = [
-        (["none"], "none: the folder has no files"),
+        (["none"], "none: no file matches this pattern"),
         (["days/*.txt"], "no file matches this pattern"),
         (twice, "part-0.csv: is named twice"),
     ]
