@@ -16,6 +16,7 @@ from rich.console import Console
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load, with_variant
 from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.errors import require
 from lcc_rl.evaluation.foreign import as_given
 from lcc_rl.evaluation.named import setting_of
 from lcc_rl.io.files import Rows, read_parquet
@@ -150,6 +151,8 @@ def compare(
         strategies = [strategies]
     named = isinstance(strategies, Mapping)
     items = strategies.items() if named else [(type(one).__name__, one) for one in strategies]
+    known = items and all(isinstance(name, str) for name, _ in items)
+    require(known, f"compare: expected strategies, or a mapping of them by name: {strategies!r}")
     given = [(name, one, as_given(one, name)) for name, one in items]
     policies = {name: policy for name, _, policy in given if policy is not None}
     others = [(name, one) for name, one, policy in given if policy is None]

@@ -63,6 +63,7 @@ NAMES_HINT = (
     "and have no quotes; lcc_rl.compare accepts any name"
 )
 ADDED = ("faults", "filter", "fleet", "knowledge")  # groups that no file of the package chooses
+OWN_FILES = re.compile(r"path=(?!pkg://|structured://)")  # in Hydra's search path
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
 
@@ -112,8 +113,10 @@ def composed(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
     hydra, meant = GlobalHydra.instance(), as_meant(overrides)
     try:
         where = str(hydra.config_loader().get_search_path()) if hydra.is_initialized() else ""
-        made = _composed.__wrapped__ if "command-line" in where else _composed  # own files change
-        cfg = deepcopy(made(entry, tuple(filter(_is_choice, meant)), where))
+        chosen = tuple(filter(_is_choice, meant))
+        own = OWN_FILES.search(where) or any("searchpath" in word for word in chosen)
+        made = _composed.__wrapped__ if own else _composed  # own files change
+        cfg = deepcopy(made(entry, chosen, where))
         read = OverridesParser.create().parse_overrides([x for x in meant if not _is_choice(x)])
         ConfigLoaderImpl.validate_sweep_overrides_legal(read, RunMode.RUN, from_shell=False)
         ConfigLoaderImpl._apply_overrides_to_config(read, cfg)
@@ -130,7 +133,7 @@ def _composed(entry: str, chosen: tuple[str, ...], where: str) -> DictConfig:
 
 
 def as_meant(overrides: Sequence[str]) -> list[str]:
-    """Return overrides in the form for Hydra.
+    """Return overrides in the form for Hydra; a list of choices of a group with one is refused.
 
     Hydra accepts only settings of a file, so ``++`` is added; the typed tree checks names. Names of
     variants, which papers write in capitals, are converted to lower case.
@@ -146,6 +149,12 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
     found = []
     for item in overrides:
         key, equals, value = item.partition("=")
+        group = key.lstrip("+").partition("@")[0]
+        one = group not in (*ADDED, "experiment") and (Path(str(files(CONF))) / group).is_dir()
+        if one and re.match(r"\[.+,", value):
+            raise ConfigError(
+                f"{item}: {group} takes one choice; for a run of each: -m {key}={value.strip('[]')}"
+            )
         if key.lstrip("+") in ("variant", "variants"):
             found.append(f"{key}{equals}{value.lower()}")
         elif key in ("compare", "policy", "resume"):  # folders of a sweep: seed=0_…

@@ -7,10 +7,9 @@ import hashlib
 import inspect
 import sys
 import sysconfig
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from functools import lru_cache
-from glob import glob
 from importlib.util import resolve_name
 from os.path import expanduser
 from pathlib import Path
@@ -21,6 +20,7 @@ from hydra.core.hydra_config import HydraConfig
 from lcc_rl.config.nodes import settings_at
 from lcc_rl.config.words import FILTERED, YAML
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.io.paths import matching
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.settings import TARGET, find_target
 
@@ -28,6 +28,7 @@ FileHashes = dict[str, dict[str, str]]
 NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
 NAMING_SECTIONS = ("compare", "policy")  # sections that name policies, controllers and classes
 OURS = "lcc_rl."
+FRESH = 2.0  # a file may change again within the resolution of its times [s]
 PLACES = ("stdlib", "platstdlib", "purelib", "platlib")  # folders of installed modules
 INSTALLED = [Path(sysconfig.get_path(x)) for x in PLACES] + [Path(__file__).parents[1]]
 
@@ -54,8 +55,7 @@ def inputs_of(content: Mapping[str, Any]) -> FileHashes:
                 continue
             with suppress(OSError, ValueError, ResultsError):  # the reader raises the error later
                 for path in filter(Path.is_file, _files(last, named, holder, name)):
-                    stat = path.stat()
-                    digest = _digest(str(path), stat.st_size, stat.st_mtime_ns)
+                    digest = _digest(path)
                     known = found.setdefault(section, {})
                     label = path.name if path.suffix == ".py" else str(path)
                     same = known.get(label, digest) == digest
@@ -71,8 +71,7 @@ def _files(last: str, named: bool, holder: Any, name: str) -> Iterator[Path]:
     elif named:
         yield from compared_files(name)
     elif last == "path" or not _ours(holder):
-        found = [path] if path.exists() else map(Path, sorted(glob(str(path), recursive=True)))
-        yield from sorted(path.iterdir()) if path.is_dir() else found
+        yield from map(Path, matching(str(path), deep=last == "path"))
 
 
 def _ours(holder: Any) -> bool:
@@ -127,7 +126,13 @@ def _own_modules(module: Any, seen: set[Path]) -> Iterator[Path]:
         yield from _own_modules(sys.modules[name], seen)
 
 
-@lru_cache(maxsize=4096)  # once per file and process
-def _digest(path: str, size: int, modified: int) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+_digests: dict[tuple[object, ...], str] = {}  # once per content of a file and process
+
+
+def _digest(path: Path) -> str:
+    stat = path.stat()
+    key = path.absolute(), stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
+    if key not in _digests or time.time() - stat.st_ctime < FRESH:
+        with path.open("rb") as file:
+            _digests[key] = hashlib.file_digest(file, "sha256").hexdigest()[:16]
+    return _digests[key]

@@ -57,9 +57,9 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
             if role not in cfg.scenario.vehicles.names:
                 yield f"scenario.{group}.{role}", f"no vehicle of the string is {role}"
     for name, node in cfg.scenario.fleet.items():
-        if node is not None and not {*node.settings["roles"]} & {*cfg.scenario.vehicles.names}:
-            roles = " or ".join(node.settings["roles"])
-            yield f"scenario.fleet.{name}", f"no vehicle of the string is {roles}"
+        roles = node.settings.get("roles") if node is not None else None  # none of another class
+        if roles and not {*roles} & {*cfg.scenario.vehicles.names}:
+            yield f"scenario.fleet.{name}", f"no vehicle of the string is {' or '.join(roles)}"
 
 
 def _of_agent(cfg: StudyConfig) -> Iterator[tuple[str, str]]:

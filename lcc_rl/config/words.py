@@ -23,7 +23,10 @@ def key_of(override: str) -> str:
 def with_variant(variant: str, overrides: Any) -> list[Any]:
     """Return the words of a command from what a program gives; a text is one setting."""
     single = isinstance(overrides, str) or not isinstance(overrides, Iterable)
-    return [f"variant={variant}", *([overrides] if single else overrides)]
+    words = [overrides] if single else [*overrides]
+    for word in filter(re.compile("hydra.(run|sweep|job)").match, map(str, words)):
+        raise ConfigError(f"{word} has no effect in Python: give folder=…")
+    return [f"variant={variant}", *words]
 
 
 def quoted(path: str | Path) -> str:

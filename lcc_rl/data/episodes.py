@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from lcc_rl.data.grid import Places, continuous, on_grid, places, stretches
+from lcc_rl.data.grid import Places, continuous, cut_by_files, on_grid, places, stretches
 from lcc_rl.data.tables import LARGEST_ID, Column, Names, TableFile, Units, lacking, whole_numbers
-from lcc_rl.data.text import stem
+from lcc_rl.data.text import labels
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
 
@@ -73,31 +73,33 @@ def read_episodes(
     """
     tables: list[pd.DataFrame] = []
     notes: list[str] = []
-    place = partial(places, files=paths, columns=columns)
-    for number, path in enumerate(paths):
-        table, lines = _table(path, number, columns or {}, units or {}, place)
+    place = partial(places, columns=columns)
+    for path, label in zip(paths, labels(paths), strict=True):
+        file = TableFile(path, label=label)
+        table, lines = _table(file, columns or {}, units or {}, place, tables)
         if tables:
             table["episode"] += tables[-1]["episode"].max() + 1 - table["episode"].min()
         tables.append(table)
         notes += lines
-    return pd.concat(tables, ignore_index=True), list(dict.fromkeys(notes))
+    whole = pd.concat(tables, ignore_index=True)
+    notes += cut_by_files(whole, "label", paths)
+    return whole, list(dict.fromkeys(notes))
 
 
 def _table(
-    path: str, number: int, columns: Names, units: Units, place: Places
+    file: TableFile, columns: Names, units: Units, place: Places, tables: Sequence[pd.DataFrame]
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Read file ``number`` and resample it to the grid."""
-    file = TableFile(path)
+    """Read a file after others, ``tables``, and resample it to the grid."""
     names = _names(file, columns)
-    table, numbers = _rows(file, number, names, units)
+    table, numbers = _rows(file, names, units, tables)
     notes = list(file.notes)
     for name, words in (
-        ("recording", f"no column recording: {path} is one recording"),
+        ("recording", "no column recording: each file is one recording"),
         ("leader_length", "no column leader_length_m: lengths are not known"),
     ):
         if names.get(name) is None:
             notes.append(words)
-    report = ReadReport([path])
+    report = ReadReport([str(file.path)])
     table = continuous(table, "episode", place, report)
     start = table.groupby("episode")["time_s"].transform("min").to_numpy()
     table, _ = on_grid(table, start, MOTION_COLUMNS, place, report)
@@ -107,11 +109,14 @@ def _table(
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
         notes.append(DERIVED_POSITIONS)
-    return table, [*notes, *(f"{path}: {line}" for line in (*report.left_out(), *report.notes))]
+    return table, [
+        *notes,
+        *(f"{file.path}: {line}" for line in (*report.left_out(), *report.notes)),
+    ]
 
 
 def _rows(
-    file: TableFile, number: int, names: Names, units: Units
+    file: TableFile, names: Names, units: Units, tables: Sequence[pd.DataFrame]
 ) -> tuple[pd.DataFrame, NDArray[np.int64]]:
     """Return rows of a file with episodes numbered from 0, and the file's own numbers."""
     read = file.read(PAIR_FIELDS, names, units, "data.columns", PAIR_MEASURED)
@@ -124,16 +129,19 @@ def _rows(
     numbers = whole_numbers(np.asarray(found))
     if numbers is None or (np.abs(numbers) >= 2**31).any():
         numbers = np.arange(len(found))
-    follower = 2 * codes + 2
+    recording = read.get("recording", np.full(rows, file.label))
+    shared = any({*table["recording"].unique()} & {*np.unique(recording)} for table in tables)
+    before = shared * sum(table["episode"].nunique() for table in tables)
+    follower = 2 * (codes + before) + 2  # unknown vehicles of several files are different ones
     values = {
         **dict.fromkeys(SCHEMA, np.zeros(rows)),
-        "recording": np.full(rows, stem(str(file.path))),
         **{EPISODE_NAMES[key]: cells for key, cells in read.items()},
+        "recording": recording,
         "follower_id": read.get("follower_id", follower),
         "leader_id": read.get("leader_id", follower - 1),
     }
     table = pd.DataFrame({**values, "time_s": read["time"].round(6)})  # resolution 1 µs
-    table = table.assign(file=number, row=kept, label=labels, episode=codes)
+    table = table.assign(file=len(tables), row=kept, label=labels, episode=codes)
     _check_pairs(table, file)
     return table, numbers
 

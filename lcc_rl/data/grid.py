@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lcc_rl.arrays import Floats, Integers, Mask
 from lcc_rl.data.trajectories import FRAME, ReadReport, starts_of
-from lcc_rl.errors import DataError
+from lcc_rl.errors import Concern, DataError
 
 HOLE = 1.75  # steps longer than this multiple of the usual one are holes
 HOLE_S, MANY_HOLES = 2.0, 0.1  # least hole [s] if more than this share of steps would be holes
@@ -38,7 +38,8 @@ def places(
 ) -> Place:
     """Return a function that describes a sample: file, recording, episode, row, vehicle, column.
 
-    Unknown parts are left out. Without a row number, the time is given.
+    Unknown parts are left out. Without a row number, the time is given. A single file is left out,
+    because the messages begin with it.
 
     Args:
         table: table of vehicles, pairs or drives.
@@ -68,7 +69,7 @@ def places(
             words.append(f"vehicle {name}" + f" ({role})" * (at is None))
         words.append(f"{known['time_s']:g} s" if at is None else "")
         words.append(f"column {own!r}" if column else "")
-        file = f"{files[known['file']]}: " if files and "file" in known else ""
+        file = f"{files[known['file']]}: " if len(files) > 1 and "file" in known else ""
         return file + ", ".join(filter(None, words))
 
     return place
@@ -140,7 +141,7 @@ def _first_of_moments(
     where = place(samples)(int(rows[samples["row"].to_numpy()[rows].argmin()]), "time_s")
     if others.sum() > MOST_TWICE * len(samples):
         raise DataError(
-            f"{where} repeats a time of its {what} with other values, as do "
+            f"{report.source}: {where} repeats a time of its {what} with other values, as do "
             f"{100 * others.mean():.0f} % of the rows; does a column name the {what}?"
         )
     words = f"rows that repeat a time of their {what}, {int(others.sum()):,} of them with"
@@ -210,6 +211,20 @@ def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return starts, np.diff(np.append(starts, len(values)))
 
 
+def cut_by_files(samples: pd.DataFrame, key: str, files: Sequence[str]) -> list[Concern]:
+    """Return a warning on records, named in the column ``key``, that continue in another file."""
+    times = samples.groupby([key, "file"])["time_s"].agg(["min", "max", "size"]).reset_index()
+    times = times.sort_values([key, "min"], ignore_index=True)
+    usual = (times["max"] - times["min"]) / (times["size"] - 1)
+    step = (times["min"] - times["max"].shift()).where(times[key] == times[key].shift())
+    found = np.flatnonzero((step > 0) & (step < HOLE * usual))
+    if not len(found):
+        return []
+    before, after = (files[times["file"][row]] for row in (found[0] - 1, found[0]))
+    words = f"{len(found):,} records continue in another file and are read as two, the first from"
+    return [Concern(f"{words} {before} in {after}; join the files")]
+
+
 # -- every 0.1 s -----------------------------------------------------------------------------------
 
 
@@ -235,22 +250,29 @@ def on_grid(
     if at.max() > LAST_FRAME:
         row = int(np.argmax(at > LAST_FRAME))
         raise DataError(
-            f"{place(samples)(row, '')} is {FRAME * at[row]:g} s after the first; is the time in "
-            "another unit?"
+            f"{report.source}: {place(samples)(row, '')} is {FRAME * at[row]:g} s after the first; "
+            "is the time in another unit?"
         )
     frame, episode = np.rint(at).astype(np.int64), samples["episode"].to_numpy()
     same = np.diff(episode) == 0
-    steps, skipped = np.diff(samples["time_s"])[same], (np.diff(frame)[same] > 1).any()
-    step = float(np.median(steps))
+    skipped = (np.diff(frame)[same] > 1).any() or np.abs(at - frame).max() > REGULAR
+    line = interpolated(samples, FRAME, skipped)
     samples = samples.assign(origin=origin)
-    uneven = abs(step - FRAME) > UNEVEN * FRAME or np.abs(at - frame).max() > REGULAR
-    if uneven or skipped:
-        odd = int((np.abs(steps - step) > UNEVEN * step).sum())
-        irregular = f", {odd:,} of them irregular," * bool(odd)
-        report.notes.append(f"samples {step:g} s apart{irregular} were interpolated to {FRAME:g} s")
+    if line:
+        report.notes += line
         samples, frame = _interpolated(samples, at, [*smooth], report)
     samples["time_s"] = samples.pop("origin") + frame / round(1 / FRAME)
     return samples, frame
+
+
+def interpolated(samples: pd.DataFrame, step: float, skipped: bool = False) -> list[str]:
+    """Return a line on samples that are not ``step`` seconds apart, or with ``skipped`` frames."""
+    steps = np.diff(samples["time_s"])[np.diff(samples["episode"]) == 0]
+    usual = float(np.median(steps))
+    odd = int((np.abs(steps - usual) > UNEVEN * usual).sum())
+    irregular = f", {odd:,} of them irregular," * bool(odd)
+    line = f"samples {usual:g} s apart{irregular} were interpolated to {step:g} s"
+    return [line] * bool(skipped or odd or abs(usual - step) > UNEVEN * step)
 
 
 def _interpolated(

@@ -169,7 +169,7 @@ class RecordLeaders(Settings):
         report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s"] + [
             f"{group}: {line}"
             for group, x in parts.items()
-            for line in described_records(joined(x))
+            for line in described_records(joined(x), horizon)
         ]
         leaders = Leaders(joined(parts["training"]), windows, report=tuple(report))
         if followers is None:
@@ -217,7 +217,7 @@ class TrajectoryLeaders(Settings):
         profiles = at_step(leader_profiles(loaded.episodes, FRAME), time_step)
         training, held_out = self.split(profiles.at_least(horizon))
         windows = varying(held_out.windows(horizon), self.least_variation)
-        lines = described_records(profiles), apart(training, held_out, loaded.vehicles)
+        lines = described_records(profiles, horizon), apart(training, held_out, loaded.vehicles)
         report = (*loaded.report, *lines[0], *lines[1])
         return Leaders(training, windows, report=report)
 
@@ -305,7 +305,8 @@ class DriveLeaders(Settings):
         by = "at the end" if single else f"by name (a hash, {self.evaluation_share:.2g} each)"
         count = f"{len(held_out)} of {len(profiles)} record(s) for evaluation, {by}: "
         line = f"{self.path}: {count}{', '.join(held_out.names)}"
-        return Leaders(training, windows, report=(*report, *described_records(profiles), line))
+        report += [*described_records(profiles, horizon), line]
+        return Leaders(training, windows, report=tuple(report))
 
     def _by_name(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
         """Divide drives by a hash of their names; twice for tuning."""

@@ -12,6 +12,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from lcc_rl.data.trajectories import listed
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Settings
 
@@ -207,16 +208,24 @@ def joined(parts: Sequence[Profiles]) -> Profiles:
     )
 
 
-def described_records(profiles: Profiles) -> list[str]:
-    """Return lines on duration, mean and largest speed of the records, fastest first."""
-    lines = []
+def described_records(profiles: Profiles, horizon: int) -> list[str]:
+    """Return lines on duration, mean and largest speed of the records, fastest first.
+
+    A last line counts the records that are shorter than ``horizon`` steps.
+    """
+    lines, short = [], []
     for index, name in enumerate(profiles.names):
         x = profiles.record(index)
         seconds, most = (len(x) - 1) * profiles.time_step, float(x.max())
         line = f"{name}: {seconds:,.0f} s, speed {float(x.mean()):.3g} m/s, at most {most:.3g} m/s"
         lines.append((-most, line))
+        short += [f"{name} ({seconds:g} s)"] * (len(x) <= horizon)
     more = [f"… and {len(lines) - MOST_LINES:,} slower records"] if len(lines) > MOST_LINES else []
-    return [line for _, line in (sorted(lines)[:MOST_LINES] if more else lines)] + more
+    words = f"left out {len(short):,} of {len(profiles):,} record(s), shorter than an episode of"
+    more += [f"{words} {horizon * profiles.time_step:g} s: {listed(short)}"] * bool(short)
+    return [
+        line for _, line in (sorted(lines)[:MOST_LINES] if len(lines) > MOST_LINES else lines)
+    ] + more
 
 
 def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from glob import escape, glob, has_magic
-from os.path import expanduser
+from glob import has_magic
+from os.path import abspath, expanduser
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -27,8 +28,9 @@ from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.smoothing import averaged
 from lcc_rl.data.tables import SI, Column, Names, Units, check_map
-from lcc_rl.data.trajectories import Trajectories
+from lcc_rl.data.trajectories import Trajectories, listed
 from lcc_rl.errors import DataError, raised_as
+from lcc_rl.io.paths import matching
 from lcc_rl.settings import Settings
 
 ASSETS = Path(lcc_rl.assets.__file__).parent
@@ -161,7 +163,7 @@ class EpisodesSource(Source):
         """
         files = find_files(self.path)
         episodes, notes = read_episodes(files, self.columns, self.units)
-        count, source = episodes["episode"].nunique(), ", ".join(files)
+        count, source = episodes["episode"].nunique(), listed(files)
         lines = [f"read {count:,} episodes, {len(episodes):,} rows, {source}", *notes]
         named = {**{key: EPISODE_NAMES[key] for key in self.units}, **self.columns}
         source += read_as(PAIR_FIELDS, named, self.units)
@@ -194,7 +196,8 @@ def units_of(columns: Iterable[Column], names: Names, units: Units) -> dict[str,
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     """Return the files of a path, a pattern or a list of them; those of a pattern are sorted.
 
-    A path may be the name of a shipped recording or cycle. A folder stands for its files.
+    A path may be the name of a shipped recording or cycle. A folder stands for its files, or, if it
+    has none, for those of its folders.
 
     Raises:
         DataError: if a pattern matches no file, or a file is named twice.
@@ -202,17 +205,13 @@ def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     files: list[str] = []
     for entry in [path] if isinstance(path, (str, Path)) else path:
         name = str(expanduser(entry))
-        found = [SHIPPED_FILES.get(name, name)]
-        if Path(name).is_dir():
-            name = str(Path(escape(name)) / "*")
-        if has_magic(name) and not Path(name).exists():
-            found = sorted(match for match in glob(name, recursive=True) if Path(match).is_file())
-            if not found:
-                raise DataError(f"{name}: no file matches this pattern")
-        files += found
+        found = [SHIPPED_FILES[name]] if name in SHIPPED_FILES else matching(name)
+        if not found and (has_magic(name) or Path(name).is_dir()):
+            raise DataError(f"{name}: no file matches this pattern")
+        files += found or [name]  # the reader refuses a missing file
     if not files:
         raise DataError("no file is named; expected at least one path")
-    twice = [name for name in files if files.count(name) > 1]
+    twice = [name for name, count in Counter(map(abspath, files)).items() if count > 1]
     if twice:
         raise DataError(f"{twice[0]}: is named twice; expected every file once")
     return files

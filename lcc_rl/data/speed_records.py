@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lcc_rl.data.grid import continuous, places
+from lcc_rl.data.grid import continuous, interpolated, places
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
 from lcc_rl.data.sources import SHIPPED_FILES, find_files
 from lcc_rl.data.tables import Column, Names, TableFile, Units
-from lcc_rl.data.text import stem
+from lcc_rl.data.text import labels
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
 
@@ -23,11 +23,9 @@ TIME_COLUMN, SPEED_COLUMN = "time_s", "speed_mps"
 # Columns of a table of drives, and their default names.
 DRIVE_FIELDS = (
     Column("drive", "text", required=False),
-    Column("time", "time"),
-    Column("speed", "speed"),
+    Column("time", "time", blank=True),
+    Column("speed", "speed", blank=True),
 )
-# Columns of the first car of a native OpenACC file; blank cells divide a record.
-NATIVE = (Column("time", "time"), Column("speed", "speed", blank=True))
 DRIVE_COLUMNS: dict[str, str | None] = {
     "drive": "drive",
     "time": TIME_COLUMN,
@@ -88,7 +86,10 @@ def read_drives(
     files = find_files(path)
     if len(files) > 1 and columns["drive"] is None:
         raise DataError(f"{path}: {len(files)} files; leader=record drives one, see leader=drives")
-    read = [_read(TableFile(name), columns, plausible, units or {}) for name in files]
+    tables = [
+        TableFile(name, label=label) for name, label in zip(files, labels(files), strict=True)
+    ]
+    read = [_read(table, columns, plausible, units or {}) for table in tables]
     table = pd.concat([samples for samples, _ in read], keys=files, names=["file"]).reset_index(0)
     own = table.groupby("name")["file"].nunique()
     if (own > 1).any():
@@ -100,7 +101,8 @@ def read_drives(
     ]
     names, drives = map(str, records.groups), map(str, records["drive"].first())
     profiles = from_records(speeds, [*names], [*drives], time_step)
-    return profiles, [line for _, lines in read for line in lines]
+    lines = [line for x, own in read for line in (*own, *interpolated(x, time_step))]
+    return profiles, list(dict.fromkeys(lines))
 
 
 def _read(
@@ -125,19 +127,22 @@ def _read(
 
 def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:
     """Return drive (as recording), time and speed of every row with a speed."""
-    fields: Sequence[Column] = DRIVE_FIELDS
+    single = columns["drive"] is None
     if table.preamble:
-        fields = DRIVE_FIELDS if columns["drive"] is None else NATIVE
         native = {TIME_COLUMN: "Time", SPEED_COLUMN: "Speed1"}
         columns = {key: native.get(str(columns[key]), columns[key]) for key in ("time", "speed")}
     elif columns["drive"] == DRIVE_COLUMNS["drive"] and columns["drive"] not in table.header:
         columns = {**columns, "drive": None}  # each file is one drive
-    read = table.read(fields, columns, units, "leader.columns", ["speed"])
-    if not len(read["time"]):
+    read = table.read(DRIVE_FIELDS, columns, units, "leader.columns", ["time", "speed"])
+    rows = read["row"]
+    if not len(rows):
         raise DataError(f"{table.path}: holds 0 samples, at least 2 are needed")
+    # A record may end before the table; in native files, blank cells divide it.
+    if rows[-1] >= len(rows) and (single or not table.preamble):
+        raise table.fault(int(np.argmax(rows != np.arange(len(rows)))), "speed", "is blank")
     samples = pd.DataFrame(
-        {TIME_COLUMN: read["time"], SPEED_COLUMN: read["speed"], "file": 0, "row": read["row"]}
+        {TIME_COLUMN: read["time"], SPEED_COLUMN: read["speed"], "file": 0, "row": rows}
     )
-    samples["recording"] = read.get("drive", stem(table.path))
+    samples["recording"] = read.get("drive", table.label)
     samples["episode"] = np.unique(samples["recording"], return_inverse=True)[1]
     return samples

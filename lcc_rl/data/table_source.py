@@ -12,11 +12,11 @@ from pydantic import Field
 
 from lcc_rl.arrays import Integers
 from lcc_rl.data.agreement import LEAST_WAY
-from lcc_rl.data.grid import Places, continuous, on_grid, places
+from lcc_rl.data.grid import Places, continuous, cut_by_files, on_grid, places
 from lcc_rl.data.plausible import SMOOTHING
 from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource, find_files, read_as, units_of
 from lcc_rl.data.tables import Column, TableFile, check_map, whole_numbers
-from lcc_rl.data.text import stem
+from lcc_rl.data.text import labels
 from lcc_rl.data.trajectories import (
     FRAME,
     ReadReport,
@@ -97,6 +97,8 @@ class TableSource(TrajectorySource):
         names = {**self.columns, "preceding": self.columns.get("leader")}
         names["gap"] = names.get("gap") or names.get("position")
         place = partial(places, files=report.files, columns=names, vehicles=report.names)
+        if self.columns.get("recording") is None:
+            report.notes += cut_by_files(rows, "vehicle", report.files)
         trajectories = to_trajectories(rows, place, report)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
@@ -146,12 +148,6 @@ def _report_blank_gaps(table: TableFile, read: Mapping[str, NDArray]) -> None:
             f"{int(blank.sum()):,} samples with a leader but a blank gap follow no vehicle, "
             f"the first: {first}"
         )
-
-
-def labels(files: Sequence[str]) -> list[str]:
-    """Return the names of files' recordings, without folders if these are unique."""
-    stems = [stem(name) for name in files]
-    return [x if stems.count(x) == 1 else name for x, name in zip(stems, files, strict=True)]
 
 
 def _vehicles(

@@ -23,6 +23,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from lcc_rl.data.text import (
+    NO_TABLE,
     SEPARATORS,
     cells_of,
     line_chunks,
@@ -30,6 +31,7 @@ from lcc_rl.data.text import (
     preamble,
     separator_of,
     single_spaces,
+    stem,
     unended,
 )
 from lcc_rl.data.trajectories import FOOT
@@ -63,6 +65,7 @@ UNIT_WORDS = {
     },
     "length": {"ft": "ft|feet|foot", "cm": "cm", "km": "km"},
 }
+APART = "no row has all columns: interpolate signals at their own times to common times first"
 Cells = Any  # a pyarrow array, chunked or not
 Names = Mapping[str, str | None]  # names of columns in a file, by key
 Units = Mapping[str, str]  # units of columns, by key
@@ -149,12 +152,14 @@ class TableFile:
 
     The separator of text is the one that divides the header and the next row equally: comma,
     semicolon, tab, bar or spaces. With semicolons, numbers may have a decimal comma. ``preamble``
-    holds the lines before the header of a native OpenACC file.
+    holds the lines before the header of a native OpenACC file, ``folders`` the columns that
+    folders such as ``day=3`` add to the header.
 
     Args:
         path: a .csv or other text file, gzipped or not, or a .parquet file.
         spelled: maps a name in the header to that of a column.
         bare: names of the columns of text without a header.
+        label: its name as a recording or drive; by default the stem.
 
     Raises:
         DataError: if the file is missing, damaged or no table.
@@ -165,11 +170,13 @@ class TableFile:
         path: str | Path,
         spelled: Callable[[str], str] = str.strip,
         bare: Sequence[str] = (),
+        label: str = "",
     ) -> None:
-        self.path = Path(expanduser(path))
+        self.path, self.label = Path(expanduser(path)), label or stem(path)
         self.preamble: dict[str, str] = {}
         self.notes: list[str] = []
         self.names: dict[str, str] = {}
+        self.first: list[str] = []  # cells of the first row of text
         self.count = 0  # number of rows, known after reading
         self.comma = False  # whether numbers have a decimal comma
         if not self.path.is_file():
@@ -180,6 +187,9 @@ class TableFile:
                 self.header = [*pq.read_schema(self.path).names]
         else:
             self._open_text(spelled, bare)
+        keys = dict(part.split("=", 1) for part in self.path.parent.parts if "=" in part)
+        self.folders = {key: keys[key] for key in keys if key not in self.header}
+        self.width, self.header = len(self.header), [*self.header, *self.folders]
 
     def read(
         self,
@@ -234,6 +244,8 @@ class TableFile:
             return read
         row = int(np.argmax(wrong))
         first = self.fault(row, next(key for key in blank if blank[key][row]), "is blank")
+        if wrong.all() and not any(column.all() for column in blank.values()):
+            raise DataError(f"{first}; {APART}")
         if wrong.all():
             raise first
         line = f"left out {int(wrong.sum()):,} rows with a blank cell, the first: {first}"
@@ -262,11 +274,19 @@ class TableFile:
         for name in names:
             if self.header.count(name) > 1:
                 raise DataError(f"{self.path}: has column {name!r} twice; expected it once")
+        for rows, before in self._rows([name for name in names if name not in self.folders]):
+            for name in (name for name in names if name in self.folders):
+                cells = pa.array([self.folders[name]] * rows.num_rows, pa.string())
+                rows = rows.append_column(name, cells)
+            yield Block(self, rows, before)
+
+    def _rows(self, names: Sequence[str]) -> Iterator[tuple[pa.Table, int]]:
+        """Yield rows of the file, and the number of rows before them."""
         if self.parquet:
             with raised_as(DataError, f"{self.path}: not a readable table", Exception):
                 whole = pq.read_table(self.path, columns=[*names])
                 whole.validate(full=True)  # else damaged text would fail only when used
-            yield Block(self, whole)
+            yield whole, 0
             return
         places, row = {str(self.header.index(name)): name for name in names}, 0
         for lines in self.lines:
@@ -274,23 +294,27 @@ class TableFile:
                 lines = single_spaces(lines)
             if not lines.strip():
                 continue
-            width, source = len(self.header), str(self.path)
-            table = parse_text(lines, width, self.separator, [*places], source, row)
-            yield Block(self, table.rename_columns([places[x] for x in table.column_names]), row)
+            source = str(self.path)
+            table = parse_text(lines, self.width, self.separator, [*places], source, row)
+            yield table.rename_columns([places[x] for x in table.column_names]), row
             row += table.num_rows
             self.notes += unended(lines, f"{self.path}: data row {row}")
         if not row:
-            yield Block(self, pa.table({name: pa.array([], pa.string()) for name in names}))
+            yield pa.table({name: pa.array([], pa.string()) for name in names}), 0
 
     def fault(self, row: int, key: str, words: str) -> DataError:
         """Return the error about a cell."""
-        name = self.names.get(key, key)
+        name, units = self.names.get(key, key), chain.from_iterable(UNITS.values())
+        if row == 0 and {cell.strip(" []()") for cell in self.first} & {*units}:
+            words = f"{words}; does this row hold units? Remove it, and set units={{…}}"
         return DataError(f"{self.path}: data row {row + 1}, column {name!r} {words}")
 
     def _open_text(self, spelled: Callable[[str], str], bare: Sequence[str]) -> None:
         chunks = line_chunks(self.path, self.notes)
         content = next(chunks, b"").removeprefix(b"\xef\xbb\xbf")
         self.preamble, content = preamble(re.sub(rb"\A([ \t]*\r?\n)+", b"", content))
+        for start in filter(content.startswith, NO_TABLE):
+            raise DataError(f"{self.path}: is {NO_TABLE[start]}")
         self.separator = separator_of(content)
         first, _, rows = content.partition(b"\n")
         if self.separator == " ":
@@ -306,7 +330,7 @@ class TableFile:
                 )
             self.header, rows = [*bare], content
         self.lines = chain([rows], chunks)
-        cells = cells_of(rows.partition(b"\n")[0], self.separator)
+        self.first = cells = cells_of(rows.partition(b"\n")[0], self.separator)
         if len(cells) == len(self.header) + 1 and not cells[-1].strip():
             self.header.append("")  # rows end in a separator
         if self.separator != ",":
@@ -352,6 +376,8 @@ def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: 
     near = get_close_matches(missing[0].lower(), folded, n=1)
     hint = f" (is it {folded[near[0]]!r}?)" if near else ""
     how = f"; name the columns by {option}={{…}}" if option else ""
+    if sum(map(bool, header)) == 1 or header[0].startswith(("#", "%")):
+        how = ": is it a title or a comment? The first line must name the columns"
     if all(re.fullmatch(NUMBER, name) for name in header if name):
         how = ": is the header missing? The first line must name the columns"
     shown = ", ".join(header)[:400]

@@ -7,9 +7,11 @@ import gzip
 import re
 import zlib
 from codecs import EncodedFile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import BufferedReader
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,10 @@ OTHER_FORMATS = {
     b"\x89HDF": " but an HDF5 or MATLAB file (mat); save the table as CSV",
     b"PAR1": " but a parquet file; name it .parquet",
     **dict.fromkeys(UTF16, " but in UTF-16; save it in UTF-8"),
+}
+NO_TABLE = {
+    b"version https://git-lfs": "a Git LFS pointer in place of the file: run git lfs pull",
+    b"<?xml": "XML; save the table as CSV (SUMO: --fcd-output fcd.csv)",
 }
 
 
@@ -152,6 +158,18 @@ def separator_of(content: bytes) -> str:
 def stem(file: str | Path) -> str:
     """Return the name of a file without folder and endings, ``a`` for ``x/a.csv.gz``."""
     return Path(Path(file).name.removesuffix(".gz")).stem
+
+
+def labels(files: Sequence[str]) -> list[str]:
+    """Return the names of files' recordings: the stems, or folder and file where these repeat."""
+    stems = [stem(name) for name in files]
+    counts = Counter(stems)
+    folders = [Path(name).parent.parts for name in files if counts[stem(name)] > 1]
+    same = len([*takewhile(lambda parts: len({*parts}) == 1, zip(*folders, strict=False))])
+    return [
+        x if counts[x] == 1 else "/".join(Path(name).parts[same:])
+        for x, name in zip(stems, files, strict=True)
+    ]
 
 
 def parse_text(

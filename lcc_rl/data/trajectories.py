@@ -75,7 +75,7 @@ class ReadReport:
     @property
     def source(self) -> str:
         """The files and their units, the subject of messages."""
-        return ", ".join(self.files) + self.read_as
+        return listed(self.files) + self.read_as
 
     def drop(self, reason: str, count: int) -> None:
         """Count dropped rows by reason."""

@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
 
 # Exit codes.
@@ -23,8 +23,9 @@ Restore = Callable[[], None]
 
 
 def _end(*_: Any) -> NoReturn:
-    os.write(2, b"lcc_rl: interrupted\n")
-    # A module that is being imported could suppress an exception.
+    # A module that is being imported could suppress an exception, such as that of a closed stderr.
+    with suppress(OSError):
+        os.write(2, b"lcc_rl: interrupted\n")
     os._exit(INTERRUPTED)
 
 

@@ -10,6 +10,7 @@ import pytest
 from commands import NO_AGENT, tiny
 from helpers import check_refused
 
+import lcc_rl
 from lcc_rl.agents.controller import ControllerPolicy
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.config import load
@@ -28,6 +29,11 @@ WRONG = {
     "time_step=1": "it is scenario.time_step",
     "help": "key=value; -h shows the help",
     "scenario.controllers.human.parameters={a: 1}": "drivers=fixed drivers.acceleration",
+    "variant=[alcc,reference]": "variant takes one choice; for a run of each: -m variant=alcc,refe",
+    "energy=[fuel,bolt]": "energy takes one choice",
+    "leader=[udds,us06]": "leader takes one choice",
+    "+scenario.fleet.t={_target_: builtins.dict}": "scenario.fleet.t.*",
+    "scenario.string='automated human*٢٥'": "expected .* at character 16",
     "agent=dddpg": "agent 'dddpg'.*'ddpg'.* agent/dddpg.yaml, needs --config-dir",
     "reward.terms.safety.wieght=1": "reward.terms.safety .*'weight'",
     "agent._partial_=true": "agent._partial_ has no effect",
@@ -100,6 +106,15 @@ def test_a_bad_setting_is_one_line_before_the_data_are_read(tmp_path) -> None:
 def test_options_without_effect_are_refused() -> None:
     cases = [(typed, rf"has no effect: .*({why})") for typed, why in IGNORED.items()]
     check_refused(lambda typed: load("train", typed.split()), cases, ConfigError)
+
+
+def test_programs_are_refused_what_has_no_effect_in_them() -> None:
+    cases = [
+        (lcc_rl.learn, "alcc", ["hydra.run.dir=a"], r"hydra.run.dir=a has no effect .* folder="),
+        (lcc_rl.compare, [], "alcc", "expected strategies, or a mapping of them by name: \\[\\]"),
+        (lcc_rl.compare, {3: "idm"}, "alcc", "mapping of them by name: {3: 'idm'}"),
+    ]
+    check_refused(lambda call, *given: call(*given), cases, ConfigError)
 
 
 def test_drivers_have_an_effect_on_whatever_drives_as_they_do() -> None:

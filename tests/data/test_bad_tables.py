@@ -16,6 +16,10 @@ from lcc_rl.errors import Concern, DataError
 GOOD = csv_text(pair())
 TABLE = long_table()
 RECORD = "time_s,speed_mps\n"
+APART = pairs().assign(  # gap and speeds at their own times
+    gap_m=pairs()["gap_m"].where(pairs().index % 2 == 0),
+    follower_speed_mps=pairs()["follower_speed_mps"].where(pairs().index % 2 == 1),
+)
 DRIVES = "drive,time_s,speed_mps\na,0,1\n"
 
 
@@ -114,6 +118,19 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("table", table(id=""), "data row 501, column 'id' is blank"),
     ("table", table(id="x" * 1001), "data row 501, column 'id' holds a text of 1,001 characters"),
     ("record", RECORD + "0,1\n1,fast\n", "data row 2, column 'speed_mps' holds 'fast'"),
+    # Files of other programs: lines before and below the header, signals at their own times.
+    ("table", "ACC test 3\n" + csv(TABLE), "is it a title or a comment.*must name the columns"),
+    ("table", "ACC test 3,,,,\n" + csv(TABLE), "is it a title or a comment"),
+    ("table", "# 2024-05-01\n" + csv(TABLE), "is it a title or a comment"),
+    (
+        "table",
+        csv(TABLE).replace("\n", "\n-,s,m/s,m,-,-,m,m\n", 1),
+        "row 1, .*does this row hold uni",
+    ),
+    ("record", "version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "run git lfs pull"),
+    ("table", "<?xml version='1.0'?>\n<fcd-export/>\n", "is XML; save the table as CSV"),
+    ("episodes", csv(APART), "row 1, column 'follower_speed_mps' is blank; no row has all columns"),
+    ("record", RECORD + "0,1\n1,\n2,1\n", "data row 2, column 'speed_mps' is blank"),
     # Rows that contradict each other, and times.
     ("table", csv(LATE), r"data row 1191, vehicle 3 is 1e\+11 s after the first"),
     ("table", csv(TABLE.assign(id=range(len(TABLE)))), "no vehicle has two samples"),
@@ -151,6 +168,11 @@ ODD = [  # and what is reported
     ("drives", DRIVES + "a,0.1,1\na,0.1,1\na,0.2,1\n", "1 rows: .* 0 of them .*data row 3,"),
     ("drives", DRIVES + "a,0.2,1\na,0.1,1\n", "are not in order of time: sorted"),
     ("drives", DRIVES + "b,0,1\nb,0.1,1\n", "1 rows: alone between holes"),
+    (
+        "drives",
+        DRIVES + "a,0.1,1\na,0.2,\na,,\n",
+        "left out 2 rows with a blank cell, .*data row 3,",
+    ),
 ]
 
 

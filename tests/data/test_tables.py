@@ -214,7 +214,7 @@ def test_the_first_sample_left_out_is_named_by_file_row_and_column(tmp_path) -> 
     frame.loc[1100, "ahead"] = 77
     path = written(tmp_path, frame)
     report = TableSource(path=path, columns=BY_GAP).load().report
-    where = f"the first: {path}: recording my, data row"
+    where = "the first: recording my, data row"
     assert [line for line in report if line.startswith("left out 1 sample:")] == [
         f"left out 1 sample: the preceding vehicle is not seen in that frame, {where} 1101, "
         "vehicle 3, column 'ahead'",

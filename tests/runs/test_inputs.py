@@ -12,6 +12,7 @@ from helpers import slow_but
 
 from lcc_rl.commands.evaluation import made_by
 from lcc_rl.config import identity, load
+from lcc_rl.config.inputs import inputs_of
 from lcc_rl.drivers.tables import load_drivers
 from lcc_rl.io.files import write_parquet
 
@@ -71,6 +72,29 @@ def test_a_configuration_has_another_identity_once_a_file_holds_something_else(
     with file.open("a") as text:
         text.write("# two\n")
     assert identity(load("evaluate", words)) != first
+
+
+def test_a_file_replaced_within_its_size_and_times_has_another_hash(place, monkeypatch) -> None:
+    file, other, content = place / "cycle.csv", place / "other.csv", {"leader": {"path": "*.csv"}}
+    for aged in (False, True):  # written just now, or a while ago
+        monkeypatch.setattr("lcc_rl.config.inputs.FRESH", 0.0 if aged else 1e9)
+        found = []
+        for text in ("one", "two"):
+            other.write_text(text)
+            os.utime(other, (1, 1))
+            other.replace(file)
+            found.append(inputs_of(content)["leader"]["cycle.csv"])
+        assert found[0] != found[1], aged
+
+
+def test_own_files_of_settings_are_read_anew(place, monkeypatch) -> None:
+    own = "# @package _global_\nscenario: {{horizon: {}}}\n"
+    words = ["hydra.searchpath=[file://c]", "+knowledge=mine"]
+    for folder, horizon in ((place, 31), (place, 32), (place / "sub", 33), (place, 32)):
+        (folder / "c" / "knowledge").mkdir(parents=True, exist_ok=True)
+        (folder / "c" / "knowledge" / "mine.yaml").write_text(own.format(horizon))
+        monkeypatch.chdir(folder)
+        assert load("train", words).scenario.horizon == horizon
 
 
 def test_a_run_without_own_files_has_none(place) -> None:

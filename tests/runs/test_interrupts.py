@@ -42,6 +42,15 @@ class Slow:
 sys.meta_path.insert(0, Slow())
 runpy.run_module("lcc_rl", run_name="__main__", alter_sys=True)
 """
+# A module that closes stderr and suppresses errors while it is imported.
+DEAF = """
+            import os
+            os.close(2)
+            try:
+                print("on", flush=True), input()
+            except Exception:
+                os._exit(0)
+"""
 # A program of the user's own, which starts a process.
 MINE = """
 import signal
@@ -77,6 +86,17 @@ def test_a_command_that_imports_yet_ends_with_one_line(kind) -> None:
         child.send_signal(kind)
         _, errors = child.communicate(timeout=60)
     assert (child.returncode, errors) == (130, "lcc_rl: interrupted\n")
+
+
+def test_a_command_that_imports_ends_without_a_stderr() -> None:
+    deaf = IMPORTS.replace('print("on", flush=True), input()', DEAF)
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", deaf], text=True, **pipes) as child:
+        assert child.stdout.readline() == "on\n"
+        child.terminate()
+        with suppress(BrokenPipeError):
+            child.communicate("\n", timeout=60)
+    assert child.returncode == 130
 
 
 @pytest.mark.slow
