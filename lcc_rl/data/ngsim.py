@@ -22,12 +22,14 @@ from numpy.typing import NDArray
 from lcc_rl.data.ngsim_recordings import Group, name_recordings
 from lcc_rl.data.tables import LARGEST_ID, Block, Column, TableFile, lacking
 from lcc_rl.data.trajectories import (
+    CAR_LENGTH,
     FOOT,
     SAMPLE_TYPES,
     ReadReport,
     RowIndex,
     Trajectories,
     assembled,
+    median_lengths,
 )
 from lcc_rl.errors import Concern, DataError
 
@@ -84,8 +86,8 @@ CONSEQUENCES = {
     "Space_Headway": "space headways are derived from positions",
 }
 METRES = {"feet": FOOT, "metres": 1.0}
-CAR_LENGTH = (2.0, 12.0)  # range of the median length of vehicles on any road [m]
 JAM = 3.0  # least distance of cars in a queue, front to front [m]
+CLOSE, MOVING = 0.5, 3.0  # least median time gap [s] of followers above a speed [m/s]
 EXACT_DUPLICATE = "exact duplicate (vehicle, frame)"
 CONFLICTING_DUPLICATE = "conflicting duplicate (vehicle, frame)"
 NgsimColumns = dict[str, NDArray]
@@ -286,26 +288,33 @@ def _kept_order(
 
 
 def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> None:
-    """Check that the vehicles of every recording have plausible lengths.
+    """Check that the vehicles of every recording have plausible lengths and time gaps.
 
-    Without lengths, the shortest headways (1 % quantile) are checked.
+    Without lengths, the shortest headways (1 % quantile) are checked. Time gaps do not depend on
+    the unit, unless that of lengths differs from that of positions and speeds.
     """
+    medians, other = median_lengths(samples), "feet" if units == "metres" else "metres"
     for name, part in samples.groupby("recording", observed=True):
-        lengths = part.groupby("vehicle")["length_m"].first()
-        lengths = lengths[lengths > 0]
+        gaps, hint = [], f"is the file in {other}? Use data.units={other}"
         headways = part.loc[part["space_headway_m"] > 0, "space_headway_m"]
-        if len(lengths):
-            what, found = "the median length of vehicles", float(lengths.median())
+        if name in medians:
+            what, found = "the median length of vehicles", float(medians[name])
             low, high = CAR_LENGTH
+            moves = part.loc[headways.index, "speed_mps"] > MOVING * METRES[units]
+            gaps = ((headways - found) / part.loc[headways.index, "speed_mps"])[moves]
         elif len(headways):
             what, found = "the least headway (1 % quantile)", float(headways.quantile(0.01))
             low, high = JAM, float("inf")
         else:
             continue
-        if not low <= found <= high:
-            other = "feet" if units == "metres" else "metres"
+        near = len(gaps) > 0 and float(gaps.median()) < CLOSE
+        if near:
+            hint = (
+                f"at the same unit, the median time gap is {gaps.median():.2g} s; are lengths in "
+                "feet and positions and speeds in metres? Give all in one unit"
+            )
+        if near or not low <= found <= high:
             raise DataError(
                 f"{', '.join(files)}: recording {name}: {what} is {found / METRES[units]:.3g} "
-                f"{units}; expected {low:g} to {high:g} m; is the file in {other}? Use "
-                f"data.units={other}"
+                f"{units}; expected {low:g} to {high:g} m; {hint}"
             )

@@ -14,7 +14,7 @@ from lcc_rl.arrays import Floats, Mask
 from lcc_rl.data.agreement import OF_PAIRS, check_pairs
 from lcc_rl.data.grid import ORIGIN, Place, Places, divided, stretches
 from lcc_rl.data.tables import Units
-from lcc_rl.data.trajectories import FRAME, starts_of
+from lcc_rl.data.trajectories import CAR_LENGTH, FRAME, starts_of
 from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
@@ -42,6 +42,7 @@ class Plausible(Settings):
     max_acceleration: Positive = 10.0  # absolute change of speed between samples [m/s²]
     min_length: NonNegative = 2.0  # length of a vehicle [m]; 0 counts as not given
     max_length: Positive = 30.0
+    max_median_length: Positive = CAR_LENGTH[1]  # of vehicles with a length in a table [m]
     min_gap: Number = 0.0  # between bumpers [m]
     max_gap: Positive = 500.0
     max_jump: Positive = 4.0  # change of a gap in 0.5 s beyond that by both speeds [m]
