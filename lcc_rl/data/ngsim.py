@@ -87,7 +87,7 @@ CONSEQUENCES = {
 }
 METRES = {"feet": FOOT, "metres": 1.0}
 JAM = 3.0  # least distance of cars in a queue, front to front [m]
-CLOSE, MOVING = 0.5, 3.0  # least median time gap [s] of followers above a speed [m/s]
+CLOSE, MOVING = 0.4, 3.0  # least median time gap [s] of followers above a speed [m/s]
 EXACT_DUPLICATE = "exact duplicate (vehicle, frame)"
 CONFLICTING_DUPLICATE = "conflicting duplicate (vehicle, frame)"
 NgsimColumns = dict[str, NDArray]
@@ -294,14 +294,14 @@ def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> Non
     the unit, unless that of lengths differs from that of positions and speeds.
     """
     medians, other = median_lengths(samples), "feet" if units == "metres" else "metres"
+    moves = samples["speed_mps"] > MOVING * METRES[units]
     for name, part in samples.groupby("recording", observed=True):
         gaps, hint = [], f"is the file in {other}? Use data.units={other}"
         headways = part.loc[part["space_headway_m"] > 0, "space_headway_m"]
         if name in medians:
             what, found = "the median length of vehicles", float(medians[name])
             low, high = CAR_LENGTH
-            moves = part.loc[headways.index, "speed_mps"] > MOVING * METRES[units]
-            gaps = ((headways - found) / part.loc[headways.index, "speed_mps"])[moves]
+            gaps = ((headways - found) / part["speed_mps"])[moves]
         elif len(headways):
             what, found = "the least headway (1 % quantile)", float(headways.quantile(0.01))
             low, high = JAM, float("inf")
