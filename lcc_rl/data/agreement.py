@@ -158,8 +158,7 @@ def check_pairs(
         max_mismatch, max_lag: see :class:`lcc_rl.data.plausible.Plausible`.
 
     Returns:
-        Lines on lags, on biased speeds, on gaps that fit no unit and on medians; and whether any
-        pair agrees.
+        Lines on lags, biases, gaps that fit no unit, and medians; and whether any pair agrees.
 
     Raises:
         DataError: naming the pair and the probable mistake, if one or all contradict their speeds.
@@ -247,20 +246,18 @@ def _mistaken(
 
 def _biased(pair: Mapping[Any, Any]) -> list[tuple[int, str, str]]:
     """Return row, signal and words on a clock or a speed that is slightly off; else nothing."""
-    a, b, rate = (pair[name] for name in ("leader", "follower", "rate"))
-    factors, most = (a, b), log(LOUD_FACTOR)
-    if min(map(log, factors)) > most or max(map(log, factors)) < -most:
+    row, a, b, rate = (pair[name] for name in ("row", "leader", "follower", "rate"))
+    if min(a, b) > LOUD_FACTOR or max(a, b) < 1 / LOUD_FACTOR:
         words = f"the gap changes by {(a * b) ** 0.5:.2f} m where both speeds give 1 m"
-        return [(pair["row"], "gap", f"{words}; is a clock too fast or slow by this factor?")]
+        return [(row, "gap", f"{words}; is a clock too fast or slow by this factor?")]
     if abs(rate) < LOUD_RATE:
         return []
-    words = f"the gap changes by {rate:+.1f} m/s against both speeds"
     signal = "follower" if abs(b - 1) > abs(a - 1) else "leader"
+    hint = f"multiply the {signal}'s speed by {pair[signal]:.3f}"
     if abs(pair["constant"]) > abs(rate) / 2:
         hint = f"add {rate:.1f} m/s to the leader's speed, or take it from the follower's"
-    else:
-        hint = f"multiply the {signal}'s speed by {pair[signal]:.3f}"
-    return [(pair["row"], signal, f"{words}; is a speed biased? To correct it, {hint}")]
+    words = f"the gap changes by {rate:+.1f} m/s against both speeds"
+    return [(row, signal, f"{words}; is a speed biased? To correct it, {hint}")]
 
 
 def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Units) -> str:

@@ -87,7 +87,7 @@ CONSEQUENCES = {
 }
 METRES = {"feet": FOOT, "metres": 1.0}
 JAM = 3.0  # least distance of cars in a queue, front to front [m]
-CLOSE, MOVING = 0.4, 3.0  # least median time gap [s] of followers above a speed [m/s]
+CLOSE, MOVING = 0.4, 1.0  # least median time gap of traffic [s], above a speed [m/s]
 EXACT_DUPLICATE = "exact duplicate (vehicle, frame)"
 CONFLICTING_DUPLICATE = "conflicting duplicate (vehicle, frame)"
 NgsimColumns = dict[str, NDArray]
@@ -294,25 +294,21 @@ def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> Non
     the unit, unless that of lengths differs from that of positions and speeds.
     """
     medians, other = median_lengths(samples), "feet" if units == "metres" else "metres"
-    moves = samples["speed_mps"] > MOVING * METRES[units]
     for name, part in samples.groupby("recording", observed=True):
-        gaps, hint = [], f"is the file in {other}? Use data.units={other}"
         headways = part.loc[part["space_headway_m"] > 0, "space_headway_m"]
+        gaps, hint = headways[:0], f"is the file in {other}? Use data.units={other}"
         if name in medians:
             what, found = "the median length of vehicles", float(medians[name])
             low, high = CAR_LENGTH
-            gaps = ((headways - found) / part["speed_mps"])[moves]
+            gaps = ((headways - found) / part["speed_mps"])[part["speed_mps"] > MOVING]
         elif len(headways):
             what, found = "the least headway (1 % quantile)", float(headways.quantile(0.01))
             low, high = JAM, float("inf")
         else:
             continue
-        near = len(gaps) > 0 and float(gaps.median()) < CLOSE
+        near = bool(gaps.median() < CLOSE)
         if near:
-            hint = (
-                f"at the same unit, the median time gap is {gaps.median():.2g} s; are lengths in "
-                "feet and positions and speeds in metres? Give all in one unit"
-            )
+            hint = f"and followers are {gaps.median():.2g} s apart; are lengths alone in feet?"
         if near or not low <= found <= high:
             raise DataError(
                 f"{', '.join(files)}: recording {name}: {what} is {found / METRES[units]:.3g} "

@@ -14,7 +14,7 @@ from lcc_rl.arrays import Floats, Mask
 from lcc_rl.data.agreement import OF_PAIRS, check_pairs
 from lcc_rl.data.grid import ORIGIN, Place, Places, divided, stretches
 from lcc_rl.data.tables import Units
-from lcc_rl.data.trajectories import CAR_LENGTH, FRAME, starts_of
+from lcc_rl.data.trajectories import FRAME, starts_of
 from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
@@ -42,7 +42,6 @@ class Plausible(Settings):
     max_acceleration: Positive = 10.0  # absolute change of speed between samples [m/s²]
     min_length: NonNegative = 2.0  # length of a vehicle [m]; 0 counts as not given
     max_length: Positive = 30.0
-    max_median_length: Positive = CAR_LENGTH[1]  # of vehicles with a length in a table [m]
     min_gap: Number = 0.0  # between bumpers [m]
     max_gap: Positive = 500.0
     max_jump: Positive = 4.0  # change of a gap in 0.5 s beyond that by both speeds [m]
@@ -142,21 +141,15 @@ class Plausible(Settings):
         off, wrong = gap_jumps(table, self.max_jump)
         if not wrong.any():
             return table, []
-        row = int(np.argmax(wrong))
-        first = (
-            f"the first: {place(table)(row, 'gap_m')} changes by {off[row]:.3g} m more than the "
-            f"speeds give, {setting}.max_jump={self.max_jump:g}"
+        row, kept = int(np.argmax(wrong)), divided(table, wrong, wrong, SHORTEST_PART)
+        words = (
+            f"{int(wrong.sum()):,} sample(s) where the gap jumps or is held, the first: "
+            f"{place(table)(row, 'gap_m')} changes by {off[row]:.3g} m more than the speeds give, "
+            f"{setting}.max_jump={self.max_jump:g}"
         )
-        kept = divided(table, wrong, np.zeros_like(wrong), SHORTEST_PART)
-        lost = 1 - len(kept) / len(table)
-        if lost > MOST_JUMPS:
-            raise DataError(
-                f"{source}: {100 * lost:.3g} % of the samples lie where the gap jumps or is held, "
-                f"or within less than {SHORTEST_PART:g} s between such, {first}; expected the gap "
-                "to one leader; is it that to other cars, or a value for none?"
-            )
-        jumps = f"left out {int(wrong.sum()):,} sample(s) where the gap jumps or is held, {first}"
-        return kept, [jumps, *cut_line(table, kept, wrong)]
+        if len(kept) < (1 - MOST_JUMPS) * len(table):
+            raise DataError(f"{source}: has {words}; expected the gap to one leader")
+        return kept, [f"left out {words}", *cut_line(table, kept, wrong)]
 
     def _check_hard(self, kept: pd.DataFrame, source: str, setting: str, agree: bool) -> list[str]:
         """Check that speeds change as those of cars; ``agree``: the gaps agree with them."""
@@ -213,17 +206,15 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
     """
     number, gap, time = (table[x].to_numpy(np.float64) for x in ("episode", "gap_m", "time_s"))
     relative = (table["leader_speed_mps"] - table["follower_speed_mps"]).to_numpy(np.float64)
-    steps = np.where(np.diff(number, prepend=number[0]) == 0, np.diff(time, prepend=time[0]), 0.0)
-    way = np.cumsum(steps * (relative + np.append(0.0, relative[:-1])) / 2)
+    way = np.cumsum(np.diff(time, prepend=time[0]) * (relative + np.append(0, relative[:-1])) / 2)
     starts, lengths = stretches(number + 1j * gap)  # of equal gaps
     ends = starts + lengths - 1
     # Sensors hold a value until the next one: linear between the samples at which it changes.
     last = np.append(starts_of(number)[1:], len(gap)) - 1  # of each record
     nodes = np.union1d(starts, last)
     rest = pd.Series(np.interp(np.arange(len(gap)), nodes, gap[nodes]) - way)
-    reach = round(JUMP_S / FRAME)
-    if "row" in table:  # of the recording
-        reach = max(reach, round(len(table) / len(starts_of(table["row"].to_numpy()))))
+    given = len(starts_of(table["row"].to_numpy())) if "row" in table else len(table)
+    reach = max(round(JUMP_S / FRAME), round(len(table) / given))  # or a step of the recording
     change = rest.groupby(number).diff(reach)
     change -= change.groupby(number).transform("median")
     noise = change.abs().groupby(number).transform("median")

@@ -13,11 +13,12 @@ from pydantic import Field
 from lcc_rl.arrays import Integers
 from lcc_rl.data.agreement import LEAST_WAY
 from lcc_rl.data.grid import Places, continuous, on_grid, places
-from lcc_rl.data.plausible import SMOOTHING, Plausible
+from lcc_rl.data.plausible import SMOOTHING
 from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource, find_files, read_as, units_of
 from lcc_rl.data.tables import Column, TableFile, check_map, whole_numbers
 from lcc_rl.data.text import stem
 from lcc_rl.data.trajectories import (
+    CAR_LENGTH,
     FRAME,
     ReadReport,
     Trajectories,
@@ -26,7 +27,7 @@ from lcc_rl.data.trajectories import (
     listed,
     median_lengths,
 )
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import Concern, ConfigError, DataError
 from lcc_rl.settings import Positive
 
 TABLE_FIELDS = (
@@ -99,24 +100,14 @@ class TableSource(TrajectorySource):
         names["gap"] = names.get("gap") or names.get("position")
         place = partial(places, files=report.files, columns=names, vehicles=report.names)
         trajectories = to_trajectories(rows, place, report)
-        if self.columns.get("length"):
-            self._check_lengths(trajectories)
+        for name, length in median_lengths(trajectories.samples).items():
+            if length > CAR_LENGTH[1]:
+                words = f"recording {name}: the median length of vehicles is {length:.3g} m"
+                report.notes.append(Concern(f"{words}; is it in ft (data.units.length=ft)?"))
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
         remedy = f", smooth it ({SMOOTHING})" if self.columns.get("position") else ""
         return self.extracted(trajectories, remedy, place)
-
-    def _check_lengths(self, trajectories: Trajectories) -> None:
-        """Check that a column of lengths is in its unit: its median must be that of cars."""
-        most = (self.plausible or Plausible()).max_median_length
-        for name, length in median_lengths(trajectories.samples).items():
-            if length > most:
-                raise DataError(
-                    f"{trajectories.report.source}: recording {name}, column "
-                    f"{self.columns['length']!r}: the median length of vehicles is {length:.3g} m; "
-                    "is it in ft (data.units.length=ft), or are they trucks? "
-                    f"(data.plausible.max_median_length={most:g})"
-                )
 
     def _rows(self, report: ReadReport) -> pd.DataFrame:
         """Return the rows of all files in SI."""

@@ -217,9 +217,9 @@ class _Fit:
         error, genetic = self.error(constants), getattr(self.settings, f"{self.mode}_genetic")
         found = self.search(error, self.names, self.observed.count, genetic, self.progress)
         drivers = self.table(found.best.to("cpu", torch.float64), constants)
-        if moving := int((~found.converged).sum()):
-            line = f"the errors of {moving} of {len(drivers)} records still fall: more generations"
-            lines.append(Concern(f"{line} (calibration.{self.mode}_genetic) would lower them"))
+        if falling := int((~found.converged).sum()):
+            line = f"{falling} of {len(drivers)} records have not converged: more generations?"
+            lines.append(Concern(f"{line} (calibration.{self.mode}_genetic)"))
         what = self.names, self.limits, self.table_of, self.settings.objective
         return drivers, lines + _findings(drivers, *what)
 
@@ -340,15 +340,11 @@ def _findings(
             lines.append(f"{part}: {both} of the gap (means)")
     speed, share = drivers["rmspe"].mean(), drivers["gap_nrmse"].mean()
     concerns = []
-    if objective != SPEED_RMSPE and share > BADLY_OFF:
+    apart = objective == SPEED_RMSPE
+    if share > (max(GAPS_OFF, 3.0 * speed) if apart else BADLY_OFF):
+        hint = "calibration.objective=both fits gaps, too" if apart else "are they to one leader?"
         concerns.append(
-            f"gaps are off by {100.0 * share:.0f} %, although they are fitted: do they fit the "
-            "speeds, and belong to one leader?"
-        )
-    elif objective == SPEED_RMSPE and share > max(GAPS_OFF, 3.0 * speed):
-        concerns.append(
-            f"gaps are off by {100.0 * share:.0f} %, speeds by {100.0 * speed:.1f} %: "
-            "calibration.objective=both fits gaps, too"
+            f"gaps are off by {100.0 * share:.0f} %, speeds by {100.0 * speed:.1f} %: {hint}"
         )
     for name in names:
         bound = drivers[f"{name}_at_bound"]
