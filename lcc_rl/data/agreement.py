@@ -252,12 +252,13 @@ def _biased(pair: Mapping[Any, Any]) -> list[tuple[int, str, str]]:
         return [(row, "gap", f"{words}; is a clock too fast or slow by this factor?")]
     if abs(rate) < LOUD_RATE:
         return []
-    signal = "follower" if abs(b - 1) > abs(a - 1) else "leader"
-    hint = f"multiply the {signal}'s speed by {pair[signal]:.3f}"
-    if abs(pair["constant"]) > abs(rate) / 2:
-        hint = f"add {rate:.1f} m/s to the leader's speed, or take it from the follower's"
-    words = f"the gap changes by {rate:+.1f} m/s against both speeds"
-    return [(row, signal, f"{words}; is a speed biased? To correct it, {hint}")]
+    words = (
+        f"the gap changes by {rate:+.1f} m/s against both speeds, fitted by {a:.2f} of the "
+        f"leader's, {b:.2f} of the follower's and {pair['constant']:+.1f} m/s; is a speed biased? "
+        f"Add {rate:.1f} m/s to the leader's, or multiply the follower's by "
+        f"{1 - rate * pair['seconds'] / max(pair['own'], 1.0):.3f}"
+    )
+    return [(row, "leader", words)]
 
 
 def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Units) -> str:

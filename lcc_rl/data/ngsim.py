@@ -296,19 +296,20 @@ def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> Non
     medians, other = median_lengths(samples), "feet" if units == "metres" else "metres"
     for name, part in samples.groupby("recording", observed=True):
         headways = part.loc[part["space_headway_m"] > 0, "space_headway_m"]
-        gaps, hint = headways[:0], f"is the file in {other}? Use data.units={other}"
+        hint, near = f"is the file in {other}? Use data.units={other}", False
         if name in medians:
             what, found = "the median length of vehicles", float(medians[name])
             low, high = CAR_LENGTH
-            gaps = ((headways - found) / part["speed_mps"])[part["speed_mps"] > MOVING]
+            speeds = part.loc[part["speed_mps"] > MOVING, "speed_mps"]
+            own, mixed = (((headways - x) / speeds).median() for x in (found, FOOT * found))
+            near = own < CLOSE and mixed > 2 * CLOSE
         elif len(headways):
             what, found = "the least headway (1 % quantile)", float(headways.quantile(0.01))
             low, high = JAM, float("inf")
         else:
             continue
-        near = bool(gaps.median() < CLOSE)
         if near:
-            hint = f"and followers are {gaps.median():.2g} s apart; are lengths alone in feet?"
+            hint = f"with a time gap of {own:.2g} s; are lengths alone in feet? Convert them"
         if near or not low <= found <= high:
             raise DataError(
                 f"{', '.join(files)}: recording {name}: {what} is {found / METRES[units]:.3g} "

@@ -211,7 +211,8 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
     ends = starts + lengths - 1
     # Sensors hold a value until the next one: linear between the samples at which it changes.
     last = np.append(starts_of(number)[1:], len(gap)) - 1  # of each record
-    nodes = np.union1d(starts, last)
+    long = time[ends] - time[starts] > HELD_S
+    nodes = np.union1d(np.union1d(starts, last), ends[long])
     rest = pd.Series(np.interp(np.arange(len(gap)), nodes, gap[nodes]) - way)
     given = len(starts_of(table["row"].to_numpy())) if "row" in table else len(table)
     reach = max(round(JUMP_S / FRAME), round(len(table) / given))  # or a step of the recording
@@ -222,7 +223,7 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
     off = jump.shift(-(reach // 2), fill_value=0.0).to_numpy(np.float64)
     drift = (gap - way)[ends] - (gap - way)[starts]
     beside = np.logical_or.reduceat(off != 0, starts)
-    held = (time[ends] - time[starts] > HELD_S) & (beside | (np.abs(drift) > limit))
+    held = long & (beside | (np.abs(drift) > limit))
     held &= ~np.isin(starts, starts_of(number)) | ~np.isin(ends, last)  # not the whole record
     wrong = (off != 0) | np.repeat(held, lengths)
     return np.where(off != 0, off, np.repeat(drift, lengths)), wrong
