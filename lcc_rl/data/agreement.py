@@ -23,8 +23,7 @@ CHANGE_S, EVERY_S = 2.0, 1.0  # changes compared, and the time between them [s]
 LONGEST_LAG = 3.0  # [s]
 # Least compared time [s], share explained and relative motion in a window [m] for a clear result.
 LEAST_S, LEAST_FIT, LEAST_MOTION, LEAST_ALL_S = 6.0, 0.9, 0.15, 100.0
-SAME = 1e-3  # relative motion of equal speeds [m]
-SURE_FIT = 0.97  # least share explained for the report of a small factor or bias
+SURE_FIT, SAME = 0.97, 1e-3  # least share for small biases; motion of equal speeds [m]
 GAIN, FLOOR = 6.0, 2e-4  # factor on the residual by which a lag is accepted; that of exact data
 RIDGE = np.diag([1e-6, 1e-6, 0.1])  # [m²]: for a bias of speeds, unknown in steady traffic
 LEAST_WAY = 50.0  # least distance from which the unit of a speed is concluded [m]
@@ -185,8 +184,8 @@ def check_pairs(
         for fit in _mistaken(pair, units, max_mismatch)
     ]
     same = pairs[(pairs["motion"] < SAME) & (pairs["change"] > LEAST_MOTION)]
-    equal = "both speeds are equal, but the gap changes; does one column hold both?"
-    wrong += [(row, "leader", equal) for row in same["row"]]
+    words = "both speeds are equal, but the gap changes; does one column hold both?"
+    wrong += [(row, "leader", words) for row in same["row"]]
     late, too_late = [], []
     for pair in pairs[right & (pairs["late"].abs() > LOUD - FRAME / 2)].to_dict("records"):
         most = " or more" * (abs(pair["late"]) > LONGEST_LAG - FRAME / 2)

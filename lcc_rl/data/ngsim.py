@@ -290,8 +290,7 @@ def _kept_order(
 def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> None:
     """Check that the vehicles of every recording have plausible lengths and time gaps.
 
-    Without lengths, the shortest headways (1 % quantile) are checked. Time gaps do not depend on
-    the unit, unless that of lengths differs from that of positions and speeds.
+    Without lengths, the shortest headways (1 % quantile) are checked.
     """
     medians, other = median_lengths(samples), "feet" if units == "metres" else "metres"
     for name, part in samples.groupby("recording", observed=True):

@@ -200,9 +200,8 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
         limit: least jump [m]; that of a noisy record is 12 times its median change.
 
     Returns:
-        The change of each gap within 0.5 s, or a longer step of the recording, beyond that by both
-        speeds ``[rows]`` [m]; and the rows at which it exceeds the limit, with those beside them,
-        or at different speeds, of gaps that do not change for more than 1 s.
+        The change of each gap in 0.5 s, or a longer step, beyond that by both speeds ``[rows]``
+        [m]; and the rows at which it exceeds the limit, or a gap beside them is held for 1 s.
     """
     number, gap, time = (table[x].to_numpy(np.float64) for x in ("episode", "gap_m", "time_s"))
     relative = (table["leader_speed_mps"] - table["follower_speed_mps"]).to_numpy(np.float64)
@@ -211,7 +210,7 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
     ends = starts + lengths - 1
     # Sensors hold a value until the next one: linear between the samples at which it changes.
     last = np.append(starts_of(number)[1:], len(gap)) - 1  # of each record
-    long = time[ends] - time[starts] > HELD_S
+    long = time[ends] - time[starts] > HELD_S  # not measured
     nodes = np.union1d(np.union1d(starts, last), ends[long])
     rest = pd.Series(np.interp(np.arange(len(gap)), nodes, gap[nodes]) - way)
     given = len(starts_of(table["row"].to_numpy())) if "row" in table else len(table)
