@@ -23,11 +23,12 @@ CHANGE_S, EVERY_S = 2.0, 1.0  # changes compared, and the time between them [s]
 LONGEST_LAG = 3.0  # [s]
 # Least compared time [s], share explained and relative motion in a window [m] for a clear result.
 LEAST_S, LEAST_FIT, LEAST_MOTION, LEAST_ALL_S = 6.0, 0.9, 0.15, 100.0
+SURE_FIT, SAME = 0.97, 1e-3  # least share for small biases; motion of equal speeds [m]
 GAIN, FLOOR = 6.0, 2e-4  # factor on the residual by which a lag is accepted; that of exact data
 RIDGE = np.diag([1e-6, 1e-6, 0.1])  # [m²]: for a bias of speeds, unknown in steady traffic
 LEAST_WAY = 50.0  # least distance from which the unit of a speed is concluded [m]
 NEAR_MISTAKE, ALIKE = 1.25, 1.05  # largest factors to a mistake's coefficients; between mistakes
-LOUD = 0.3  # lag that is reported [s]
+LOUD, LOUD_RATE, LOUD_FACTOR = 0.3, 0.3, 1.15  # reported: lag [s], bias of a speed [m/s], factor
 STANDING, LEAST_STANDING = 0.5, 300  # speed [m/s], samples
 FAR_STANDING = 15.0  # gap that may be in feet [m]
 
@@ -48,9 +49,10 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     Returns:
         A row for each pair and a last one for all, without lag: row (the pair's first), seconds
         (compared), leader, follower, slope (of the gap over the relative distance), fit (share of
-        the variance explained), motion (root mean square of the relative distance [m]), late [s],
-        signal (the late one), ahead, own, grown (distances of leader and follower, growth of the
-        gap [m]).
+        the variance explained), motion, change (root mean squares of relative distance and change
+        of the gap [m]), late [s], signal (the late one), ahead, own, grown (distances of leader and
+        follower, growth of the gap [m]), constant, rate (growth of the gap beyond that by both
+        speeds, fitted with and without the coefficients [m/s]).
     """
     keys = [name for name in ("recording", "follower_id", "leader_id") if name in episodes]
     pair = episodes.groupby(keys or ["episode"], sort=False).ngroup().to_numpy()
@@ -73,17 +75,19 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     best[-1] = 0
     each, count = np.arange(pairs + 1), sums[2, 2]
     ahead, own, grown = sums[[0, 1, 3], 2] * [[1], [-1], [1]] * EVERY_S / CHANGE_S
-    names = ["leader", "follower", "slope"]
+    names = ["leader", "follower", "constant", "slope"]
     return pd.DataFrame(found[best, :, each], columns=names).assign(
         row=np.append(np.unique(pair, return_index=True)[1], 0),
         seconds=EVERY_S * count,
         fit=1 - rest[best, each],
         motion=np.sqrt(sums[:2, :2].sum(axis=(0, 1)).clip(0.0) / count.clip(1.0)),
+        change=np.sqrt(sums[3, 3] / count.clip(1.0)),
         late=FRAME * lags[best].sum(axis=1),
         signal=np.array([*PAIR_SIGNALS])[np.abs(lags[best]).argmax(axis=1)],
         ahead=ahead,
         own=own,
         grown=grown,
+        rate=(grown - ahead + own) / (EVERY_S * count).clip(1.0),
     )
 
 
@@ -95,7 +99,7 @@ def _fit(
     late: Floats,
     rows: NDArray[np.intp],
 ) -> tuple[Floats, Floats, Floats]:
-    """Return coefficients and slope of each pair and of all, residuals and products.
+    """Return coefficients, constant, slope of each pair and of all, residuals and products.
 
     ``series`` are the gap and the distances of leader and follower, each shifted by ``late``.
     Changes over ``width`` samples begin at ``rows``; ``pair`` is the number of each row's pair.
@@ -109,7 +113,8 @@ def _fit(
     found = np.linalg.solve(known, sums[:3, 3].T[..., None])[..., 0].T
     rest = sums[3, 3] - (found * sums[:3, 3]).sum(axis=0)
     rest /= sums[3, 3] - sums[2, 3] ** 2 / sums[2, 2]
-    found[2] = sums[:2, 3].sum(axis=0) / sums[:2, :2].sum(axis=(0, 1))
+    slope = sums[:2, 3].sum(axis=0) / sums[:2, :2].sum(axis=(0, 1))
+    found = np.vstack([found[:2], found[2:] / CHANGE_S, slope])
     return found, np.nan_to_num(rest, nan=9.0).clip(FLOOR, 9.0), sums
 
 
@@ -152,11 +157,15 @@ def check_pairs(
         max_mismatch, max_lag: see :class:`lcc_rl.data.plausible.Plausible`.
 
     Returns:
-        Lines on lags, on gaps that fit no unit and on medians; and whether any pair agrees.
+        Lines on lags, biases, gaps that fit no unit, and medians; and whether any pair agrees.
 
     Raises:
         DataError: naming the pair and the probable mistake, if one or all contradict their speeds.
     """
+    if {"follower_id", "leader_id"} <= {*episodes}:
+        itself = (episodes["follower_id"] == episodes["leader_id"]).to_numpy()
+        if itself.any():
+            raise DataError(f"{place(int(itself.argmax()), 'leader_id')} is the follower itself")
     found = agreement(episodes)
     pairs, every = found.iloc[:-1], found.iloc[-1]
     moves, span = found["motion"] >= LEAST_MOTION, (1 / max_mismatch, max_mismatch)
@@ -174,6 +183,9 @@ def check_pairs(
         for pair in pairs.assign(clear=clear)[~right].to_dict("records")
         for fit in _mistaken(pair, units, max_mismatch)
     ]
+    same = pairs[(pairs["motion"] < SAME) & (pairs["change"] > LEAST_MOTION)]
+    words = "both speeds are equal, but the gap changes; does one column hold both?"
+    wrong += [(row, "leader", words) for row in same["row"]]
     late, too_late = [], []
     for pair in pairs[right & (pairs["late"].abs() > LOUD - FRAME / 2)].to_dict("records"):
         most = " or more" * (abs(pair["late"]) > LONGEST_LAG - FRAME / 2)
@@ -182,15 +194,18 @@ def check_pairs(
         too_late += late[-1:] * (abs(pair["late"]) > max_lag)
     for line in (*middle(wrong), *middle(too_late)):
         raise DataError(line)
-    odd = pairs[clear & ~pairs["slope"].between(*span)].to_dict("records")
+    odd = pairs[clear & ~right & ~pairs["slope"].between(*span)].to_dict("records")
+    sure = right & (pairs["fit"] >= SURE_FIT)  # noise lowers the coefficients
+    biased = [x for pair in pairs[sure].to_dict("records") for x in _biased(pair)]
     words = "the gap changes by {:.2f} m where both speeds give 1 m, and no unit fits"
     strange = [(pair["row"], "gap", words.format(pair["slope"])) for pair in odd]
     enough = every["seconds"] >= LEAST_ALL_S and moves.iloc[-1]
     if (enough or clear.any()) and not (right.any() or span[0] <= every["slope"] <= span[1]):
         raise DataError(
-            f"{words.format(every['slope'])}: are times in another unit, or speeds to be smoothed?"
+            f"{words.format(every['slope'])}: are times in another unit, speeds to be smoothed, or "
+            f"biased (the gap changes by {every['rate']:+.1f} m/s against them)?"
         )
-    lines = [Concern(line) for line in (*middle(late), *middle(strange))]
+    lines = [Concern(line) for cases in (late, biased, strange) for line in middle(cases)]
     return [*lines, medians(episodes, pairs[clear], len(pairs), units)], bool(right.any())
 
 
@@ -226,6 +241,23 @@ def _mistaken(
     near = [x for x in sorted(near, key=lambda x: x[1:2]) if x[0] < least + log(ALIKE)]
     questions = " or ".join(x[3] for x in near)
     return [(pair["row"], near[0][2], f"{words}; {questions}")]
+
+
+def _biased(pair: Mapping[Any, Any]) -> list[tuple[int, str, str]]:
+    """Return row, signal and words on a clock or a speed that is slightly off; else nothing."""
+    row, a, b, rate = (pair[name] for name in ("row", "leader", "follower", "rate"))
+    if min(a, b) > LOUD_FACTOR or max(a, b) < 1 / LOUD_FACTOR:
+        words = f"the gap changes by {(a * b) ** 0.5:.2f} m where both speeds give 1 m"
+        return [(row, "gap", f"{words}; is a clock too fast or slow by this factor?")]
+    if abs(rate) < LOUD_RATE:
+        return []
+    words = (
+        f"the gap changes by {rate:+.1f} m/s against both speeds, fitted by {a:.2f} of the "
+        f"leader's, {b:.2f} of the follower's and {pair['constant']:+.1f} m/s; is a speed biased? "
+        f"Add {rate:.1f} m/s to the leader's, or multiply the follower's by "
+        f"{1 - rate * pair['seconds'] / max(pair['own'], 1.0):.3f}"
+    )
+    return [(row, "leader", words)]
 
 
 def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Units) -> str:

@@ -22,12 +22,14 @@ from numpy.typing import NDArray
 from lcc_rl.data.ngsim_recordings import Group, name_recordings
 from lcc_rl.data.tables import LARGEST_ID, Block, Column, TableFile, lacking
 from lcc_rl.data.trajectories import (
+    CAR_LENGTH,
     FOOT,
     SAMPLE_TYPES,
     ReadReport,
     RowIndex,
     Trajectories,
     assembled,
+    median_lengths,
 )
 from lcc_rl.errors import Concern, DataError
 
@@ -84,8 +86,8 @@ CONSEQUENCES = {
     "Space_Headway": "space headways are derived from positions",
 }
 METRES = {"feet": FOOT, "metres": 1.0}
-CAR_LENGTH = (2.0, 12.0)  # range of the median length of vehicles on any road [m]
 JAM = 3.0  # least distance of cars in a queue, front to front [m]
+CLOSE, MOVING = 0.4, 1.0  # least median time gap of traffic [s], above a speed [m/s]
 EXACT_DUPLICATE = "exact duplicate (vehicle, frame)"
 CONFLICTING_DUPLICATE = "conflicting duplicate (vehicle, frame)"
 NgsimColumns = dict[str, NDArray]
@@ -286,26 +288,29 @@ def _kept_order(
 
 
 def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> None:
-    """Check that the vehicles of every recording have plausible lengths.
+    """Check that the vehicles of every recording have plausible lengths and time gaps.
 
     Without lengths, the shortest headways (1 % quantile) are checked.
     """
+    medians, other = median_lengths(samples), "feet" if units == "metres" else "metres"
     for name, part in samples.groupby("recording", observed=True):
-        lengths = part.groupby("vehicle")["length_m"].first()
-        lengths = lengths[lengths > 0]
         headways = part.loc[part["space_headway_m"] > 0, "space_headway_m"]
-        if len(lengths):
-            what, found = "the median length of vehicles", float(lengths.median())
+        hint, near = f"is the file in {other}? Use data.units={other}", False
+        if name in medians:
+            what, found = "the median length of vehicles", float(medians[name])
             low, high = CAR_LENGTH
+            speeds = part.loc[part["speed_mps"] > MOVING, "speed_mps"]
+            own, mixed = (((headways - x) / speeds).median() for x in (found, FOOT * found))
+            near = own < CLOSE and mixed > 2 * CLOSE
         elif len(headways):
             what, found = "the least headway (1 % quantile)", float(headways.quantile(0.01))
             low, high = JAM, float("inf")
         else:
             continue
-        if not low <= found <= high:
-            other = "feet" if units == "metres" else "metres"
+        if near:
+            hint = f"with a time gap of {own:.2g} s; are lengths alone in feet? Convert them"
+        if near or not low <= found <= high:
             raise DataError(
                 f"{', '.join(files)}: recording {name}: {what} is {found / METRES[units]:.3g} "
-                f"{units}; expected {low:g} to {high:g} m; is the file in {other}? Use "
-                f"data.units={other}"
+                f"{units}; expected {low:g} to {high:g} m; {hint}"
             )

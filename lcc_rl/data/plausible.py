@@ -10,17 +10,20 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import Field
 
-from lcc_rl.arrays import Mask
+from lcc_rl.arrays import Floats, Mask
 from lcc_rl.data.agreement import OF_PAIRS, check_pairs
-from lcc_rl.data.grid import ORIGIN, Place, Places, divided
+from lcc_rl.data.grid import ORIGIN, Place, Places, divided, stretches
 from lcc_rl.data.tables import Units
-from lcc_rl.data.trajectories import starts_of
+from lcc_rl.data.trajectories import FRAME, starts_of
 from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
 SMOOTHING = "'data.smoothing={_target_:lcc_rl.data.smoothing.SavitzkyGolay,window_s:1.5}'"
 SHORTEST_PART = 10.0  # least length of parts of a cut record [s]
 HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; least samples of a share
+JUMP_S, HELD_S = 0.5, 1.0  # time in which a gap jumps; longest time without a measurement [s]
+NOISE = 12.0  # least jump, as a multiple of the median change of a gap beyond that by the speeds
+MOST_JUMPS = 0.5  # largest share of samples that jumps of gaps may cost
 # Column, words with a place for a number, the numbers ``[rows]``, name of the threshold, and the
 # samples outside of it ``[rows]``.
 Finding = tuple[str, str, NDArray[np.float64], str, Mask]
@@ -41,6 +44,7 @@ class Plausible(Settings):
     max_length: Positive = 30.0
     min_gap: Number = 0.0  # between bumpers [m]
     max_gap: Positive = 500.0
+    max_jump: Positive = 4.0  # change of a gap in 0.5 s beyond that by both speeds [m]
     max_step: Positive = 10.0  # time between consecutive samples [s]
     max_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1  # largest share of implausible samples
     # Largest factor between the change of a gap and that by the speeds.
@@ -88,18 +92,12 @@ class Plausible(Settings):
                 f"than {SHORTEST_PART:g} s between such (at most {setting}.max_share="
                 f"{self.max_share:g} of them may), the first: {advice}"
             )
-        if lines:
-            records = int(np.logical_or.reduceat(wrong, starts).sum())
-            count = len(table) - len(kept)
-            line = (
-                f"{records:,} of {len(starts):,} records were cut there: {count:,} samples, "
-                f"{count * usual_step(table):,.0f} s, are left out, with parts shorter than "
-                f"{SHORTEST_PART:g} s"
-            )
-            lines.append(Concern(line))
+        lines += cut_line(table, kept, wrong) if lines else []
         kept, more_lines = _not_negative(kept)
         agree, last = False, list[str]()
         if set(kept.columns) >= OF_PAIRS:
+            kept, jumps = self._without_jumps(kept, source, place, setting)
+            more_lines += jumps
             limits = {"max_mismatch": self.max_mismatch, "max_lag": self.max_lag}
             try:
                 last, agree = check_pairs(kept, place(kept), units or {}, **limits)
@@ -135,6 +133,23 @@ class Plausible(Settings):
             advice = advice or f"{example}; correct the file or units{more}, or raise the threshold"
             wrong |= new
         return wrong, lines, advice
+
+    def _without_jumps(
+        self, table: pd.DataFrame, source: str, place: Places, setting: str
+    ) -> tuple[pd.DataFrame, list[str]]:
+        """Cut records of pairs where their gap jumps, and report it."""
+        off, wrong = gap_jumps(table, self.max_jump)
+        if not wrong.any():
+            return table, []
+        row, kept = int(np.argmax(wrong)), divided(table, wrong, wrong, SHORTEST_PART)
+        words = (
+            f"{int(wrong.sum()):,} sample(s) where the gap jumps or is held, the first: "
+            f"{place(table)(row, 'gap_m')} changes by {off[row]:.3g} m more than the speeds give, "
+            f"{setting}.max_jump={self.max_jump:g}"
+        )
+        if len(kept) < (1 - MOST_JUMPS) * len(table):
+            raise DataError(f"{source}: has {words}; expected the gap to one leader")
+        return kept, [f"left out {words}", *cut_line(table, kept, wrong)]
 
     def _check_hard(self, kept: pd.DataFrame, source: str, setting: str, agree: bool) -> list[str]:
         """Check that speeds change as those of cars; ``agree``: the gaps agree with them."""
@@ -175,6 +190,55 @@ class Plausible(Settings):
                 short = (values != 0) & (values < self.min_length)
                 yield name, "holds {:g} m", values, "min_length", short
                 yield name, "holds {:g} m", values, "max_length", values > self.max_length
+
+
+def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
+    """Return where the gap of a pair jumps: to another car, or to a value for none.
+
+    Args:
+        table: see :meth:`Plausible.select`.
+        limit: least jump [m]; that of a noisy record is 12 times its median change.
+
+    Returns:
+        The change of each gap in 0.5 s, or a longer step, beyond that by both speeds ``[rows]``
+        [m]; and the rows at which it exceeds the limit, or a gap beside them is held for 1 s.
+    """
+    number, gap, time = (table[x].to_numpy(np.float64) for x in ("episode", "gap_m", "time_s"))
+    relative = (table["leader_speed_mps"] - table["follower_speed_mps"]).to_numpy(np.float64)
+    way = np.cumsum(np.diff(time, prepend=time[0]) * (relative + np.append(0, relative[:-1])) / 2)
+    starts, lengths = stretches(number + 1j * gap)  # of equal gaps
+    ends = starts + lengths - 1
+    # Sensors hold a value until the next one: linear between the samples at which it changes.
+    last = np.append(starts_of(number)[1:], len(gap)) - 1  # of each record
+    long = time[ends] - time[starts] > HELD_S  # not measured
+    nodes = np.union1d(np.union1d(starts, last), ends[long])
+    rest = pd.Series(np.interp(np.arange(len(gap)), nodes, gap[nodes]) - way)
+    given = len(starts_of(table["row"].to_numpy())) if "row" in table else len(table)
+    reach = max(round(JUMP_S / FRAME), round(len(table) / given))  # or a step of the recording
+    change = rest.groupby(number).diff(reach)
+    change -= change.groupby(number).transform("median")
+    noise = change.abs().groupby(number).transform("median")
+    jump = change.where(change.abs() > np.maximum(limit, NOISE * noise), 0.0)
+    off = jump.shift(-(reach // 2), fill_value=0.0).to_numpy(np.float64)
+    drift = (gap - way)[ends] - (gap - way)[starts]
+    beside = np.logical_or.reduceat(off != 0, starts)
+    held = long & (beside | (np.abs(drift) > limit))
+    held &= ~np.isin(starts, starts_of(number)) | ~np.isin(ends, last)  # not the whole record
+    wrong = (off != 0) | np.repeat(held, lengths)
+    return np.where(off != 0, off, np.repeat(drift, lengths)), wrong
+
+
+def cut_line(table: pd.DataFrame, kept: pd.DataFrame, wrong: Mask) -> list[str]:
+    """Return a line on the samples that were left out of records with ``wrong`` samples."""
+    starts = starts_of(table["episode"].to_numpy())
+    records = int(np.logical_or.reduceat(wrong, starts).sum())
+    count = len(table) - len(kept)
+    line = (
+        f"{records:,} of {len(starts):,} records were cut there: {count:,} samples, "
+        f"{count * usual_step(table):,.0f} s, are left out, with parts shorter than "
+        f"{SHORTEST_PART:g} s"
+    )
+    return [Concern(line)]
 
 
 def hard_share(table: pd.DataFrame) -> float | None:

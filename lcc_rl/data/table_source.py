@@ -18,14 +18,16 @@ from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource, find_files, re
 from lcc_rl.data.tables import Column, TableFile, check_map, whole_numbers
 from lcc_rl.data.text import labels
 from lcc_rl.data.trajectories import (
+    CAR_LENGTH,
     FRAME,
     ReadReport,
     Trajectories,
     assembled,
     find_leaders,
     listed,
+    median_lengths,
 )
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import Concern, ConfigError, DataError
 from lcc_rl.settings import Positive
 
 TABLE_FIELDS = (
@@ -100,6 +102,10 @@ class TableSource(TrajectorySource):
         if self.columns.get("recording") is None:
             report.notes += cut_by_files(rows, "vehicle", report.files)
         trajectories = to_trajectories(rows, place, report)
+        for name, length in median_lengths(trajectories.samples).items():
+            if length > CAR_LENGTH[1]:
+                words = f"recording {name}: the median length of vehicles is {length:.3g} m"
+                report.notes.append(Concern(f"{words}; is it in ft (data.units.length=ft)?"))
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
         remedy = f", smooth it ({SMOOTHING})" if self.columns.get("position") else ""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 FOOT = 0.3048  # m
 FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
+CAR_LENGTH = (2.0, 12.0)  # range of the median length of vehicles on any road [m]
 SAMPLE_KEYS = ("recording", "vehicle", "frame", "preceding")
 # Columns of trajectories besides the recording.
 SAMPLE_TYPES = {
@@ -129,6 +130,13 @@ class Trajectories:
 
     samples: pd.DataFrame
     report: ReadReport
+
+
+def median_lengths(samples: pd.DataFrame) -> pd.Series:
+    """Return the median length of the vehicles of each recording that have one [m]."""
+    known = samples[samples["length_m"] > 0]
+    lengths = known.groupby(["recording", "vehicle"], observed=True)["length_m"].first()
+    return lengths.groupby("recording", observed=True).median()
 
 
 def assembled(

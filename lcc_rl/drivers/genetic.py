@@ -18,6 +18,7 @@ Fitness = Callable[[Tensor], Tensor]
 Progress = Callable[[int, int, str], None]
 
 Individuals = Annotated[int, Field(ge=1, le=100_000)]
+LATE, STEADY = 0.75, (0.99, 1e-3)  # see Evolution.converged
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
@@ -35,7 +36,7 @@ class GeneticSettings(Settings):
     mutation_rate: Probability = 0.3  # probability of Gaussian noise on a gene
     mutation_start: Positive = 0.1  # standard deviation of that noise, as a share of the bounds
     mutation_end: Positive = 1e-4  # that in the last generation; geometric in between
-    patience: Individuals = 5  # generations without improvement after which the search stops
+    patience: Individuals = 20  # generations without improvement after which a problem stops
     tolerance: NonNegative = 1e-5  # least relative improvement of the best fitness
 
 
@@ -46,10 +47,13 @@ class Evolution:
     Args:
         best: fittest individual of every problem, ``[problems, dims]``, in the bounds' units.
         fitness: its objective, ``[problems]``; infinite if no individual was valid.
+        converged: whether it fell by less than 1 %, or 0.001, in the last quarter of the
+            generations, ``[problems]``.
     """
 
     best: Tensor
     fitness: Tensor
+    converged: Tensor
 
 
 def minimise(
@@ -65,7 +69,8 @@ def minimise(
 
     The algorithm uses tournament selection, blend crossover (Eshelman & Schaffer 1993), mutation by
     differences of individuals and by annealed Gaussian noise, and elitist survival. All problems
-    share the random numbers of a generation, so a result does not depend on other problems.
+    share the random numbers of a generation, and each stops by its own patience, so a result does
+    not depend on other problems.
 
     Args:
         objective: maps ``[problems, population, dims]`` to ``[problems, population]``; values that
@@ -98,17 +103,23 @@ def _evolve(
     genes = _latin_hypercube(random, settings.founders * settings.population)
     genes = genes.expand(problems, -1, -1).contiguous()
     genes, fitness = _fittest(genes, evaluate(genes), settings.population)
-    best, stale = fitness[:, 0], 0
+    best = late = fitness[:, 0]
+    stale = torch.zeros_like(best)
     for generation in range(1, settings.generations + 1):
         children = _children(genes, fitness, random, settings, generation)
-        genes, fitness = _survivors(genes, fitness, children, evaluate(children), settings)
-        improved = bool((fitness[:, 0] < best * (1.0 - settings.tolerance)).any())
-        best, stale = fitness[:, 0], 0 if improved else stale + 1
+        evolved = _survivors(genes, fitness, children, evaluate(children), settings)
+        stopped = (stale >= settings.patience).unsqueeze(-1)
+        genes = torch.where(stopped.unsqueeze(-1), genes, evolved[0])
+        fitness = torch.where(stopped, fitness, evolved[1])
+        stale = torch.where(fitness[:, 0] < best * (1.0 - settings.tolerance), 0.0, stale + 1.0)
+        best = fitness[:, 0]
+        late = best if generation <= LATE * settings.generations else late
         if progress is not None:
             progress(generation, settings.generations, f"mean best {best.mean().item():.5g}")
-        if stale >= settings.patience:
+        if bool((stale >= settings.patience).all()):
             break
-    return Evolution(genes[:, 0], fitness[:, 0])
+    least = torch.minimum(late * STEADY[0], late - STEADY[1])
+    return Evolution(genes[:, 0], best, best >= least)
 
 
 class _Random:

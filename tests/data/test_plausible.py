@@ -14,7 +14,7 @@ from table_text import pairs
 
 from lcc_rl.data.agreement import agreement
 from lcc_rl.data.grid import Place
-from lcc_rl.data.ngsim import read_ngsim
+from lcc_rl.data.ngsim import METRES, read_ngsim
 from lcc_rl.data.plausible import Plausible, hard_share
 from lcc_rl.data.sources import EpisodesSource, NgsimSource
 from lcc_rl.data.speed_records import read_speed_record
@@ -317,3 +317,127 @@ def test_a_blank_cell_or_a_row_twice_costs_the_row(tmp_path: Path) -> None:
         assert loaded.episodes.groupby("episode").size().to_dict() == sizes, (column, cell)
         (said,) = (x for x in loaded.report if re.search("(left out|dropped) 1 rows", x))
         assert f"data row {1801 if cell is None else 201}, column" in said
+
+
+def with_gap(rows: slice, values: object, base: pd.DataFrame | None = None) -> pd.DataFrame:
+    """The table with other gaps in some rows; a function gets the gaps of these rows."""
+    table = irregular() if base is None else base
+    gap = table["gap_m"].to_numpy().copy()
+    gap[rows] = values(gap[rows]) if callable(values) else values
+    return table.assign(gap_m=gap)
+
+
+def held_while(table: pd.DataFrame) -> pd.DataFrame:
+    """The table with a leader that speeds away while the gap of 4 s is that of their start."""
+    faster = table["leader_speed_mps"].to_numpy().copy()
+    faster[200:240] += 3.0 * np.sin(np.linspace(0, np.pi, 40))
+    way = np.cumsum(np.where(table["episode"] == 0, faster - table["leader_speed_mps"], 0.0)) * 0.1
+    return with_gap(
+        slice(200, 240),
+        lambda x: x[:1],
+        table.assign(leader_speed_mps=faster, gap_m=table.gap_m + way),
+    )
+
+
+def noisy(size: float) -> pd.DataFrame:
+    noise = np.random.default_rng(0).normal(0.0, size, 1800)
+    return with_gap(slice(None), lambda gap: gap + noise)
+
+
+# Words, table, least and most rows left out, row of the first jump (None: no jump).
+JUMPS = [
+    ("consistent", irregular(), 0, 0, None),
+    ("noise", noisy(0.5), 0, 0, None),
+    ("whole metres", with_gap(slice(None), np.round), 0, 0, None),
+    (
+        "a value for each second",
+        with_gap(slice(None), lambda x: np.repeat(x[::10], 10)),
+        0,
+        0,
+        None,
+    ),
+    ("a car cuts in", with_gap(slice(300, 600), lambda x: x - 8.0), 1, 9, 300),
+    ("and the gap is noisy", with_gap(slice(300, 600), lambda x: x - 8.0, noisy(0.5)), 1, 9, 300),
+    ("another car for 6 s", with_gap(slice(300, 360), lambda x: x * 0.45), 60, 70, 300),
+    ("255 m for none", with_gap(slice(300, 360), 255.0), 60, 70, 300),
+    ("none for longer than the least part", with_gap(slice(300, 450), 100.0), 150, 160, 300),
+    ("none at the end", with_gap(slice(450, 600), 100.0), 150, 160, 450),
+    ("none at the begin", with_gap(slice(0, 150), 0.0), 150, 160, 0),
+    ("held over a dropout", held_while(irregular()), 40, 45, 200),
+]
+
+
+def test_records_are_cut_where_the_gap_jumps_or_is_held() -> None:
+    for words, table, least, most, first in JUMPS:
+        kept, lines = Plausible().select(table.assign(row=table.index), "f.csv", rows_of)
+        said = [line for line in lines if "where the gap jumps or is held" in line]
+        assert least <= len(table) - len(kept) <= most, (words, len(table) - len(kept))
+        assert len(said) == (first is not None), words
+        if said:
+            row = int(re.search(r"first: row (\d+), gap_m changes by", said[0])[1])
+            assert abs(row - first) <= 2, (words, said)
+            assert any("1 of 3 records were cut there" in line for line in lines), words
+        if "nois" not in words and "metres" not in words:
+            assert "lag 0.0 s of " in lines[-1], (words, lines[-1])  # the parts are checked
+
+
+def test_jumps_do_not_hide_other_mistakes_and_many_are_refused() -> None:
+    cut = with_gap(slice(300, 600), lambda x: x - 8.0)
+    flicker = np.where(np.arange(1800) // 50 % 2, 0.0, 100.0)
+    cases = [
+        (cut.assign(gap_m=cut["gap_m"] / 0.3048), "is the gap in ft"),
+        (cut.rename(columns=dict(zip(SPEEDS, SPEEDS[::-1], strict=True))), "exchanged"),
+        (later(cut, "leader_speed_mps", 2.0), "leader 2.0 s late"),
+        (with_gap(slice(None), lambda x: x + flicker), r"max_jump=4; expected the gap to one lead"),
+    ]
+    check_refused(judged, cases, DataError)
+
+
+def scaled(columns: list[str], factor: float = 1.0, more: float = 0.0) -> pd.DataFrame:
+    table = irregular()
+    return table.assign(**{name: factor * table[name] + more for name in columns})
+
+
+# Table, and what is reported of it; nothing where it is None.
+BIASES = [
+    (irregular(), None),
+    (scaled(LEADER, more=-1.5), r"by \+1\.5 m/s .* Add 1\.5 m/s to the leader's, or multiply"),
+    (scaled(FOLLOWER, more=-1.0), r"by -1\.0 m/s .* Add -1\.0 m/s to the leader's, or multiply"),
+    (scaled(FOLLOWER, 1.03), r"by \+0\.[45] m/s .* multiply the follower's by 0\.97"),
+    (scaled(LEADER, 1.05), r"by -0\.[78] m/s .* Add -0\.[78] m/s to the leader's"),
+    (scaled(BOTH, 1.3), r"by 0\.77 m where both speeds give 1 m; is a clock .*3 of 3 pairs"),
+    (scaled(BOTH, 1 / 1.3), r"by 1\.30 m where both speeds give 1 m; is a clock .*3 of 3 pairs"),
+    (
+        scaled(BOTH, 1.3).where(irregular()["episode"] == 1, irregular()),
+        r"row 600, gap_m: the gap .* 0\.77 m where .* is a clock .*1 of 3 pairs",
+    ),
+]
+
+
+def test_a_biased_speed_or_a_slow_clock_is_reported_with_its_remedy() -> None:
+    for table, words in BIASES:
+        loud = " ".join(line for line in judged(table) if isinstance(line, Concern))
+        assert re.search(words, loud) if words else not loud, (words, loud)
+
+
+def test_two_names_of_one_car_are_refused() -> None:
+    same = irregular().assign(leader_speed_mps=lambda x: x["follower_speed_mps"])
+    cases = [
+        (same, "row 600, leader_speed_mps: both speeds are equal, but the gap changes.*3 of 3"),
+        (irregular().assign(follower_id=7, leader_id=7), "row 0, leader_id is the follower itself"),
+    ]
+    check_refused(judged, cases, DataError)
+
+
+def test_lengths_in_another_unit_than_positions_are_named(tmp_path) -> None:
+    rows = pair(range(200), v_Length=15, Space_Headway=62, v_Vel=39)
+    mixed = [row.copy() for row in rows]
+    for row in mixed:
+        for place in (5, 11, 12, 16):  # Local_Y, v_Vel, v_Acc, Space_Headway
+            row[place] = f"{float(row[place]) * 0.3048:.4f}"
+    path = tmp_path / "mixed.csv"
+    path.write_text(csv_text(mixed))
+    words = r"mixed\.csv: recording .* gap of 0\.\d+ s; are lengths alone in feet"
+    check_refused(
+        lambda unit: read_ngsim(path, units=unit), [(x, words) for x in METRES], DataError
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import dataclass
 from functools import cache
@@ -197,6 +198,9 @@ def test_gaps_that_speeds_do_not_tell_are_named(make_episodes):
         for aim in ("speed_rmspe", "both")
     }
     assert named == {"speed_rmspe": True, "both": False}
+    episodes["gap_m"] = make_episodes([40.0], [1.2])["gap_m"] * np.where(noise > 1, 3.0, 0.5)
+    jumps = " ".join(fit(episodes, objective="both").report)
+    assert re.search(r"gaps are off by \d+ %, speeds by .*: are they to one leader", jumps)
     clean = fit(make_episodes([40.0], [1.2])).report
     assert not any("calibration.objective=both" in line for line in clean)
 

@@ -44,9 +44,24 @@ def test_optimum_on_a_bound_is_reached_exactly():
 
 def test_a_problem_does_not_depend_on_its_neighbours():
     centres = torch.tensor([[1.0, 2.0], [-3.0, 0.5], [4.0, -4.0]], dtype=torch.float64)
-    together = solve(spheres(centres), 3)
-    alone = solve(spheres(centres[1:2]), 1)
-    assert torch.equal(together.best[1], alone.best[0])
+    hard = torch.tensor([1.0, 1.0, 1e-3], dtype=torch.float64).unsqueeze(-1)
+    for settings in (SETTINGS, GeneticSettings(population=16, patience=2)):
+        # The flat third problem stops at once, or when it does not improve, and stops no other.
+        together = solve(lambda x: hard * spheres(centres)(x) + 1.0, 3, settings=settings)
+        for one in range(3):
+            own = centres[one : one + 1]
+            alone = solve(
+                lambda x, h=hard[one], c=own: h * spheres(c)(x) + 1.0, 1, settings=settings
+            )
+            assert torch.equal(together.best[one], alone.best[0]), (settings, one)
+
+
+def test_a_search_that_still_improves_has_not_converged():
+    centre = torch.tensor([[1.0, 2.0]], dtype=torch.float64)
+    for generations, converged in ((80, True), (8, False)):
+        settings = GeneticSettings(population=8, generations=generations, founders=1)
+        found = solve(spheres(centre), 1, settings=settings, low=-50.0, high=50.0)
+        assert found.converged.tolist() == [converged], generations
 
 
 def test_equal_seeds_give_equal_results_and_others_do_not():
