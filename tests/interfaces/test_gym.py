@@ -411,7 +411,7 @@ def trained(sb3, kind="PPO", wrap=None, around=None, policy="MlpPolicy", seed=0,
     from stable_baselines3.common.vec_env import DummyVecEnv
 
     wrap = wrap or (lambda env: env)
-    env = DummyVecEnv([lambda: wrap(gymnasium.make(NAME, overrides=SHORT)) for _ in range(2)])
+    env = DummyVecEnv([lambda: wrap(gymnasium.make(NAME, overrides=SHORT))])
     few = {"n_steps": 20, "batch_size": 20} if kind == "PPO" else {"learning_starts": 10}
     env = around(env) if around else env
     model = getattr(sb3, kind)(policy, env, device="cpu", seed=seed, **few, **settings)
@@ -441,13 +441,13 @@ def test_a_model_acts_as_in_the_environment_of_its_training(sb3) -> None:
         ({"wrap": shares(-3.0, 3.0), "kind": "SAC"}, 0.0, 3.0),
         ({"wrap": shares(-1.0, 2.0), "kind": "TD3"}, 0.5, 1.5),
     ]
-    seen = np.random.default_rng(0).normal(size=(50, 7)).astype(np.float32)
+    seen = 0.3 * np.random.default_rng(0).normal(size=(50, 7)).astype(np.float32)
     for settings, middle, half in cases:
         model = trained(sb3, **settings)
         norm = model.get_vec_normalize_env()
         own = norm.normalize_obs(seen) if norm else seen
         wanted = (model.predict(own, deterministic=True)[0] - middle) / half
-        assert np.ptp(wanted) > 0.5
+        assert np.ptp(wanted) > 0.1
         found = network_of(model)(torch.as_tensor(seen)).detach()
         np.testing.assert_allclose(found, wanted, atol=1e-4, err_msg=str(settings))
 
