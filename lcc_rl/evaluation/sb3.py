@@ -14,16 +14,13 @@ from lcc_rl.envs.arrays import LARGEST_SCALED
 from lcc_rl.errors import ConfigError, raised_as, require
 
 ENVIRONMENT, RESCALED, NORMALIZED = "CarFollowing", "RescaleAction", "VecNormalize"
-# Wrappers of Gymnasium and stable-baselines3, by name, that act on neither observation nor action.
-TRANSPARENT = {
-    *("OrderEnforcing", "PassiveEnvChecker", "TimeLimit", "Monitor", "RecordEpisodeStatistics"),
-    *("RecordVideo", "HumanRendering", "NormalizeReward", "TransformReward", "ClipReward"),
-    *("DummyVecEnv", "SubprocVecEnv", "VecMonitor", "VecCheckNan", "VecVideoRecorder"),
+# Vectors and wrappers, by name, that can be carried over; most leave observation and action alone.
+CARRIED = {
+    *(ENVIRONMENT, RESCALED, NORMALIZED, "OrderEnforcing", "PassiveEnvChecker", "TimeLimit"),
+    *("Monitor", "RecordEpisodeStatistics", "RecordVideo", "HumanRendering", "NormalizeReward"),
+    *("TransformReward", "ClipReward", "DummyVecEnv", "SubprocVecEnv", "VecMonitor"),
+    *("VecCheckNan", "VecVideoRecorder"),
 }
-ELSE = (
-    "pass a torch module from this package's observations to actions in [−1, 1], or train with no "
-    f"other wrappers than {RESCALED} and {NORMALIZED}"
-)
 
 
 class StableBaselinesPolicy(nn.Module):
@@ -44,74 +41,70 @@ class StableBaselinesPolicy(nn.Module):
 
     def __init__(self, model: Any, normalize: Any = None) -> None:
         super().__init__()
-        self.title = type(model).__name__
-        env = model.get_env() if normalize is None else normalize
-        normalizers, names = ([], set()) if env is None else self._wrappers(env)
+        self.title, policy = type(model).__name__, model.policy
+        vectors, names = self._wrappers(model.get_env() if normalize is None else normalize)
         # Only models trained with VecNormalize have it; those with a replay buffer always do.
         raw = getattr(model, "_last_original_obs", None) is not None
-        lacking = raw and not normalizers and (env is None or not hasattr(model, "replay_buffer"))
+        lacking = (
+            raw and NORMALIZED not in names and not (vectors and hasattr(model, "replay_buffer"))
+        )
         words = f"{self.title} lacks the {NORMALIZED} of its training, or the vector without one: "
         require(not lacking, f"{words}load it by {self.title}.load(path, env=…)")
-        low, high = self._bounds(model, RESCALED in names)
-        self.middle, self.half = (high + low) / 2.0, (high - low) / 2.0
-        own = next((one for one in normalizers if one.norm_obs), None)
-        self.limit = torch.inf if own is None else float(own.clip_obs)
-        mean = 0.0 if own is None else own.obs_rms.mean
-        scale = 1.0 if own is None else (own.obs_rms.var + own.epsilon) ** 0.5
+        spaces = model.action_space, model.observation_space
+        ends = [np.unique(getattr(x, end, np.nan)) for x in spaces for end in ("low", "high")]
+        skipped = 2 * (RESCALED in names)
+        wanted = [-1.0, 1.0, -LARGEST_SCALED, LARGEST_SCALED][skipped:]
+        usable = spaces[0].shape == (1,) and [x.tolist() for x in ends[skipped:]] == [
+            [x] for x in wanted
+        ]
+        words = (
+            f"{self.title}: its spaces {spaces[0]} and {spaces[1]} are not those of this package"
+        )
+        require(usable, f"{words}'s environment, and no wrapper of the training explains them")
+        low, high = float(ends[0][0]), float(ends[1][0])
+        self.middle, self.half, self.squashed = (
+            (low + high) / 2,
+            (high - low) / 2,
+            policy.squash_output,
+        )
+        norm = next((x for x in vectors if getattr(x, "norm_obs", False)), None)
+        self.limit = float(norm.clip_obs) if norm else torch.inf
+        mean, scale = (
+            (norm.obs_rms.mean, (norm.obs_rms.var + norm.epsilon) ** 0.5) if norm else (0, 1)
+        )
         self.register_buffer("mean", torch.as_tensor(mean, dtype=torch.float32))
         self.register_buffer("scale", torch.as_tensor(scale, dtype=torch.float32))
-        policy, width = model.policy, model.observation_space.shape[-1]
-        self.squashed = bool(policy.squash_output)
         kind = f"{self.title}: its {type(policy).__name__} cannot be carried over"
-        with raised_as(ConfigError, kind, Exception):  # any error of a class of the user's
+        with raised_as(ConfigError, kind, Exception), torch.no_grad():  # any of a user's class
             self.network = deepcopy(nn.Sequential(*_layers(policy))).cpu().eval()
-            draw = (
-                np.random.default_rng(0).normal(size=(64, width)) * np.linspace(0, 3, 64)[:, None]
+            rows = np.linspace(0.0, 3.0, 64)[:, None]
+            seen = (rows * np.random.default_rng(0).normal(size=(64, *spaces[1].shape))).astype(
+                "f4"
             )
-            seen = draw.astype(np.float32)
-            wanted = (model.predict(seen, deterministic=True)[0] - self.middle) / self.half
-            with torch.no_grad():
-                off = np.abs(self._action(torch.as_tensor(seen)).numpy() - wanted).max()
+            acts = (model.predict(seen, deterministic=True)[0] - self.middle) / self.half
+            off = np.abs(self._action(torch.as_tensor(seen)).numpy() - acts).max()
             require(off < 1e-4, f"its layers act otherwise than predict(), by up to {off:.2g}")
 
-    def _wrappers(self, env: Any) -> tuple[list[Any], set[str]]:
-        """Return the ``VecNormalize`` of a vector and the names of its other wrappers."""
+    def _wrappers(self, env: Any) -> tuple[list[Any], list[str]]:
+        """Return a vector with all that it wraps, and the names of these and of inner wrappers."""
+        if env is None:
+            return [], []
         vectors = [env]
         while hasattr(vectors[-1], "venv"):
             vectors.append(vectors[-1].venv)
-        names = [type(one).__name__ for one in vectors]
-        self._check_known(names[:-1], NORMALIZED)
-        self._check_known(names[-1:])
         words = f"{self.title}: the wrappers of its environment cannot be read; is it closed?"
         with raised_as(ConfigError, words, Exception):  # of a process that has ended
-            texts = vectors[-1].env_method("__str__")  # <Monitor<CarFollowing<lcc_rl/alcc-v0>>>
-        inner = {name for text in texts for name in re.findall(r"<(\w+)(?=[< ])", text)}
-        require(ENVIRONMENT in inner, f"{self.title}: {texts[0]} is no environment here; {ELSE}")
-        self._check_known(sorted(inner - {ENVIRONMENT}), RESCALED)
-        return [one for one in vectors if type(one).__name__ == NORMALIZED], inner
-
-    def _check_known(self, names: list[str], *more: str) -> None:
-        strange = [name for name in names if name not in TRANSPARENT.union(more)]
-        words = f"{self.title} was trained with {', '.join(strange)}, which cannot be carried over"
-        require(not strange and names.count(NORMALIZED) < 2, f"{words}: {ELSE}")
-
-    def _bounds(self, model: Any, rescaled: bool) -> tuple[float, float]:
-        """Return the bounds of the model's actions, which stand for −1 and 1.
-
-        Raises:
-            ConfigError: if its spaces are not those of an environment of this package.
-        """
-        spaces = (model.action_space, model.observation_space)
-        ends = [[getattr(space, end, None) for end in ("low", "high")] for space in spaces]
-        usable = all(x is not None and x.ndim == 1 for pair in ends for x in pair)
-        low, high = (float(x[0]) for x in ends[0]) if usable else (np.nan, np.nan)
-        usable = usable and np.abs(ends[1]).min() == np.abs(ends[1]).max() == LARGEST_SCALED
-        usable = usable and len(ends[0][0]) == 1 and (rescaled or (low, high) == (-1.0, 1.0))
-        words = (
-            f"{self.title} has the spaces {spaces[0]} of actions and {spaces[1]} of observations"
+            texts = {*vectors[-1].env_method("__str__")}  # <Monitor<CarFollowing<lcc_rl/alcc-v0>>>
+        names = [type(one).__name__ for one in vectors]
+        names += [name for text in texts for name in re.findall(r"<(\w+)(?=[< ])", text)]
+        strange = ", ".join({*names} - CARRIED) or "wrappers"
+        require(
+            CARRIED.issuperset(names) and ENVIRONMENT in names and names.count(NORMALIZED) < 2,
+            f"{self.title} was trained with {strange}, which cannot be carried over: pass a torch "
+            "module from this package's observations to actions in [−1, 1], or train with no "
+            f"other wrappers than one {NORMALIZED} and {RESCALED}",
         )
-        require(usable, f"{words}, which are not those of this package's environment: {ELSE}")
-        return low, high
+        return vectors, names
 
     def _action(self, seen: Tensor) -> Tensor:
         """Return the actions for normalised observations."""
@@ -129,7 +122,7 @@ def _layers(policy: Any) -> list[nn.Module]:
     actor = getattr(policy, "actor", None)
     if actor is None:  # A2C, PPO: the mean of a Gaussian
         layers = [policy.pi_features_extractor, policy.mlp_extractor.policy_net, policy.action_net]
-        return [*layers, *([nn.Tanh()] if policy.squash_output else [])]
+        return [*layers, nn.Tanh()] if policy.squash_output else layers
     if hasattr(actor, "latent_pi"):  # SAC
         return [actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh()]
     return [actor.features_extractor, actor.mu]  # DDPG, TD3
