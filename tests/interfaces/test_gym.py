@@ -264,6 +264,23 @@ def test_every_autoreset_mode_plays_the_same_episodes() -> None:
         assert len(same) > len(series["NextStep"][place])
 
 
+def test_gymnasiums_normaliser_of_vectors_takes_the_next_step_only() -> None:
+    from gymnasium.wrappers.vector import NormalizeObservation, NormalizeReward
+
+    for mode in ("SameStep", "NextStep", "Disabled"):
+        many = gymnasium.make_vec(NAME, num_envs=3, overrides=SHORT, autoreset_mode=mode)
+        NormalizeReward(many)
+        if mode != "NextStep":
+            with pytest.raises(ValueError, match="NEXT_STEP"):
+                NormalizeObservation(many)
+            continue
+        scaled = NormalizeObservation(many)
+        scaled.reset(seed=0)
+        seen = [scaled.step(STILL)[0] for _ in range(48)]  # past two ends of episodes
+        assert np.isfinite(seen).all()
+        assert scaled.obs_rms.count > 3 * 48
+
+
 def test_disabled_resets_are_asked_for() -> None:
     many = gymnasium.make_vec(NAME, num_envs=2, overrides=SHORT, autoreset_mode="Disabled")
     many.reset(seed=0)
