@@ -106,7 +106,7 @@ def test_options_without_effect_are_refused() -> None:
     cases = [(lambda: load("evaluate", words), "has no effect: compare names every controller")]
     cases += [(lambda: lcc_rl.compare("idm_acc", overrides=words[:1]), cases[0][1])]
     check_refused(lambda call: call(), cases, ConfigError)
-    assert load("evaluate", [*words, "variant=idm"]).compare
+    assert load("evaluate", [f"{AUTO}.time_gap=1.5", words[1], "variant=idm"]).compare
 
 
 def test_drivers_have_an_effect_on_whatever_drives_as_they_do() -> None:
