@@ -49,11 +49,11 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
         f"{where}.loop must be a class derived from lcc_rl.agents.TrainingLoop, got {loop!r}",
     )
     keys = [getattr(policy, name, None) for name in ("in_keys", "out_keys")]
-    require(
-        isinstance(policy, TensorDictModule) and keys == [["observation"], ["action"]],
-        f"{where}.policy must be a TensorDictModule from 'observation' to 'action', such as "
-        f"make_actor's, got {type(policy).__name__}",
-    )
+    if not isinstance(policy, TensorDictModule) or keys != [["observation"], ["action"]]:
+        raise ConfigError(
+            f"{where}.policy must be a TensorDictModule from 'observation' to 'action', such as "
+            f"make_actor's, got {type(policy).__name__}"
+        )
     words = f"{where}.policy fails for observations of {scene.observation_size} numbers"
     with raised_as(ConfigError, words, Exception), torch.no_grad():  # any error of a module
         seen = TensorDict({"observation": torch.zeros(2, scene.observation_size)}, [2])

@@ -45,45 +45,32 @@ class StableBaselinesPolicy(nn.Module):
         vectors, names = self._wrappers(model.get_env() if normalize is None else normalize)
         # Only models trained with VecNormalize have it; those with a replay buffer always do.
         raw = getattr(model, "_last_original_obs", None) is not None
-        lacking = (
-            raw and NORMALIZED not in names and not (vectors and hasattr(model, "replay_buffer"))
-        )
+        known = NORMALIZED in names or (vectors and hasattr(model, "replay_buffer"))
         words = f"{self.title} lacks the {NORMALIZED} of its training, or the vector without one: "
-        require(not lacking, f"{words}load it by {self.title}.load(path, env=…)")
-        spaces = model.action_space, model.observation_space
-        ends = [np.unique(getattr(x, end, np.nan)) for x in spaces for end in ("low", "high")]
-        skipped = 2 * (RESCALED in names)
-        wanted = [-1.0, 1.0, -LARGEST_SCALED, LARGEST_SCALED][skipped:]
-        usable = spaces[0].shape == (1,) and [x.tolist() for x in ends[skipped:]] == [
-            [x] for x in wanted
-        ]
-        words = (
-            f"{self.title}: its spaces {spaces[0]} and {spaces[1]} are not those of this package"
-        )
-        require(usable, f"{words}'s environment, and no wrapper of the training explains them")
+        require(known or not raw, f"{words}load it by {self.title}.load(path, env=…)")
+        acts, sees = model.action_space, model.observation_space
+        ends = [np.unique(getattr(x, at, np.nan)) for x in (acts, sees) for at in ("low", "high")]
+        own, first = [-1.0, 1.0, -LARGEST_SCALED, LARGEST_SCALED], 2 * (RESCALED in names)
+        usable = all(map(np.array_equal, ends[first:], [[x] for x in own[first:]]))
+        usable = usable and acts.shape == (1,)
+        words = f"{self.title}: its spaces {acts} and {sees} are not those of this package's"
+        require(usable, f"{words} environment, and no wrapper of the training explains them")
         low, high = float(ends[0][0]), float(ends[1][0])
-        self.middle, self.half, self.squashed = (
-            (low + high) / 2,
-            (high - low) / 2,
-            policy.squash_output,
-        )
-        norm = next((x for x in vectors if getattr(x, "norm_obs", False)), None)
-        self.limit = float(norm.clip_obs) if norm else torch.inf
-        mean, scale = (
-            (norm.obs_rms.mean, (norm.obs_rms.var + norm.epsilon) ** 0.5) if norm else (0, 1)
-        )
+        self.middle, self.reach = (low + high) / 2.0, (high - low) / 2.0
+        self.squashed, self.limit, mean, scale = policy.squash_output, torch.inf, 0.0, 1.0
+        for norm in (x for x in vectors if getattr(x, "norm_obs", False)):
+            self.limit, mean = float(norm.clip_obs), norm.obs_rms.mean
+            scale = (norm.obs_rms.var + norm.epsilon) ** 0.5
         self.register_buffer("mean", torch.as_tensor(mean, dtype=torch.float32))
         self.register_buffer("scale", torch.as_tensor(scale, dtype=torch.float32))
         kind = f"{self.title}: its {type(policy).__name__} cannot be carried over"
         with raised_as(ConfigError, kind, Exception), torch.no_grad():  # any of a user's class
             self.network = deepcopy(nn.Sequential(*_layers(policy))).cpu().eval()
-            rows = np.linspace(0.0, 3.0, 64)[:, None]
-            seen = (rows * np.random.default_rng(0).normal(size=(64, *spaces[1].shape))).astype(
-                "f4"
-            )
-            acts = (model.predict(seen, deterministic=True)[0] - self.middle) / self.half
-            off = np.abs(self._action(torch.as_tensor(seen)).numpy() - acts).max()
-            require(off < 1e-4, f"its layers act otherwise than predict(), by up to {off:.2g}")
+            sizes = np.geomspace(0.01, 3.0, 64)[:, None]
+            seen = np.random.default_rng(0).normal(0.0, sizes, (64, *sees.shape)).astype("float32")
+            found = self._action(torch.as_tensor(seen)) * self.reach + self.middle
+            off = np.abs(model.predict(seen, deterministic=True)[0] - found.numpy()).max()
+            require(off < 1e-4 * self.reach, f"predict() differs from its layers by {off:.2g}")
 
     def _wrappers(self, env: Any) -> tuple[list[Any], list[str]]:
         """Return a vector with all that it wraps, and the names of these and of inner wrappers."""
@@ -109,7 +96,7 @@ class StableBaselinesPolicy(nn.Module):
     def _action(self, seen: Tensor) -> Tensor:
         """Return the actions for normalised observations."""
         found = self.network(seen)
-        return found if self.squashed else ((found - self.middle) / self.half).clamp(-1.0, 1.0)
+        return found if self.squashed else ((found - self.middle) / self.reach).clamp(-1.0, 1.0)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the actions in [−1, 1], ``[rows, 1]``."""

@@ -78,7 +78,7 @@ class ScoreRow(Settings):
     limits: dict[str, Limit]
 
 
-SHAPE = [field.name for field in fields(ScoreRow)]  # type: ignore[arg-type]
+SHAPE = [field.name for field in fields(ScoreRow)]
 
 
 def row_of(
@@ -191,8 +191,8 @@ def check_alike(documents: Mapping[str, Mapping[str, Any]]) -> None:
     headings: dict[str, BoardRow] = {}
     for file, document in documents.items():
         usable = isinstance(document, Mapping) and isinstance(document.get("results"), list)
-        usable = usable and re.fullmatch(CELL, str(document.get("name", "")))
-        require(usable, f"{file}: expected an object with a name, in one line, and results")
+        named = usable and re.fullmatch(CELL, str(document.get("name", "")))
+        require(named, f"{file}: expected an object with a name, in one line, and results")
         for number, row in enumerate(document["results"], 1):
             check_row(row, f"{file}, row {number}")
             place = (row["task"], row["source"])
@@ -207,16 +207,14 @@ def check_alike(documents: Mapping[str, Mapping[str, Any]]) -> None:
             require(len({str(x) for x in same}) == 1, f"{file}: {place[0]}: it has other limits")
             heading = headings.setdefault(place[0], row)
             for key, one in [*product(OF_HEADING, [heading]), *product(OF_PLACE, [known])]:
+                rounded = key == "baseline" and isclose(
+                    row[key] or 0.0, one[key] or 0.0, rel_tol=1e-3
+                )
                 require(
-                    row[key] == one[key] or (key == "baseline" and _alike(row[key], one[key])),
+                    rounded or row[key] == one[key],
                     f"{file}: {place[0]} behind {place[1]} was measured with other "
                     f"{key} ({row[key]!s:.8}, not {one[key]!s:.8})",
                 )
-
-
-def _alike(one: float | None, other: float | None) -> bool:
-    """Whether two numbers are equal but for the rounding of processors."""
-    return one is not None and other is not None and isclose(one, other, rel_tol=1e-3)
 
 
 def check_row(row: BoardRow, where: str) -> None:

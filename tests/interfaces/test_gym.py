@@ -507,7 +507,7 @@ def test_models_that_would_act_differently_are_refused(sb3, tmp_path) -> None:
             trained(sb3, around=lambda env: VecNormalize(VecNormalize(env))),
             cannot.format("wrappers"),
         ),
-        (trained(sb3, policy=Remembering), "its Remembering cannot be carried over: its layers"),
+        (trained(sb3, policy=Remembering), "its Remembering cannot be carried over: predict"),
         (alone(bounded), spaces),
         (alone(seen), spaces),
         (alone(stacked), "fails for observations of 7 numbers"),
