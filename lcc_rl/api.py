@@ -16,6 +16,7 @@ from rich.console import Console
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load, with_variant
 from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config.unused import check_used
 from lcc_rl.errors import require
 from lcc_rl.evaluation.foreign import as_given
 from lcc_rl.evaluation.named import setting_of
@@ -160,6 +161,8 @@ def compare(
         cfg.compare = {name: setting_of(one, f"compare.{name}") for name, one in others}
     else:
         cfg.compare = [setting_of(one) for _, one in others]
+    if not policies:  # these drive with the settings of the variant's controller
+        check_used(cfg, overrides)
     rows = evaluation.run(cfg, target, own=False, quiet=True, policies=policies)
     if folder is not None:
         evaluation.draw(rows, cfg, target)

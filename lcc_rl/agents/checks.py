@@ -6,12 +6,13 @@ import math
 from collections.abc import Mapping
 from typing import Any, SupportsFloat
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from lcc_rl.errors import Diverged, require
+from lcc_rl.errors import Diverged, one_line, require
 from lcc_rl.functional.finite import nonfinite_weight, require_finite
 from lcc_rl.pieces.base import ACTION, NEXT, as_key, root_key
 from lcc_rl.results.runs import flatten
@@ -19,11 +20,21 @@ from lcc_rl.results.runs import flatten
 
 def check_state(policy: TensorDictModule, state: Mapping[str, Any]) -> None:
     """Check that the state of an agent contains the policy's weights."""
+    kind = type(state).__name__
+    require(isinstance(state, Mapping), f"an agent's state_dict returns {kind}, expected a dict")
     held = [value for _, value in flatten(state) if isinstance(value, Tensor)]
     for name, weight in policy.state_dict().items():
         same = any(x.shape == weight.shape and torch.equal(x, weight) for x in held)
         words = "an agent's state_dict lacks the policy's weight"
         require(same, f"{words} {name}; extend super().state_dict() and load_state_dict, too")
+
+
+def check_restored(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Check that an agent's load_state_dict restored all tensors of a state."""
+    held = dict(flatten(now))
+    for name, value in flatten(saved):
+        same = not isinstance(value, Tensor) or torch.equal(value, held[name].to(value.device))
+        require(same, f"an agent's load_state_dict does not restore {name}")
 
 
 def check_learner(
@@ -41,7 +52,8 @@ def check_learner(
     """
     for name, value in values.items():
         words = "learn returns numbers by name, anneal the policy's learning rate"
-        require(isinstance(value, (SupportsFloat, Tensor)), f"{name} is {value!r}; {words}")
+        single = isinstance(value, (SupportsFloat, Tensor)) and np.size(value) == 1
+        require(single, f"{name} is {one_line(repr(value))[:80]}; {words}")
         if not math.isfinite(value):
             raise Diverged(f"{name} became {float(value)}", advice)
     found = nonfinite_weight(policy.state_dict())

@@ -6,6 +6,8 @@ import inspect
 from pathlib import Path
 from typing import Any
 
+import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from lcc_rl.agents.agent import Agent, Scene
@@ -15,7 +17,7 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import after_humans, world_of
-from lcc_rl.errors import require
+from lcc_rl.errors import ConfigError, raised_as, require
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import Observation
 from lcc_rl.pieces.controllers import Population
@@ -47,11 +49,17 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
         f"{where}.loop must be a class derived from lcc_rl.agents.TrainingLoop, got {loop!r}",
     )
     keys = [getattr(policy, name, None) for name in ("in_keys", "out_keys")]
-    require(
-        isinstance(policy, TensorDictModule) and keys == [["observation"], ["action"]],
-        f"{where}.policy must be a TensorDictModule from 'observation' to 'action', such as "
-        f"make_actor's, got {type(policy).__name__}",
-    )
+    if not isinstance(policy, TensorDictModule) or keys != [["observation"], ["action"]]:
+        raise ConfigError(
+            f"{where}.policy must be a TensorDictModule from 'observation' to 'action', such as "
+            f"make_actor's, got {type(policy).__name__}"
+        )
+    words = f"{where}.policy fails for observations of {scene.observation_size} numbers"
+    with raised_as(ConfigError, words, Exception), torch.no_grad():  # any error of a module
+        seen = TensorDict({"observation": torch.zeros(2, scene.observation_size)}, [2])
+        action = policy(seen.to(device)).get("action")
+        found = [*action.shape, action.dtype]
+        require(found == [2, 1, torch.float32], f"expected an action [2, 1, float32], got {found}")
     return learner
 
 

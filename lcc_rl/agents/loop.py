@@ -19,10 +19,10 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.agent import Agent
-from lcc_rl.agents.checks import check_learner, check_state
+from lcc_rl.agents.checks import check_learner, check_restored, check_state
 from lcc_rl.agents.vectors import denormals_flushed
 from lcc_rl.config.schemas import TrainingConfig
-from lcc_rl.errors import Diverged, Interrupted, ResultsError
+from lcc_rl.errors import Diverged, Interrupted, ResultsError, require
 from lcc_rl.io.files import write_parquet
 from lcc_rl.io.tensors import check_like, write_torch
 from lcc_rl.pieces.base import REWARD
@@ -77,6 +77,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
         self.on_row: Callable[[dict[str, float]], None] = lambda row: None
         self.on_keep: Callable[[int], None] = lambda iteration: None
         check_state(agent.policy, agent.state_dict())
+        self.trained = [*map(id, agent.policy.parameters())]
         self._prepare()
 
     def _prepare(self) -> None:
@@ -163,10 +164,15 @@ class TrainingLoop(ABC, Generic[AgentT]):
             "updates": float(self.updates),
             **begin,
             **episode_statistics(torch.cat(list(played), dim=1)),
-            **mean_of(losses),
             **(end or {}),
         }
+        learned = mean_of(losses)
+        taken = ", ".join(row.keys() & learned.keys())
+        require(not taken, f"learn returns {taken}, a column of the record: choose another name")
+        row |= learned
         check_learner(self.agent.policy, row, self.advice)
+        same = [*map(id, self.agent.policy.parameters())] == self.trained
+        require(same, "the training replaced agent.policy: change its weights in place")
         self.rows.append(row)
         times = dict(zip(("collect_s", "learn_s"), spent, strict=True))
         self.times.append({"iteration": row["iteration"], **times})
@@ -219,6 +225,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
                 raise ValueError(f"iteration {found.iteration} of {self.iterations}")
             check_like(found.agent, self.agent.state_dict(), "agent")
             self.agent.load_state_dict(found.agent)
+            check_restored(found.agent, self.agent.state_dict())
             self._remember(found.memory)
         except Exception as error:  # parts that do not fit raise many kinds of errors
             raise ResultsError(f"{path}: does not fit this training: {error!r}") from error
@@ -251,7 +258,13 @@ def episode_statistics(batch: TensorDictBase) -> dict[str, float]:
 
 
 def mean_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Return the mean of each entry."""
+    """Return the mean of each entry.
+
+    Raises:
+        ConfigError: if the rows have different entries.
+    """
+    same = all(row.keys() == rows[0].keys() for row in rows)
+    require(same, "learn must return the same names after every segment")
     return {name: sum(float(row[name]) for row in rows) / len(rows) for name in rows[0]}
 
 

@@ -147,6 +147,8 @@ def _run(
         (folder / EPISODES).unlink(missing_ok=True)
     save_config(cfg, folder)
     rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
+    for words in filter(None, (policy.clipped() for policy in policies.values())):
+        log.warning(words)
     if not quiet:
         draw(rows, cfg, folder)
     return rows

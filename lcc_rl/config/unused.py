@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from lcc_rl.config.nodes import nodes_in, takes_action
-from lcc_rl.config.schemas import BaseConfig, StudyConfig
+from lcc_rl.config.schemas import AUTO, BaseConfig, EvaluateConfig, StudyConfig
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, RING
 
@@ -28,6 +28,8 @@ def check_used(cfg: BaseConfig, overrides: Sequence[str], sweep: bool = False) -
     reasons = dict(_of_road(cfg))
     if not sweep:
         reasons |= dict(_of_roles(cfg)) | dict(_of_agent(cfg))
+        if isinstance(cfg, EvaluateConfig) and cfg.compare and not cfg.policy and cfg.agent:
+            reasons[AUTO] = "compare names every controller, with its own settings"
         reasons["sweep"] = "it names the folder of a sweep, -m"
     typed = {item: item.lstrip("+~").partition("=")[0].partition("@")[0] for item in overrides}
     for item, key in typed.items():

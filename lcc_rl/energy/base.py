@@ -38,7 +38,7 @@ class EnergyModel(Settings, ABC):
         carbon_dioxide: carbon dioxide per gram of fuel [g]; NaN if unknown.
     """
 
-    mass = 1500.0
+    mass = math.nan
     rotating_mass = 1.0
     efficiency = 1.0
     heating_value = 0.0

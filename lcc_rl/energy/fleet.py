@@ -38,6 +38,10 @@ class VehicleClass(Settings):
     speed_limit: Positive | None = None  # None: limited by its power only [m/s]
     bounded: bool = True  # False: it accelerates as commanded, without limits of power
 
+    def validate(self) -> None:
+        kind, mass = type(self.energy).__name__, self.energy.mass
+        require(mass > 0.0, f"{kind}: an energy model needs its mass [kg], got {mass!r}")
+
     def within(self, command: Tensor, speed: Tensor, time_step: float) -> Tensor:
         """Return commands within the vehicle's power and its speed limit [m/s²].
 

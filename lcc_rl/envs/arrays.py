@@ -36,6 +36,8 @@ from lcc_rl.pieces.base import (
 )
 from lcc_rl.pieces.rewards import TERMS, TotalReward
 
+LARGEST_SCALED = 1e6  # exceeds all scaled speeds [m/s], gaps [m] and times [s]
+
 
 class ArrayEpisodes:
     """Episodes of one automated vehicle, stepped as rows of arrays by :class:`Rowwise`.

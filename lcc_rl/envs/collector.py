@@ -41,8 +41,9 @@ class StringCollector(BaseCollector):
             is logged.
 
     Raises:
-        ConfigError: if the frames are no multiple of the parallel episodes, or the environment has
-            transforms other than pieces and the single-agent view.
+        ConfigError: if the frames are no multiple of the parallel episodes, no vehicle is
+            automated, or the environment has transforms other than pieces and the single-agent
+            view.
     """
 
     def __init__(
@@ -69,7 +70,9 @@ class StringCollector(BaseCollector):
         )
         self.steps = frames_per_batch // episodes
         self.single = _is_single(env)
-        self.action: Key = as_key(next(iter(env.full_action_spec.keys(True, True))))
+        actions = [as_key(key) for key in env.full_action_spec.keys(True, True)]
+        require(actions, "no vehicle of the string is automated: StringCollector needs an action")
+        self.action: Key = actions[0]
         reads = map(as_key, getattr(policy, "in_keys", []))
         self.reads = [key for key in reads if key != self.action]
         state = self._entries(env.reset())

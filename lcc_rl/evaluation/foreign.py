@@ -6,7 +6,6 @@ stable-baselines3. It can be evaluated (:class:`GivenPolicy`) or exported (:func
 
 from __future__ import annotations
 
-from copy import deepcopy
 from typing import Any
 
 import torch
@@ -14,10 +13,11 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
-from torchrl.envs.transforms import CatFrames, Transform
+from torchrl.envs.transforms import CatFrames, ObservationNorm, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lcc_rl.errors import ConfigError, raised_as, require
+from lcc_rl.evaluation.sb3 import StableBaselinesPolicy
 from lcc_rl.pieces.base import ACTION, OBSERVATION, STEP, StepTransform
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import NEXT
@@ -31,7 +31,8 @@ class GivenPolicy(TensorDictModuleBase):
     The module reads ``"observation"``, ``[rows, n]``, and writes ``"action"``, ``[rows, 1]``, one
     row per vehicle; or these entries of the group ``"automated"``, ``[*batch, vehicles, …]``. It
     may read ``"is_init"`` and entries that it wrote to ``("next", key)`` in the previous step.
-    Transforms at the head of a sequence, such as ``CatFrames``, work as in an environment.
+    Transforms at the head of a sequence, such as ``CatFrames``, work as in an environment; the
+    statistics of ``VecNorm`` and ``VecNormV2`` are those of the moment at which this is made.
 
     Args:
         module: a TensorDict module.
@@ -47,8 +48,11 @@ class GivenPolicy(TensorDictModuleBase):
         self.name, self.module = name, module
         self.heads: list[Transform] = []
         while isinstance(self.module, TensorDictSequential) and _is_head(self.module[0]):
-            self.heads.append(self.module[0])
+            self.heads.append(_still(self.module[0], name))
             self.module = self.module[1:]
+        moving = [type(part).__name__ for part in self.module.modules() if _normalizes(part)]
+        words = f"{name}: {', '.join(moving)} must be the first module of the sequence"
+        require(not moving, words)
         reads, writes = (list(map(unravel_key, x)) for x in (module.in_keys, module.out_keys))
         self.grouped = OBSERVATION in reads
         self.action = ACTION if self.grouped else ACTION[-1]
@@ -60,6 +64,7 @@ class GivenPolicy(TensorDictModuleBase):
             "of the group 'automated', 'is_init', and entries that it writes to ('next', key)",
         )
         self.kept: dict[Any, Tensor] = {}
+        self.steps, self.beyond, self.largest = 0, torch.zeros(()), torch.zeros(())
 
     @torch.compiler.disable
     @torch.no_grad()
@@ -82,7 +87,22 @@ class GivenPolicy(TensorDictModuleBase):
             self.module.train(training)
         self.kept = {key: seen.get(after) for key, after in self.memory.items()}
         action = seen.get(self.action).reshape(*observed.shape[:-1], 1)
+        size = action.detach().abs().cpu()
+        self.steps += 1
+        self.beyond = self.beyond + (size > 1.0 + 1e-5).float().mean()
+        self.largest = torch.maximum(self.largest, size.max())
         return tensordict.set(ACTION, action)
+
+    def clipped(self) -> str:
+        """Return a warning if actions so far were beyond [−1, 1]; else nothing."""
+        if not self.beyond:
+            return ""
+        share = 100.0 * float(self.beyond) / self.steps
+        return (
+            f"{self.name}: {share:.2g} % of its actions are beyond ±1, up to {self.largest:.3g}; "
+            "they were clipped. An action is a share of the largest acceleration (3 m/s²): divide "
+            "accelerations in m/s² by it"
+        )
 
     def tried(self, moment: TensorDictBase) -> None:
         """Check that it returns an action for the first state of an episode.
@@ -103,6 +123,29 @@ def _anew(head: Transform) -> Transform:
     keys = {"in_keys": head.in_keys, "out_keys": head.out_keys}
     padding = {"padding": head.padding, "padding_value": head.padding_value}
     return CatFrames(N=head.N, dim=head.dim, **keys, **padding)
+
+
+def _normalizes(part: nn.Module) -> bool:
+    return hasattr(part, "to_observation_norm")
+
+
+def _still(head: Any, name: str) -> Transform:
+    """Return a transform whose statistics, if it has some, do not change.
+
+    Raises:
+        ConfigError: if it has none yet, or separate ones for each environment.
+    """
+    kind = type(head).__name__
+    words = f"{name}: {kind} has no statistics yet; pass the one of the training"
+    with raised_as(ConfigError, words, Exception):  # torchrl has no check
+        still = head.to_observation_norm() if _normalizes(head) else head
+    norms = [part for part in still.modules() if isinstance(part, ObservationNorm)]
+    require(
+        all(norm.loc.ndim < 2 + (OBSERVATION in norm.in_keys) for norm in norms),
+        f"{name}: {kind} has statistics of its own for each environment: train with "
+        "VecNormV2(…, reduce_batch_dims=True)",
+    )
+    return still
 
 
 def _is_head(part: Any) -> bool:
@@ -129,43 +172,11 @@ def network_of(policy: Any, normalize: Any = None) -> nn.Module | None:
 
     Returns:
         The module; None for TensorDict modules and anything else.
+
+    Raises:
+        ConfigError: if a model would act differently here.
     """
     if hasattr(policy, "get_vec_normalize_env"):
-        return Deterministic(policy.policy, normalize or policy.get_vec_normalize_env())
+        return StableBaselinesPolicy(policy, normalize)
     plain = isinstance(policy, nn.Module) and not isinstance(policy, TensorDictModuleBase)
     return policy if plain else None
-
-
-class Deterministic(nn.Module):
-    """The policy of a stable-baselines3 model without exploration, and its normalisation.
-
-    Args:
-        policy: ``model.policy``.
-        normalize: ``VecNormalize`` or None; its statistics are copied.
-    """
-
-    mean: Tensor
-    scale: Tensor
-
-    def __init__(self, policy: Any, normalize: Any) -> None:
-        super().__init__()
-        actor = getattr(policy, "actor", None)
-        if actor is None:  # A2C, PPO: the mean of a Gaussian
-            layers = [policy.pi_features_extractor, policy.mlp_extractor.policy_net]
-            layers += [policy.action_net, nn.Hardtanh()]
-        else:  # DDPG, TD3, SAC
-            sac = hasattr(actor, "latent_pi")
-            layers = [actor.features_extractor, *([actor.latent_pi] if sac else []), actor.mu]
-            layers += [nn.Tanh()] if sac else []
-        self.network = deepcopy(nn.Sequential(*layers)).cpu().eval()
-        own = normalize is not None and normalize.norm_obs
-        self.limit = float(normalize.clip_obs) if own else torch.inf
-        mean = normalize.obs_rms.mean if own else 0.0
-        scale = (normalize.obs_rms.var + normalize.epsilon) ** 0.5 if own else 1.0
-        self.register_buffer("mean", torch.as_tensor(mean, dtype=torch.float32))
-        self.register_buffer("scale", torch.as_tensor(scale, dtype=torch.float32))
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """Return the actions in [−1, 1]."""
-        seen = ((observation - self.mean) / self.scale).clamp(-self.limit, self.limit)
-        return self.network(seen)

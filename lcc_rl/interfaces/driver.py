@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,9 @@ from lcc_rl.config import load
 from lcc_rl.config.words import FILTERED
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.checks import BATCH, check_step
+from lcc_rl.envs.clock import checked_seed
 from lcc_rl.envs.rowwise import Array, Rowwise
-from lcc_rl.errors import ConfigError, Diverged, require, unknown_name
+from lcc_rl.errors import ConfigError, Diverged, raised_as, require, unknown_name
 from lcc_rl.evaluation.named import controller_of, is_policy, label_of, setting_of
 from lcc_rl.functional.machine_code import kept
 from lcc_rl.functional.pattern import AUTOMATED
@@ -88,7 +89,9 @@ class Driver:
         require(usable, f"time_step must be a positive number of seconds, got {time_step!r}")
         spec = setting_of(name)
         self.name = spec if isinstance(spec, str) else label_of(spec)
-        self.time_step, self.seed = time_step, seed
+        first = checked_seed(seed)
+        require(first is not None, "seed must be a whole number, got None")
+        self.time_step, self.seed = time_step, first or 0
         if is_policy(spec):
             require(drivers is None, f"drivers needs a rule; {self.name} is a policy")
             self.program = program(spec, trust, safety=safety)
@@ -138,7 +141,8 @@ class Driver:
             self.memory = np.zeros((0, self.program.width))
             self.numbers: dict[Hashable, int] = {}  # seeds of all cars, in order of appearance
             return
-        stay = [place for place, car in enumerate(self.cars) if car not in cars]
+        gone = _ids(cars)
+        stay = [place for place, car in enumerate(self.cars) if car not in gone]
         self.cars, self.memory = [self.cars[place] for place in stay], self.memory[stay]
 
     def step(self, measured: Mapping[str, Any], cars: Sequence[Hashable] | None = None) -> Any:
@@ -157,10 +161,15 @@ class Driver:
 
         Raises:
             ConfigError: if a measurement is missing or unknown, or sizes differ.
-            Diverged: if a command is not finite; memories are then unchanged.
+            Diverged: if a command is not finite, or a measurement is NaN and there is no filter;
+                memories are then unchanged.
         """
         state, alone = self._state(measured)
-        self._admit(range(len(state)) if cars is None else list(cars), state)
+        ids = range(len(state)) if cars is None else _ids(cars)
+        if self.program.safety is None and (lost := np.isnan(state)).any():
+            row, column = np.argwhere(lost)[0]
+            raise Diverged(f"{self.name}: {self.names[column]} is nan in row {row} of the cars")
+        self._admit(ids, state)
         command, *memory = self._rows(state, *[self.memory] * (self.program.width > 0))
         if not np.isfinite(command).all():
             place = int(np.isfinite(command).argmin())
@@ -200,8 +209,13 @@ class Driver:
             raise unknown_name("measurement", str(min(unknown, key=str)), MEASURED)
         try:
             measured = self._completed(measured) if self.behind else measured
-            columns = [np.asarray(measured[name], np.float32) for name in self.names]
-            shape = max((column.shape for column in columns), key=len)
+            columns = [np.asarray(measured[name]) for name in self.names]
+            for name, column in zip(self.names, columns, strict=True):
+                if column.dtype.kind not in "biuf":
+                    raise ValueError(f"{name} is {measured[name]!r}"[:100])
+            shape, *others = {column.shape for column in columns} - {()} or [()]
+            if others:
+                raise ValueError(f"their shapes are {sorted([shape, *others])}")
             state = np.empty((math.prod(shape), len(columns)), np.float32)
             for place, column in enumerate(columns):
                 state[:, place] = column
@@ -209,7 +223,7 @@ class Driver:
             name, unit, meaning = described_input(error.args[0])
             words = f"{self.name} reads {name}, which is not given: {meaning} [{unit}]"
             raise ConfigError(words) from error
-        except ValueError as error:
+        except (ValueError, TypeError, RuntimeError) as error:  # torch's, of a gradient
             words = f"measured must hold numbers, or arrays of one length: {error}"
             raise ConfigError(words) from error
         return state, not shape
@@ -234,6 +248,19 @@ class Driver:
         """The program by rows, compiled on demand."""
         make = partial(kept, fused=True) if self.program.width <= WIDEST else _by_tensors
         return Rowwise(self.program.step, self._examples(1), self.name, make)
+
+
+def _ids(cars: Iterable[Hashable]) -> list[Hashable]:
+    """Return the ids of cars as a list.
+
+    Raises:
+        ConfigError: if they are a text, or cannot be keys.
+    """
+    require(not isinstance(cars, str), f"cars must be a list of ids, got {cars!r}")
+    with raised_as(ConfigError, "cars must be a list of ids", TypeError):
+        found = list(cars)
+        hash(tuple(found))
+    return found
 
 
 def _by_tensors(source: str) -> Any:

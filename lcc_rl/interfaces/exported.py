@@ -23,6 +23,7 @@ from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.envs.step import pieces_of, read_before
 from lcc_rl.errors import ConfigError, require
+from lcc_rl.evaluation.foreign import as_given
 from lcc_rl.evaluation.strategies import with_weights
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.pieces import Action, CBFFilter, Controller, Observation
@@ -229,7 +230,10 @@ def program(
     assert cfg is not None
     scenario = cfg.scenario
     leader = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["constant"])
-    pieces = pieces_of(build_env(cfg, leader, population))
+    env = build_env(cfg, leader, population)
+    if isinstance(policy, nn.Module) and (given := as_given(policy, type(policy).__name__)):
+        given.tried(env.reset())
+    pieces = pieces_of(env)
     found = {kind: [p for p in pieces if isinstance(p, kind)] for kind in (Observation, Action)}
     require(all(found.values()), f"{policy}: no network drives its vehicles; nothing to export")
     for name, node in scenario.fleet.items():

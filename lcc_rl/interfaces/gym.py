@@ -17,7 +17,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from lcc_rl.envs.arrays import ArrayEpisodes
+from lcc_rl.envs.arrays import LARGEST_SCALED, ArrayEpisodes
 from lcc_rl.envs.clock import checked_seed
 from lcc_rl.envs.factory import make_env
 from lcc_rl.envs.rowwise import Array
@@ -25,7 +25,6 @@ from lcc_rl.errors import ConfigError, require, require_known
 
 GYM_VARIANTS = ("alcc", "reference", "own_energy")
 TERMS_INFO, MASK_OPTION = "reward_terms", "reset_mask"
-LARGEST_SCALED = 1e6  # exceeds all scaled speeds [m/s], gaps [m] and times [s]
 MODES = ["rgb_array"]
 FIRST_EPISODE = np.zeros(1, np.int64)  # the place of the only episode
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
-from math import isfinite
-from typing import Any
+from dataclasses import fields
+from itertools import product
+from math import isclose
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
+from pydantic import Field
 from rich.table import Table
 
-from lcc_rl.errors import require
+from lcc_rl.errors import require, require_known
 from lcc_rl.results import measures, render
 from lcc_rl.results.bootstrap import LEAST_DRIVES
 from lcc_rl.results.measures import FINAL_SPREAD, FLOW, MEASURES, Shown
@@ -18,6 +22,7 @@ from lcc_rl.results.names import in_words
 from lcc_rl.results.remarks import FLOW_LOST, FLOW_NAMED
 from lcc_rl.results.render import DASH, markdown_row, saved_text, signed
 from lcc_rl.results.task import Task
+from lcc_rl.settings import Number, Settings, Whole, parse
 
 BoardRow = Mapping[str, Any]
 BOARD_COLUMNS = (
@@ -32,7 +37,48 @@ BOARD_COLUMNS = (
 )
 HEAD = ["leaders", "driven by", "saved [%]", "flow [1/h]", "flow [%]", "limits not kept"]
 SAVED_SHARE = ("saving", "saving_low", "saving_high")
+OF_HEADING, OF_PLACE = ("measure", "unit", "against"), ("data", "settings", "baseline")
 COPIED = ("score", *SAVED_SHARE, "distance_lost", FLOW, FLOW_LOST, "string_ratio", FINAL_SPREAD)
+
+
+CELL = r"[^\r\n|`]{1,200}"  # a text in a cell of a table
+Name = Annotated[str, Field(pattern=f"^{CELL}$")]
+Missing = Number | None
+
+
+class Limit(Settings):
+    """The bound and the value of a limit of a row."""
+
+    bound: Number
+    value: Missing
+
+
+class ScoreRow(Settings):
+    """A row of a file of ``lcc-rl score``."""
+
+    task: Name
+    source: Name
+    measure: Name
+    unit: Name | None
+    against: Name
+    baseline: Missing
+    score: Number
+    saving: Missing
+    saving_low: Missing
+    saving_high: Missing
+    distance_lost: Number
+    flow_vph: Missing
+    flow_lost: Missing
+    collisions: Whole
+    windows: Whole
+    drives: Whole
+    data: Name
+    settings: Name
+    kept: bool
+    limits: dict[str, Limit]
+
+
+SHAPE = [field.name for field in fields(ScoreRow)]
 
 
 def row_of(
@@ -142,8 +188,13 @@ def check_alike(documents: Mapping[str, Mapping[str, Any]]) -> None:
     """
     first: dict[tuple[str, str], BoardRow] = {}
     files: dict[tuple[str, str, str], str] = {}
+    headings: dict[str, BoardRow] = {}
     for file, document in documents.items():
-        for row in document["results"]:
+        usable = isinstance(document, Mapping) and isinstance(document.get("results"), list)
+        named = usable and re.fullmatch(CELL, str(document.get("name", "")))
+        require(named, f"{file}: expected an object with a name, in one line, and results")
+        for number, row in enumerate(document["results"], 1):
+            check_row(row, f"{file}, row {number}")
             place = (row["task"], row["source"])
             known = first.setdefault(place, row)
             other = files.setdefault((document["name"], *place), file)
@@ -152,14 +203,17 @@ def check_alike(documents: Mapping[str, Mapping[str, Any]]) -> None:
                 f"{other} and {file} both score {document['name']} in {place[0]} behind "
                 f"{place[1]}: remove one, or give it another name",
             )
-            check_row(row, f"{file}: {place[0]} behind {place[1]}")
             same = ({name: x["bound"] for name, x in one["limits"].items()} for one in (row, known))
             require(len({str(x) for x in same}) == 1, f"{file}: {place[0]}: it has other limits")
-            for key in ("data", "settings"):
+            heading = headings.setdefault(place[0], row)
+            for key, one in [*product(OF_HEADING, [heading]), *product(OF_PLACE, [known])]:
+                rounded = key == "baseline" and isclose(
+                    row[key] or 0.0, one[key] or 0.0, rel_tol=1e-3
+                )
                 require(
-                    row[key] == known[key],
+                    rounded or row[key] == one[key],
                     f"{file}: {place[0]} behind {place[1]} was measured with other "
-                    f"{key} ({row[key][:8]}, not {known[key][:8]})",
+                    f"{key} ({row[key]!s:.8}, not {one[key]!s:.8})",
                 )
 
 
@@ -169,14 +223,18 @@ def check_row(row: BoardRow, where: str) -> None:
     Raises:
         ConfigError: naming the contradiction.
     """
-    numbers = [row.get("score"), *(row[key] for key in SAVED_SHARE)]
-    numbers += [limit[key] for limit in row["limits"].values() for key in ("bound", "value")]
-    for number in numbers:
-        good = number is None or (isinstance(number, int | float) and isfinite(number))
-        require(good, f"{where}: expected numbers, got {number!r}")
+    require(isinstance(row, Mapping), f"{where}: expected a row with names, got {row!r:.80}")
+    lacking = ", ".join(name for name in SHAPE if name not in row)
+    require(not lacking, f"{where}: it lacks {lacking}")
+    parse(ScoreRow, {name: row[name] for name in SHAPE}, where)
+    where = f"{where}: {row['task']} behind {row['source']}"
+    require_known(f"limit ({where})", row["limits"], measures.limit_measures())
     value, low, high = (row[key] for key in SAVED_SHARE)
     inside = value is None or low is None or low <= value <= high
     require(inside, f"{where}: the saving {value} is not within its interval {low} … {high}")
+    score, baseline = row["score"], row["baseline"]
+    same = value is None or not baseline or isclose(value, 1.0 - score / baseline, abs_tol=1e-4)
+    require(same, f"{where}: the saving {value} is not that of {score} against {baseline}")
     wrong = broken(row)
     require(
         row["kept"] is (not wrong),

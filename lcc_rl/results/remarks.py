@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from lcc_rl.config import choices
 from lcc_rl.config.words import FILTERED
 from lcc_rl.results import measures
 from lcc_rl.results.measures import BROKEN, FASTER, REACH
@@ -103,9 +104,11 @@ def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
     people = [shares[name] for name in (HUMAN, "direct") if name in shares]
     for name in shares.index if people else ():
         if not name.endswith(FILTERED) and not np.isclose(shares[name], people).any():
-            kind = "lcc_rl.pieces.LinearACC" if name == "acc" else "<its class>"
-            option = f"'compare={{faster: {{_target_: {kind}, desired_speed: 45}}}}'"
-            remedies.setdefault(name, option)
+            driver = "scenario.controllers.automated"
+            option = f"variant=idm controller@{driver}={name} {driver}.desired_speed=45"
+            option += " 'compare=[<run>]'"
+            own = "desired_speed: 45 beside its other settings in compare="
+            remedies.setdefault(name, option if name in choices("controller") else own)
     return [
         f"the leaders drive faster than the desired speed of {name} for {shares[name]:.0%} of the "
         f"time (more than {MOSTLY:.0%}): savings against it are not valid. Raise v0: {remedy}"

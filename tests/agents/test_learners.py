@@ -15,7 +15,7 @@ from torch import nn
 
 from lcc_rl.agents import PPO, TrainingLoop
 from lcc_rl.agents.agent import Scene
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, ResultsError
 
 SMALL = (
     *("training.episodes=16", "training.environments=4", "training.checkpoint_every=2"),
@@ -89,6 +89,8 @@ def test_the_clipped_ratio_is_of_the_policy_that_played() -> None:
 # What a learner of one's own has wrong, as what replaces what on the page, and the error.
 STATE = "    def state_dict(self):\n        return {'best': 1.0}\n\n"
 RATE = "    def anneal(self, share):\n        self.rate = share\n\n"
+NOTHING = "    def state_dict(self):\n        pass\n\n"
+MADE = "agent.policy = make_actor(batch['automated', 'observation'].shape[-1], 1, [8], 0)"
 WRONG = [
     ("self.noise = GaussianExploration", "self.sound = abs", "must make noise, the exploration"),
     ("loop = ReinforceLoop", "loop = dict", "loop must be a class derived .* got <class 'dict'>"),
@@ -97,7 +99,27 @@ WRONG = [
     ("(Agent)", "(Settings)", "expected a subclass of .*Agent, got my_learner.Reinforce"),
     ("    def setup(", f"{STATE}    def setup(", "lacks the policy's weight .*extend super"),
     ("    def setup(", f"{RATE}    def setup(", "learning_rate is None; .*anneal the policy's"),
+    ("    def setup(", f"{NOTHING}    def setup(", "state_dict returns NoneType, expected a dict"),
+    (
+        "observation_size, 1,",
+        "observation_size, 2,",
+        r"policy fails .* \[2, 1, float32\], got \[2, 2",
+    ),
+    ("self.noise =", "self.policy.double(); self.noise =", "policy fails for observations of 7"),
+    ("loss.item()", "log_prob", "loss_actor is tensor.*; learn returns numbers by name"),
+    ('"loss_actor"', '"episode_reward"', "learn returns episode_reward, a column of the record"),
+    ('"loss_actor"', 'f"loss_{before}"', "learn must return the same names after every segment"),
+    ("self.updates += 1", MADE, "the training replaced agent.policy: change its weights in place"),
 ]
+
+
+def test_a_state_that_is_not_restored_is_refused(tmp_path, my_learner) -> None:
+    lost = "    def load_state_dict(self, state):\n        pass\n\n    def setup("
+    exec(my_learner.text.replace("    def setup(", lost), vars(my_learner))
+    other = f"seed={crc32(lost.encode())}"
+    small_loop(tmp_path, *AGENTS["own"], *SMALL, other).run()
+    with pytest.raises(ResultsError, match="load_state_dict does not restore policy"):
+        small_loop(tmp_path, *AGENTS["own"], *SMALL, other).load()
 
 
 def test_what_a_learner_of_ones_own_lacks_is_one_line(tmp_path, my_learner) -> None:

@@ -52,6 +52,8 @@ class Rounded(RewardTerm):
 
 
 class Heavy(EnergyModel):
+    mass = 2000.0
+
     def power(self, speed, acceleration):
         return speed.mul_(2.0) * acceleration
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 
 import numpy as np
 import pandas as pd
@@ -12,9 +13,11 @@ from commands import tiny
 
 from lcc_rl.api import Run
 from lcc_rl.commands import evaluation
+from lcc_rl.config import load
 from lcc_rl.data.leaders import stretch
 from lcc_rl.data.profiles import from_records
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.named import controller_of
 from lcc_rl.evaluation.rows import leader_faster
 from lcc_rl.results.measures import FASTER, REACH
 from lcc_rl.results.names import in_words
@@ -52,8 +55,11 @@ def test_every_baseline_with_a_desired_speed_is_warned_of() -> None:
 def test_the_remedy_for_a_controller_is_an_option() -> None:
     rows = pd.DataFrame({"strategy": ["human", "acc", "mine"], FASTER: [0.1, 0.9, 0.8]})
     acc, mine = (line.split("Raise v0: ")[1] for line in leader_too_fast(windows_for(rows)))
-    assert acc == "'compare={faster: {_target_: lcc_rl.pieces.LinearACC, desired_speed: 45}}'"
-    assert mine == "'compare={faster: {_target_: <its class>, desired_speed: 45}}'"
+    assert mine == "desired_speed: 45 beside its other settings in compare="
+    words = shlex.split(acc)
+    assert words.pop() == "compare=[<run>]"
+    faster, tuned = load("evaluate", words).scenario.controllers["automated"], controller_of("acc")
+    assert faster.settings == {**tuned.settings, "desired_speed": 45}
 
 
 def test_a_scale_that_makes_a_leader_implausibly_fast() -> None:

@@ -106,6 +106,12 @@ def test_a_bad_setting_is_one_line_before_the_data_are_read(tmp_path) -> None:
 def test_options_without_effect_are_refused() -> None:
     cases = [(typed, rf"has no effect: .*({why})") for typed, why in IGNORED.items()]
     check_refused(lambda typed: load("train", typed.split()), cases, ConfigError)
+    stronger = f"+{AUTO}.max_acceleration=6"
+    words = [stronger, "compare=[idm_acc]"]
+    cases = [(lambda: load("evaluate", words), "has no effect: compare names every controller")]
+    cases += [(lambda: lcc_rl.compare("idm_acc", overrides=words[:1]), cases[0][1])]
+    check_refused(lambda call: call(), cases, ConfigError)
+    assert load("evaluate", [f"{AUTO}.time_gap=1.5", words[1], "variant=idm"]).compare
 
 
 def test_programs_are_refused_what_has_no_effect_in_them() -> None:

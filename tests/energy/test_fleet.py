@@ -9,7 +9,7 @@ from lcc_rl.agents.actor import shared_policy
 from lcc_rl.commands.evaluation import task_of
 from lcc_rl.config import identity, load
 from lcc_rl.config.nodes import as_plain
-from lcc_rl.energy import CirclesFuel, ElectricCar, Fleet, PaperMotor, VehicleClass
+from lcc_rl.energy import CirclesFuel, ElectricCar, EnergyModel, Fleet, PaperMotor, VehicleClass
 from lcc_rl.envs import DifferentiableRollout, StringCollector
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError
@@ -92,6 +92,11 @@ def test_power_of_an_environment_is_that_of_the_models() -> None:
     torch.testing.assert_close(after["power"], wanted)
 
 
+class Weightless(EnergyModel):
+    def power(self, speed, acceleration):
+        return speed * acceleration
+
+
 def test_mistakes_are_named() -> None:
     check_refused(
         lambda make: make(),
@@ -102,6 +107,10 @@ def test_mistakes_are_named() -> None:
             (lambda: Fleet(MODELS, None, {"human": {"bus": 1.0}}), r"energy.roles.human.*'bus'"),
             (lambda: build_energy(load("train", ["energy._target_=builtins.dict"])), "energy"),
             (lambda: CirclesFuel(vehicle="van"), "van"),
+            (
+                lambda: Fleet({"x": Weightless()}),
+                "Weightless: an energy model needs its mass .* nan",
+            ),
             (
                 lambda: lcc_rl.make_env("alcc", 1, [*MIXED, "+energy.roles.lorry={class8: 1}"]),
                 r"energy.roles.*lorry.*automated, human",

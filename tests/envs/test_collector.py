@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from helpers import TERMS, compose, make_agent, single_env, small_env, string
+from helpers import TERMS, check_refused, compose, make_agent, single_env, small_env, string
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import BaseCollector, Collector
 
@@ -14,6 +14,7 @@ from lcc_rl.agents.actor import GaussianExploration, shared_policy
 from lcc_rl.agents.collecting import LEARNED_FROM
 from lcc_rl.envs import StringCollector
 from lcc_rl.envs.step import Step, pieces_of
+from lcc_rl.errors import ConfigError
 from lcc_rl.pieces.base import SEED, as_key
 
 KEYS = (*LEARNED_FROM, ("next", *TERMS), ("vehicles", "gap"))
@@ -124,6 +125,18 @@ def first(env, **settings):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of the compiler's own making
+def test_what_cannot_be_collected_is_refused() -> None:
+    cases = [
+        (small_env("alcc", 4, [string("human*3")]), 40, "no vehicle of the string is automated"),
+        (environment("one"), 41, "must be a multiple of the 8 episodes side by side"),
+    ]
+
+    def collect(env, frames: int) -> None:
+        StringCollector(env, None, frames_per_batch=frames)
+
+    check_refused(collect, cases, ConfigError)
+
+
 def test_compiled_agrees_and_repeats_itself() -> None:
     env = ["scenario.horizon=100"]
     plain = first(small_env("alcc", 8, env), frames_per_batch=800)

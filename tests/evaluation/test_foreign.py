@@ -8,12 +8,20 @@ from commands import NO_AGENT
 from helpers import check_refused, slow_but
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.envs.transforms import CatFrames
-from torchrl.modules import GRUModule, NormalParamExtractor, ProbabilisticActor, TanhNormal
+from torchrl.envs.transforms import CatFrames, VecNorm, VecNormV2
+from torchrl.modules import (
+    GRUModule,
+    NormalParamExtractor,
+    ProbabilisticActor,
+    TanhNormal,
+    TruncatedNormal,
+)
 
 import lcc_rl
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.foreign import as_given
 
+EXPERIMENTAL = pytest.mark.filterwarnings("ignore:Support of VecNormV2")
 ROOT, GROUP = (["observation"], ["action"]), (["automated", "observation"], ["automated", "action"])
 SMALL = [*NO_AGENT, "evaluation.baselines=[]"]
 WIDTH = 7
@@ -89,6 +97,52 @@ def test_a_policy_of_any_keys_drives_as_its_network_does(tmp_path, string) -> No
     assert list((tmp_path / "run" / "figures").glob("*.png"))
 
 
+def normalized(kind: type, network: nn.Module, **settings) -> TensorDictSequential:
+    """Return a policy behind a normaliser that has seen episodes of four environments."""
+    keys = {"in_keys": ["observation"], "out_keys": ["observation"]}
+    norm = kind(**keys, **settings)
+    env = lcc_rl.make_env("alcc", 4, [*NO_AGENT], seed=1).append_transform(norm)
+    env.rollout(30, break_when_any_done=False)
+    return TensorDictSequential(norm, TensorDictModule(network, *ROOT))
+
+
+@EXPERIMENTAL
+@pytest.mark.parametrize(("kind", "settings"), [(VecNorm, {}), (VecNormV2, {"decay": 1.0})])
+def test_comparing_leaves_the_statistics_of_a_normaliser(kind, settings) -> None:
+    reduced = {"reduce_batch_dims": True} if kind is VecNormV2 else {}
+    policy = normalized(kind, networks()[0], **settings, **reduced)
+    still = TensorDictSequential(policy[0].to_observation_norm(), policy[1])
+    before = {name: value.clone() for name, value in still[0].state_dict().items()}
+    found = lcc_rl.compare({"a": policy, "b": policy, "c": still}, overrides=SMALL).rows
+    energies = found.groupby("strategy")["total_path_energy_kj"].sum()
+    assert energies.nunique() == 1
+    after = policy[0].to_observation_norm().state_dict()
+    assert all(torch.equal(after[name], value) for name, value in before.items())
+
+
+def test_what_acts_of_a_distribution_is_the_deterministic_sample_of_torchrl() -> None:
+    moment = lcc_rl.make_env("alcc", 3, [*NO_AGENT], single=False).reset()
+    kinds = [(TanhNormal, 0.7616), (TruncatedNormal, 0.2772)]  # of location 1, scale 1, ±1
+    for kind, wanted in kinds:
+        spread = TensorDictModule(
+            lambda seen: (seen[:, :1] * 0.0 + 1.0,) * 2, ROOT[0], ["loc", "scale"]
+        )
+        keys = {"in_keys": ["loc", "scale"], "distribution_class": kind}
+        given = as_given(ProbabilisticActor(spread, **keys), "x")
+        action = given(moment)["automated", "action"]
+        torch.testing.assert_close(action, torch.full_like(action, wanted), rtol=0, atol=1e-4)
+
+
+def test_actions_beyond_their_range_are_named(caplog) -> None:
+    network = networks()[0]
+    loud = nn.Sequential(network, nn.Linear(1, 1, bias=False)).requires_grad_(False)
+    loud[1].weight.fill_(3.0)  # an acceleration instead of a share
+    lcc_rl.compare({"loud": loud, "right": network}, overrides=SMALL)
+    (line,) = [one for one in caplog.messages if "beyond" in one]
+    assert line.startswith("loud: ")
+    assert "share of the largest acceleration" in line
+
+
 def test_a_recurrent_policy_of_torchrl_drives() -> None:
     torch.manual_seed(0)
     keys = {"in_keys": ["observation", "rs"], "out_keys": ["seen", ("next", "rs")]}
@@ -100,9 +154,15 @@ def test_a_recurrent_policy_of_torchrl_drives() -> None:
     assert set(found.rows["strategy"]) == {"TensorDictSequential"}
 
 
+@EXPERIMENTAL
 def test_what_is_no_policy_of_these_keys_is_refused_in_a_line() -> None:
     network = networks()[0]
+    apart = normalized(VecNormV2, network)
+    unplayed = VecNorm(in_keys=["observation"], out_keys=["observation"])
     cases = [
+        ({"x": apart}, "x: VecNormV2 has statistics of its own for each .*reduce_batch_dims=True"),
+        ({"x": TensorDictSequential(unplayed, apart[1])}, "x: VecNorm has no statistics yet; pass"),
+        ({"x": TensorDictSequential(apart[1], unplayed)}, "x: VecNorm must be the first module"),
         ({"x": nn.Linear(5, 1)}, "x fails for observations of 7 numbers: mat1 and mat2"),
         ({"x": nn.Linear(WIDTH, 2)}, r"x fails .* shape '\[1, 1, 1\]' is invalid"),
         ({"x": TensorDictModule(network, ["obs"], ["action"])}, r"x reads \['obs'\] and writes"),

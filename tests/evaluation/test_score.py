@@ -100,18 +100,47 @@ def test_mistakes_are_named(tmp_path) -> None:
 LIMITS = {"share_ttc_unsafe": {"bound": 0.01, "value": 0.005}}
 ROW = {"task": "t", "source": "s", "data": "1", "settings": "2", "kept": True, "collisions": 0}
 ROW |= {"saving": 0.02, "saving_low": 0.01, "saving_high": 0.03, "limits": LIMITS}
+ROW |= {"score": 98.0, "baseline": 100.0, "measure": "path_energy", "unit": "kJ/km"}
+ROW |= {"against": "human", "distance_lost": 0.0, "flow_vph": None, "flow_lost": None}
+ROW |= {"windows": 20, "drives": 1}
 BROKEN = {"share_ttc_unsafe": {"bound": 0.01, "value": 0.02}}
+HEADINGS = [({"unit": "g/km"}, "unit"), ({"measure": "net_energy"}, "measure")]
+HEADINGS += [({"against": "idm"}, "against")]
 WIDER = {"share_ttc_unsafe": {"bound": 0.5, "value": 0.02}}
 
 
 def test_a_table_of_scores_refuses_what_is_not_alike_or_contradicts_itself() -> None:
     cases = [
         ({"data": "3"}, r"b\.json: t behind s .* other data"),
-        ({"saving": 0.5}, r"b\.json: t behind s: the saving 0\.5 is not within .* 0\.01 … 0\.03"),
-        ({"limits": BROKEN}, r"b\.json: t behind s: kept is True, but .* not kept: TTC < 4 s"),
+        (
+            {"saving": 0.5},
+            r"b\.json, row 1: t behind s: the saving 0\.5 is not within .* 0\.01 … 0\.03",
+        ),
+        (
+            {"limits": BROKEN},
+            r"b\.json, row 1: t behind s: kept is True, but .* not kept: TTC < 4 s",
+        ),
         ({"kept": False}, r"kept is False, but limits are not kept: none"),
         ({"collisions": 3}, r"kept is True, but .* 3 coll\."),
         ({"limits": WIDER}, r"b\.json: t: it has other limits"),
+        ({"saving": 0.025}, r"b\.json.* the saving 0\.025 is not that of 98\.0 against 100\.0"),
+        *(
+            ({"source": "other", **one}, f"t behind other was measured with other {key}")
+            for one, key in HEADINGS
+        ),
+        ({"score": 49.0, "baseline": 50.0}, "measured with other baseline"),
+        ({"flow_vph": float("nan")}, r"b\.json, row 1.flow_vph must be .*, got nan"),
+        ({"collisions": "no"}, r"b\.json, row 1.collisions must be .*, got 'no'"),
+        ({"collisions": -3}, r"b\.json, row 1.collisions must be .*, got -3"),
+        ({"source": "s\nt"}, r"b\.json, row 1.source must"),
+        ({"saving": "2 %"}, r"row 1.saving must be .*, got '2 %'"),
+        (
+            {"limits": {"share_ttc_unsafe": {"bound": 0.01}}},
+            r"row 1.limits.share_ttc_unsafe.*value",
+        ),
+        ({"limits": {"speed": {"bound": 0.01, "value": 0.0}}}, "unknown limit .* 'speed'"),
+        ({"limits": []}, r"row 1.limits must"),
+        ({"kept": None}, r"row 1.kept must be .*, got None"),
         ({}, r"a\.json and b\.json both score a"),
     ]
 
@@ -120,6 +149,16 @@ def test_a_table_of_scores_refuses_what_is_not_alike_or_contradicts_itself() -> 
         board.check_alike({"a.json": {"name": "a", "results": [ROW]}, "b.json": other})
 
     check_refused(check, cases, ConfigError)
+    whole = [
+        (["a"], "expected an object with a name"),
+        ({"name": "a"}, "b.json: expected an object"),
+        ({"name": "a\nb", "results": [ROW]}, "a name, in one line, and results"),
+        ({"name": "a", "results": [3]}, "b.json, row 1: expected a row with names, got 3"),
+        ({"name": "a", "results": [{"task": "t"}]}, "b.json, row 1: it lacks source, measure,"),
+    ]
+    check_refused(lambda document: board.check_alike({"b.json": document}), whole, ConfigError)
+    rounded = {"name": "b", "results": [{**ROW, "baseline": 100.001}]}  # of another processor
+    board.check_alike({"a.json": {"name": "a", "results": [ROW]}, "b.json": rounded})
 
 
 def test_a_killed_score_is_played_again_and_a_finished_or_running_one_is_left_alone(

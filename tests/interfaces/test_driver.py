@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from functools import cache
 from importlib.resources import files
 from time import perf_counter
@@ -18,7 +19,7 @@ from lcc_rl.drivers.population import fixed
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.evaluation.strategies import baseline, trained
-from lcc_rl.interfaces.driver import Driver
+from lcc_rl.interfaces.driver import MEASURED, Driver
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.base import SEED
 from lcc_rl.results.policies import load_policy
@@ -182,6 +183,7 @@ def test_bad_input_is_one_clear_error() -> None:
         ("idm_ac", 0.1, "Did you mean 'idm_acc'"),
         *((x, 0, "time_step must be a positive number") for x in ("idm_acc", POLICY)),
         ("idm_acc", None, "time_step must be a positive number of seconds, got None"),
+        *(("human", 0.1, (), None, x, "seed must be a whole") for x in (-1, 2**40, 0.5, None)),
     ]
     check_refused(Driver, making, ConfigError)
     given = {"self.speed": 9.0, "self.gap": 20.0, "ahead.speed": 9.0}
@@ -193,11 +195,39 @@ def test_bad_input_is_one_clear_error() -> None:
         (given | {"self.gap": [[1.0], [2.0]]}, None, "arrays of one length"),
         (given | {"self.gap": [1.0, 2.0], "self.speed": [1.0]}, None, "arrays of one length"),
         ([1.0, 2.0], None, "measured must name measurements, such as self.gap, got list"),
-        (given | {"self.gap": "near"}, None, "measured must hold numbers"),
+        (given | {"self.gap": [1.0, 2.0], "ahead.speed": [1.0]}, None, "arrays of one length"),
+        *(
+            (given | {"self.gap": x}, None, "measured must hold numbers")
+            for x in ("near", 1j, [1j], 10**400, None, torch.ones(1, requires_grad=True))
+        ),
+        (given | {"self.gap": [1.0, 2.0]}, "ab", "cars must be a list of ids, got 'ab'"),
+        (given, [[1]], "cars must be a list of ids: unhashable type: 'list'"),
     ]
-    check_refused(Driver("idm_acc", 0.1).step, steps, ConfigError)
+    driver = Driver("idm_acc", 0.1)
+    check_refused(driver.step, steps, ConfigError)
+    check_refused(driver.reset, [("car12", "cars must be a list of ids"), ([[1]], "list")])
+    people = Driver("human", 0.1)
+    people.step(given, ["car1"])
+    check_refused(people.reset, [("car12", "cars must be a list of ids, got 'car12'")], ConfigError)
+    assert list(people.cars) == ["car1"]
     with pytest.raises(Diverged, match="nothing: the command of car7 is nan"):
         Driver(nothing, 0.1).step({"self.gap": [1.0]}, ["car7"])
+
+
+def test_no_driver_takes_a_measurement_that_is_no_number() -> None:
+    """Behind a filter it brakes; without one every controller ends in one error."""
+    given = dict.fromkeys(MEASURED, np.full(2, 12.0))
+    for name in ("follower_stopper", "constant", "ovm", "idm_acc", "human", "pretrained/alcc"):
+        driver = Driver(name, 0.1)
+        for entry in driver.names:
+            with pytest.raises(Diverged, match=f"{re.escape(entry)} is nan in row 1 of the cars"):
+                driver.step({**given, entry: np.array([12.0, np.nan])})
+            assert not len(driver.cars)
+    for name in (POLICY, "idm_acc_filtered", "pretrained/i80-follow"):
+        for entry in Driver(name, 0.1).names:
+            found = Driver(name, 0.1).step({**given, entry: np.array([12.0, np.nan])})
+            assert found[1] == pytest.approx(-3.0), (name, entry)
+            assert found[0] > -3.0
 
 
 def test_the_example_of_the_page_prints_what_it_shows(capsys) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import check_refused, small_env
+from torch import nn
 
 import lcc_rl
 from lcc_rl.config import load
@@ -95,6 +96,32 @@ def test_onnxruntime_computes_the_same(module, tmp_path) -> None:
     about = json.loads(session.get_modelmeta().custom_metadata_map["lcc_rl"])
     assert about["filter"] is True
     assert [item["name"] for item in about["inputs"]] == module.names
+
+
+def test_a_measurement_that_is_no_number_brakes_or_shows(module, tmp_path) -> None:
+    """In every input of every format: clamp and minimum let NaN through, and hide nothing."""
+    ort = pytest.importorskip("onnxruntime", reason="extra interfaces")
+    network = nn.Sequential(nn.Linear(7, 1), nn.Hardtanh())
+    for policy, wanted in (("pretrained/i80-follow", -3.0), (network, np.nan)):
+        files = [
+            lcc_rl.export(policy, tmp_path / f"{np.isnan(wanted)}{end}")
+            for end in (".onnx", ".pt2")
+        ]
+        session = ort.InferenceSession(files[0])
+        makes = torch.export.load(files[1]).module()
+        given = [one.name for one in session.get_inputs()]
+        widths = [one.shape[1] for one in session.get_inputs()]
+        for rows in (1, 5):
+            for column in range(widths[0]):
+                state = torch.full((rows, widths[0]), 12.0)
+                state[0, column] = torch.nan
+                entries = [state, *(torch.zeros(rows, width) for width in widths[1:])]
+                feed = {name: x.numpy() for name, x in zip(given, entries, strict=True)}
+                found = makes(*entries)
+                found = found[0] if isinstance(found, tuple) else found
+                for one in (session.run(None, feed)[0], found.detach().numpy()):
+                    np.testing.assert_allclose(one[0], wanted, rtol=1e-6)
+                    assert np.isfinite(one[1:]).all()
 
 
 def test_bad_input_is_one_clear_error() -> None:

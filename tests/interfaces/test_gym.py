@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers import check_refused
 from tensordict import TensorDict
+from torch import nn
 
 import lcc_rl
 from lcc_rl.envs.arrays import ArrayEpisodes
@@ -263,6 +264,23 @@ def test_every_autoreset_mode_plays_the_same_episodes() -> None:
         assert len(same) > len(series["NextStep"][place])
 
 
+def test_gymnasiums_normaliser_of_vectors_takes_the_next_step_only() -> None:
+    from gymnasium.wrappers.vector import NormalizeObservation, NormalizeReward
+
+    for mode in ("SameStep", "NextStep", "Disabled"):
+        many = gymnasium.make_vec(NAME, num_envs=3, overrides=SHORT, autoreset_mode=mode)
+        NormalizeReward(many)
+        if mode != "NextStep":
+            with pytest.raises(ValueError, match="NEXT_STEP"):
+                NormalizeObservation(many)
+            continue
+        scaled = NormalizeObservation(many)
+        scaled.reset(seed=0)
+        seen = [scaled.step(STILL)[0] for _ in range(48)]  # past two ends of episodes
+        assert np.isfinite(seen).all()
+        assert scaled.obs_rms.count > 3 * 48
+
+
 def test_disabled_resets_are_asked_for() -> None:
     many = gymnasium.make_vec(NAME, num_envs=2, overrides=SHORT, autoreset_mode="Disabled")
     many.reset(seed=0)
@@ -394,7 +412,112 @@ def test_models_of_stable_baselines3_are_compared_and_exported(sb3, tmp_path) ->
             rows = lcc_rl.compare({"model": model, "file": file}, overrides=words).rows
             energy = rows.groupby("strategy")["total_path_energy_kj"].mean()
             assert energy["model"] == pytest.approx(energy["file"], rel=1e-5)
-    cases = [("acc", "acc is a rule"), (object(), "expected a run, a file, a torch module or a")]
+    wide = nn.Linear(9, 1)
+    cases = [
+        ("acc", "acc is a rule"),
+        (wide, "Linear fails for observations of 7"),
+        (object(), "expected a run, a file, a torch module or a"),
+    ]
     check_refused(lambda who: lcc_rl.export(who, tmp_path / "x.onnx"), cases, ConfigError)
     with pytest.raises(ConfigError, match="needs a run or a policy file"):
         lcc_rl.export(model, tmp_path / "x.html")
+
+
+def trained(sb3, kind="PPO", wrap=None, around=None, policy="MlpPolicy", seed=0, **settings):
+    """Return a model of a few steps whose weights are as large as those of a trained one."""
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    wrap = wrap or (lambda env: env)
+    env = DummyVecEnv([lambda: wrap(gymnasium.make(NAME, overrides=SHORT))])
+    few = {"n_steps": 20, "batch_size": 20} if kind == "PPO" else {"learning_starts": 10}
+    env = around(env) if around else env
+    model = getattr(sb3, kind)(policy, env, device="cpu", seed=seed, **few, **settings)
+    model.learn(40)
+    torch.manual_seed(1)
+    for weight in model.policy.parameters():
+        if weight.ndim == 2:
+            torch.nn.init.normal_(weight, 0.0, 3.0 / np.sqrt(weight.shape[1]))
+    return model
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_model_acts_as_in_the_environment_of_its_training(sb3) -> None:
+    from gymnasium.wrappers import NormalizeReward, RescaleAction
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    def shares(low, high):
+        return lambda env: RescaleAction(NormalizeReward(env), low, high)
+
+    squashed = {"use_sde": True, "policy_kwargs": {"squash_output": True}}
+    cases = [
+        ({}, 0.0, 1.0),
+        (squashed, 0.0, 1.0),
+        ({"wrap": shares(-3.0, 3.0)}, 0.0, 3.0),
+        ({"wrap": shares(0.0, 1.0), "around": VecNormalize}, 0.5, 0.5),
+        ({"wrap": shares(0.0, 1.0), **squashed}, 0.5, 0.5),
+        ({"wrap": shares(-3.0, 3.0), "kind": "SAC"}, 0.0, 3.0),
+        ({"wrap": shares(-1.0, 2.0), "kind": "TD3"}, 0.5, 1.5),
+    ]
+    seen = 0.3 * np.random.default_rng(0).normal(size=(50, 7)).astype(np.float32)
+    for settings, middle, half in cases:
+        model = trained(sb3, **settings)
+        norm = model.get_vec_normalize_env()
+        own = norm.normalize_obs(seen) if norm else seen
+        wanted = (model.predict(own, deterministic=True)[0] - middle) / half
+        assert np.ptp(wanted) > 0.1
+        found = network_of(model)(torch.as_tensor(seen)).detach()
+        np.testing.assert_allclose(found, wanted, atol=1e-4, err_msg=str(settings))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_models_that_would_act_differently_are_refused(sb3, tmp_path) -> None:
+    from gymnasium.wrappers import NormalizeObservation, TransformAction, TransformObservation
+    from stable_baselines3.common.policies import ActorCriticPolicy
+    from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecNormalize
+
+    class Remembering(ActorCriticPolicy):
+        def _predict(
+            self, observation, deterministic=False
+        ):  # as one with an LSTM, more than layers
+            return super()._predict(observation, deterministic) * 0.5
+
+    def alone(model):
+        return model.load(model.save(tmp_path / "model") or tmp_path / "model")
+
+    box = gymnasium.spaces.Box(-1.0, 0.5, (1,), np.float32)
+    bounded = trained(sb3, wrap=lambda env: TransformAction(env, lambda a: a, box))
+    seen = trained(sb3, wrap=NormalizeObservation)
+    shifted = trained(
+        sb3, wrap=lambda env: TransformObservation(env, lambda x: x + 1, env.observation_space)
+    )
+    normalized = trained(sb3, around=VecNormalize)
+    stacked = trained(sb3, around=lambda env: VecFrameStack(env, 4))
+    closed = trained(sb3, around=lambda _: SubprocVecEnv([lambda: gymnasium.make(NAME)], "fork"))
+    closed.get_env().close()
+    other = sb3.PPO("MlpPolicy", "Pendulum-v1", device="cpu")
+    discrete = sb3.DQN("MlpPolicy", "CartPole-v1", device="cpu", buffer_size=10)
+    cannot = "PPO was trained with {}, which cannot be carried over: pass a torch module from"
+    spaces = "PPO: its spaces .* are not those of this package's environment, and no wrapper"
+    cases = [
+        (bounded, cannot.format("TransformAction")),
+        (seen, cannot.format("NormalizeObservation")),
+        (shifted, cannot.format("TransformObservation")),
+        (stacked, cannot.format("VecFrameStack")),
+        (
+            trained(sb3, around=lambda env: VecNormalize(VecNormalize(env))),
+            cannot.format("wrappers"),
+        ),
+        (trained(sb3, policy=Remembering), "its Remembering cannot be carried over: predict"),
+        (alone(bounded), spaces),
+        (alone(seen), spaces),
+        (alone(stacked), "fails for observations of 7 numbers"),
+        (alone(normalized), r"lacks the VecNormalize of .* load it by PPO.load\(path, env="),
+        (alone(trained(sb3, "SAC")), r"SAC lacks the VecNormalize .*, or the vector without one"),
+        (closed, "PPO: the wrappers of its environment cannot be read; is it closed"),
+        (other, cannot.format(".*PendulumEnv.*")),
+        (discrete, "DQN was trained with .*CartPoleEnv"),
+        (alone(discrete), "DQN: its spaces Discrete"),
+    ]
+    check_refused(lambda model: lcc_rl.export(model, tmp_path / "x.pt2"), cases, ConfigError)
+    with pytest.raises(ConfigError, match="NormalizeObservation"):
+        lcc_rl.compare({"x": seen})
