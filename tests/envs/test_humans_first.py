@@ -31,7 +31,7 @@ RANGES = {
 def test_a_training_takes_over_where_humans_are(tmp_path) -> None:
     """Its first moment is that of an environment in which a human drives the automated car."""
     sizes = ("agent.humans_first=20", "training.segment=30", "training.environments=3")
-    cfg = load("train", [*RING, *SHORT, *sizes])
+    cfg = load("train", [*RING, *SHORT, *sizes, "training.compiled=false"])  # as people drives
     inputs = load_inputs(cfg)
     trainer = make_trainer(cfg, make_agent(cfg), inputs.training, inputs.population, tmp_path)
     source = trainer._source()
