@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Size as BatchSize
 from torch import Tensor, compiler, device, ones_like, zeros_like
+from torchrl.data import Composite
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, FrameSkipTransform, Transform
 
@@ -29,6 +30,7 @@ from lcc_rl.pieces.base import (
     RewardPiece,
     State,
     StepTransform,
+    add_specs,
     as_key,
     root_key,
 )
@@ -158,6 +160,16 @@ class Pieces(Compose):
         self.pop(place)
         self.insert(place, transform)
         self.insert(place + 1, renewed.to(transform.parent.device) if transform.parent else renewed)
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Return the specs of action and state: what steps change, and features that they read."""
+        input_spec = super().transform_input_spec(input_spec)
+        pieces = [piece for piece in self.transforms if isinstance(piece, Piece)]
+        read = read_before(pieces)
+        for piece in pieces:
+            if not isinstance(piece, StepTransform):
+                add_specs(piece, input_spec["full_state_spec"], sorted(read & {*piece.entries}))
+        return input_spec
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         next_tensordict = self._run(len(self.transforms), tensordict, next_tensordict)

@@ -268,9 +268,6 @@ class Piece(Part, TensorDictModuleBase, Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         return add_specs(self, observation_spec)
 
-    def transform_state_spec(self, state_spec: Composite) -> Composite:
-        return add_specs(self, state_spec, self.reset_options)
-
 
 def add_specs(piece: Piece, spec: Composite, keys: Sequence[Key] | None = None) -> Composite:
     """Add declared entries of a piece to a spec, by default all of them."""
@@ -316,6 +313,9 @@ class StepTransform(Piece):
         for key, (shape, dtype) in self.layouts(start.batch_size, self.targets).items():
             start.set(key, torch.zeros(shape, dtype=dtype, device=start.device))
 
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
+        return add_specs(self, state_spec)
+
     def derive(self, before: State, reached: State, detached: bool = False) -> None:
         super().derive(before, reached, detached)
         reached.update((key, before[key]) for key in self.constants)
@@ -332,8 +332,12 @@ class StepTransform(Piece):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        self.begin(tensordict, tensordict_reset)
-        for key in (*self.targets, *self.constants):  # in the memory layout of a step
+        state = (*self.targets, *self.constants)
+        if tensordict.get(STEP, None) is None:
+            self.begin(tensordict, tensordict_reset)
+        else:  # a whole state is given
+            tensordict_reset.update(tensordict.select(*state))
+        for key in state:  # in the memory layout of a step
             tensordict_reset.set(key, batch_innermost(tensordict_reset.get(key)))
         return tensordict_reset
 

@@ -76,7 +76,7 @@ def test_updates_are_those_of_the_papers_by_hand(fused: bool) -> None:
                 behind.copy_(own.tau * ahead.detach() + (1.0 - own.tau) * behind)
         for name, loss in (("loss_actor", loss_actor), ("loss_value", loss_value)):
             torch.testing.assert_close(losses[name], loss.detach(), rtol=1e-7, atol=1e-7)
-        for name, part, expected in zip(names, found, hand, strict=True):
+        for part, expected in zip(found, hand, strict=True):
             for tensor, value in zip(part, expected, strict=True):
                 torch.testing.assert_close(tensor.detach(), value.detach(), rtol=0.0, atol=1e-7)
 
