@@ -14,9 +14,10 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from lcc_rl.envs.compiled import compile_settings
+from lcc_rl.envs.single import SingleAgent
 from lcc_rl.envs.step import pieces_of, tick, written
 from lcc_rl.errors import LAST_SEED, ConfigError, require
-from lcc_rl.pieces.base import SEED, STEP, Entry, Key, StepTransform, as_key, require_option
+from lcc_rl.pieces.base import SEED, STEP, Entry, Key, Piece, StepTransform, as_key, require_option
 
 
 def batch_shape(batch_size: Sequence[int] | int) -> torch.Size:
@@ -207,9 +208,11 @@ class Traffic(TransformedEnv):
         """Compile ``step_and_maybe_reset``, see TorchRL's ``EnvBase.compile``.
 
         Settings of pieces are compared at every step only with a ``mode``, a ``backend`` or
-        ``options``.
+        ``options``; otherwise to change one later is an error.
         """
         own = {} if {"mode", "backend", "options"} & set(given) else compile_settings(self.device)
+        for piece in pieces_of(self) if own else ():
+            piece.fixed = True
         super().compile(warmup=warmup, **{**own, **given})
         return self
 
@@ -266,5 +269,12 @@ class Traffic(TransformedEnv):
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         # TorchRL looks up the shape of every reward here, a twentieth of the time of a step. The
-        # shapes were checked when the environment was built.
-        return next_tensordict_out
+        # shapes of pieces' rewards were checked when the environment was built.
+        own = all(isinstance(x, Piece | SingleAgent) for x in self.transform)
+        return next_tensordict_out if own else super()._step_proc_data(next_tensordict_out)
+
+    def double(self) -> Traffic:
+        """Refuse: data would have another type than the specs."""
+        raise ConfigError("call torch.set_default_dtype before the environment is built")
+
+    half = bfloat16 = double

@@ -9,11 +9,13 @@ from functools import partial
 
 import pytest
 import torch
+from helpers import check_refused
 from torchrl.envs import AsyncEnvPool, ParallelEnv, SerialEnv, TransformedEnv
-from torchrl.envs.transforms import StepCounter
+from torchrl.envs.transforms import StepCounter, Transform
 
 import lcc_rl
 from lcc_rl.errors import ConfigError
+from lcc_rl.pieces import JerkReward, SafetyReward, TimeGap
 from lcc_rl.pieces.base import SEED, STEP
 
 HORIZON = 5
@@ -32,7 +34,8 @@ WRAPPERS = {
 
 
 def past_the_end(env) -> None:
-    played = TransformedEnv(env, StepCounter()).rollout(3 * HORIZON, break_when_any_done=False)
+    counted = TransformedEnv(env, StepCounter(), auto_unwrap=False)
+    played = counted.rollout(3 * HORIZON, break_when_any_done=False)
     steps = played["next", *STEP].flatten(1)
     assert steps.tolist() == 2 * [3 * [*range(1, HORIZON + 1)]]
     assert (played["next", "step_count"].flatten(1) == steps).all()
@@ -96,3 +99,60 @@ def test_a_part_of_a_state_is_refused() -> None:
     ):
         with pytest.raises(ConfigError, match=r"whole state .* lacks .*vehicles\.gap.*options=…"):
             env.reset(given, **how)
+
+
+# -- what users change in an environment -----------------------------------------------------------
+
+
+class Doubled(Transform):
+    """A reward without its last dimension, as transforms of others may write."""
+
+    def _call(self, next_tensordict):
+        reward = next_tensordict.get("reward", None)
+        return next_tensordict if reward is None else next_tensordict.set("reward", reward[..., 0])
+
+
+def test_rewards_of_other_transforms_keep_their_shape() -> None:
+    env = WRAPPERS["alone"]()
+    env.append_transform(Doubled())
+    assert env.rollout(3)["next", "reward"].shape == (2, 3, 1)
+
+
+def test_the_total_counts_the_terms_that_there_are() -> None:
+    env = lcc_rl.make_env("alcc", 2, WORDS, single=False)
+    count = len(env.transform)
+    env.transform.insert(count - 3, JerkReward(weight=1.0))
+    terms = ("automated", "reward_terms")
+    for _ in range(2):
+        after = env.rand_step()["next"]
+        total = sum(after[terms].values())
+        torch.testing.assert_close(after["automated", "reward"], total)
+        names = [getattr(piece, "name", "") for piece in env.transform]
+        if "jerk" in names:
+            assert "jerk" in after[terms].keys()  # noqa: SIM118  a TensorDict is no dict
+            env.transform.pop(names.index("jerk"))
+    assert len(env.transform) == count
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the compiler's own
+def test_what_cannot_be_changed_is_refused() -> None:
+    env = lcc_rl.make_env("alcc", 2, WORDS, single=False)
+    compiled = lcc_rl.make_env("alcc", 2, WORDS, single=False).compile()
+    late = lcc_rl.make_env("alcc", 2, WORDS, single=False)
+    places = [type(piece).__name__ for piece in late.transform]
+    late.transform.pop(places.index("TimeGap"))
+    late.transform.append(TimeGap())
+    gone = lcc_rl.make_env("alcc", 2, WORDS, single=False)
+    gone.transform.pop(places.index("StringMotion"))
+    safety = next(piece for piece in compiled.transform if isinstance(piece, SafetyReward))
+    cases = [
+        (env.double, "call torch.set_default_dtype before"),
+        (env.half, "call torch.set_default_dtype before"),
+        (lambda: setattr(safety, "weight", 2.0), r"weight cannot change after env\.compile"),
+        (
+            lambda: late.step(late.reset()),
+            r"EfficiencyReward reads vehicles\.time_gap, which nothing",
+        ),
+        (lambda: gone.step(gone.reset()), "reads .*vehicles"),
+    ]
+    check_refused(lambda change: change(), cases, ConfigError)
