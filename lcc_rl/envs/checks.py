@@ -173,11 +173,9 @@ def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
     groups = {key[0] for key in written(pieces) if len(key) > 1}
     for piece in pieces:
         for key in piece.entries:
-            require(  # tensordict confuses the two where a TensorDict lacks the group
-                len(key) == 1 or key[-1] not in groups,
-                f"{piece.title} writes {'.'.join(key)}, but {key[-1]!r} is a group of entries: use "
-                "another name",
-            )
+            where = f"{piece.title} writes {'.'.join(key)}, but {key[-1]!r} is a group of entries"
+            # tensordict confuses the two where a TensorDict lacks the group
+            require(len(key) == 1 or key[-1] not in groups, f"{where}: use another name")
     known = {SEED, STEP, DONE, TERMINATED, TRUNCATED, *actions, *written(pieces)}
     for piece in pieces:
         for _, key in piece.needs:
