@@ -32,6 +32,14 @@ def work_that_all_tests_share() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def double() -> Iterator[None]:
+    """Compute in double precision, in which ways and kernels differ by less than any fault."""
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
 def pytest_collection_finish() -> None:
     """Spare the collector of garbage what lives to the end: modules and thousands of tests."""
     gc.collect()

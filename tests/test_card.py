@@ -28,7 +28,7 @@ def test_the_cacc_policy_is_a_transform_and_a_policy() -> None:
     errors |= {f"leader_{name}": value for name, value in errors.items()}
     td = TensorDict({"vehicles": errors}, [1])
     policy = TensorDictSequential(ControllerPolicy(rule))
-    command = rule(td.copy())["next", "command", "automated"]
+    command = rule(td.copy())["next", "automated", "command"]
     action = policy(td)["automated", "action"]
     torch.testing.assert_close(action, (command / 3.0).clamp(-1.0, 1.0))
     wanted = (0.04 * 0.5 + 0.12 * 0.5 + 1.4 * 0.5 + 1.3 * 0.5) / 0.2

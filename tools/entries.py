@@ -42,8 +42,8 @@ Keys of the environments' TensorDicts, at the root after a reset and under `"nex
 Shapes: `*B` batch of episodes, `N` vehicles of the string from front to back, `A` automated
 vehicles, `n` vehicles of the role, `k` a width that depends on settings; float32 unless noted
 otherwise. The classes are in `lcc_rl.pieces` and `lcc_rl.envs`. A *reset option* may be given to
-`env.reset(TensorDict({key: value}, env.batch_size))`. Any other key is refused, unless a complete
-state of an episode is given; the reset options in it then apply.
+`env.reset(options={key: value})`, with a value for each episode. `env.reset(td, set_state=True)`
+continues from the state in `td`; without `set_state` the state is ignored.
 """
 
 

@@ -53,5 +53,5 @@ for name, driver in (("network", policy), ("CACC", ControllerPolicy(rule))):
     run = env.rollout(300, driver, break_when_any_done=False)
     count, reward = run["next", "terminated"].sum(), run["next", *REWARD].mean()
     print(f"{name}: {count} collisions, reward {reward:.2f} a step")
-advice = rule(data.clone())["next", "command", "automated"]
+advice = rule(data.clone())["next", "automated", "command"]
 print(advice.shape)

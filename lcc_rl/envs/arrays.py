@@ -131,7 +131,7 @@ class ArrayEpisodes:
         if options:
             every = torch.zeros(self.count, 1, dtype=torch.int64)
             every[places] = torch.cat(drawn)
-            moment = entries_of(self.env.reset(self._given(every, options)))
+            moment = entries_of(self.env.reset(options=self._given(every, options)))
             state = self._packed(moment)[places].numpy()
             seen = moment[OBSERVATION[1:]][places].numpy()
         else:

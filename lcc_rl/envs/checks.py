@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, entries_of, tick, written
-from lcc_rl.errors import ConfigError, LccError
+from lcc_rl.errors import ConfigError, LccError, require
 from lcc_rl.functional.guard import changed, changes
 from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
@@ -170,6 +170,12 @@ def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
         if count > 1:
             names = [type(piece).__name__ for piece in pieces if key in piece.targets]
             raise ConfigError(f"{'.'.join(key)} is written by more than one piece: {names}")
+    groups = {key[0] for key in written(pieces) if len(key) > 1}
+    for piece in pieces:
+        for key in piece.entries:
+            where = f"{piece.title} writes {'.'.join(key)}, but {key[-1]!r} is a group of entries"
+            # tensordict confuses the two where a TensorDict lacks the group
+            require(len(key) == 1 or key[-1] not in groups, f"{where}: use another name")
     known = {SEED, STEP, DONE, TERMINATED, TRUNCATED, *actions, *written(pieces)}
     for piece in pieces:
         for _, key in piece.needs:

@@ -8,15 +8,16 @@ from secrets import randbelow
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import AsyncEnvPool, EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 
 from lcc_rl.envs.compiled import compile_settings
-from lcc_rl.envs.step import tick
+from lcc_rl.envs.single import SingleAgent
+from lcc_rl.envs.step import pieces_of, tick, written
 from lcc_rl.errors import LAST_SEED, ConfigError, require
-from lcc_rl.pieces.base import SEED, STEP, Entry, Key, as_key, require_option
+from lcc_rl.pieces.base import SEED, STEP, Entry, Key, Piece, StepTransform, as_key, require_option
 
 
 def batch_shape(batch_size: Sequence[int] | int) -> torch.Size:
@@ -58,7 +59,7 @@ class Clock(EnvBase):
 
     All random numbers of an episode are functions of its seed (:mod:`lcc_rl.functional.random`),
     so the generator of this class is the only random state of an environment.
-    ``env.reset(TensorDict({("episode", "seed"): ...}))`` replays an episode.
+    ``env.reset(options={("episode", "seed"): ...})`` replays an episode.
 
     Args:
         horizon: steps per episode, after which it is truncated.
@@ -80,6 +81,8 @@ class Clock(EnvBase):
         Entry("truncated", "–", "the horizon is reached"),
         Entry("automated.action", "–", "action in [−1, 1]"),
     )
+
+    _supports_set_state = True
 
     def __init__(
         self,
@@ -131,12 +134,13 @@ class Clock(EnvBase):
         return seeds.to(self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
-        seeds = tensordict.get(SEED, None) if tensordict is not None else None
+        given = {} if tensordict is None else tensordict
+        seeds, step = given.get(SEED, None), given.get(STEP, None)
         if seeds is None:
             seeds = self.draw_seeds()
         else:
             require_option(SEED, seeds, LAST_SEED + 1)
-        return self._moment(seeds, torch.zeros_like(seeds))
+        return self._moment(seeds, torch.zeros_like(seeds) if step is None else step)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self._moment(tensordict.get(SEED), tensordict.get(STEP) + 1)
@@ -145,10 +149,10 @@ class Clock(EnvBase):
         return TensorDict(tick(seeds, step, self.horizon), self.batch_size, device=self.device)
 
 
-def option_specs(env: EnvBase) -> dict[Key, Any]:
-    """Return the spec of every entry that ``env.reset`` accepts."""
-    specs = {as_key(key): spec for key, spec in env.state_spec.items(True, True)}
-    return {key: spec for key, spec in specs.items() if key != STEP}
+def option_specs(env: TransformedEnv) -> dict[Key, Any]:
+    """Return the spec of every option of ``env.reset``."""
+    keys = [SEED, *(key for piece in pieces_of(env) for key in piece.reset_options)]
+    return {key: env.full_state_spec[key] for key in keys}
 
 
 class Traffic(TransformedEnv):
@@ -157,18 +161,58 @@ class Traffic(TransformedEnv):
     # Without this, environments around it would draw actions for the clock.
     rand_action = EnvBase.rand_action
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **settings: Any) -> TensorDictBase:
-        if tensordict is not None:
-            self._check_options(tensordict)
-        return super()._reset(tensordict, **settings)
+    def reset(
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        set_state: bool | None = None,
+        **settings: Any,
+    ) -> TensorDictBase:
+        """Begin new episodes, see TorchRL's ``EnvBase.reset``.
+
+        Args:
+            tensordict: a mask ``"_reset"`` of the episodes to begin anew; its state is ignored, as
+                by TorchRL from 0.15 on, without ``set_state``.
+            set_state: continue from the state in the TensorDict, which must be whole.
+            **settings: ``options``, reset options by their keys (docs/entries.md).
+
+        Raises:
+            ConfigError: naming the entry of the options or the state at fault.
+        """
+        return super().reset(tensordict, set_state=bool(set_state), **settings)
+
+    def _reset(
+        self,
+        tensordict: TensorDictBase | None = None,
+        options: Mapping[NestedKey, torch.Tensor] | None = None,
+        set_state: bool = False,
+        **settings: Any,
+    ) -> TensorDictBase:
+        begun = TensorDict(batch_size=self.batch_size) if tensordict is None else tensordict
+        moving = written(piece for piece in pieces_of(self) if isinstance(piece, StepTransform))
+        state = sorted({SEED, STEP, *moving})
+        missing = [".".join(key) for key in state if begun.get(key, None) is None]
+        if set_state or len(missing) < len(state):
+            require(
+                not missing,
+                "reset: the TensorDict must hold the whole state of the episodes or nothing of it, "
+                f"it lacks {', '.join(missing)}; a seed or a profile is given by reset(options=…)",
+            )
+        if not set_state:
+            begun = begun.exclude(*state)
+            for key, value in self._checked({} if options is None else options).items():
+                begun.set(key, value)
+        return super()._reset(begun, set_state=set_state, **settings)
 
     def compile(self, *, warmup: int | None = None, **given: Any) -> Traffic:
         """Compile ``step_and_maybe_reset``, see TorchRL's ``EnvBase.compile``.
 
         Settings of pieces are compared at every step only with a ``mode``, a ``backend`` or
-        ``options``.
+        ``options``; otherwise to change one later is an error.
         """
         own = {} if {"mode", "backend", "options"} & set(given) else compile_settings(self.device)
+        for piece in pieces_of(self) if own else ():
+            piece.fixed = True
         super().compile(warmup=warmup, **{**own, **given})
         return self
 
@@ -183,11 +227,6 @@ class Traffic(TransformedEnv):
                 f"episodes, got only {', '.join(map(str, tensordict.keys()))}"
             )
         return super()._step(tensordict)
-
-    def _moment_keys(self) -> set[Key]:
-        """Return the keys that a reset writes."""
-        specs = (self.full_observation_spec, self.full_done_spec)
-        return {as_key(key) for spec in specs for key in spec.keys(True, True)}
 
     def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
         if tensordict.batch_size != self.batch_size:
@@ -209,32 +248,33 @@ class Traffic(TransformedEnv):
             expected, got = (f"{list(x.shape)} {x.dtype}" for x in (wanted, found))
             raise ConfigError(f"{'.'.join(as_key(key))} must be {expected}, got {got}")
 
-    def _check_options(self, given: TensorDictBase) -> None:
-        """Check the argument of ``reset``; TorchRL would ignore unknown entries.
+    def _checked(self, options: Mapping[NestedKey, Any]) -> dict[Key, torch.Tensor]:
+        """Return reset options by their full keys.
 
         Raises:
             ConfigError: naming the key, what was expected and the valid options.
         """
-        options = option_specs(self)
-        names = ", ".join(".".join(key) for key in options)
-        keys = set(map(as_key, given.keys(True, True, is_leaf=is_leaf_nontensor)))
-        keys -= {as_key(key) for key in (*self.reset_keys, AsyncEnvPool._env_idx_key)}
-        if keys - set(options) and self._moment_keys() <= keys:
-            # TorchRL writes the first state into its argument, which may be passed again.
-            keys &= set(options)
-        for key in sorted(keys):
-            name, value = ".".join(key), given.get(key)
-            require(key in options, f"reset: {name} is no reset option; those that exist: {names}")
-            spec = options[key]
+        leaves = options.items(True, True) if is_tensor_collection(options) else options.items()
+        given, specs = {as_key(key): value for key, value in leaves}, option_specs(self)
+        for key, value in given.items():
+            name, known = ".".join(key), ", ".join(".".join(key) for key in specs)
+            require(key in specs, f"reset: {name} is no reset option; those that exist: {known}")
+            spec = specs[key]
             wanted = f"reset: {name} must be {list(spec.shape)} {spec.dtype}"
             if not isinstance(value, torch.Tensor):
                 raise ConfigError(f"{wanted}, got {value!r}")
             if value.shape != spec.shape or value.dtype != spec.dtype:
                 raise ConfigError(f"{wanted}, got {list(value.shape)} {value.dtype}")
-            if not bool(torch.isfinite(value).all()):
-                raise ConfigError(f"{wanted} and finite, got {value.flatten().tolist()}")
+        return given
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         # TorchRL looks up the shape of every reward here, a twentieth of the time of a step. The
-        # shapes were checked when the environment was built.
-        return next_tensordict_out
+        # shapes of pieces' rewards were checked when the environment was built.
+        own = all(isinstance(x, Piece | SingleAgent) for x in self.transform)
+        return next_tensordict_out if own else super()._step_proc_data(next_tensordict_out)
+
+    def double(self) -> Traffic:
+        """Refuse: data would have another type than the specs."""
+        raise ConfigError("call torch.set_default_dtype before the environment is built")
+
+    half = bfloat16 = double

@@ -8,15 +8,11 @@ from typing import Any
 
 import torch
 from torch import Tensor, compile
-from torch._dynamo.exc import TorchDynamoException
-from torch._inductor.exc import CppCompileError, InductorError
 
 from lcc_rl.functional.recorder import TensorsOnly
 
 log = logging.getLogger("lcc_rl")
 
-# CppCompileError: of a compiler that is there, but refuses the processor's code.
-COMPILER_ERRORS = (TorchDynamoException, InductorError, CppCompileError)
 # Attributes in which an object with a compiled method keeps the environment and its pieces.
 CONSTANT = ("self.env", "self.step", "self.first", "_modules['transforms']._modules[")
 
@@ -29,6 +25,15 @@ def options(device: torch.device | None) -> dict[str, Any]:
     """
     on_cpu = device is None or device.type == "cpu"
     return {"cpp_wrapper": True, "size_asserts": False} if on_cpu else {}
+
+
+def compiler_errors() -> tuple[type[Exception], ...]:
+    """Return the errors of torch's compiler, from private modules that a later torch may move."""
+    from torch._dynamo.exc import TorchDynamoException
+    from torch._inductor.exc import CppCompileError, InductorError
+
+    # CppCompileError: of a compiler that is there, but refuses the processor's code.
+    return TorchDynamoException, InductorError, CppCompileError
 
 
 class Compiled:
@@ -44,7 +49,7 @@ class Compiled:
         device: of its tensors; None: the CPU.
     """
 
-    errors: tuple[type[Exception], ...] = COMPILER_ERRORS  # for which the plain function is used
+    errors = staticmethod(compiler_errors)  # for which the plain function is used
 
     def __init__(
         self,
@@ -66,7 +71,7 @@ class Compiled:
             return self.plain(*arguments)
         try:
             return self.function(*arguments)
-        except self.errors as error:
+        except self.errors() as error:
             log.info("not compiling %s: %s", self.what, str(error).strip().splitlines()[0])
             self.function = self.plain
             return self.plain(*arguments)
@@ -85,7 +90,7 @@ class Traced(Compiled):
     """
 
     # Of many kinds; the plain function raises its own anew.
-    errors: tuple[type[Exception], ...] = (Exception,)
+    errors = staticmethod(lambda: (Exception,))
 
     def _made(self, device: torch.device | None) -> Callable[..., Any]:
         return self._first_call
@@ -108,7 +113,7 @@ class Traced(Compiled):
             graph.recompile()
             made = torch._inductor.compile(graph, list(tensors), options(tensors[0].device))
         found: Sequence[Tensor] = made(*tensors)
-        self.function, self.errors = made, ()  # errors of later calls are no compiler's
+        self.function, self.errors = made, tuple  # errors of later calls are no compiler's
         return found
 
 

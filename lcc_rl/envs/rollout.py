@@ -81,7 +81,7 @@ class DifferentiableRollout:
 
     def start(self, given: TensorDictBase | None = None) -> State:
         """Reset the environment, to given choices or drawn ones; return the first moment."""
-        td = self.env.reset(given)
+        td = self.env.reset(options=given)
         self.types = [(td.get(key).shape[1:], td.get(key).dtype) for key in self.moving]
         self.sizes = [shape.numel() for shape, _ in self.types]
         return {key: td.get(key) for key in (*self.constants, *self.moving)}

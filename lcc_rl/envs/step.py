@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Size as BatchSize
 from torch import Tensor, compiler, device, ones_like, zeros_like
+from torchrl.data import Composite
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, FrameSkipTransform, Transform
 
@@ -29,6 +30,7 @@ from lcc_rl.pieces.base import (
     RewardPiece,
     State,
     StepTransform,
+    add_specs,
     as_key,
     root_key,
 )
@@ -146,18 +148,55 @@ class Pieces(Compose):
 
     def append(self, transform: Transform | Callable[[TensorDictBase], TensorDictBase]) -> None:
         """Append a transform; a reward term is inserted before the sum of all terms."""
-        places = [i for i, piece in enumerate(self.transforms) if isinstance(piece, TotalReward)]
-        if not isinstance(transform, RewardTerm) or not places:
-            super().append(transform)
+        total = self._total()
+        if not isinstance(transform, RewardTerm) or total is None:
+            super().append(self._bound(transform))
             return
-        place = places[-1]
-        total: Any = self.transforms[place]
-        transform = transform.bind(self.world, getattr(transform, "name", None))
-        terms = [*total.terms, transform.name]
+        bound = self._bound(transform)
+        super().insert(list(self.transforms).index(total), bound)
+        self._count([*total.terms, bound.name])
+
+    def insert(self, index: int, transform: Any) -> None:
+        """Insert a transform; a reward term is appended, so that it counts."""
+        if isinstance(transform, RewardTerm):
+            self.append(transform)
+        else:
+            super().insert(index, self._bound(transform))
+
+    def pop(self, index: int | None = None) -> Transform:
+        """Remove and return a transform; the sum of all terms no longer holds a reward term."""
+        found = self.transforms[-1 if index is None else index]
+        if isinstance(found, RewardTerm):
+            self._count([name for name in self._total().terms if name != found.name])
+        return super().pop(index)
+
+    def _bound(self, transform: Any) -> Any:
+        """Return a transform; a piece that is not bound yet is bound to the world."""
+        if isinstance(transform, Piece) and "targets" not in vars(transform):
+            return transform.bind(self.world, transform.name or None)
+        return transform
+
+    def _total(self) -> Any:
+        return next((x for x in self.transforms if isinstance(x, TotalReward)), None)
+
+    def _count(self, terms: Sequence[str]) -> None:
+        """Let the sum of all terms hold these."""
+        total = self._total()
+        place = list(self.transforms).index(total)
         renewed = TotalReward(terms=terms).bind(World(total.string))
-        self.pop(place)
-        self.insert(place, transform)
-        self.insert(place + 1, renewed.to(transform.parent.device) if transform.parent else renewed)
+        renewed = renewed.to(total.parent.device) if total.parent else renewed
+        super().pop(place)
+        super().insert(place, renewed)
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Return the specs of action and state: what steps change, and features that they read."""
+        input_spec = super().transform_input_spec(input_spec)
+        pieces = [piece for piece in self.transforms if isinstance(piece, Piece)]
+        read = read_before(pieces)
+        for piece in pieces:
+            if not isinstance(piece, StepTransform):
+                add_specs(piece, input_spec["full_state_spec"], sorted(read & {*piece.entries}))
+        return input_spec
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         next_tensordict = self._run(len(self.transforms), tensordict, next_tensordict)
@@ -273,8 +312,8 @@ def _apply(pieces: list[Piece], td: TensorDictBase, next_td: TensorDictBase) -> 
             piece.derive(before, reached)
         except KeyError as error:
             raise ConfigError(
-                f"{piece.title} reads {error}, which is not in the state before the step: "
-                "transforms must keep it"
+                f"{piece.title} reads {error}, which no piece before it writes, or which is not in "
+                "the state before the step: transforms must keep it"
             ) from error
         if moves is not None and isinstance(piece, StepTransform | RewardPiece):
             earlier = {} if isinstance(piece, RewardPiece) else before

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from lcc_rl.envs.clock import option_specs
 from lcc_rl.envs.compiled import Compiled
 from lcc_rl.envs.step import TERMINATED, Step, closure, entries_of, pieces_of, written
 from lcc_rl.errors import ConfigError
@@ -75,7 +76,7 @@ class Player:
             key
             for piece in needed
             for key in piece.targets
-            if key[0] in (WANTED, COMMAND)
+            if key[-1] in (WANTED, COMMAND)
             or (isinstance(piece, Controller) and key[1] in piece.remembers)
         ]
         driven = [] if policy is None else [ACTION]
@@ -123,7 +124,7 @@ class Player:
 
     def _begin(self, given: TensorDictBase) -> State:
         """Return the first state of the episodes."""
-        state = entries_of(self.env.reset(given))
+        state = entries_of(self.env.reset(options=given))
         if self.policy is not None and not self.reads:
             return state  # it may read anything
         carried = {SEED, STEP, TERMINATED, *written(piece for piece, _ in self.step.pieces)}
@@ -180,12 +181,11 @@ def reset_options(
     number = profile * drivers + driver + repeat * STREAM_INCREMENT
     given = TensorDict(batch_size=batch, device=env.device)
     given.set(SEED, (hash_bits(number + (seed * 0x9E3779B1 & LOW_BITS)) >> 1).unsqueeze(-1))
-    spec = env.full_state_spec
-    known = [as_key(key) for key in spec.keys(True, True)]
+    known = option_specs(env)
     if PROFILE in known:
         given.set(PROFILE, profile.unsqueeze(-1))
         given.set(PROFILE_START, torch.zeros_like(profile).unsqueeze(-1))
     if DRIVER in known:
-        place = torch.arange(spec[DRIVER].shape[-2]).unsqueeze(-1)
+        place = torch.arange(known[DRIVER].shape[-2]).unsqueeze(-1)
         given.set(DRIVER, (driver.view(-1, 1, 1) + place) % drivers)
     return given

@@ -60,8 +60,7 @@ ROW_KEYS += [("vehicles", name) for name in ROW_ENTRIES]
 INDEX = (AUTOMATED, "index")
 # Safety filter: steps covered by the guarantee, steps that begin safe, desired and commanded
 # acceleration.
-FILTER_ENTRIES = tuple((AUTOMATED, name) for name in ("promised", "safe"))
-FILTER_ENTRIES += ((WANTED, AUTOMATED), (COMMAND, AUTOMATED))
+FILTER_ENTRIES = tuple((AUTOMATED, name) for name in ("promised", "safe", WANTED, COMMAND))
 # The record of each group of vehicles, ``[time, batch, n, 1]`` by entry.
 Groups = dict[str, dict[str, Tensor]]
 
@@ -76,7 +75,7 @@ def grouped(record: Record, string: VehicleString) -> Groups:
     others = [place for place in range(len(string)) if place not in own]
     for (space, name), entry in record.items():
         if (space, name) in FILTER_ENTRIES:
-            groups["cav"][name if space == AUTOMATED else space] = entry
+            groups["cav"][name] = entry
         elif space == "leader":
             groups["leader"][name] = entry.unsqueeze(-2)
         elif space == "vehicles" and not string.drawn:

@@ -53,7 +53,7 @@ DERIVED_INPUTS = {
     "behind.relative_speed": ("self.speed", "behind.speed"),
 }
 BEHIND_PRESENT = "behind.present"
-COMMAND_KEY = ("command", AUTOMATED)
+COMMAND_KEY = (AUTOMATED, "command")
 
 
 class Input(NamedTuple):

@@ -25,13 +25,13 @@ class Actuation(RoleTransform):
     lag: NonNegative = 0.0  # time constant with which the acceleration follows the command [s]
     braking: Positive | None = None  # hardest braking possible; None: no limit [m/s²]
 
-    obeyed = Entry("obeyed.role", "m/s²", "acceleration of engine and brakes for the command")
+    obeyed = Entry("role.obeyed", "m/s²", "acceleration of engine and brakes for the command")
     kept = Entry("role.actuation", "m/s²", "last acceleration, then commands that do not act yet")
 
     def setup(self, world: World) -> None:
         """Read the commands of the role."""
         self.response = self.response_in(world, self.name, HARDEST)
-        reads = [f"next.command.{self.name}", f"{self.name}.{ACTUATION}"]
+        reads = [f"next.{self.name}.command", f"{self.name}.{ACTUATION}"]
         self.declare(world, reads, [self.obeyed, self.kept.wide(1 + self.response.late)])
 
     def response_in(self, world: World, role: str, hardest: float) -> Response:

@@ -26,12 +26,13 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.guard import unchanged
 from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.views import EPISODE, NEXT, VEHICLES, Key, Views, as_key
 from lcc_rl.pieces.world import Part, World
+from lcc_rl.settings import values
 
 # The entries of one state by their full keys.
 State = dict[Key, Tensor]
@@ -141,6 +142,14 @@ class Piece(Part, TensorDictModuleBase, Transform):
             raise AttributeError(f"{kind} is not bound to a world yet: use {kind}(…).bind(world)")
         return super().__getattr__(name)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if vars(self).get("fixed") and name in values(self):
+            raise ConfigError(
+                f"{self.title}.{name} cannot change after env.compile(), whose step has the value "
+                "before: build another environment"
+            )
+        super().__setattr__(name, value)
+
     def setup(self, world: World) -> None:
         """Derive everything that depends on a world; an override calls :meth:`declare`.
 
@@ -232,6 +241,12 @@ class Piece(Part, TensorDictModuleBase, Transform):
     def _seen(self, *entries: Tensor) -> Any:
         return self.compute(*self.views(*entries))
 
+    def _present(self, entries: Sequence[Tensor | None]) -> list[Tensor]:
+        """Return entries of TensorDicts; a ConfigError names those that they lack."""
+        missing = [x for x, entry in zip(self.read_names, entries, strict=True) if entry is None]
+        require(not missing, f"{self.title} reads {', '.join(missing)}, which nothing has written")
+        return [entry for entry in entries if entry is not None]
+
     def _entries(self, before: State, reached: State) -> list[Tensor]:
         return [(reached if late else before)[key] for late, key in self.needs]
 
@@ -245,7 +260,8 @@ class Piece(Part, TensorDictModuleBase, Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the piece to any TensorDict that holds its ``in_keys``."""
         reads = self.in_keys if self.needs else ()  # an unbound piece raises here
-        values = self.computed([tensordict.get(key) for key in reads])
+        given = self._present([tensordict.get(key, None) for key in reads])
+        values = self.computed(given)
         values = (values,) if isinstance(values, Tensor) else values
         for key, value in zip(self.out_keys, values, strict=True):
             tensordict.set(key, value)
@@ -267,9 +283,6 @@ class Piece(Part, TensorDictModuleBase, Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         return add_specs(self, observation_spec)
-
-    def transform_state_spec(self, state_spec: Composite) -> Composite:
-        return add_specs(self, state_spec, self.reset_options)
 
 
 def add_specs(piece: Piece, spec: Composite, keys: Sequence[Key] | None = None) -> Composite:
@@ -316,12 +329,16 @@ class StepTransform(Piece):
         for key, (shape, dtype) in self.layouts(start.batch_size, self.targets).items():
             start.set(key, torch.zeros(shape, dtype=dtype, device=start.device))
 
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
+        return add_specs(self, state_spec)
+
     def derive(self, before: State, reached: State, detached: bool = False) -> None:
         super().derive(before, reached, detached)
         reached.update((key, before[key]) for key in self.constants)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        entries = [(next_tensordict if late else tensordict).get(key) for late, key in self.needs]
+        moments = (tensordict, next_tensordict)
+        entries = self._present([moments[late].get(key, None) for late, key in self.needs])
         reached: State = {}
         self._write(self.computed(entries), reached)
         reached.update((key, tensordict.get(key)) for key in self.constants)
@@ -332,8 +349,12 @@ class StepTransform(Piece):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        self.begin(tensordict, tensordict_reset)
-        for key in (*self.targets, *self.constants):  # in the memory layout of a step
+        state = (*self.targets, *self.constants)
+        if tensordict.get(STEP, None) is None:
+            self.begin(tensordict, tensordict_reset)
+        else:  # a whole state is given
+            tensordict_reset.update(tensordict.select(*state))
+        for key in state:  # in the memory layout of a step
             tensordict_reset.set(key, batch_innermost(tensordict_reset.get(key)))
         return tensordict_reset
 

@@ -79,7 +79,7 @@ class CBFFilter(RoleTransform):
        ahead that brakes by ``braking_ahead``.
     4. Full braking is reached with the lag (:func:`lcc_rl.functional.braking.safe_command`).
 
-    The other bounds use the expected state. The filter reads ``("wanted", role)``, which the
+    The other bounds use the expected state. The filter reads ``(role, "wanted")``, which the
     controller of a filtered role writes. It is differentiable.
     """
 
@@ -131,7 +131,7 @@ class CBFFilter(RoleTransform):
         self.from_step = world.steps(self.from_s, "from_s")
         self.agreement = Agreement(self.sensing, world.time_step)
         kept = [f"{self.role}.agreement", *self.memories]
-        seen = [f"next.{WANTED}.{self.role}", *FILTER_READS, *kept]
+        seen = [f"next.{self.role}.{WANTED}", *FILTER_READS, *kept]
         self.declare(world, [*seen, *["episode.step"] * (self.from_step > 0)])
         self.limits = Braking(self.response.braking, self.braking_ahead, self.time_to_collision)
 
@@ -258,7 +258,7 @@ class Corrected(RoleTransform):
 
     def setup(self, world: World) -> None:
         """Read the actions and commands of the role."""
-        self.declare(world, (f"{self.role}.action", f"next.command.{self.role}"))
+        self.declare(world, (f"{self.role}.action", f"next.{self.role}.command"))
 
     def compute(self, action: Tensor, command: Tensor) -> Tensor:
         """Return the correction."""

@@ -57,9 +57,9 @@ class Population(Protocol):
 
 
 class Controller(RoleTransform):
-    """Base of all controllers: writes ``("command", role)``, ``[*batch, n, 1]`` [m/s²].
+    """Base of all controllers: writes ``(role, "command")``, ``[*batch, n, 1]`` [m/s²].
 
-    Where the role has a safety filter, it writes ``("wanted", role)``, which the filter reads.
+    Where the role has a safety filter, it writes ``(role, "wanted")``, which the filter reads.
 
     Its name in an environment is the role. Commands are clamped to ± the controller's setting
     ``max_acceleration``; without this setting, those of automated vehicles to ±3 m/s².

@@ -24,8 +24,8 @@ from lcc_rl.settings import Factors, Positive, Speed
 
 RING_GAP = stream_id("string.ring_gap")
 WANTED, COMMAND, OBEYED = "wanted", "command", "obeyed"
-COMMANDED = Entry("command.role", "m/s²", "acceleration that the role's controller commands")
-WISHED = Entry("wanted.role", "m/s²", "acceleration commanded before the safety filter")
+COMMANDED = Entry("role.command", "m/s²", "acceleration that the role's controller commands")
+WISHED = Entry("role.wanted", "m/s²", "acceleration commanded before the safety filter")
 
 
 class RolePlaces(StepTransform):
@@ -109,7 +109,7 @@ class StringMotion(StepTransform):
         """
         self.time_step, string = world.time_step, world.string
         commands = [
-            next_key((OBEYED if role in world.actuators else COMMAND, role))
+            next_key((role, OBEYED if role in world.actuators else COMMAND))
             for role in string.names
         ]
         own = [(VEHICLES, name) for name in ("speed", "gap", "acceleration")]

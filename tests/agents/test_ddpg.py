@@ -41,6 +41,7 @@ def network(weights: list[torch.Tensor], *parts: torch.Tensor) -> torch.Tensor:
     return x @ weights[-2].t() + weights[-1]
 
 
+@pytest.mark.usefixtures("double")
 @pytest.mark.parametrize("fused", [True, False])
 def test_updates_are_those_of_the_papers_by_hand(fused: bool) -> None:
     """A8–A9, H7–H10 in plain torch: two losses, a step of Adam each, soft targets."""
@@ -74,11 +75,10 @@ def test_updates_are_those_of_the_papers_by_hand(fused: bool) -> None:
             for ahead, behind in zip(online, target, strict=True):
                 behind.copy_(own.tau * ahead.detach() + (1.0 - own.tau) * behind)
         for name, loss in (("loss_actor", loss_actor), ("loss_value", loss_value)):
-            torch.testing.assert_close(losses[name], loss.detach(), rtol=1e-5, atol=1e-6)
-        for name, part, expected in zip(names, found, hand, strict=True):
+            torch.testing.assert_close(losses[name], loss.detach(), rtol=1e-7, atol=1e-7)
+        for part, expected in zip(found, hand, strict=True):
             for tensor, value in zip(part, expected, strict=True):
-                close = 1e-6 if name.startswith("target") else 1e-5
-                torch.testing.assert_close(tensor.detach(), value.detach(), rtol=0.0, atol=close)
+                torch.testing.assert_close(tensor.detach(), value.detach(), rtol=0.0, atol=1e-7)
 
 
 def test_a_restored_agent_goes_on_bit_for_bit() -> None:

@@ -42,7 +42,7 @@ def envs():
 
 def test_a_bad_reset_option_is_named(envs) -> None:
     for env in envs.values():
-        check_refused(lambda given, env=env: env.reset(TensorDict(given, [2])), BAD)
+        check_refused(lambda given, env=env: env.reset(options=given), BAD)
 
 
 def test_every_way_to_reset_refuses_them(envs) -> None:
@@ -53,15 +53,8 @@ def test_every_way_to_reset_refuses_them(envs) -> None:
         DifferentiableRollout(env, nn.Identity(), [REWARD]).start(given)
     with pytest.raises(ConfigError, match=r"TensorDict of \[2\] episodes, .* got \[3\]"):
         env.reset(TensorDict({SEED: torch.zeros(3, 1).long()}, [3]))
-
-
-def test_a_whole_moment_may_be_given_and_replays_its_episode(envs) -> None:
-    for env in envs.values():
-        given = TensorDict({SEED: torch.tensor([[3], [4]])}, [2])
-        first = env.reset(given).clone()
-        assert (env.reset(given) == first).all()  # TorchRL has written the moment into it
-        reached = env.rollout(5, break_when_any_done=False, tensordict=first.clone())[:, -1]
-        assert torch.equal(env.reset(reached.exclude("next"))[SEED], first[SEED])
+    with pytest.raises(ConfigError, match=r"episode\.seed must be \[2, 1\]"):
+        env.reset(options={SEED: torch.zeros(3, 1).long()})
 
 
 def test_what_torchrl_itself_resets_is_no_option(envs) -> None:

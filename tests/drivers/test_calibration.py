@@ -320,7 +320,7 @@ def test_a_model_of_ones_own_is_calibrated_and_drives(make_episodes):
     speed, gap, rate = (data["vehicles", x][..., 1:, :] for x in ("speed", "gap", "relative_speed"))
     own = (data["human", "desired_speed"], data["human", "desired_time_gap"])
     wanted = known(speed, gap, -rate, *own)
-    torch.testing.assert_close(data["next", "command", "human"], wanted)
+    torch.testing.assert_close(data["next", "human", "command"], wanted)
 
 
 def test_a_law_without_machine_code_is_simulated_by_tensors(uneven_lengths):

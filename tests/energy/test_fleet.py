@@ -75,9 +75,7 @@ def test_an_episode_has_the_same_vehicles_whoever_drives() -> None:
     kinds = []
     for variant in ("alcc", "idm"):
         env = lcc_rl.make_env(variant, 5, MIXED, seed=0, single=False)
-        first = env.reset(
-            env.state_spec.zero().select(("episode", "seed")).set(("episode", "seed"), seeds)
-        )
+        first = env.reset(options={("episode", "seed"): seeds})
         kinds.append(first[CLASS])
     assert (kinds[0] == kinds[1]).all()
     assert len(kinds[0].unique()) > 2

@@ -89,7 +89,7 @@ def test_leader_plays_the_profile_that_is_asked_for() -> None:
         },
         [2],
     )
-    td = env.reset(given)
+    td = env.reset(options=given)
     data = env.rollout(20, tensordict=td, auto_reset=False, break_when_any_done=False)
     expected = torch.stack([profiles.record(2)[8:28], profiles.record(0)[301:321]])
     assert torch.equal(data["next", "leader", "speed"].squeeze(-1), expected)
@@ -109,7 +109,7 @@ def test_episode_seed_replays_an_episode_wherever_it_stands() -> None:
     td = env.reset()
     seeds = td["episode", "seed"]
     first = torch.stack([m["vehicles", "speed"] for m in play_from(env, td, actions)])
-    turned = env.reset(TensorDict({("episode", "seed"): seeds.flip(0)}, [4]))
+    turned = env.reset(options={("episode", "seed"): seeds.flip(0)})
     second = torch.stack([m["vehicles", "speed"] for m in play_from(env, turned, actions)])
     assert torch.equal(first, second.flip(1))
 

@@ -31,7 +31,7 @@ RANGES = {
 def test_a_training_takes_over_where_humans_are(tmp_path) -> None:
     """Its first moment is that of an environment in which a human drives the automated car."""
     sizes = ("agent.humans_first=20", "training.segment=30", "training.environments=3")
-    cfg = load("train", [*RING, *SHORT, *sizes])
+    cfg = load("train", [*RING, *SHORT, *sizes, "training.compiled=false"])  # as people drives
     inputs = load_inputs(cfg)
     trainer = make_trainer(cfg, make_agent(cfg), inputs.training, inputs.population, tmp_path)
     source = trainer._source()
@@ -47,11 +47,11 @@ def test_a_training_takes_over_where_humans_are(tmp_path) -> None:
     assert (trainer.horizon, trainer.env.base_env.horizon) == (30, 230)
     brake = nn.Linear(begun[OBSERVATION].shape[-1], 1)  # at full strength
     nn.init.constant_(brake.bias, -100.0)
-    told = DifferentiableRollout(trainer.env, brake, [("command", "automated")])
+    told = DifferentiableRollout(trainer.env, brake, [("automated", "command")])
     begun = told.skip(told.start(), trainer.agent.burn_in)
     after, _ = told.play(begun, 1)
     torch.testing.assert_close(
-        after["command", "automated"], torch.full((3, 1, 1), -3.0), atol=0, rtol=0
+        after["automated", "command"], torch.full((3, 1, 1), -3.0), atol=0, rtol=0
     )
 
 
@@ -102,7 +102,7 @@ def test_noise_differs_in_training(subtests) -> None:
             cfg = compose("alcc", "task=ring-22", *words, "scenario.controllers.human.wiener=1")
             inputs = load_inputs(cfg)
             env = build_env(cfg, inputs.training, inputs.population, 256, 0, nominal=nominal)
-            moved = env.step(env.rand_action(env.reset()))["next", "command", "human"]
+            moved = env.step(env.rand_action(env.reset()))["next", "human", "command"]
             size = moved.std(-2).flatten() * 0.1**0.5
             ends = size.quantile(torch.tensor([0.05, 0.95])).tolist()
             assert ends == pytest.approx([0.74, 1.26] if nominal else [0.5, 2.0], rel=0.15)

@@ -247,13 +247,6 @@ def test_actions_of_a_group_flattened() -> None:
     assert env.rollout(4)[key].shape == (2, 4, 2)
 
 
-@pytest.fixture
-def double():
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(torch.float32)
-
-
 @pytest.mark.usefixtures("double")
 def test_double_precision_by_default() -> None:
     env = single_env("alcc", 2)

@@ -232,10 +232,10 @@ class Unwritten(Steady):
 def test_a_controller_that_does_not_fit_is_named_and_leaves_no_folder(tmp_path) -> None:
     cases = [
         (unknown, r"\.unknown reads vehicles.velocity, .* only .*vehicles.gap, .*vehicles.speed"),
-        (plain_number, r"\.plain_number .* float .* must return command.automated as tensors \["),
-        (Wide, r"Wide writes command.automated as \[1, 2\]"),
-        (Forgetful, r"returned 1 instead of 2 .* command.automated and automated.integral as"),
-        (Talkative, r"returned 2 instead of 1 .* must return command.automated as tensors"),
+        (plain_number, r"\.plain_number .* float .* must return automated.command as tensors \["),
+        (Wide, r"Wide writes automated.command as \[1, 2\]"),
+        (Forgetful, r"returned 1 instead of 2 .* automated.command and automated.integral as"),
+        (Talkative, r"returned 2 instead of 1 .* must return automated.command as tensors"),
         (Unwritten, r"Unwritten reads my.last, which no piece of the scenario writes;"),
     ]
     out = {"overrides": SMALL, "folder": tmp_path / "a"}
@@ -276,7 +276,7 @@ def test_what_a_controller_remembers_is_its_roles_entry_from_zero_on() -> None:
     for role in (AUTOMATED, "human"):
         found = data["next", role, "steps"][..., 0, 0]
         assert torch.equal(found, torch.arange(1.0, 5.0).expand(2, 4))
-        assert torch.equal(data["next", "command", role][..., 0, 0], 0.01 * (found - 1.0))
+        assert torch.equal(data["next", role, "command"][..., 0, 0], 0.01 * (found - 1.0))
         first = data["vehicles", "speed"][:, :1, int(role == "human"), 0]
         assert (data["next", role, "first_speed"][..., 0, 0] == first).all()
 
@@ -348,10 +348,10 @@ def test_commands_to_automated_vehicles_alone_are_bounded() -> None:
         cfg = compose("idm", "scenario.start.human=${scenario.start.automated}")
         drivers = {AUTOMATED: node, "human": hard}
         cfg.scenario.controllers |= {role: Node.of(own, role) for role, own in drivers.items()}
-        command = build_env(cfg, wavy_profiles(), POPULATION, 2).rollout(3)["next", "command"]
+        command = build_env(cfg, wavy_profiles(), POPULATION, 2).rollout(3)["next"]
         expected = torch.tensor(least).expand(2, 3)
-        assert torch.equal(command[AUTOMATED][..., 0, 0], expected), node
-        assert (command["human"] == -5.0).all()
+        assert torch.equal(command[AUTOMATED, "command"][..., 0, 0], expected), node
+        assert (command["human", "command"] == -5.0).all()
 
 
 def test_a_law_reads_what_its_parameters_name() -> None:

@@ -45,7 +45,7 @@ def driven(driver: str) -> tuple[dict[str, np.ndarray], np.ndarray]:
     start[SEED] = FIRST + torch.arange(CARS).unsqueeze(-1)
     with torch.no_grad():
         data = env.rollout(
-        STEPS, strategy.policy, tensordict=env.reset(start), auto_reset=False,
+        STEPS, strategy.policy, tensordict=env.reset(options=start), auto_reset=False,
         break_when_any_done=False,
     )  # fmt: skip
     measured = {
@@ -54,7 +54,7 @@ def driven(driver: str) -> tuple[dict[str, np.ndarray], np.ndarray]:
         for entry in ("speed", "gap", "acceleration")
         if (view, entry) != ("ahead", "gap")
     }
-    return measured, data["next", "command", "automated"].flatten(2)[..., 0].numpy().T
+    return measured, data["next", "automated", "command"].flatten(2)[..., 0].numpy().T
 
 
 def at(step: int, measured: dict[str, np.ndarray], cars=slice(None)) -> dict[str, np.ndarray]:

@@ -50,8 +50,8 @@ def test_it_commands_what_the_vehicle_of_the_environment_obeys(module) -> None:
 
     said: list[torch.Tensor] = []
     memory = [torch.zeros(16, module.width)]
-    record, _ = play(env, policy, None, [("command", "automated")])
-    obeyed = record["command", "automated"].flatten(1)[-60:]
+    record, _ = play(env, policy, None, [("automated", "command")])
+    obeyed = record["automated", "command"].flatten(1)[-60:]
     # Filtered inside already, the environment's own filter changes nothing.
     torch.testing.assert_close(torch.stack(said)[: len(obeyed)], obeyed, atol=2e-3, rtol=0.0)
 

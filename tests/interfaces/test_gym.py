@@ -86,7 +86,7 @@ def test_whole_episodes_are_those_of_the_torchrl_environment(
     episodes = ArrayEpisodes(lcc_rl.make_env(variant, count, overrides))
     assert episodes.advance.translated == translated
     seen = episodes.reset(np.arange(count), range(count))
-    td = own.reset(TensorDict({SEED: torch.as_tensor(episodes.state[:, :1]).long()}, [count]))
+    td = own.reset(options={SEED: torch.as_tensor(episodes.state[:, :1]).long()})
     rng, running = np.random.default_rng(0), np.ones(count, bool)
     for _ in range(300):
         np.testing.assert_allclose(seen[running], td["observation"][running], atol=1e-5)
@@ -139,7 +139,7 @@ def test_seeds_masks_and_options_take_effect(env, many) -> None:
     own = lcc_rl.make_env("alcc", (), SHORT)
     given = {tuple(name.split(".")): torch.tensor([value]) for name, value in options.items()}
     given["human", "driver"] = given["human", "driver"].unsqueeze(-1)
-    np.testing.assert_array_equal(seen, own.reset(TensorDict(given, []))["observation"])
+    np.testing.assert_array_equal(seen, own.reset(options=given)["observation"])
 
 
 def test_an_action_of_double_precision_changes_no_type(env, many) -> None:

@@ -100,7 +100,7 @@ def test_a_program_remembers_what_it_returned(tmp_path) -> None:
     gaps = data["vehicles", "gap"][:, :, :1].cumsum(1).clamp(max=3.0)
     kept = data["next", "automated", "program"]
     torch.testing.assert_close(kept, data["vehicles", "gap"][:, :, :1].cumsum(1))
-    torch.testing.assert_close(data["next", "command", "automated"], gaps)
+    torch.testing.assert_close(data["next", "automated", "command"], gaps)
     # Alike where another simulator measures, such as SUMO.
     driver = Driver(path, 0.1)
     for step in range(1, 4):

@@ -46,7 +46,7 @@ def test_oracle_dead_beat_has_no_error_where_limits_are_inactive() -> None:
         piece.double()
     given = TensorDict({("leader", "profile"): torch.arange(3).unsqueeze(-1)}, [3])
     given.set(("leader", "start"), torch.zeros(3, 1, dtype=torch.int64))
-    td = env.reset(given).apply(lambda x: x.double() if x.is_floating_point() else x)
+    td = env.reset(options=given).apply(lambda x: x.double() if x.is_floating_point() else x)
     total = 0.0
     for _ in range(100):
         td = env.step(td)
@@ -151,7 +151,7 @@ def test_nothing_but_the_oracle_knows_the_future(name) -> None:
     given.set(("leader", "profile"), torch.tensor([[0], [1]]))
     given.set(("leader", "start"), torch.zeros(2, 1, dtype=torch.int64))
     with torch.no_grad():
-        data = env.rollout(60, tested.policy, tensordict=env.reset(given), auto_reset=False)
+        data = env.rollout(60, tested.policy, tensordict=env.reset(options=given), auto_reset=False)
     commands = data["next", "vehicles", "command"].flatten(2)
     same = (commands[0] == commands[1]).all(1)
     assert same[:FRAME].all()
@@ -222,7 +222,9 @@ def test_switching_state_is_carried_by_the_tensordict() -> None:
     ids = torch.arange(3)
     given = reset_options(env, ids, ids % count, 0, count)
     with torch.no_grad():
-        data = env.rollout(100, tested.policy, tensordict=env.reset(given), auto_reset=False)
+        data = env.rollout(
+            100, tested.policy, tensordict=env.reset(options=given), auto_reset=False
+        )
     for name in ("winner", "switches", "clamps", "cap_interventions"):
         found = data["next", "hybrid", name].squeeze(-1).transpose(0, 1)
         assert torch.equal(found, series[name]), name

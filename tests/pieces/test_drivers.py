@@ -64,7 +64,7 @@ def test_every_model_passes_torchrls_check_in_any_role(controller, delay) -> Non
 def test_drivers_start_at_their_equilibrium_and_stay(model) -> None:
     cap = "scenario.start.human.cap_time_gap=100"
     data = rolled(human(MODELS[model], QUIET, cap), steady(), batch=64, seed=3)
-    assert data["next", "command", "human"].abs().max() < 1e-3
+    assert data["next", "human", "command"].abs().max() < 1e-3
 
 
 @EACH
@@ -77,7 +77,7 @@ def test_a_delay_replays_the_same_law_on_what_was(model) -> None:
         speed, gap, relative = (values[:, max(step - delay, 0)] for values in seen.values())
         drivers = (data["human", name][:, step] for name in ("desired_speed", "desired_time_gap"))
         expected = own(speed, gap, -relative, *drivers)
-        assert torch.equal(data["next", "command", "human"][:, step], expected), step
+        assert torch.equal(data["next", "human", "command"][:, step], expected), step
 
 
 @pytest.mark.slow
@@ -99,16 +99,16 @@ def test_a_delay_makes_a_string_less_stable() -> None:
 
 @pytest.mark.parametrize("model", slow_but(["idm"], MODELS))
 def test_noise_is_that_of_the_paper_for_every_model(model) -> None:
-    quiet = rolled(human(MODELS[model], QUIET), steps=1, batch=64)["next", "command", "human"]
+    quiet = rolled(human(MODELS[model], QUIET), steps=1, batch=64)["next", "human", "command"]
     noisy = rolled(human(MODELS[model], QUIET.replace("=0", "=0.3")), steps=1, batch=64)
-    ratio = (noisy["next", "command", "human"] / quiet)[quiet.abs() > 1e-3]
+    ratio = (noisy["next", "human", "command"] / quiet)[quiet.abs() > 1e-3]
     assert ratio.min() >= 1.0 - 1e-5
     assert ratio.max() < 1.3 + 1e-5
     assert ratio.mean() == pytest.approx(1.15, abs=0.05)
     walk = "scenario.controllers.human.wiener=0.5"
     moved = rolled(human(MODELS[model], QUIET, walk), steps=1, batch=256)
     same = rolled(human(MODELS[model], QUIET), steps=1, batch=256)
-    added = (moved["next", "command", "human"] - same["next", "command", "human"]) * 0.1**0.5
+    added = (moved["next", "human", "command"] - same["next", "human", "command"]) * 0.1**0.5
     assert added.std().item() == pytest.approx(0.5, rel=0.1)
 
 
@@ -127,8 +127,8 @@ def test_drivers_react_as_their_population_does() -> None:
     assert abs(float((noise[..., 0] * noise[..., 1]).mean())) < 0.01
     # It is what is added to the late law.
     late = rolled(human("human", QUIET, "scenario.controllers.human.delay=3"), batch=256, steps=1)
-    command = data["next", "command", "human"][:, 0, :, 0]
-    assert torch.allclose(command, late["next", "command", "human"][:, 0, :, 0] + noise[:, 0])
+    command = data["next", "human", "command"][:, 0, :, 0]
+    assert torch.allclose(command, late["next", "human", "command"][:, 0, :, 0] + noise[:, 0])
     # Settings of the controller come first; a driver of given (v0, T) is not of the population.
     own = [f"scenario.controllers.human.{x}=0" for x in ("delay", "acceleration_noise")]
     given = [f"scenario.controllers.human.{x}" for x in ("desired_speed=20", "time_gap=1.2")]
@@ -149,7 +149,7 @@ def test_drivers_misjudge_their_gaps_as_their_population_does() -> None:
     exact = rolled(
         cfg, population=replace(reacting, reaction=Reaction(0.3, 0.25)), batch=256, steps=1
     )
-    command, other = (x["next", "command", "human"][:, 0, :, 0] for x in (data, exact))
+    command, other = (x["next", "human", "command"][:, 0, :, 0] for x in (data, exact))
     nearer = noise[:, 0] < 0.0
     assert (command[nearer] <= other[nearer]).all()
     assert (command[~nearer] >= other[~nearer]).all()
@@ -165,7 +165,7 @@ def test_each_driver_of_a_mixture_has_its_own_model_and_parameters() -> None:
     data = rolled(human("calibrated", QUIET), population=MIXED, batch=16)
     own, driver = MIXED.parameters(), data["human", "driver"]
     speed, gap, relative = (data["vehicles", name] for name in MOTION)
-    command = data["next", "command", "human"]
+    command = data["next", "human", "command"]
     for number, model in enumerate(MIXED.models):
         law, chosen = LAWS[model], driver == number
         values = {name: float(x[number]) for name, x in own.items()}

@@ -143,7 +143,7 @@ def test_fixed_and_drawn_places_give_the_same_numbers() -> None:
         other = small_env("reference", 16, [string(pattern), "scenario.controllers.human.noise=0"])
         given = td.select(("episode", "seed"), ("leader", "profile"), ("leader", "start")).clone()
         given.set(("human", "driver"), td["human", "driver"])
-        start = other.reset(given)
+        start = other.reset(options=given)
         runs = []
         for one, begun in ((env, td), (other, start)):
             state = begun.clone()
@@ -167,7 +167,7 @@ def test_places_are_drawn_evenly_anew_in_every_episode_and_repeat_with_its_seed(
     assert (index.diff(dim=-1) > 0).all()
     counts = torch.bincount(index.flatten(), minlength=6)
     assert counts.min() > 95  # 133 expected, 9.4 their standard deviation
-    again = env.reset(td.select(("episode", "seed")))
+    again = env.reset(options=td.select(("episode", "seed")))
     assert torch.equal(again["automated", "index"], index)
     assert not torch.equal(env.reset()["automated", "index"], index)
 

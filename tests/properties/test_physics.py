@@ -27,7 +27,7 @@ STEPS, STEP = 20, 0.1
 def played(batch: int, actions: torch.Tensor, choices: TensorDict, profiles=None):
     """Play actions ``[steps]`` in a batch with given seeds, profiles, starts and drivers."""
     env = build_env(compose("alcc"), profiles or wavy_profiles(), POPULATION, batch, nominal=True)
-    start = env.reset(choices)
+    start = env.reset(options=choices)
     number = iter(range(len(actions)))
 
     def policy(td):
