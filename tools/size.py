@@ -27,9 +27,9 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 40_100, "code": 26_150},
-    "tests": {"lines": 21_500},
-    "conf": {"yaml": 147},
+    "lcc_rl + tools": {"lines": 41_000, "code": 26_850},
+    "tests": {"lines": 22_300},
+    "conf": {"yaml": 150},
 }
 CASES = 1_100  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {"names in several modules": 60, "floors": 10, "circles": 0}

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from helpers import check_refused
-from tensordict import TensorDict
 from torch import nn
 
 import lcc_rl
