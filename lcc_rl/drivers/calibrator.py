@@ -46,8 +46,7 @@ INNER = GeneticSettings(population=16, generations=8)
 # Columns of the errors; those of the held-out part end in ``_out``.
 ERROR_COLUMNS = {SPEED_RMSPE: "rmspe", GAP_RMSE: "gap_rmse_m", GAP_NRMSE: "gap_nrmse"}
 OUT = "_out"
-BADLY_OFF = 0.4  # mean relative error of fitted gaps; published ones are at most 0.3
-GAPS_OFF = 0.1  # relative error of gaps from which the report advises to fit gaps, too
+GAPS_OFF, BADLY_OFF = 0.1, 0.4  # reported relative errors of gaps: not fitted, and fitted
 MEAN_SPEED, MEAN_GAP, EQUILIBRIUM = "mean_speed_mps", "mean_gap_m", "equilibrium_gap_m"
 IMPLAUSIBLE = 1.0  # relative error of the median driver's gap from which the report warns
 CONGESTED = "; it is unknown for followers that never drive freely"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 from functools import partial
 from io import StringIO
 
@@ -21,7 +22,7 @@ from lcc_rl.data.smoothing import SavitzkyGolay
 from lcc_rl.data.sources import EpisodesSource, LoadedEpisodes
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.data.trajectories import FOOT
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import Concern, ConfigError, DataError
 from lcc_rl.io.files import write_parquet
 
 BASE = {"vehicle": "id", "time": "t", "speed": "v"}
@@ -430,3 +431,18 @@ def test_a_real_openacc_file(shared_data) -> None:
     check_episodes(loaded.episodes)
     assert loaded.episodes["follower_id"].unique().tolist() == [2, 3, 4, 5, 6, 7, 8, 9]
     assert 4.0 < loaded.episodes["gap_m"].min() < loaded.episodes["gap_m"].max() < 30.0
+
+
+def test_lengths_in_feet_and_gaps_that_jump_are_named_in_tables(tmp_path) -> None:
+    frame = long_table()
+    feet = frame.assign(length=frame["length"] / 0.3048)
+    long = TableSource(path=written(tmp_path, feet), columns=BY_LANE).load()
+    words = r"median length of vehicles is 1\d\.?\d* m; is it in ft \(data\.units\.length=ft\)"
+    assert re.search(words, " ".join(x for x in long.report if isinstance(x, Concern)))
+    clean = TableSource(path=written(tmp_path, frame), columns=BY_GAP).load()
+    frame.loc[frame["t"].between(20.0, 24.95) & (frame["gap"] > 0), "gap"] = 100.0
+    jumps = TableSource(path=written(tmp_path, frame), columns=BY_GAP).load()
+    assert len(jumps.episodes) < len(clean.episodes)
+    assert jumps.episodes["gap_m"].max() < 90.0
+    assert any("where the gap jumps or is held" in line for line in jumps.report)
+    assert not any("jumps or is held" in line for line in clean.report)
