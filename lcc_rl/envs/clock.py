@@ -248,7 +248,7 @@ class Traffic(TransformedEnv):
             expected, got = (f"{list(x.shape)} {x.dtype}" for x in (wanted, found))
             raise ConfigError(f"{'.'.join(as_key(key))} must be {expected}, got {got}")
 
-    def _checked(self, options: Mapping[NestedKey, Any]) -> dict[Key, torch.Tensor]:
+    def _checked(self, options: Any) -> dict[Key, torch.Tensor]:
         """Return reset options by their full keys.
 
         Raises:

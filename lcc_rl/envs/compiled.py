@@ -49,7 +49,7 @@ class Compiled:
         device: of its tensors; None: the CPU.
     """
 
-    errors = staticmethod(compiler_errors)  # for which the plain function is used
+    errors: Any = staticmethod(compiler_errors)  # for which the plain function is used
 
     def __init__(
         self,
@@ -90,7 +90,7 @@ class Traced(Compiled):
     """
 
     # Of many kinds; the plain function raises its own anew.
-    errors = staticmethod(lambda: (Exception,))
+    errors: Any = staticmethod(lambda: (Exception,))
 
     def _made(self, device: torch.device | None) -> Callable[..., Any]:
         return self._first_call
