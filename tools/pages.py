@@ -27,7 +27,7 @@ from lcc_rl.config import load
 from lcc_rl.config.nodes import as_plain
 from lcc_rl.config.words import RECORDED
 from lcc_rl.data.leaders import stretch
-from lcc_rl.energy import AVERAGED, AVERAGES
+from lcc_rl.energy import AVERAGED, AVERAGES, SECOND
 from lcc_rl.errors import require
 from lcc_rl.figures.calibration import twins_figure
 from lcc_rl.figures.drawing import (
@@ -45,14 +45,13 @@ from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import read_parquet
 from lcc_rl.io.settings import read_json
 from lcc_rl.results import board
-from lcc_rl.results.fronts import ENERGY, FRONT_KINDS, LONG_SHARE, points
+from lcc_rl.results.fronts import ENERGY, FRONT_KINDS, LONG_SHARE, at_equal_flow, points
 from lcc_rl.results.measures import AT_LEAST, FLOW, Measure
 from lcc_rl.results.measures import SHARE as IS_SHARE
-from lcc_rl.results.names import NETWORK, in_words, worded
+from lcc_rl.results.names import NETWORK, ON_FRONT, in_words, worded
 from lcc_rl.results.render import as_markdown, markdown_row, saved_text, signed
 from lcc_rl.results.runs import naming_run
 from lcc_rl.results.task import Task
-from lcc_rl.results.windows import DISTANCE, savings
 from lcc_rl.studies.alcc.results import narrow
 from lcc_rl.studies.reproduce import STUDY_RESULTS
 
@@ -81,11 +80,10 @@ KINDS_SHOWN = {  # label and colour by variant and policy
 # Labels of the sources of averaged energies.
 SOURCES = {
     "i80": "I-80",
-    "ring": "ring",
-    "openacc": "OpenACC, test track and low speed",
+    "stop_and_go": "OpenACC, test track and low speed (`data=stop_and_go`)",
     "platoons": "OpenACC, motorways (`data=platoons`)",
 }
-RIVALS = (RECORDED, "idm_acc_filtered")
+FILTERED_RULE = "idm_acc_filtered"
 LEARNERS = {"ppo": "PPO", "td3": "TD3", "sac": "SAC", "analytic": "gradient (`analytic`)"}
 
 
@@ -138,25 +136,29 @@ def tasks(reference: Path, docs: Path) -> None:
 
 
 def averaged(rows: pd.DataFrame) -> str:
-    """Return a Markdown table of savings by source, longest time gap and baseline.
+    """Return a Markdown table of savings at equal flow by source and comparison.
 
     Args:
-        rows: ``source``, ``time_gap`` of the filter [s], ``average_s`` of the leaders [s],
-            strategy and window, with the energies of raw and of averaged speeds, distance and flow.
+        rows: ``source``, strategy (also behind filters with other longest time gaps) and window,
+            with the energies of raw and of averaged speeds and of petrol, distance and flow.
     """
-    energies = [f"all_{name}" for name in ("path_energy_kj", *AVERAGED)]
-    head = ["traffic, longest time gap", "against", "raw"]
-    head += [f"{seconds:g} s" for seconds in AVERAGES]
-    lines = [[*head, "flow"], ["---"] * (len(head) + 1)]
-    raw = rows[rows["average_s"] == 0.0]
+    energies = [f"total_{name}" for name in ("path_energy_kj", *AVERAGED, SECOND)]
+    lines = [["traffic", "", "raw", *(f"{seconds:g} s" for seconds in AVERAGES), "petrol, raw"]]
+    lines.append(["---"] * len(lines[0]))
     for source, words in SOURCES.items():
-        for gap, part in raw[raw["source"] == source].groupby("time_gap", sort=False):
-            flow = part.groupby("strategy")[FLOW].mean()
-            for rival in RIVALS:
-                gained = signed(100.0 * (flow[NETWORK] / flow[rival] - 1.0))
-                found = (savings(part, x, NETWORK, rival, [DISTANCE]) for x in energies)
-                cells = [f"{words}, {gap:g} s", in_words(rival), *map(fleets.percent, found)]
-                lines.append([*cells, f"{gained} %"])
+        part = rows[rows["source"] == source]
+        names = part["strategy"].unique()
+        own, rule = (
+            [x for x in names if x.partition(ON_FRONT)[0] == one]
+            for one in (NETWORK, FILTERED_RULE)
+        )
+        for label, mine, other in (
+            ("network against the recorded drivers", own, [RECORDED]),
+            ("tuned IDM against the recorded drivers", rule, [RECORDED]),
+            ("network against tuned IDM", own, rule),
+        ):
+            found = (at_equal_flow(part, mine, other, x, RECORDED) for x in energies)
+            lines.append([words, label, *map(fleets.percent, found)])
     return "\n".join(map(markdown_row, lines))
 
 
