@@ -35,7 +35,7 @@ from lcc_rl.runs.interrupts import ENDING_SIGNALS
 UNTRAINED = ("direct", "idm", "human", "idm_acc", "acc")
 
 # Data that take a fraction of a second to generate; enough for every entry point.
-DATA = ("data.platoons=2", "data.recordings=2", "data.duration_s=[32,40]")
+DATA = ("data.platoons=2", "data.recordings=2", "data.duration_s=[62,70]")
 HORIZON = "scenario.horizon=20"
 QUICK = "calibration.local_genetic.generations=2"
 AGENT = ("agent.batch_size=64", "agent.hidden=[16,16]")

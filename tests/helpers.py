@@ -93,14 +93,16 @@ def _loaded(overrides: tuple[str, ...]) -> TrainConfig:
 
 
 def composed(*overrides: str) -> TrainConfig:
-    """Compose the configuration of a training; the same one is composed only once."""
-    return deepcopy(_loaded(overrides))
+    """Compose the configuration of a training; the same one is composed only once.
+
+    All seconds count, so that episodes may be short.
+    """
+    return deepcopy(_loaded(("evaluation.warm_up=0", *overrides)))
 
 
 def compose(variant: str = "alcc", *overrides: str) -> TrainConfig:
     """Compose the configuration of a training with short episodes."""
-    short = ("scenario.horizon=20", "evaluation.warm_up=0")
-    return composed(f"variant={variant}", *short, *overrides)
+    return composed(f"variant={variant}", "scenario.horizon=20", *overrides)
 
 
 def small_env(

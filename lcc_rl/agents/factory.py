@@ -58,8 +58,8 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
     with raised_as(ConfigError, words, Exception), torch.no_grad():  # any error of a module
         seen = TensorDict({"observation": torch.zeros(2, scene.observation_size)}, [2])
         action = policy(seen.to(device)).get("action")
-        found = [*action.shape, action.dtype]
-        require(found == [2, 1, torch.float32], f"expected an action [2, 1, float32], got {found}")
+        found, expected = [*action.shape, action.dtype], [2, 1, torch.get_default_dtype()]
+        require(found == expected, f"expected an action {expected}, got {found}")
     return learner
 
 

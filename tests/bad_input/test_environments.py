@@ -71,8 +71,9 @@ def test_an_impossible_batch_seed_or_device() -> None:
         *(({"seed": seed}, "seed must be") for seed in (-1, 2**32, 1.0, True, "1")),
         *(({"device": name}, f"device '{name}' is not available") for name in devices),
     ]
+    words = [*DATA, "scenario.horizon=300"]
     check_refused(
-        lambda given: make_env("alcc", **{"batch_size": (), **given}, overrides=DATA), cases
+        lambda given: make_env("alcc", **{"batch_size": (), **given}, overrides=words), cases
     )
 
 

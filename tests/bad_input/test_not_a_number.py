@@ -80,7 +80,7 @@ def test_an_evaluation_names_strategy_entry_step_and_episode(tmp_path) -> None:
     which = r"of episode \d+ \(profile \S.*, driver \d+, seed \d+\)$"
     cases = [
         (*CONTROL, f"strategy NanControl: automated.command is nan at step 4 {which}"),
-        (*CONTROL, *FILTER, f"strategy NanControl: wanted.automated is nan at step 4 {which}"),
+        (*CONTROL, *FILTER, f"strategy NanControl: automated.wanted is nan at step 4 {which}"),
         (*DRIVER, f"strategy direct: human.command is nan at step 4 {which}"),
         (*POWER, f"strategy direct: vehicles.power is -?inf at step 1 {which}"),
     ]

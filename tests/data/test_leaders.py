@@ -62,7 +62,7 @@ def test_shipped_cycles_are_the_published_ones() -> None:
     # Duration [s] and distance [km] as the regulations print them.
     published = {"udds": (1369, 11.99), "us06": (600, 12.89), "hwfet": (765, 16.51)}
     published["wltc_3b"] = (1800, 23.27)
-    assert sorted(SHIPPED_FILES) == sorted([*published, "drives", "platoons"])
+    assert sorted(SHIPPED_FILES) == sorted([*published, "drives", "platoons", "stop_and_go"])
     for name, (duration, kilometres) in published.items():
         time, own = read_speed_record(name)
         assert time[-1] == duration

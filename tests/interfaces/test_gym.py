@@ -24,7 +24,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 import lcc_rl.interfaces.gym  # noqa: E402
 from lcc_rl.evaluation.foreign import network_of  # noqa: E402
 
-DATA = ["data.platoons=2", "data.recordings=2", "data.duration_s=[32,40]"]
+DATA = ["data.platoons=2", "data.recordings=2", "data.duration_s=[62,70]"]
 SHORT = [*DATA, "scenario.horizon=20"]
 RING = "scenario.string=automated human*21"
 STILL = np.zeros((3, 1), np.float32)
