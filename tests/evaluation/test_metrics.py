@@ -69,6 +69,7 @@ def test_safety() -> None:
     expected = {
         "min_gap_m": [7.0, 3.0],
         "mean_gap_m": [7.5, 3.0],
+        "gap_opened_m": [-1.0, 0.0],
         "max_gap_m": [8.0, 3.0],
         "min_time_gap_s": [1.0, 1.0],
         "min_ttc_s": [3.0, 5.0],
@@ -82,9 +83,8 @@ def test_safety() -> None:
     assert set(measures) == set(expected)
     named = {name for name in expected if name.startswith(("max_", "min_", "share_"))}
     filtered = {"share_ttc_unpromised", "share_turned_unsafe"}
-    assert named | {"share_leader_faster", "share_time_gap_short", "flow_vph"} | filtered == set(
-        limit_measures()
-    )
+    others = {"share_leader_faster", "share_time_gap_short", "flow_vph", "mean_speed_mps"}
+    assert named | others | filtered == set(limit_measures())
     for name, values in expected.items():
         torch.testing.assert_close(measures[name].flatten(), torch.tensor(values))
 
