@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers import ACTION, POPULATION, REWARD, composed, small_env, string, wavy_profiles
+from helpers import ACTION, POPULATION, REWARD, compose, small_env, string, wavy_profiles
 from torch import Tensor
 
 from lcc_rl.config.nodes import Node
@@ -266,7 +266,7 @@ def test_follower_stopper_desires_its_own_mean_speed() -> None:
 
 
 def test_a_handover_switches_at_its_moment() -> None:
-    human = composed("variant=idm", "controller@scenario.controllers.automated=human")
+    human = compose("idm", "controller@scenario.controllers.automated=human")
     node = {
         "_target_": "lcc_rl.pieces.Handover",
         "before": human.scenario.controllers["automated"],
