@@ -133,7 +133,8 @@ def saved_at_flow(own: Curve, other: Curve, reference: Curve | None = None) -> A
     reference that of the reference, or the least one that both fronts have if that is more. The
     share is NaN if a front has less flow everywhere.
     """
-    flow, most = own[FLOW][..., 0], np.nan
+    flow = own[FLOW][..., 0]
+    most: float | None = np.nan
     if reference is not None:
         flow = np.maximum(reference[FLOW][..., 0], own[FLOW].min(-1))
         flow = np.maximum(flow, other[FLOW].min(-1))
