@@ -50,14 +50,12 @@ def flow_note(table: pd.DataFrame) -> str:
 
 def by_ends(table: pd.DataFrame) -> str:
     """Return a sentence on savings that start and end of the episodes exceed; empty for none."""
-    found = table[table["end_saving"].abs() > table["saving"].abs()]
-    rows = zip(found["strategy"], 100.0 * found["saving"], 100.0 * found["end_saving"], strict=True)
-    parts = (f"{in_words(str(name))} {one:+.1f} and {other:+.1f} %" for name, one, other in rows)
-    words = "; ".join(parts).replace("-", "−")
+    found = table["strategy"][table["end_saving"].abs() > table["saving"].abs()]
+    names = ", ".join(in_words(str(name)) for name in found)
     return (
-        "Of the energy drawn in an episode, less is saved by steady driving than by what an "
-        f"episode begins and ends with (distance, stored energy): {words}."
-        if words
+        "Start and end of episodes (distance, stored energy) change the energy drawn more than "
+        f"steady driving: {names}."
+        if names
         else ""
     )
 

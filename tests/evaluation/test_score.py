@@ -19,7 +19,7 @@ from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.results import board
 from lcc_rl.runs.states import Busy, claim
 
-SMALL = ("scenario.horizon=60", "evaluation.profiles=3")
+SMALL = ("scenario.horizon=60", "evaluation.warm_up=0", "evaluation.profiles=3")
 ON = ("--task", "i80-follow", "--on", "everyday", "evaluation.drivers=2", *SMALL)
 
 

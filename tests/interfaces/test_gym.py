@@ -80,7 +80,7 @@ def test_gymnasium_accepts_it() -> None:
 def test_whole_episodes_are_those_of_the_torchrl_environment(
     variant, overrides, translated
 ) -> None:
-    count, overrides = 8, [*DATA, *overrides]
+    count, overrides = 8, [*DATA, "scenario.horizon=300", *overrides]
     own = lcc_rl.make_env(variant, count, overrides)
     episodes = ArrayEpisodes(lcc_rl.make_env(variant, count, overrides))
     assert episodes.advance.translated == translated
@@ -392,7 +392,13 @@ def test_models_of_stable_baselines3_are_compared_and_exported(sb3, tmp_path) ->
     from stable_baselines3.common.vec_env import VecNormalize
 
     pytest.importorskip("onnxruntime", reason="extra interfaces")
-    words = [*SHORT, "evaluation.baselines=[]", "evaluation.profiles=2", "evaluation.drivers=2"]
+    words = [
+        *SHORT,
+        "evaluation.warm_up=0",
+        "evaluation.baselines=[]",
+        "evaluation.profiles=2",
+        "evaluation.drivers=2",
+    ]
     for kind, more in (
         *((name, {"n_steps": 20}) for name in ("PPO", "A2C")),
         *((name, {"learning_starts": 10}) for name in ("SAC", "TD3", "DDPG")),

@@ -94,7 +94,7 @@ def test_a_program_remembers_what_it_returned(tmp_path) -> None:
         onnx.helper.make_node("Identity", ["next_memory"], ["acceleration"]),
     ]
     path = written(tmp_path / "sum.onnx", nodes, takes, makes)
-    cfg = load("evaluate", ["variant=idm", "scenario.horizon=3"])
+    cfg = load("evaluate", ["variant=idm", "scenario.horizon=3", "evaluation.warm_up=0"])
     env = build_env(driven_by(cfg, controller_of(path)), wavy_profiles(), POPULATION, 4)
     data = env.rollout(3, break_when_any_done=False)
     gaps = data["vehicles", "gap"][:, :, :1].cumsum(1).clamp(max=3.0)
@@ -118,7 +118,10 @@ def follow(tmp_path_factory) -> str:
 
 
 def test_an_exported_policy_that_remembers_drives_as_the_policy(follow) -> None:
-    cfg = load("evaluate", ["task=i24-follow5", "variant=alcc", "scenario.horizon=40"])
+    cfg = load(
+        "evaluate",
+        ["task=i24-follow5", "variant=alcc", "scenario.horizon=40", "evaluation.warm_up=0"],
+    )
     weights = load_policy("pretrained/i24-follow5", "alcc")
     policy = trained(cfg, "pretrained", weights, POPULATION)
     program = replace(policy, cfg=driven_by(policy.cfg, controller_of(follow)), policy=None)
@@ -151,6 +154,7 @@ def test_a_program_with_memory_brakes_after_a_nan_until_it_begins_anew(follow) -
 @pytest.mark.parametrize("kind", ["filtered", "stacked"])
 def test_it_remembers_as_the_piece_does(kind) -> None:
     words = ["+knowledge=memory", f"scenario.pieces.memory.kind={kind}", "scenario.horizon=9"]
+    words.append("evaluation.warm_up=0")
     env = small_env("alcc", 3, words, nominal=True)
     pieces = pieces_of(env)
     kinds = (Observation, Action, ObservationMemory)

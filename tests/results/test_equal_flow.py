@@ -94,10 +94,9 @@ def test_what_episodes_end_with_is_told_from_steady_driving() -> None:
     one = report(windows_for(slower))
     row = one.table.set_index("strategy").loc["alcc"]
     assert row["end_saving"] == pytest.approx(0.6 - (1.0 - 90.0 / 120.0))
-    said = [line for line in one.remarks if "begins and ends with" in line]
-    assert len(said) == 1
-    assert "network +25.0 and +35.0 %" in said[0]
-    assert not any("begins and ends" in x for x in report(windows_for(rows())).remarks)
+    said = [line for line in one.remarks if line.startswith("Start and end of episodes")]
+    assert [line.rpartition(": ")[2] for line in said] == ["network."]
+    assert not any("Start and end" in x for x in report(windows_for(rows())).remarks)
 
 
 @pytest.mark.usefixtures("blank_figures")

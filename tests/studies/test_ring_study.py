@@ -14,6 +14,7 @@ SMALL = (
     "scenario.circumference=72",
     "evaluation.humans_first=2",
     "scenario.horizon=40",
+    "evaluation.warm_up=0",
     "evaluation.profiles=2",
 )
 

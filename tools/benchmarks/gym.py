@@ -13,6 +13,7 @@ from benchmarks.plain import PlainLoop, training
 from benchmarks.plain_numba import NUMBA, NumbaLoop
 
 SMALL = ["data.platoons=3", "data.recordings=2", "data.vehicles=3", "data.duration_s=[35,45]"]
+SMALL.append("experiment=paper_windows")
 MANY, SYNC = 16, "SyncVectorEnv"
 
 
