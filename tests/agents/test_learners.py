@@ -103,7 +103,7 @@ WRONG = [
     (
         "observation_size, 1,",
         "observation_size, 2,",
-        r"policy fails .* \[2, 1, float32\], got \[2, 2",
+        r"policy fails .* \[2, 1, torch.float32\], got \[2, 2",
     ),
     ("self.noise =", "self.policy.double(); self.noise =", "policy fails for observations of 7"),
     ("loss.item()", "log_prob", "loss_actor is tensor.*; learn returns numbers by name"),

@@ -32,7 +32,7 @@ Played = tuple[State, State, Tensor]  # the next state, what was written, the ne
 @cache
 def study(quick: bool) -> tuple[StudyConfig, Inputs]:
     """Configuration and inputs of the ALCC study on the synthetic stream."""
-    cfg = load("train", ["variant=alcc"])
+    cfg = load("train", ["variant=alcc", "experiment=paper_windows"])
     return cfg, load_inputs(cfg, stream(quick).load().episodes)
 
 
