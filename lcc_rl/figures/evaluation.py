@@ -167,7 +167,8 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, report:
     legend_above(left)
     against = str(report.against)
     what, _, unit = report.label.removesuffix("]").partition(" [")
-    dots(right, range(len(table)), table.fillna({"saved_pct": 0.0}), "saved_pct", INK)
+    saved = table["saved_pct"].mask(table["strategy"] == against, 0.0)  # none after collisions
+    dots(right, range(len(table)), table.assign(saved_pct=saved), "saved_pct", INK)
     right.axvline(0.0, color=SOFT, lw=0.8, zorder=0)
     rows_of(right, list(table["strategy"]))
     for place, value in enumerate(column_cells(table, report.score)):
