@@ -57,9 +57,8 @@ def test_a_training_takes_over_where_humans_are(tmp_path) -> None:
 
 def test_an_evaluation_measures_what_follows() -> None:
     """Against the same episodes played as one, the first part cut off by hand."""
-    sizes = ("evaluation.profiles=2", "scenario.circumference=72")
-    sizes += ("scenario.horizon=30", "evaluation.humans_first=20", "evaluation.warm_up=0")
-    cfg = load("evaluate", [*RING, *sizes])
+    sizes = ("evaluation.profiles=2", "scenario.circumference=72", "evaluation.warm_up=0")
+    cfg = load("evaluate", [*RING, *sizes, "scenario.horizon=30", "evaluation.humans_first=20"])
     inputs = load_inputs(cfg)
     rows, steps = evaluate(baseline(cfg, "follower_stopper"), inputs, None, 8, 0, 1)
     whole = baseline(load("evaluate", [*RING, *sizes, "scenario.horizon=230"]), "handover")
