@@ -38,9 +38,9 @@ def test_one_command_writes_table_figure_and_reports(tmp_path) -> None:
     assert "4 vehicles, 1 times behind each of 2 windows of 6 s, the first 1 s not counted" in page
     assert "## Data\n\n* read 6 episodes" in page
     assert "## Drivers" in page
-    assert "RMSPE of 6 records" in page
+    assert "RMSPE of 6 " in page
     again = read_parquet(tmp_path / "road" / "leaders.parquet")
-    assert again.groupby("drive").size().max() == 4209  # seven minutes, recorded minute by minute
+    assert again.groupby("drive").size().max() == 4209  # seven minutes
     with pytest.raises(ResultsError, match="of other data; choose another folder"):
         road.run(tmp_path / "road", [*SMALL, "data=stream"], ("25",))
 
