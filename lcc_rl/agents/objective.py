@@ -43,10 +43,15 @@ class Objective:
         self.terms: list[tuple[RewardTerm, float]] = []
 
     def replace(self, terms: Sequence[RewardTerm]) -> None:
-        """Replace the reward's terms by their surrogates, and add the regularizers."""
+        """Replace the reward's terms by their surrogates, and add the regularizers.
+
+        A term of weight 0 has no part in the objective, and no limit.
+        """
         own = self.surrogates
         chosen = [
-            (own[term.name], term.weight) if term.name in own else (term, 1.0) for term in terms
+            (own[term.name], term.weight) if term.name in own else (term, 1.0)
+            for term in terms
+            if term.weight
         ]
         self.terms = chosen + [(term, 1.0) for term in self.regularizers.values()]
 

@@ -37,7 +37,7 @@ from lcc_rl.config.nodes import (
 )
 from lcc_rl.config.schemas import AUTO, KINDS, SECTIONS, parse_config
 from lcc_rl.config.unused import check_used
-from lcc_rl.config.words import key_of
+from lcc_rl.config.words import key_of, typed_keys
 from lcc_rl.errors import ConfigError, how_to_install, require, require_known, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
 from lcc_rl.settings import TARGET, find_target
@@ -85,6 +85,7 @@ def terms_of_energy(string: Any) -> float:
 
 find_conf()
 OmegaConf.register_new_resolver("lcc.either", lambda so, yes, no: yes if so else no, replace=True)
+OmegaConf.register_new_resolver("lcc.sum", lambda *values: sum(values), replace=True)
 OmegaConf.register_new_resolver("lcc.pairs", lambda a, b: len(a) * len(b), replace=True)
 OmegaConf.register_new_resolver("lcc.energies", terms_of_energy, replace=True)
 
@@ -225,7 +226,7 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     for name in NEEDED:
         if getattr(tree, name, TARGET) is None:
             raise ConfigError(f"{name}: expected a node with {TARGET}, got None")
-    check_used(tree, overrides, sweep)
+    check_used(tree, overrides, sweep, OmegaConf.to_container(cfg, resolve=False))
     return with_inputs(tree)
 
 
@@ -258,11 +259,7 @@ def leave_out_foreign(content: dict[str, Any], overrides: Sequence[str]) -> None
         content: a configuration as plain containers, changed in place.
         overrides: overrides of the command line.
     """
-    typed = set()
-    for item in overrides:
-        key, _, value = item.lstrip("+~").partition("=")
-        inside = re.findall(r"(\w+)\s*:", value) if value.startswith("{") else []
-        typed |= {key, *(f"{key}.{name}" for name in inside)}
+    typed = set().union(*map(typed_keys, overrides))
     for place in (key.removesuffix(f".{TARGET}") for key in typed if key.endswith(f".{TARGET}")):
         node: Any = content
         for part in place.split("."):

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
+from typing import Any
 
 from lcc_rl.config.nodes import nodes_in, takes_action
 from lcc_rl.config.schemas import AUTO, BaseConfig, EvaluateConfig, StudyConfig
+from lcc_rl.config.words import typed_keys
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, RING
+from lcc_rl.settings import TARGET
 
 NO_AGENT = ("agent=none", "agent=null")
 
 
-def check_used(cfg: BaseConfig, overrides: Sequence[str], sweep: bool = False) -> None:
+def check_used(
+    cfg: BaseConfig, overrides: Sequence[str], sweep: bool = False, written: Any = None
+) -> None:
     """Refuse options that the configuration would ignore.
 
     Args:
         cfg: the configuration.
         overrides: overrides of the command line.
         sweep: allow settings of an agent without one, because the runs of a sweep share them.
+        written: the configuration as plain containers with its references, for the objective.
 
     Raises:
         ConfigError: naming the option and the reason.
@@ -26,15 +33,18 @@ def check_used(cfg: BaseConfig, overrides: Sequence[str], sweep: bool = False) -
     if not isinstance(cfg, StudyConfig):
         return
     reasons = dict(_of_road(cfg))
+    typed = {item: typed_keys(item) for item in overrides}
     if not sweep:
         reasons |= dict(_of_roles(cfg)) | dict(_of_agent(cfg))
         if isinstance(cfg, EvaluateConfig) and cfg.compare and not cfg.policy and cfg.agent:
             reasons[AUTO] = "compare names every controller, with its own settings"
         reasons["sweep"] = "it names the folder of a sweep, -m"
-    typed = {item: item.lstrip("+~").partition("=")[0].partition("@")[0] for item in overrides}
-    for item, key in typed.items():
+    if written is not None and cfg.agent is not None and "surrogates" in cfg.agent.settings:
+        reasons |= dict(_of_objective(cfg, written["agent"], set().union(*typed.values())))
+    for item, keys in typed.items():
         for unused, reason in reasons.items():
-            if (key == unused or key.startswith(f"{unused}.")) and item not in NO_AGENT:
+            used = (key != unused and not key.startswith(f"{unused}.") for key in keys)
+            if not all(used) and item not in NO_AGENT:
                 raise ConfigError(f"{item.removeprefix('++')} has no effect: {reason}")
 
 
@@ -76,3 +86,32 @@ def _of_agent(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
         reason += f": {driver.name} drives the automated vehicles and uses no action of a policy"
     for key in ("agent", "training"):
         yield key, reason
+
+
+def _of_objective(
+    cfg: StudyConfig, written: Any, typed: AbstractSet[str]
+) -> Iterator[tuple[str, str]]:
+    """Yield settings of terms and surrogates that a training by the gradient ignores, and why."""
+    surrogates, limits = (cfg.agent.settings[key] for key in ("surrogates", "limits"))
+    limited = {name for name, share in limits.items() if share is not None}
+    terms = {name: term for name, term in cfg.reward.terms.items() if term.settings.get("weight")}
+    for name in {*surrogates, *limits} - {*terms}:
+        for key in ("surrogates", "limits"):
+            yield f"agent.{key}.{name}", f"the reward has no term {name}"
+    if not limited:
+        yield "agent.limit_rate", "agent.limits has no limit"
+    for name, own in surrogates.items():
+        if name not in terms or own is None:
+            continue
+        at, term = f"agent.surrogates.{name}", f"reward.terms.{name}"
+        text = str(written["surrogates"][name])
+        if name not in limited and "limit" in own.settings and "{.limit}" not in text:
+            yield f"{at}.limit", f"it belongs to agent.limits.{name}=<share>"
+        if name in limited:
+            yield f"{term}.weight", f"agent.limits.{name} sets the price of the term"
+        elif not own.settings["weight"]:
+            yield f"{term}.weight", f"the term counts with {at}.weight=0"
+        for key in terms[name].settings if not {at, f"{at}.{TARGET}"} & typed else ():
+            if key != "weight" and f"{term}.{key}" not in text:
+                what = f"{at} ({own.kind.__name__}) takes the term's place in the objective"
+                yield f"{term}.{key}", f"{what} and has its own settings"

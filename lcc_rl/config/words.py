@@ -20,6 +20,18 @@ def key_of(override: str) -> str:
     return override.lstrip("+~").split("=")[0]
 
 
+def typed_keys(override: str) -> set[str]:
+    """Return the dotted keys that an override sets; those in braces, too.
+
+    Examples:
+        >>> sorted(typed_keys("+a.b={c: 1, d: x}"))
+        ['a.b', 'a.b.c', 'a.b.d']
+    """
+    key, _, value = override.lstrip("+~").partition("=")
+    inside = re.findall(r"(\w+)\s*:", value) if value.startswith("{") else []
+    return {key.partition("@")[0], *(f"{key}.{name}" for name in inside)}
+
+
 def with_variant(variant: str, overrides: Any) -> list[Any]:
     """Return the words of a command from what a program gives; a text is one setting."""
     single = isinstance(overrides, str) or not isinstance(overrides, Iterable)

@@ -22,6 +22,7 @@ from helpers import (
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.loop import TrainingLoop
+from lcc_rl.config import load
 from lcc_rl.errors import Diverged, Interrupted
 from lcc_rl.io.files import read_parquet
 
@@ -124,6 +125,44 @@ def test_the_value_is_fitted_to_returns_of_all_lengths(every) -> None:
                 errors.append((seen[episode, place] - wanted) * alive)
     loss = agent._fit(rewards, running, moments)
     assert float(loss) == pytest.approx(float(torch.stack(errors).square().mean()), rel=1e-5)
+
+
+# Setting of a term, experiment, and the settings of surrogates that follow from it.
+FOLLOW = (
+    ("", "", {"safety": {"limit": 4.0, "threshold": 4.2}, "efficiency": {"threshold": 2.3}}),
+    ("", "limits", {"safety": {"threshold": 4.2}, "efficiency": {"limit": 2.5, "threshold": 2.4}}),
+    ("reward.terms.safety.threshold=2.0", "limits", {"safety": {"limit": 2.0, "threshold": 2.2}}),
+    ("reward.terms.safety.margin=0.5", "", {"safety": {"margin": 0.5}}),
+    ("reward.terms.efficiency.threshold=1.2", "", {"efficiency": {"limit": 1.2, "threshold": 1.0}}),
+    ("reward.terms.efficiency.threshold=1.2", "limits", {"efficiency": {"threshold": 1.1}}),
+    ("scenario.pieces.time_gap.speed_floor=0.5", "limits", {"efficiency": {"speed_floor": 0.5}}),
+    ("reward.terms.hdv_energy.scale=2000.0", "", {"hdv_energy": {"scale": 2000.0}}),
+    ("reward.terms.cav_energy.scale=2000.0", "main", {"cav_energy": {"scale": 2000.0}}),
+    ("~reward.terms.safety", "limits", {"safety": {"limit": 4.0}}),
+    ("scenario.vehicle_length=4.0", "main", {"efficiency": {"vehicle_length": 4.0}}),
+)
+
+
+def test_surrogates_take_the_settings_of_their_terms(subtests) -> None:
+    for word, experiment, expected in FOLLOW:
+        words = [word, experiment and f"experiment={experiment}"]
+        with subtests.test(words=words):
+            cfg = load("train", ["variant=alcc", "agent=analytic", *filter(None, words)])
+            for name, settings in expected.items():
+                found = cfg.agent.settings["surrogates"][name].settings
+                assert {key: found[key] for key in settings} == pytest.approx(settings)
+
+
+def test_a_term_of_weight_zero_is_no_part_of_the_objective(tmp_path) -> None:
+    words = ("surrogates@agent=limits", "agent.limits.safety=null")
+    names = {}
+    for word in ("reward.terms.efficiency.weight=0", "~reward.terms.efficiency"):
+        objective = make(tmp_path / word, *words, word).objective
+        names[word] = [term.name for term, _ in objective.terms], list(objective.limited())
+    first, second = names.values()
+    assert (
+        first == second == (["safety", "cav_energy", "hdv_energy", "collision", "smoothness"], [])
+    )
 
 
 def test_divergence_is_named(tmp_path) -> None:

@@ -81,6 +81,20 @@ IGNORED = {
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",
     "sweep=mine": "names the folder of a sweep, -m",
 }
+# Settings of terms and surrogates that a training by the gradient ignores, and why.
+GRADIENT = {
+    "reward.terms.safety.floor=0.1": r"surrogates.safety \(SmoothSafety\) takes the term's place",
+    "reward.terms.hdv_energy.power=vehicles.power": "surrogates.hdv_energy .* takes the term's",
+    "reward.terms.safety={_target_:lcc_rl.pieces.JerkReward}": "takes the term's place",
+    "agent.limit_rate=0.3": "agent.limits has no limit",
+    "~reward.terms.safety agent.surrogates.safety.weight=2": "the reward has no term safety",
+    "reward.terms.safety.weight=0 agent.surrogates.safety.weight=2": "has no term safety",
+    "agent.surrogates.safety.threshold=5 agent.surrogates.safety.limit=3": "belongs to agent.lim",
+    "experiment=limits reward.terms.efficiency.weight=5": "agent.limits.efficiency sets the price",
+    "experiment=limits reward.terms.safety.weight=5": "with agent.surrogates.safety.weight=0",
+    "experiment=main reward.terms.efficiency.threshold=2": r"\(ExcessSpacing\) takes the term",
+    "experiment=main agent.limits.safety=0.1 ~reward.terms.safety": "reward has no term safety",
+}
 
 
 def train_without_data(words: list[str], folder: Path) -> None:
@@ -105,6 +119,8 @@ def test_a_bad_setting_is_one_line_before_the_data_are_read(tmp_path) -> None:
 
 def test_options_without_effect_are_refused() -> None:
     cases = [(typed, rf"has no effect: .*({why})") for typed, why in IGNORED.items()]
+    ignored = {f"variant=alcc agent=analytic {typed}": why for typed, why in GRADIENT.items()}
+    cases += [(typed, rf"has no effect: .*({why})") for typed, why in ignored.items()]
     check_refused(lambda typed: load("train", typed.split()), cases, ConfigError)
     stronger = f"+{AUTO}.max_acceleration=6"
     words = [stronger, "compare=[idm_acc]"]
