@@ -76,11 +76,27 @@ def test_the_tests_know_every_variant() -> None:
     assert sorted(VARIANTS) == options("variant")
 
 
-def test_every_experiment_composes() -> None:
+def test_every_experiment_composes(caplog) -> None:
     for experiment in options("experiment"):
         variant = ["variant=ddpg"] if "hcfs" in experiment else []
-        cfg = load("pipeline", [f"experiment={experiment}", *variant])
-        assert cfg.training.episodes % cfg.training.environments == 0
+        load("pipeline", [f"experiment={experiment}", *variant])
+    assert not caplog.text  # whole batches
+
+
+def test_a_training_has_whole_batches(caplog) -> None:
+    cfg = load("train", ["training.environments=128", "training.episodes=4000"])
+    assert cfg.training.episodes == 4096
+    assert "training.episodes=4000 is rounded up to 4096, whole batches of 128" in caplog.text
+
+
+def test_a_sweep_can_leave_out_a_term() -> None:
+    whole = load("train", ["variant=alcc", "reward.without=null"])
+    assert identity(whole) == identity(load("train", ["variant=alcc"]))
+    for given in ("safety", "[safety]", "[safety,cav_energy]"):
+        removed = given.strip("[]").split(",")
+        one = load("train", ["variant=alcc", f"reward.without={given}"])
+        other = load("train", ["variant=alcc", *(f"~reward.terms.{name}" for name in removed)])
+        assert identity(one) == identity(other) != identity(whole)
 
 
 def test_every_choice_of_a_group_builds(subtests) -> None:

@@ -86,11 +86,6 @@ def check_lengths(cfg: StudyConfig) -> None:
     warm_up = cfg.agent.settings.get("warm_up") or 0.0
     counted = horizon - round(warm_up / cfg.scenario.time_step)
     require(
-        settings.episodes % settings.environments == 0,
-        f"training.episodes ({settings.episodes}) must be a multiple of training.environments "
-        f"({settings.environments})",
-    )
-    require(
         counted > 0 and counted % settings.segment == 0,
         f"training.segment ({settings.segment}) must divide scenario.horizon ({horizon})"
         + f" without the steps of agent.warm_up ({counted})" * (counted < horizon),

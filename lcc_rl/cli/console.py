@@ -22,6 +22,7 @@ HYDRA_COMMANDS = {
 TOOLS = {
     "status": ("lcc_rl.cli.status", "runs that are running, waiting, finished, failed"),
     "table": ("lcc_rl.cli.table", "the table of an evaluation: text, Markdown, LaTeX, CSV"),
+    "repeat": ("lcc_rl.commands.repeat", "a run again, from its folder; are the rows equal?"),
     "score": ("lcc_rl.commands.score", "a policy on every task and source that it fits"),
     "animate": ("lcc_rl.commands.animate", "animations of episodes: page, SVG, GIF, MP4"),
     "reproduce": ("lcc_rl.studies.reproduce", "a paper's study: tables and figures"),

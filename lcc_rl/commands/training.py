@@ -58,7 +58,7 @@ def run(cfg: TrainConfig, folder: str | Path, quiet: bool = False, resume: bool 
         LccError: for any error in settings, data or files, in one line, which is also written to
             error.txt.
     """
-    folder, named = Path(folder), cfg.resume is not None
+    folder = Path(folder)
     if cfg.resume is not None:
         folder = Path(cfg.resume)
         cfg = _resumed(cfg, folder)
@@ -70,7 +70,7 @@ def run(cfg: TrainConfig, folder: str | Path, quiet: bool = False, resume: bool 
     else:
         check_folder(with_inputs(cfg), folder, *(NOT_IDENTITY if resume else ()))
     with working(folder):
-        return _run(cfg, folder, quiet, named or (folder / CHECKPOINT).exists())
+        return _run(cfg, folder, quiet, (folder / CHECKPOINT).exists())
 
 
 def _resumed(cfg: TrainConfig, folder: Path) -> TrainConfig:
@@ -84,6 +84,11 @@ def _resumed(cfg: TrainConfig, folder: Path) -> TrainConfig:
             raise ResultsError(
                 f"{folder}: {table} belongs to another configuration than config.yaml; resume with "
                 "the settings it was started with"
+            )
+        if learns(own) and (folder / table).exists() and not (folder / CHECKPOINT).exists():
+            raise ResultsError(
+                f"{folder}: {table} without {CHECKPOINT} cannot be resumed; lcc-rl repeat {folder} "
+                "begins again in a new folder"
             )
     if not isinstance(build_logger(cfg), Silent):
         own.logger = cfg.logger

@@ -213,6 +213,7 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     if "agent" in content and not _learns(content):
         content["agent"] = None
     leave_out_foreign(content, overrides)
+    leave_out_terms(content.get("reward"))
     if "inputs" in content:
         raise ConfigError("inputs: runs record the files that they read; remove the setting")
     try:
@@ -247,6 +248,22 @@ def _learns(content: Mapping[str, Any]) -> bool:
     if not isinstance(driver, Mapping) or AUTOMATED not in driver:
         return True
     return takes_action(as_nodes(driver[AUTOMATED], AUTO))
+
+
+def leave_out_terms(reward: Any) -> None:
+    """Remove the terms of ``reward.without``, which a sweep can vary, from a reward.
+
+    Args:
+        reward: the section as plain containers, changed in place.
+
+    Raises:
+        ConfigError: naming a term that the reward lacks.
+    """
+    names = reward.pop("without", None) if isinstance(reward, dict) else None
+    if names:
+        terms, names = reward.get("terms") or {}, [names] if isinstance(names, str) else names
+        require_known("term of the reward in reward.without", names, terms)
+        reward["terms"] = {name: term for name, term in terms.items() if name not in names}
 
 
 def leave_out_foreign(content: dict[str, Any], overrides: Sequence[str]) -> None:
@@ -305,6 +322,11 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         return ConfigError(f"~{found.group(2)}: no file sets it: there is nothing to leave out")
     if found is not None:
         return _unknown_option(found.group(2))
+    if found := re.search(r"Ambiguous value for argument '\+*([^']+?)=([^']+)'", str(error)):
+        key, value = found.groups()
+        return ConfigError(
+            f"{key}={value}: several values are runs of a sweep, -m; a list is {key}=[{value}]"
+        )
     cause = error.__cause__
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)
     words = [*overrides, *text.partition("See https://")[0].split()]

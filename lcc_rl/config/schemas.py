@@ -7,6 +7,7 @@ Values are in conf/. Objects with a ``_target_`` (pieces, agents, data …) are 
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -28,6 +29,8 @@ from lcc_rl.settings import (
     Speed,
     parse,
 )
+
+log = logging.getLogger("lcc_rl")
 
 Device = Annotated[str, Field(pattern=r"^(cpu|cuda)(:\d+)?$")]
 # Each variant has a folder in the job's folder.
@@ -109,6 +112,13 @@ class TrainingConfig(Settings):
     compiled: bool | None = None
     collector: Literal["string", "torchrl"] = "string"
     gap_range: list[float]
+
+    def validate(self) -> None:
+        size, wanted = self.environments, self.episodes
+        self.episodes = -(-wanted // size) * size
+        if self.episodes > wanted:
+            text = "training.episodes=%d is rounded up to %d, whole batches of %d environments"
+            log.warning(text, wanted, self.episodes, size)
 
 
 class EvaluationConfig(Settings):

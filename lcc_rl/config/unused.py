@@ -93,6 +93,9 @@ def _of_objective(
 ) -> Iterator[tuple[str, str]]:
     """Yield settings of terms and surrogates that a training by the gradient ignores, and why."""
     surrogates, limits = (cfg.agent.settings[key] for key in ("surrogates", "limits"))
+    if not cfg.agent.settings["bootstrap"]:
+        for key in ("value_lr", "value_every", "td_lambda", "tau"):
+            yield f"agent.{key}", "agent.bootstrap=false learns no value"
     limited = {name for name, share in limits.items() if share is not None}
     terms = {name: term for name, term in cfg.reward.terms.items() if term.settings.get("weight")}
     for name in {*surrogates, *limits} - {*terms}:
@@ -110,7 +113,10 @@ def _of_objective(
         if name in limited:
             yield f"{term}.weight", f"agent.limits.{name} sets the price of the term"
         elif not own.settings["weight"]:
-            yield f"{term}.weight", f"the term counts with {at}.weight=0"
+            idle = [f"{at}.{key}" for key in own.settings if key != "weight"]
+            for key in (*idle, *(f"{term}.{key}" for key in terms[name].settings)):
+                yield key, f"{at}.weight is 0"
+            continue
         for key in terms[name].settings if not {at, f"{at}.{TARGET}"} & typed else ():
             if key != "weight" and f"{term}.{key}" not in text:
                 what = f"{at} ({own.kind.__name__}) takes the term's place in the objective"

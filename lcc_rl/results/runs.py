@@ -17,6 +17,7 @@ from lcc_rl.errors import LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.results.trust import trusted
+from lcc_rl.runs.origin import ORIGIN, origin
 from lcc_rl.runs.states import CONFIG, no_run
 
 log = logging.getLogger("lcc_rl")
@@ -30,9 +31,11 @@ RUN_FILES = (EPISODES, "drivers.parquet", "checkpoint.pt", "command.txt", "block
 
 
 def save_config(cfg: BaseConfig, folder: Path) -> None:
-    """Write the resolved configuration of a run into its folder."""
+    """Write the resolved configuration of a run into its folder, and where the run comes from."""
     with atomic_path(folder / CONFIG) as temporary:
         temporary.write_text(as_text(cfg), encoding="utf-8")
+    with atomic_path(folder / ORIGIN) as temporary:
+        temporary.write_text(origin(), encoding="utf-8")
 
 
 def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:

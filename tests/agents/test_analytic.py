@@ -131,7 +131,7 @@ def test_the_value_is_fitted_to_returns_of_all_lengths(every) -> None:
 FOLLOW = (
     ("", "", {"safety": {"limit": 4.0, "threshold": 4.2}, "efficiency": {"threshold": 2.3}}),
     ("", "limits", {"safety": {"threshold": 4.2}, "efficiency": {"limit": 2.5, "threshold": 2.4}}),
-    ("reward.terms.safety.threshold=2.0", "limits", {"safety": {"limit": 2.0, "threshold": 2.2}}),
+    ("reward.terms.safety.threshold=2.0", "", {"safety": {"limit": 2.0, "threshold": 2.2}}),
     ("reward.terms.safety.margin=0.5", "", {"safety": {"margin": 0.5}}),
     ("reward.terms.efficiency.threshold=1.2", "", {"efficiency": {"limit": 1.2, "threshold": 1.0}}),
     ("reward.terms.efficiency.threshold=1.2", "limits", {"efficiency": {"threshold": 1.1}}),

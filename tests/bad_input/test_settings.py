@@ -51,7 +51,7 @@ WRONG = {
     f"scenario.horizon={HUGE}": "scenario.horizon must be less than",
     f"seed={10**19}": "seed must be a number of 63 bits",
     "agent.batch_size=50000": "buffer_size",
-    "training.episodes=25": "training.episodes",
+    "reward.without=[safety,jerk]": "term of the reward in reward.without 'jerk'; valid: cav_energy",
     "+logger={_target_: lcc_rl.runs.loggers.RowLogger, kind: paper}": "kind must be",
     # objects of another kind
     "data._target_=os.getcwd": "data.*",
@@ -91,7 +91,10 @@ GRADIENT = {
     "reward.terms.safety.weight=0 agent.surrogates.safety.weight=2": "has no term safety",
     "agent.surrogates.safety.threshold=5 agent.surrogates.safety.limit=3": "belongs to agent.lim",
     "experiment=limits reward.terms.efficiency.weight=5": "agent.limits.efficiency sets the price",
-    "experiment=limits reward.terms.safety.weight=5": "with agent.surrogates.safety.weight=0",
+    "experiment=limits reward.terms.safety.weight=5": "agent.surrogates.safety.weight is 0",
+    "experiment=limits reward.terms.safety.threshold=2": "agent.surrogates.safety.weight is 0",
+    "experiment=limits agent.surrogates.safety.width=1": "agent.surrogates.safety.weight is 0",
+    "experiment=limits agent.tau=0.1": "agent.bootstrap=false learns no value",
     "experiment=main reward.terms.efficiency.threshold=2": r"\(ExcessSpacing\) takes the term",
     "experiment=main agent.limits.safety=0.1 ~reward.terms.safety": "reward has no term safety",
 }

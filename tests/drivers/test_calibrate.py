@@ -1,6 +1,7 @@
 """The calibrate command: files, report, and one clear line for whatever is wrong."""
 
 import io
+from contextlib import chdir
 from copy import deepcopy
 from functools import partial
 
@@ -12,7 +13,7 @@ from helpers import check_refused, slow_but
 from rich.console import Console
 from table_text import long_table
 
-from lcc_rl.commands import calibration
+from lcc_rl.commands import calibration, repeat
 from lcc_rl.config import load
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.functional.laws import LAWS
@@ -108,6 +109,8 @@ def test_command_writes_into_the_run_folder(source, command):
     assert (source / "here" / "drivers.parquet").is_file()
     assert (source / "here" / ".hydra" / "config.yaml").is_file()
     assert "v0 on a bound" in done.stdout
+    with chdir(source):
+        assert repeat.main(["here"]) == 0
 
 
 @pytest.mark.usefixtures("blank_figures")

@@ -1,0 +1,89 @@
+"""A run is repeated from its folder alone, and the rows are compared."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from commands import NO_AGENT, QUICK, TINY, assert_same_tables, run_command, tiny
+from helpers import check_refused
+
+from lcc_rl.commands import repeat, training
+from lcc_rl.errors import LccError
+from lcc_rl.io.files import read_parquet, write_parquet
+from lcc_rl.runs.origin import ORIGIN, origin
+from lcc_rl.version import __version__
+
+
+def test_a_run_is_repeated_from_its_folder(trained, tmp_path, capsys) -> None:
+    assert repeat.main([str(trained), "--out", str(tmp_path / "again")]) == 0
+    assert_same_tables(trained, tmp_path / "again")
+    assert f"{tmp_path / 'again'}: all rows are equal" in capsys.readouterr().out
+
+
+def test_rows_that_differ_are_named(trained, tmp_path) -> None:
+    one, other = (shutil.copytree(trained, tmp_path / name) for name in "ab")
+    rows = read_parquet(one / "episodes.parquet")
+    rows.loc[0, "total_energy_kj"] *= 1.25
+    write_parquet(rows, other / "episodes.parquet")
+    (other / "steps.parquet").unlink()
+    found = dict(repeat.differences(one, other))
+    assert [*found.values()] == [False, False, True]
+    first, second, _ = found
+    assert re.search(r"1 of \d+ columns differ \(total_energy_kj\), by up to 0\.2$", first)
+    assert second == "steps.parquet: not written"
+
+
+def test_settings_alone_are_a_run_to_begin(trained, tmp_path) -> None:
+    folder = tmp_path / "sent"
+    folder.mkdir()
+    shutil.copy(trained / "config.yaml", folder)
+    training.run(tiny("train", f"resume={folder}"), tmp_path, quiet=True)
+    assert_same_tables(trained, folder)
+    (folder / "checkpoint.pt").unlink()
+    again = tiny("train", f"resume={folder}")
+    cases = [
+        (lambda: training.run(again, tmp_path), "parquet without checkpoint.pt .* lcc-rl repeat"),
+        (lambda: repeat.repeat(folder, trained), "exists already; choose another with --out"),
+        (lambda: repeat.repeat(tmp_path, folder), "not a run folder"),
+    ]
+    check_refused(lambda call: call(), cases, LccError)
+
+
+JOB = (*TINY, QUICK, "variants=[alcc]", "jobs=1", "evaluation.baselines=[human]")
+COMMANDS = {"train": (*NO_AGENT, "variant=idm"), "evaluate": (*NO_AGENT, "variant=idm")}
+SLOW = pytest.param("pipeline", JOB, marks=pytest.mark.slow)
+
+
+@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.parametrize(("command", "words"), [*COMMANDS.items(), SLOW])
+def test_every_command_is_repeated(command, words, tmp_path, capsys) -> None:
+    here = f"hydra.run.dir={tmp_path / 'run'}"
+    run_command(f"lcc_rl.cli.{command}", *words, here, cwd=tmp_path, check=True)
+    assert repeat.main([str(tmp_path / "run")]) == 0
+    assert "run_repeated: all rows are equal" in capsys.readouterr().out
+
+
+def test_a_run_says_where_it_comes_from(evaluated) -> None:
+    command, versions, folder = (evaluated / ORIGIN).read_text().splitlines()
+    assert command
+    assert versions.startswith(f"lcc_rl {__version__}, torch ")
+    assert Path(folder.partition(", commit ")[0]).is_absolute()
+
+
+def test_the_state_of_the_users_folder_is_recorded(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    origin.cache_clear()
+    assert ", commit " not in origin()
+    for words in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "one"]):
+        subprocess.run([*git, *words], check=True)
+    origin.cache_clear()
+    assert origin().rstrip().endswith(", unchanged")
+    (tmp_path / "mine.py").touch()
+    origin.cache_clear()
+    assert origin().rstrip().endswith(", 1 files changed")
+    origin.cache_clear()
