@@ -51,7 +51,7 @@ WRONG = {
     f"scenario.horizon={HUGE}": "scenario.horizon must be less than",
     f"seed={10**19}": "seed must be a number of 63 bits",
     "agent.batch_size=50000": "buffer_size",
-    "reward.without=[safety,jerk]": "term of the reward in reward.without 'jerk'; valid: cav_energy",
+    "reward.without=[safety,jerk]": "term of the reward in reward.without 'jerk'; valid",
     "+logger={_target_: lcc_rl.runs.loggers.RowLogger, kind: paper}": "kind must be",
     # objects of another kind
     "data._target_=os.getcwd": "data.*",
