@@ -12,8 +12,8 @@ from lcc_rl.cli.guard import main_guard
 from lcc_rl.errors import require
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.overview import EVERY, counts, left, live, overview_line, progress, states_table
+from lcc_rl.runs.plans import read_plan
 from lcc_rl.runs.states import clean, survey
-from lcc_rl.runs.sweeps import read_plan
 
 
 def show_states(root: Path, console: Console) -> None:

@@ -7,6 +7,7 @@ lcc-rl table outputs/evaluate/<run> --format latex      # for booktabs
 lcc-rl table outputs/evaluate/<run> --columns driver,saved_pct
 lcc-rl table outputs/evaluate/<run> --format csv --decimal comma
 lcc-rl table outputs/train/<sweep> --figure sweep.pdf   # a row per setting
+lcc-rl table outputs/train/<sweep> --rename alcc full --against full
 lcc-rl table outputs/alcc/tables/<table>.parquet --format latex
 """
 
@@ -15,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from textwrap import fill
 from typing import Annotated
 
 import pandas as pd
@@ -22,12 +24,12 @@ from pydantic import Field
 
 from lcc_rl.api import Run
 from lcc_rl.cli.guard import main_guard
-from lcc_rl.io.files import as_rows, read_parquet
-from lcc_rl.results.loading import load_sweep
-from lcc_rl.results.names import worded
+from lcc_rl.io.files import Rows, as_rows, read_parquet
+from lcc_rl.results.names import rename, worded
 from lcc_rl.results.render import as_latex, as_markdown, chosen, for_print
 from lcc_rl.results.report import together
 from lcc_rl.results.runs import EPISODES, FINAL, PARTS, load_config, naming_run
+from lcc_rl.results.sweeps import load_sweep
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.states import CONFIG, run_folders
 
@@ -48,7 +50,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--format", choices=TABLE_FORMATS, default="text", help=form)
     parser.add_argument("--all", action="store_true", help="all measures, as table=all")
     parser.add_argument("--columns", help="names of columns of --format csv, separated by commas")
-    parser.add_argument("--against", help="baseline of savings")
+    parser.add_argument("--against", help="baseline of savings, a name of the table")
+    new = "another name of a row, in all formats; may be repeated"
+    parser.add_argument("--rename", nargs=2, action="append", metavar=("ROW", "NAME"), help=new)
     ending = typed(Annotated[str, Field(pattern=r"\.(png|pdf|svg)$")])
     parser.add_argument("--figure", type=ending, help="also draw the table: a .png, .pdf or .svg")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
@@ -63,6 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         table = chosen(worded(read_parquet(options.run)), names or [])
     else:
         run = read_run(options.run, options.trust)
+        for row, label in options.rename or ():
+            rename(row, label, names_of(run.rows))
         if options.figure:
             draw(run, options.against, options.figure)
         with naming_run(run.folder / EPISODES):
@@ -80,7 +86,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     else:
         print(TABLE_FORMATS[options.format](table))
     if note and options.format != "csv":
-        print(f"% {note}" if options.format == "latex" else f"\n{note}")
+        lines = fill(note, 98, initial_indent="% ", subsequent_indent="% ")
+        print(lines if options.format == "latex" else f"\n{note}")
+
+
+def names_of(rows: Rows) -> list[object]:
+    """Return the strategies of rows."""
+    table = rows if isinstance(rows, pd.DataFrame) else rows.to_table(["strategy"]).to_pandas()
+    return list(table["strategy"].unique())
 
 
 def draw(run: Run, against: str | None, path: str) -> None:
@@ -102,8 +115,9 @@ def draw(run: Run, against: str | None, path: str) -> None:
 def read_run(folder: Path, trust: Sequence[str]) -> Run:
     """Return the run of a folder: the last part of a job, all runs of a sweep as one."""
     folder = folder / FINAL if (folder / PARTS).is_dir() else folder
-    if not (folder / CONFIG).is_file() and (runs := run_folders(folder)):
-        return Run(folder, load_sweep(folder), load_config(runs[0], trust))
+    if not (folder / CONFIG).is_file() and run_folders(folder):
+        rows = load_sweep(folder)
+        return Run(folder, rows, load_config(rows.attrs["first"], trust))
     cfg = load_config(folder, trust)
     with naming_run(folder / EPISODES):
         return Run(folder, as_rows(folder / EPISODES), cfg)

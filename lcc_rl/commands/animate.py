@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pandas as pd
 
-from lcc_rl.errors import ConfigError, ResultsError, require, unknown_name
+from lcc_rl.errors import ConfigError, ResultsError, require
 from lcc_rl.figures.animation import ANIMATION_FORMATS, animate, check_ending
 from lcc_rl.figures.drawing import in_file
 from lcc_rl.io.atomic import new_file
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.motion import SampleMotion, motion_of, sample_episodes
-from lcc_rl.results.names import in_words
+from lcc_rl.results.names import in_words, strategy_named
 from lcc_rl.results.runs import CONFIG, STEPS, naming_run, stored_config
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.states import no_run
@@ -65,11 +65,8 @@ def run(
     with naming_run(folder):
         known = list(dict.fromkeys(map(str, steps["strategy"])))
         named = [name.partition(": ")[::2] for name in strategies or known[-1:]]
-        stored = {in_words(name): name for name in known} | {name: name for name in known}
         for given, words in named:
-            if given not in stored:
-                raise unknown_name("strategy", given, known)
-            strategy = stored[given]
+            strategy = strategy_named(given, known)
             label, rows = _episode(steps, strategy, episode)
             scenario = stored_config(folder)["scenario"]
             motion = _cut(motion_of(rows, scenario), start, duration)

@@ -440,6 +440,7 @@ def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterato
         return
     filtered = cfg.scenario.filters.get(AUTOMATED) is not None
     words = list(filter(None, [other_drivers(cfg), classes(cfg)]))
+    of_sweep = rows.attrs.get("remarks", ()) if isinstance(rows, pd.DataFrame) else ()
     for source, part in by_source(windows_for(rows)):
         one = report(
             part,
@@ -450,7 +451,7 @@ def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterato
             against=against,
             second=second_energy(cfg),
         )
-        yield dataclasses.replace(one, remarks=[*one.remarks, *words])
+        yield dataclasses.replace(one, remarks=[*one.remarks, *words, *of_sweep])
 
 
 def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:

@@ -20,12 +20,12 @@ from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
 from lcc_rl.evaluation.cases import WINDOW_CASES, check_cases
 from lcc_rl.evaluation.fit import check_policy
-from lcc_rl.evaluation.strategies import POLICY, Strategy, deployed, rule, with_weights
+from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.io.files import Rows, as_rows
 from lcc_rl.results.platoons import case_table
 from lcc_rl.results.policies import load_policy, save_policy
 from lcc_rl.results.report import summary, windows_for
-from lcc_rl.results.runs import EPISODES, check_folder, resumed_config, save_config
+from lcc_rl.results.runs import EPISODES, POLICY, check_folder, resumed_config, save_config
 from lcc_rl.results.trust import trust_option
 from lcc_rl.runs.loggers import RowLogger, Silent
 from lcc_rl.runs.precision import prepare_torch

@@ -36,8 +36,9 @@ from lcc_rl.evaluation.rows import (
 )
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, RING
-from lcc_rl.pieces.base import SEED
+from lcc_rl.pieces.base import SEED, Key
 from lcc_rl.pieces.features import CLASS
+from lcc_rl.pieces.rewards import TERMS
 from lcc_rl.results.measures import FASTER
 
 # Steps of a strategy from which compiling saves more than the 3 to 6 s that it takes.
@@ -168,12 +169,18 @@ class Episodes:
         self.begun = begun + self.warm_up
         if compiled is None:
             compiled = len(plan) * self.cfg.scenario.horizon >= COMPILED_STEPS
+        # Of a learned policy; without their weights, which rows have beside the weighted means.
+        terms = self.cfg.reward.terms if strategy.policy is not None else {}
+        self.weights = {name: node.settings.get("weight", 1.0) for name, node in terms.items()}
+        for name, node in terms.items():
+            terms[name] = node.changed(weight=1.0) if "weight" in node.settings else node
         env = build_env(
             self.cfg, inputs.evaluation, inputs.population, plan.size, 0, device, nominal=True
         )
         self.energy, self.second = build_energy(self.cfg), second_energy(self.cfg)
         filtered = self.cfg.scenario.filters.get(AUTOMATED) is not None
-        keys = [*ROW_KEYS, INDEX, CLASS, *(FILTER_ENTRIES if filtered else ())]
+        keys: list[Key] = [*ROW_KEYS, INDEX, CLASS, *(FILTER_ENTRIES if filtered else ())]
+        keys += [(*TERMS, name) for name in self.weights]
         self.player = Player(env, strategy.policy, keys, strategy.title, compiled)
         count = min(sample_episodes, len(plan))
         self.samples = set(np.linspace(0, len(plan) - 1, count).round().astype(int).tolist())
@@ -195,6 +202,7 @@ class Episodes:
             return f"{number} (profile {name}, driver {met}, seed {int(options[SEED][number])})"
 
         record, alive = self.player.play(options, named)
+        terms = {key[-1]: record.pop(key) for key in list(record) if key[:-1] == TERMS}
         crashed = (alive.unsqueeze(-2) & (record["vehicles", "gap"] <= 0.0)).any(0).any(-2)
         braked = brakings(record, alive, self.cfg.scenario.vehicles)
         record, alive = {key: x[self.begun :] for key, x in record.items()}, alive[self.begun :]
@@ -220,6 +228,10 @@ class Episodes:
         measured = measures(groups, alive, time_step, self.energy, recorded, self.second)
         length, free = self.cfg.scenario.vehicle_length, inputs.population.desired_speed[driver]
         measured |= traffic(record, alive, length, time_step, free, self.energy)
+        for name, term in terms.items():  # means of a step, sums over vehicles
+            mean = (term[self.begun :].sum(-2) * alive).sum(0) / alive.sum(0)
+            weighted = self.weights[name] * mean
+            measured |= {f"mean_reward_{name}": weighted, f"mean_term_{name}": mean}
         rows = pd.concat([described, leader, braked, as_frame(measured, crashed)], axis=1)
         rows = rows.iloc[:count]
         inside = [index - block * plan.size for index in sorted(self.samples)]

@@ -35,12 +35,12 @@ from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces import Observation, Piece, TimeGapStart
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.results.names import ON_FRONT, RULE_ROWS
-from lcc_rl.results.runs import distinguished, flatten
+from lcc_rl.results.runs import POLICY, flatten
+from lcc_rl.results.sweeps import labels
 from lcc_rl.settings import TARGET, path_of
 
 log = logging.getLogger("lcc_rl")
 
-POLICY = "policy.pt"
 # Settings that do not distinguish trainings: those of other commands, and those of the seed.
 OF_NO_TRAINING = tuple(
     f"{key}." for key in (*NOT_IDENTITY, "seed", "evaluation", "policy", "inputs.policy")
@@ -378,9 +378,14 @@ def _labels(strategies: Sequence[Strategy], marks: Sequence[tuple[str, int]]) ->
     apart = Counter((name, place) for (name, _), place in places.items())
     differences: dict[tuple[str, str], str] = {}
     for name in {name for name, _ in groups}:
-        texts = list(dict.fromkeys(text for other, (text, _) in places if other == name))
-        words = distinguished([json.loads(text) for text in texts])
-        differences |= {(name, text): word for text, word in zip(texts, words, strict=True)}
+        texts = {
+            text: Path(one.source)
+            for one, (own, (text, _)) in zip(strategies, groups, strict=True)
+            if own == name
+        }
+        every = labels([json.loads(text) for text in texts], list(texts.values()))
+        for text, words in zip(texts, every, strict=True):
+            differences[name, text] = ", ".join(words.values())
     found = []
     for one, (name, (text, which)) in zip(strategies, groups, strict=True):
         place = places[name, (text, which)]

@@ -38,7 +38,7 @@ from lcc_rl.results.bootstrap import Estimate, share_saved
 from lcc_rl.results.motion import most_varied
 from lcc_rl.results.names import ON_FRONT, RULE, in_words, several
 from lcc_rl.results.render import column_cells, signed
-from lcc_rl.results.report import AGAINST, Report
+from lcc_rl.results.report import AGAINST, COUNTS, Report
 from lcc_rl.results.runs import stored_config
 from lcc_rl.results.windows import Means, by_driver
 
@@ -193,12 +193,18 @@ def measures_of(report: Report, seeds: Sequence[Report] = ()) -> Figure:
         seeds: the report of each training seed.
     """
     table = report.short.assign(of=report.short.get("of", ""))
-    names = table[["of", "driver"]].to_numpy()
-    labels = [fill(f"{of}: {driver}".removeprefix(": "), 28) for of, driver in names]
+    names = table["of"] + ": " + table["driver"]
+    if "seeds" in {one.key for one in report.shown}:
+        names += [f", {several(count, 'seed')}" for count in table["seeds"]]
+    labels = [fill(name.removeprefix(": "), 28) for name in names]
     places = {tuple(key): place for place, key in enumerate(table[["of", "strategy"]].to_numpy())}
     shown = [one for one in report.shown if is_numeric_dtype(table[one.key])]
+    shown = [one for one in shown if one.key not in COUNTS]
     shown = [one for one in shown if table[one.key].any()] or shown
-    figure = new_figure(PAGE_WIDTH, 1.0 + 0.17 * len("\n".join(labels).splitlines()))
+    note = "\n".join(fill(line, 120) for line in report.remarks)
+    height = 0.17 * len("\n".join(labels).splitlines()) + 0.12 * len(note.splitlines())
+    figure = new_figure(PAGE_WIDTH, 1.0 + height)
+    figure.supxlabel(note, x=0.01, ha="left", fontsize=6)
     axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
     for axis, (key, head) in zip(axes, shown, strict=True):
         for own in (one.short.assign(of=one.short.get("of", "")) for one in seeds):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zipfile
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,13 @@ def read_torch(path: str | Path) -> Any:
         raise ResultsError(
             f"{path}: not a readable weights file: damaged or of another kind"
         ) from error
+
+
+def checksums(path: Path) -> tuple[int, ...]:
+    """Return the checksums of the tensors of a file; none if it is damaged."""
+    with suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+        return tuple(item.CRC for item in archive.infolist() if "/data/" in item.filename)
+    return ()
 
 
 def check_like(found: Any, wanted: Any, name: str) -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from pathlib import Path
+from textwrap import shorten
 from typing import Any, Literal, overload
 
 import pandas as pd
@@ -18,8 +20,7 @@ import pyarrow as pa
 from pandas.api.types import is_numeric_dtype
 from pyarrow.dataset import Dataset
 
-from lcc_rl.config import NOT_IDENTITY
-from lcc_rl.errors import ResultsError, require, require_known, unknown_name
+from lcc_rl.errors import ResultsError, require_known, unknown_name
 from lcc_rl.io.atomic import SUBFOLDERS
 from lcc_rl.io.files import (
     Rows,
@@ -29,7 +30,8 @@ from lcc_rl.io.files import (
     texts_of,
     unified,
 )
-from lcc_rl.results.runs import CONFIG, FINAL, PARTS, distinguished, flat_settings
+from lcc_rl.results.runs import CONFIG, FINAL, PARTS, flat_settings
+from lcc_rl.runs.plans import unfinished
 
 log = logging.getLogger("lcc_rl")
 
@@ -41,14 +43,13 @@ TABLES = {
     "steps": ("strategy", "time_s"),
     "drivers": ("desired_speed_mps", "time_gap_s"),
 }
+MOST = 12  # most runs in a sentence
+# In the name of a run: all but the last two words of a key, and the hash.
+KEY, HASH = re.compile(r"(?:[\w-]+\.)+(?=\w+\.\w+=)"), re.compile(r"_[0-9a-f]{8}$")
 ALWAYS = ("variant", "seed")  # settings that are columns even if all runs agree
 SHARD, SHARDS = "evaluation.shard", "evaluation.shards"
 # Nullable integers of pandas.
 NULLABLE = {pa.int64(): pd.Int64Dtype(), pa.int32(): pd.Int32Dtype()}
-# Settings in which the parts and the seeds of one study differ.
-SHARED = tuple(f"{key}." for key in (*NOT_IDENTITY, "seed", SHARD))
-TRAINING = ["strategy", "training_seed"]
-EPISODE = [*TRAINING, "profile_id", "driver_id", "repeat", "case", "run_id", "follower"]
 Runs = dict[Path, dict[str, Any]]  # the settings of each run by its table
 
 
@@ -114,6 +115,7 @@ def load(
     """Read one table of every run below a folder.
 
     A damaged run is left out with a warning; ``frame.attrs["damaged"]`` holds the reasons by run,
+    ``frame.attrs["unfinished"]`` the failed, stopped, running and waiting runs with their states,
     and ``frame.attrs["missing"]`` the missing shards of an evaluation. The episodes of a finished
     job of ``lcc-rl run`` are those of its evaluation, which includes its trainings.
 
@@ -123,7 +125,7 @@ def load(
         settings: settings that become columns, by dotted keys (``"seed"``, ``"agent.gamma"``) or
             patterns (``"reward.*"``, ``"*"``); by default ``"variant"``, ``"seed"`` and those in
             which the runs differ.
-        strict: raise for a damaged run or a missing shard.
+        strict: raise for a damaged or unfinished run or a missing shard.
         lazy: return a pyarrow dataset, which reads rows on demand, for tables that do not fit into
             memory.
 
@@ -138,7 +140,10 @@ def load(
     require_known("table", table, TABLES)
     root = Path(root)
     damaged = Damaged(root, strict)
-    runs, schema = _surveyed(root, table, damaged)
+    states = unfinished(root) if root.is_dir() else {}
+    if strict and states:
+        raise ResultsError(f"{root}: not finished: {listed(states)}")
+    runs, schema = _surveyed(root, table, damaged, states)
     constants = _chosen(runs, settings, schema.names)
     parts = {}
     if not lazy:
@@ -148,6 +153,9 @@ def load(
         runs = {path: runs[path] for path in parts}
         if not runs:
             raise _nothing(root, table, damaged)
+    states = {name: state for name, state in states.items() if name not in damaged}
+    if states:
+        log.warning("%s: not finished: %s", root, listed(states))
     missing = missing_shards(list(runs.values())) if table == "episodes" else []
     for line in missing:
         if strict:
@@ -157,49 +165,9 @@ def load(
         return as_dataset(constants, schema)
     frame = _frame(parts, constants)
     frame.attrs |= {"damaged": dict(damaged)} if damaged else {}
+    frame.attrs |= {"unfinished": states} if states else {}
     frame.attrs |= {"missing": missing} if missing else {}
     return frame
-
-
-def load_sweep(root: str | Path) -> pd.DataFrame:
-    """Read the rows of all runs below a folder as those of one evaluation.
-
-    Strategies are named by the settings in which the runs differ (:func:`distinguished`); the seeds
-    of a training share a name. A strategy with the same rows in all runs occurs once.
-
-    Raises:
-        ConfigError: if the runs have different leaders, or a training occurs twice.
-        ResultsError: as :func:`load`.
-    """
-    root = Path(root)
-    rows = load(root, settings=())
-    names = list(rows["run"].unique())
-    stored = [flat_settings(root / name / CONFIG) for name in names]
-    settings = [{k: x for k, x in one.items() if not f"{k}.".startswith(SHARED)} for one in stored]
-    labels = dict(zip(names, distinguished(settings), strict=True))
-    rows = rows.assign(run=rows["run"].astype(str), strategy=rows["strategy"].astype(str))
-    for strategy, part in rows.groupby("strategy"):
-        first, *others = (one.drop(columns="run") for _, one in part.groupby("run"))
-        if all(first.reset_index(drop=True).equals(x.reset_index(drop=True)) for x in others):
-            rows = rows.drop(index=part.index.difference(first.index))
-        else:
-            names = [f"{strategy} {labels[run]}".strip() for run in part["run"]]
-            rows.loc[part.index, "strategy"] = names
-    _check_one_study(root, rows)
-    return rows.drop(columns="run").reset_index(drop=True)
-
-
-def _check_one_study(root: Path, rows: pd.DataFrame) -> None:
-    if "leader_speed_mps" in rows:
-        leaders = rows.groupby("profile_id")["leader_speed_mps"].nunique()
-        require(
-            leaders.max() == 1,
-            f"{root}: its runs have different leaders (profile_id {leaders.idxmax()}); "
-            f"lcc_rl.results.load({str(root)!r}) reads them",
-        )
-    twice = rows[rows.duplicated([key for key in EPISODE if key in rows])]
-    which = [f"{strategy}, seed {seed}" for strategy, seed in twice[TRAINING].to_numpy()[:1]]
-    require(not which, f"{root}: it contains a training twice: {''.join(which)}")
 
 
 def _files(root: Path, name: str, damaged: Damaged) -> list[Path]:
@@ -215,7 +183,9 @@ def _files(root: Path, name: str, damaged: Damaged) -> list[Path]:
     return sorted(found)
 
 
-def _surveyed(root: Path, table: str, damaged: Damaged) -> tuple[Runs, pa.Schema]:
+def _surveyed(
+    root: Path, table: str, damaged: Damaged, states: Mapping[str, str]
+) -> tuple[Runs, pa.Schema]:
     """Return the settings of all runs with readable tables, and their common columns."""
     runs, schemas = {}, {}
     for path in _files(root, f"{table}.parquet", damaged):
@@ -231,7 +201,7 @@ def _surveyed(root: Path, table: str, damaged: Damaged) -> tuple[Runs, pa.Schema
             whole = unified(whole, schemas[path], path)
             kept.append(path)
     if not kept:
-        raise _nothing(root, table, damaged)
+        raise _nothing(root, table, {**states, **damaged})
     return {path: runs[path] for path in sorted(kept)}, whole
 
 
@@ -306,6 +276,19 @@ def missing_shards(runs: Sequence[Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def _nothing(root: Path, table: str, damaged: Damaged) -> ResultsError:
-    why = f"; none is readable: {next(iter(damaged.values()))}" if damaged else ""
+def listed(reasons: Mapping[str, str]) -> str:
+    """Return runs in words by the reasons why they have no rows."""
+    groups: dict[str, list[str]] = {}
+    for name, why in reasons.items():
+        short = HASH.sub("", KEY.sub("", name))
+        groups.setdefault(shorten(why, 100, placeholder=" …"), []).append(short)
+    more = " and {} more"
+    return "; ".join(
+        f"{', '.join(names[:MOST])}{more.format(len(names) - MOST) * (len(names) > MOST)} ({why})"
+        for why, names in groups.items()
+    )
+
+
+def _nothing(root: Path, table: str, reasons: Mapping[str, str]) -> ResultsError:
+    why = f"; none is readable: {listed(reasons)}" if reasons else ""
     return ResultsError(f"{root}: no {table}.parquet in it or below it{why}")

@@ -186,7 +186,9 @@ def score_measures() -> dict[str, Measure]:
 
 def table_columns() -> list[str]:
     """Return the columns of episodes.parquet, or derived from them, that tables need."""
-    return list(dict.fromkeys((*WAYS, *(name for one in MEASURES for name in one.columns))))
+    return list(
+        dict.fromkeys((*WAYS, "drivers", *(name for one in MEASURES for name in one.columns)))
+    )
 
 
 def means(windows: pd.DataFrame, keys: tuple[str, ...]) -> pd.DataFrame:

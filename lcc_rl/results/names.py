@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import pandas as pd
 
 from lcc_rl.config.words import FILTERED
+from lcc_rl.errors import require, unknown_name
 from lcc_rl.functional.pattern import HUMAN
 
 # Units of columns by the end of their names.
@@ -21,6 +24,7 @@ SUFFIX_UNITS |= {"l_per_100km": "L/100 km", "per_100km": "1/100 km"}
 INITIALS = ("cav", "hdv", "ttc", "sd")
 NETWORK = "alcc"
 FILTER_ALONE = "constant_filtered"
+MARKS = "†‡"  # after names in tables: loss of flow; a single training
 RULE = "rule"  # the IDM, tuned on the same data by the gradient
 RULE_ROWS = (RULE, "idm_acc_filtered", "idm_acc")
 ON_FRONT = " X="  # between the name of a strategy and the longest time gap of its filter [s]
@@ -75,8 +79,34 @@ def in_words(name: str) -> str:
         return f"{in_words(name.removesuffix(FILTERED))}, filtered"
     first, _, rest = name.partition(" ")
     if name not in LABELS and first in SEVERAL:
-        return f"{SEVERAL[first]} ({rest.replace('_', ' ')})"
+        words = rest if "=" in rest else rest.replace("_", " ")
+        return f"{SEVERAL[first]} ({words})"
     return LABELS.get(name, name)
+
+
+def strategy_named(given: str, known: Iterable[object]) -> str:
+    """Return the strategy of a name, or of a name in tables.
+
+    Raises:
+        ConfigError: if there is none, naming the nearest.
+    """
+    names = list(map(str, known))
+    stored = {in_words(name): name for name in names} | {name: name for name in names}
+    name = " ".join(given.split()).rstrip(f" {MARKS}")
+    if name not in stored:
+        raise unknown_name("strategy", given, names)
+    return stored[name]
+
+
+def rename(given: str, label: str, known: Iterable[object]) -> None:
+    """Give a strategy another name in tables and figures of this process.
+
+    Raises:
+        ConfigError: if there is no such strategy, or the new name is that of another one.
+    """
+    names = list(map(str, known))
+    require(label not in (*LABELS, *names, *map(in_words, names)), f"--rename: {label!r} is in use")
+    LABELS[strategy_named(given, names)] = label
 
 
 def worded(table: pd.DataFrame) -> pd.DataFrame:

@@ -15,6 +15,7 @@ from lcc_rl.config.schemas import StudyConfig, as_text
 from lcc_rl.errors import ConfigError, ResultsError, raised_as
 from lcc_rl.io.settings import parse_yaml
 from lcc_rl.io.tensors import check_like, read_torch, write_torch
+from lcc_rl.results.runs import POLICY
 from lcc_rl.results.trust import trusted
 from lcc_rl.runs.states import CONFIG, no_run, run_folders
 from lcc_rl.settings import S, Settings, parse
@@ -103,7 +104,7 @@ def policy_file(path: str | Path, variant: str = "") -> Path:
         raise ConfigError(f"policy={path}: no such file; did you mean {PRETRAINED!r}?")
     if first == PRETRAINED and not path.exists():
         path = pretrained_path(path.name if len(path.parts) > 1 else variant)
-    file = path / "policy.pt" if path.is_dir() else path
+    file = path / POLICY if path.is_dir() else path
     if not file.exists() and (path / "checkpoint.pt").is_file():
         raise ConfigError(f"{path}: its training has not ended: lcc-rl train resume={path}")
     if path.is_dir() and not (file.exists() or (path / CONFIG).is_file()) and run_folders(path):

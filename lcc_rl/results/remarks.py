@@ -1,16 +1,29 @@
-"""Sentences on the limitations of an evaluation's numbers."""
+"""Sentences on the result of an evaluation and the limitations of its numbers."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from lcc_rl.config import choices
-from lcc_rl.config.words import FILTERED
+from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.results import measures
-from lcc_rl.results.measures import BROKEN, FASTER, REACH
-from lcc_rl.results.names import HUMAN, counted_windows, in_words, several
+from lcc_rl.results.measures import (
+    BROKEN,
+    FASTER,
+    FLOW,
+    LONG_GAPS,
+    PATH,
+    PATH_PER_KM,
+    REACH,
+)
+from lcc_rl.results.names import HUMAN, NETWORK, RULE_ROWS, counted_windows, in_words, several
+from lcc_rl.results.windows import DISTANCE, savings
 
+ONE = " ‡"  # marks a training of one seed beside several
 MUCH = 0.01  # share of time with infeasible accelerations that tables and log mention
 MOSTLY = 0.2  # share of time; I-80's drivers behind its leaders have 0.02, the stream's 0.06
 FLOW_LOST, FLOW_NAMED, MARK = "flow_lost", 0.02, " †"  # loss of flow that tables mark, as a share
@@ -46,6 +59,18 @@ def flow_note(table: pd.DataFrame) -> str:
     parts = (f"{in_words(str(name))} {100.0 * share:.0f} %" for name, share in named)
     against = in_words(str(table["against"].iloc[0]))
     return f"{MARK.strip()}: flow lost against {against}: {'; '.join(parts)}." if len(lost) else ""
+
+
+def seeds_note(table: pd.DataFrame) -> str:
+    """Return sentences on single trainings, and on seeds that comparisons leave out, if any."""
+    rows = table[table["left_out"] != ""]
+    names = zip(rows["strategy"], rows["left_out"], strict=True)
+    left = [f"for {in_words(str(name))} {seeds}" for name, seeds in names]
+    words = [
+        f"{ONE.strip()}: one training seed, so that intervals exclude the variation of trainings."
+    ] * bool(table["single"].any())
+    words += [f"Savings are by equal training seeds; left out: {'; '.join(left)}."] * bool(left)
+    return " ".join(words)
 
 
 def by_ends(table: pd.DataFrame) -> str:
@@ -133,3 +158,57 @@ def few_windows(windows: int, seconds: float | None = None) -> str:
         return ""
     found = counted_windows(windows) + (f" of {seconds:g} s" if seconds else "")
     return f"{found} are too few for conclusions: these numbers only show that everything runs"
+
+
+def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> str:
+    """Return a sentence on the result of the network; empty without one.
+
+    If no network has its variant's name, each network has a sentence.
+
+    Args:
+        windows: result of :func:`windows_for`.
+        found: their :func:`summary`.
+        of_few: whether too few windows are mentioned.
+    """
+    cars = found[found[PATH].notna()].to_dict("records")
+    rows: dict[str, Any] = {str(row["strategy"]): row for row in cars}
+    other = next((name for name in (*RULE_ROWS, HUMAN) if name in rows), None)
+    if other is None:
+        return ""
+    learned = [name for name, row in rows.items() if row["seeds"] and name not in RULE_ROWS]
+    names = [NETWORK] if NETWORK in rows else learned
+    words = []
+    for name in names:
+        if (count := rows[name]["windows"]) >= FEW_WINDOWS:
+            words.append(_sentence(windows, rows, name, other))
+        elif of_few:
+            both = (f"{rows[x][PATH_PER_KM]:,.1f} kJ ({in_words(x)})" for x in (name, other))
+            few = f"{counted_windows(count)} are too few for a conclusion."
+            words.append(f"Per vehicle and km: {', '.join(both)}; {few}")
+    least = min(rows, key=lambda name: rows[name][PATH_PER_KM])
+    # It may be the user's rule.
+    if words and rows[least]["windows"] >= FEW_WINDOWS and least not in (*names, other):
+        words.append(f"Least energy: {in_words(least)}, {rows[least][PATH_PER_KM]:,.1f} kJ/km.")
+    return "\n".join(words)
+
+
+def _sentence(windows: pd.DataFrame, rows: Mapping[str, Any], name: str, other: str) -> str:
+    """Return a sentence that compares a network with another strategy."""
+    share = savings(windows, PATH, name, other, [DISTANCE])
+    saved, low, high = (100.0 * x for x in (share.value, share.low, share.high))
+    less = "less"
+    if saved < 0.0:
+        less, saved, low, high = "more", -saved, -high, -low
+    within = "" if low > 0.0 else ", within the uncertainty"
+    own, theirs = (100.0 * rows[x][LONG_GAPS] for x in (name, other))
+    article = "the " if in_words(name) != name else ""
+    interval = f"({low:.1f} … {high:.1f})".replace("-", "−")
+    flows = [f"{rows[x][FLOW]:,.0f}" for x in (name, other, RECORDED) if x in rows]
+    flow = f"; flow: {flows[0]} vehicles per hour against {flows[1]}"
+    flow += f", {in_words(RECORDED)} {flows[2]}" if len(flows) > 2 else ""
+    flow *= bool(np.isfinite(rows[name][FLOW]))
+    return (
+        f"With {article}{in_words(name)}, energy per vehicle and km is {saved:.1f} % {interval} "
+        f"{less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of "
+        f"the time against {theirs:.2f} %{flow}."
+    )

@@ -147,13 +147,16 @@ def as_rich(table: pd.DataFrame, shown: Sequence[Shown], title: str, caption: st
     drawn = Table(title=escape(title), caption=escape(caption), **PLAIN)
     for place, column in enumerate(shown):
         drawn.add_column(escape(column.heading), justify="right" if place else "left")
+    words = [len(word) for name in table[shown[0].key] for word in name.split()]
+    drawn.columns[0].min_width = min(max(words, default=0), WIDTH // 2)  # wrapped at spaces
+    drawn.columns[0].overflow = "fold"
     for row in zip(*(_short_cells(table, column.key) for column in shown), strict=True):
         drawn.add_row(*map(escape, row))
     return drawn
 
 
 def _short_cells(table: pd.DataFrame, name: str) -> list[str]:
-    if f"{name}_low" not in table:
+    if f"{name}_low" not in table or not name.endswith("_pct"):
         return column_cells(table, name)
     bounds = zip(*(table[f"{name}{end}"] for end in ("", "_low", "_high")), strict=True)
     return [saved_text(*row) for row in bounds]

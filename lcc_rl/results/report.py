@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +18,6 @@ from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING
 from lcc_rl.results.fronts import at_equal_flow
 from lcc_rl.results.measures import (
     FLOW,
-    LONG_GAPS,
     MEASURES,
     PATH,
     PATH_PER_KM,
@@ -28,28 +27,38 @@ from lcc_rl.results.measures import (
 )
 from lcc_rl.results.names import (
     HUMAN,
-    NETWORK,
     ON_FRONT,
     RULE,
     RULE_ROWS,
-    counted_windows,
     in_words,
+    strategy_named,
 )
 from lcc_rl.results.remarks import (
     FEW_DRIVES,
-    FEW_WINDOWS,
     FLOW_LOST,
     FLOW_NAMED,
     MARK,
+    ONE,
     by_ends,
     crashes,
     few_drives,
     flow_note,
     remarks,
+    seeds_note,
+    verdict,
 )
 from lcc_rl.results.task import Task
 from lcc_rl.results.units import burns_one_fuel, check_unit, in_unit
-from lcc_rl.results.windows import DISTANCE, DRIVE, TRAINED, WAYS, savings, windows_of
+from lcc_rl.results.windows import (
+    DISTANCE,
+    DRIVE,
+    TRAINED,
+    WAYS,
+    ratio,
+    savings,
+    seeds_left_out,
+    windows_of,
+)
 
 # Baselines of tables and verdicts; the first one that was evaluated is used.
 AGAINST = (RECORDED, HUMAN, "idm", "idm_acc_filtered", "idm_acc", "rule", "reference")
@@ -80,6 +89,7 @@ SAVINGS = {  # columns of short tables by estimate
 }
 WAY, FLOW_SHARE = Shown("distance_pct", "dis-\ntance\n[%]"), Shown("flow_pct", "flow\n[%]")
 COLLISIONS, KEEPS = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
+COUNTS = {"windows": "windows", "drives": "drives", "drivers": "drivers", "seeds": "training seeds"}
 ALL = "all measures: table=all or --all."
 CAPTION = f"Path energy per vehicle and km; {{}}{ALL}"
 SHARES = "shares of the time: TTC < 4 s; time gap > 2.5 s above 1 m/s; "
@@ -175,8 +185,10 @@ def summary(
         their flow, ``rule_saving``, that against the rule at this flow, and ``drawn_saving``, that
         of the energy drawn in an episode, with their intervals;
         ``end_saving``, the difference of the drawn and the first saving; the shares of distance
-        and flow lost; numbers of windows, drives and training seeds; and for a task score, limits
-        and whether they are kept without a collision. Missing values are NaN, as are savings and
+        and flow lost; numbers of windows, drives, drivers behind each window and training seeds;
+        ``left_out``, the seeds that the first saving leaves out, and ``single``, whether it has
+        one training beside others of several; and for a task score, limits and whether they are
+        kept without a collision. Missing values are NaN, as are savings and
         losses of a strategy with collisions.
 
     Raises:
@@ -195,14 +207,19 @@ def summary(
         row: dict[str, Any] = {"strategy": name, "against": against or ""}
         kinds = {"windows": "profile_id", "drives": DRIVE, "seeds": TRAINED}
         row |= {key: part.get(of, part["profile_id"]).nunique() for key, of in kinds.items()}
+        row |= {"drivers": int(part["drivers"].max())} if "drivers" in part else {}
+        row["left_out"], kept = seeds_left_out(windows, name, against)
+        row["single"] = kept == 1
         if task:
             row |= {SCORE: score_of(task, part, energy)}
         crashed = bool(part.get("collisions", pd.Series(dtype=float)).sum())
         row |= _savings(windows, name, (column, per), None if crashed else against)
+        row |= ratio(windows, "all_path_energy_kj", name, [DISTANCE]).columns(PATH_PER_KM, 1e3)
         row |= {measure.key: measure.value(part) for measure in MEASURES}
         rows.append(row)
     table = pd.DataFrame(rows)
     table = table.astype({"collisions": int, "episodes": int})
+    table["single"] &= table["seeds"].max() > 1
     whole = table[table["strategy"] == against]
     for key, lost in {"distance_lost": DISTANCE, FLOW_LOST: FLOW}.items():
         table[key] = 1.0 - table[lost] / (whole[lost].iloc[0] if len(whole) else np.nan)
@@ -277,6 +294,7 @@ def report(
         against: the baseline; by default that of the task, or the first of :data:`AGAINST`.
         second: the second energy model, if any, for a heading.
     """
+    against = strategy_named(against, windows["strategy"].unique()) if against else None
     if task:
         task = replace(task, against=against) if against else task.among(windows["strategy"])
         task = task.resolved(windows)
@@ -287,13 +305,13 @@ def report(
         for end in ("", "_low", "_high")
     }
     percent["distance_pct"] = -100.0 * table["distance_lost"] + 0.0  # no negative zero
-    every = table.assign(**percent)
+    every = pd.concat([table, pd.DataFrame(percent)], axis=1)  # in few blocks, for more columns
     made = _of_task(every, task) if task else _of_energy(every, energy, filtered, second)
     short, shown = made.pop("short")
     rows = _rows(task, table["against"].iloc[0])
     words = "" if task else verdict(windows, table, few)
     words = "\n".join(filter(None, [words, few_drives(table)]))
-    notes += [*crashes(table), *filter(None, [flow_note(table), by_ends(table)])]
+    notes += [*crashes(table), *filter(None, [flow_note(table), by_ends(table), seeds_note(table)])]
     made |= {"full_caption": FULL, "verdict": words, "remarks": notes}
     return Report(of, table, short, shown, rows, **made)
 
@@ -302,7 +320,6 @@ def _rows(task: Task | None, against: str | None) -> list[Measure]:
     """Return the rows of the full table."""
     bounds = task.bounds if task else {}
     kept = [Measure("kept", "keeps the limits (1: yes)", "{:d}")] if task else []
-    counts = {"windows": "windows", "drives": "drives", "seeds": "training seeds"}
     return [
         *([Measure(SCORE, task.label)] if task else ()),
         Measure("saving", f"saved against {in_words(str(against))}", "{:+.2%}"),
@@ -323,7 +340,7 @@ def _rows(task: Task | None, against: str | None) -> list[Measure]:
             for one in sorted(bounds, key=lambda one: one.key.startswith(SHARE))
         ),
         *kept,
-        *(Measure(key, label, "{:d}") for key, label in counts.items()),
+        *(Measure(key, label, "{:.0f}") for key, label in COUNTS.items()),
     ]
 
 
@@ -338,11 +355,14 @@ def _of_energy(
     cars = table[table[PATH].notna()] if table[PATH].notna().any() else table
     cars = cars.sort_values(PATH_PER_KM, ascending=False, kind="stable").reset_index(drop=True)
     against = (cars["against"].iloc[0] or None) if len(cars) > 1 else None
+    ends = ("", "_low", "_high") if against is None and len(cars) > 1 else ("",)
     source, flow = flow_against(cars)
     way, basis = (WAY, "distance against theirs") if flow.isna().all() else (FLOW_SHARE, source)
     note = "" if against is None else f"{saved_against(cars, against)}; {basis}; "
+    note += f"{with_interval(cars, 'energy')}; " * (len(ends) > 1)
     short = [one for one in MEASURES if one.short]
-    columns = {"energy_kj_per_km": cars[PATH_PER_KM], FLOW_SHARE.key: flow}
+    columns = {f"energy_kj_per_km{end}": cars.get(f"{PATH_PER_KM}{end}") for end in ends}
+    columns[FLOW_SHARE.key] = flow
     columns |= {one.shown.key: (one.scale * cars[one.key]).round(2) for one in short}
     shown = [Shown("energy_kj_per_km", "energy\n[kJ/km]")]
     if energy is not None and burns_one_fuel(energy):
@@ -388,13 +408,23 @@ def shortened(
 ) -> tuple[pd.DataFrame, tuple[Shown, ...]]:
     """Return columns of a table with intervals and strategies in words, and the columns.
 
-    Strategies that lose more than 2 % of the flow are marked.
+    Strategies that lose more than 2 % of the flow, and single trainings beside several, are marked.
+    With several seeds, collisions are means of a training.
     """
+    if table.get("seeds", pd.Series([0])).max() > 1:
+        per = Shown(COLLISIONS.key, f"{COLLISIONS.heading}\n/ seed")
+        shown = [*(per if one == COLLISIONS else one for one in shown), Shown("seeds", "seeds")]
+        table = table.assign(collisions=table["collisions"] / table["seeds"].clip(lower=1))
+    counts = [key for key in ("windows", "drivers") if key in table and table[key].nunique() > 1]
+    shown = [*shown, *(Shown(key, key) for key in counts)]
     lost = table.get(FLOW_LOST, pd.Series(np.nan, table.index)) > FLOW_NAMED
     words = [in_words(str(name)) for name in table["strategy"]]
-    table = table.assign(driver=[x + MARK * y for x, y in zip(words, lost, strict=True)])
+    single = table.get("single", lost & False)
+    rows = zip(words, lost, single, strict=True)
+    table = table.assign(driver=[x + MARK * y + ONE * z for x, y, z in rows])
     shown = (Shown("driver", "driven by"), *shown)
     names = [f"{one.key}{end}" for one in shown for end in ("", "_low", "_high")]
+    names += [key for key in COUNTS if key not in names]
     return table[["strategy", *(x for x in names if x in table)]], shown
 
 
@@ -409,8 +439,14 @@ def saved_against(found: pd.DataFrame, against: str, always: bool = False) -> st
     words = f"saved: against {in_words(against)}"
     if not always and found["saving_low"].isna().all():
         return words
+    return with_interval(found, words)
+
+
+def with_interval(found: pd.DataFrame, words: str) -> str:
+    """Return the words with the kind of the interval; ``found`` as for :func:`saved_against`."""
     windows, drives, seeds = (int(found[name].max()) for name in ("windows", "drives", "seeds"))
     over = "windows" if drives < LEAST_DRIVES else f"{drives} drives"
+    over += " of one training" * (seeds == 1)
     if seeds > 1:
         up_to = "up to " if found.loc[found["seeds"] > 0, "seeds"].nunique() > 1 else ""
         over += f" and {up_to}{seeds} training seeds"
@@ -430,57 +466,3 @@ def flow_against(table: pd.DataFrame) -> tuple[str, pd.Series]:
     whole = table.loc[table["strategy"] == name, FLOW]
     share = table[FLOW] / (whole.iloc[0] if len(whole) else np.nan) - 1.0
     return f"flow against {in_words(str(name))}", 100.0 * share
-
-
-def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> str:
-    """Return a sentence on the result of the network; empty without one.
-
-    If no network has its variant's name, each network has a sentence.
-
-    Args:
-        windows: result of :func:`windows_for`.
-        found: their :func:`summary`.
-        of_few: whether too few windows are mentioned.
-    """
-    cars = found[found[PATH].notna()].to_dict("records")
-    rows: dict[str, Any] = {str(row["strategy"]): row for row in cars}
-    other = next((name for name in (*RULE_ROWS, HUMAN) if name in rows), None)
-    if other is None:
-        return ""
-    learned = [name for name, row in rows.items() if row["seeds"] and name not in RULE_ROWS]
-    names = [NETWORK] if NETWORK in rows else learned
-    words = []
-    for name in names:
-        if (count := rows[name]["windows"]) >= FEW_WINDOWS:
-            words.append(_sentence(windows, rows, name, other))
-        elif of_few:
-            both = (f"{rows[x][PATH_PER_KM]:,.1f} kJ ({in_words(x)})" for x in (name, other))
-            few = f"{counted_windows(count)} are too few for a conclusion."
-            words.append(f"Per vehicle and km: {', '.join(both)}; {few}")
-    least = min(rows, key=lambda name: rows[name][PATH_PER_KM])
-    # It may be the user's rule.
-    if words and rows[least]["windows"] >= FEW_WINDOWS and least not in (*names, other):
-        words.append(f"Least energy: {in_words(least)}, {rows[least][PATH_PER_KM]:,.1f} kJ/km.")
-    return "\n".join(words)
-
-
-def _sentence(windows: pd.DataFrame, rows: Mapping[str, Any], name: str, other: str) -> str:
-    """Return a sentence that compares a network with another strategy."""
-    share = savings(windows, PATH, name, other, [DISTANCE])
-    saved, low, high = (100.0 * x for x in (share.value, share.low, share.high))
-    less = "less"
-    if saved < 0.0:
-        less, saved, low, high = "more", -saved, -high, -low
-    within = "" if low > 0.0 else ", within the uncertainty"
-    own, theirs = (100.0 * rows[x][LONG_GAPS] for x in (name, other))
-    article = "the " if in_words(name) != name else ""
-    interval = f"({low:.1f} … {high:.1f})".replace("-", "−")
-    flows = [f"{rows[x][FLOW]:,.0f}" for x in (name, other, RECORDED) if x in rows]
-    flow = f"; flow: {flows[0]} vehicles per hour against {flows[1]}"
-    flow += f", {in_words(RECORDED)} {flows[2]}" if len(flows) > 2 else ""
-    flow *= bool(np.isfinite(rows[name][FLOW]))
-    return (
-        f"With {article}{in_words(name)}, energy per vehicle and km is {saved:.1f} % {interval} "
-        f"{less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of "
-        f"the time against {theirs:.2f} %{flow}."
-    )

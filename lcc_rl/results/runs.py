@@ -22,6 +22,7 @@ from lcc_rl.runs.states import CONFIG, no_run
 
 log = logging.getLogger("lcc_rl")
 
+POLICY = "policy.pt"
 EPISODES = "episodes.parquet"  # last file of a run, which shows that it is finished
 STEPS = "steps.parquet"
 PARTS, FINAL = ".parts", "evaluation"  # parts' settings and last part of a job of lcc-rl run
@@ -174,11 +175,11 @@ def flatten(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield name, str(value) if isinstance(value, list) else value
 
 
-def distinguished(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return for each flat mapping the values by which it differs, ``key=value, …``.
+def differences(settings: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Return for each flat mapping the values by which it differs, ``key=value``, by key.
 
-    As few keys as possible are used, each with as many of its last words as are unique:
-    ``safety.weight=0.5``. Hashes of files are used only if no setting differs.
+    As few keys as possible are used, each with its last words: ``safety.weight=0.5``. Hashes of
+    files are used only if no setting differs.
     """
     every = list(dict.fromkeys(key for one in settings for key in one))
 
@@ -189,12 +190,12 @@ def distinguished(settings: Sequence[Mapping[str, Any]]) -> list[str]:
     for key in sorted(chosen, key=lambda key: (not key.startswith("inputs."), kinds([key]))):
         rest = [x for x in chosen if x != key]
         chosen = rest if kinds(rest) == kinds(chosen) else chosen
-    names = {key: _last_words(key, every) for key in chosen}
-    return [", ".join(f"{names[key]}={one.get(key)}" for key in chosen) for one in settings]
+    names = {key: _last_words(key, chosen) for key in chosen}
+    return [{key: f"{names[key]}={one.get(key)}" for key in chosen} for one in settings]
 
 
 def _last_words(key: str, keys: Sequence[str]) -> str:
-    """Return as many of the last words of a dotted key as are unique."""
+    """Return as many of the last words of a dotted key as are unique, at least two."""
     words = key.split(".")
-    ends = (".".join(words[-count:]) for count in range(1, len(words)))
+    ends = (".".join(words[-count:]) for count in range(2, len(words)))
     return next((end for end in ends if sum(f".{x}".endswith(f".{end}") for x in keys) == 1), key)

@@ -13,7 +13,8 @@ import pyarrow as pa
 
 from lcc_rl.energy import AVERAGED, BURNT, SECOND
 from lcc_rl.io.files import Rows, read_parquet
-from lcc_rl.results.bootstrap import NOTHING, Estimate, saving, share_saved
+from lcc_rl.results.bootstrap import NOTHING, Estimate, estimate, saving, share_saved
+from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import EPISODES
 
 WINDOWS, DRIVERS = "windows.parquet", "drivers.parquet"
@@ -33,7 +34,8 @@ PER_KM = "vehicle and km"
 # Distances by which the energies of each group of vehicles are divided.
 DRIVEN = {"cav": WAYS[:1], "hdv": WAYS[1:], "total": WAYS}
 # Aggregation of columns that are not averaged, by first word or whole name.
-HOW = {"min": "min", "max": "max", "worst": "max", "episodes": "sum", "collisions": "sum"}
+HOW = {"min": "min", "max": "max", "worst": "max"}
+HOW |= dict.fromkeys(("episodes", "collisions", "drivers"), "sum")
 
 
 def how(column: str) -> str:
@@ -50,8 +52,9 @@ def windows_of(rows: Rows, columns: Sequence[str] = ()) -> pd.DataFrame:
 
     Returns:
         A row per strategy, training seed and window. Columns ``min_…`` and ``max_…`` are the
-        smallest and largest values, ``episodes`` the number of rows, ``collisions`` that of rows
-        with a collision, ``worst_share_…`` the largest share of an episode.
+        smallest and largest values, ``episodes`` the number of rows, ``drivers`` that of drivers,
+        ``collisions`` that of rows with a collision, ``worst_share_…`` the largest share of an
+        episode.
     """
     return fold(rows, [*WINDOW_KEYS, *PER_WINDOW], columns)
 
@@ -82,7 +85,7 @@ def _frames(rows: Rows, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
         yield rows
         return
     wanted = set(columns) or set(rows.schema.names)
-    wanted |= {"collided", DAMPING, *WAYS}
+    wanted |= {"collided", DAMPING, REPEAT, *WAYS}
     wanted |= {f"{group}_{name}" for group in ("total", "hdv") for name in ENERGIES}
     known = [name for name in rows.schema.names if name in wanted]
     for file in rows.get_fragments():
@@ -99,6 +102,7 @@ def _derived(rows: pd.DataFrame) -> pd.DataFrame:
     """Add numbers, distances and energies of all vehicles, and whether an episode is damped."""
     seed = pd.to_numeric(rows.get(TRAINED, pd.Series(np.nan, rows.index))).astype("Int64")
     found: dict[str, Any] = {TRAINED: seed, "episodes": 1.0}
+    found["drivers"] = (rows[REPEAT] == 0).astype(float) if REPEAT in rows else 1.0
     if "collided" in rows:
         found |= dict.fromkeys(("collisions", "collided"), rows["collided"].astype(float))
     if ways := [name for name in WAYS if name in rows]:
@@ -122,7 +126,7 @@ def _sums(frame: pd.DataFrame, by: Sequence[str], columns: Sequence[str]) -> pd.
         shares = [name for name in names if name.startswith("share_")]
         frame = frame.assign(**{f"worst_{name}": frame[name] for name in shares})
         names += [f"worst_{name}" for name in shares]
-    names = list(dict.fromkeys(["episodes", *names]))
+    names = list(dict.fromkeys(["episodes", "drivers", *names]))
     keys = [frame[name] for name in by if name in frame]
     values = frame[names].astype(np.float64)
     groups = values.groupby(keys, sort=False, dropna=False, observed=True)
@@ -191,7 +195,8 @@ def savings(
 ) -> Estimate:
     """Return the share of the baseline's mean energy that a strategy saves.
 
-    Tables show ``savings(rows, "total_path_energy_kj", "alcc", "human", per=WAYS)``.
+    Tables show ``savings(rows, "total_path_energy_kj", "alcc", "human", per=WAYS)``. Trainings are
+    compared by equal seeds (:func:`with_equal_seeds`).
 
     Args:
         rows: rows of an evaluation, or result of :func:`windows_of`.
@@ -206,10 +211,50 @@ def savings(
         (:func:`lcc_rl.results.bootstrap.estimate`), for the windows of both; NaN if one of them is
         missing.
     """
+    energy, way, drives = _by_window(with_equal_seeds(rows, strategy, baseline), column, per)
+    if energy.empty or not {strategy, baseline} <= set(energy.columns.get_level_values(0)):
+        return NOTHING
+    ours, theirs = ((energy[x].to_numpy(), way[x].to_numpy()) for x in (strategy, baseline))
+    return saving(ours[0], theirs[0], drives=drives, ways=(ours[1], theirs[1]))
+
+
+def ratio(rows: pd.DataFrame, column: str, strategy: str, per: Sequence[str]) -> Estimate:
+    """Return a strategy's mean energy per distance with its interval, as :func:`savings`."""
+    if column not in rows:
+        return NOTHING
+    energy, way, drives = _by_window(rows[rows[STRATEGY] == strategy], column, per)
+    side = {"energy": energy.to_numpy(), "way": way.to_numpy()}
+    return estimate(lambda x: x["energy"] / x["way"], side, drives=drives) if way.size else NOTHING
+
+
+def with_equal_seeds(rows: pd.DataFrame, strategy: str, baseline: str) -> pd.DataFrame:
+    """Return the rows of two strategies, of their common training seeds if they have any."""
     chosen = rows[rows[STRATEGY].isin([strategy, baseline])]
     if TRAINED not in chosen:
-        chosen = chosen.assign(**{TRAINED: np.nan})
-    ways = [name for name in per if name in rows]
+        return chosen.assign(**{TRAINED: np.nan})
+    seeds = [set(x.dropna()) for _, x in chosen.groupby(STRATEGY, observed=True)[TRAINED]]
+    common = set.intersection(*seeds) if seeds else ()
+    return chosen[chosen[TRAINED].isna() | chosen[TRAINED].isin(common)] if common else chosen
+
+
+def seeds_left_out(rows: pd.DataFrame, strategy: str, baseline: str | None) -> tuple[str, int]:
+    """Return in words the seeds of two strategies that are not compared, and the number of others.
+
+    The number is that of the strategy's seeds.
+    """
+    every = rows[rows[STRATEGY].isin([strategy, baseline])].dropna(subset=TRAINED)
+    every = every.drop_duplicates(WINDOW_KEYS[:2]).sort_values(TRAINED)
+    kept = with_equal_seeds(every, strategy, str(baseline))
+    left = every.drop(kept.index).groupby(STRATEGY, sort=False)[TRAINED]
+    words = (f"seed {', '.join(map(str, seeds))} of {in_words(str(of))}" for of, seeds in left)
+    return " and ".join(words), int((kept[STRATEGY] == strategy).sum())
+
+
+def _by_window(
+    chosen: pd.DataFrame, column: str, per: Sequence[str]
+) -> tuple[pd.DataFrame, pd.DataFrame, list[object] | None]:
+    """Return energy and distance by window, strategy and seed, and the drives of the windows."""
+    ways = [name for name in per if name in chosen]
     groups = chosen.groupby([*WINDOW_KEYS[:2], "profile_id"], dropna=False, sort=False)
     means = groups[list(dict.fromkeys([column, *ways]))].mean().reset_index()
     means[TRAINED] = means[TRAINED].astype(object).fillna(-1)
@@ -219,14 +264,10 @@ def savings(
         for name in (column, "way")
     )
     energy = energy.dropna(axis=1, how="all").dropna()
-    if energy.empty or not {strategy, baseline} <= set(energy.columns.get_level_values(0)):
-        return NOTHING
-    way = way.loc[energy.index, energy.columns]
     drives = None
-    if DRIVE in rows:
+    if DRIVE in chosen:
         drives = chosen.groupby("profile_id")[DRIVE].first().reindex(energy.index).tolist()
-    ours, theirs = ((energy[x].to_numpy(), way[x].to_numpy()) for x in (strategy, baseline))
-    return saving(ours[0], theirs[0], drives=drives, ways=(ours[1], theirs[1]))
+    return energy, way.loc[energy.index, energy.columns], drives
 
 
 def episode_mean(part: pd.DataFrame, column: str) -> float:

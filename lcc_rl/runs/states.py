@@ -66,6 +66,9 @@ class RunState:
     eta_s: float | None = None
     error: str = ""
 
+    def __str__(self) -> str:
+        return f"{self.state}: {self.error}".removesuffix(": ")
+
 
 @contextmanager
 def claim(folder: Path) -> Iterator[None]:

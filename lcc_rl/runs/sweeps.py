@@ -11,7 +11,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
 from shutil import which
@@ -26,11 +26,11 @@ from rich.console import Console
 from rich.live import Live
 
 from lcc_rl.config import NOT_IDENTITY, identity, key_of, parsed
-from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
+from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
-from lcc_rl.io.settings import read_json
 from lcc_rl.runs.interrupts import BAD_INPUT, was_interrupted
 from lcc_rl.runs.overview import live
+from lcc_rl.runs.plans import MOST_RUNS, PLAN, SweepPlan, read_plan
 from lcc_rl.runs.states import (
     CONFIG,
     Busy,
@@ -44,8 +44,6 @@ from lcc_rl.runs.states import (
 
 log = logging.getLogger("lcc_rl")
 
-PLAN = "sweep.json"
-MOST_RUNS = 100_000  # most runs of a sweep: Hydra holds all of them in memory
 LONGEST_NAME = 100  # characters of a folder's name before the hash
 SILENT = logging.CRITICAL + 1
 
@@ -213,19 +211,6 @@ def limit_batches(config: DictConfig) -> None:
             hydra.sweeper.max_batch_size = parallel_jobs(config.threads)
 
 
-@dataclass(frozen=True)
-class SweepPlan:
-    """Plan of a sweep.
-
-    Args:
-        runs: number of runs; 0 if unknown.
-        varied: dotted keys of settings that differ between runs.
-    """
-
-    runs: int = 0
-    varied: list[str] = field(default_factory=list)
-
-
 def make_plan(config: DictConfig) -> SweepPlan:
     """Return the plan of a sweep's configuration."""
     typed = words_of(config)
@@ -234,17 +219,8 @@ def make_plan(config: DictConfig) -> SweepPlan:
     parsed = OverridesParser.create().parse_overrides(result_overrides(typed))
     swept = {item.get_key_element(): item for item in parsed if item.is_sweep_override()}
     varied = [key_of(key) for key in swept]
-    values = (islice(item.sweep_string_iterator(), MOST_RUNS + 1) for item in swept.values())
-    return SweepPlan(math.prod(sum(1 for _ in some) for some in values), varied)
-
-
-def read_plan(folder: Path) -> SweepPlan:
-    """Return the plan of the sweep in a folder; an empty one if there is none."""
-    try:
-        plan = SweepPlan(**read_json(folder / PLAN))
-        return SweepPlan(int(plan.runs), [str(key) for key in plan.varied])
-    except (ResultsError, ValueError, TypeError, OverflowError):
-        return SweepPlan()
+    values = [list(islice(item.sweep_string_iterator(), MOST_RUNS + 1)) for item in swept.values()]
+    return SweepPlan(math.prod(map(len, values)), varied, values)
 
 
 def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path) -> Any:

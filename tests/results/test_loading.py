@@ -19,8 +19,8 @@ from lcc_rl.cli.status import main as status
 from lcc_rl.commands import animate
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.results.loading import load_sweep
-from lcc_rl.results.runs import distinguished
+from lcc_rl.results.runs import differences
+from lcc_rl.results.sweeps import load_sweep
 
 TABLE = "episodes.parquet"
 
@@ -84,13 +84,13 @@ def test_what_tells_runs_apart_is_few_settings_by_their_last_words() -> None:
         ([{"rate": r, "kind": r > 1} for r in (1, 2, 3)], ["rate=1", "rate=2", "rate=3"]),
         (
             [{"a.gamma": g, "a.rate": r, "c": 0} for g in (0, 1) for r in (2, 3)],
-            [f"gamma={g}, rate={r}" for g in (0, 1) for r in (2, 3)],
+            [f"a.gamma={g}, a.rate={r}" for g in (0, 1) for r in (2, 3)],
         ),
-        ([{"inputs.data": "x"}, {"inputs.data": "y"}], ["data=x", "data=y"]),
+        ([{"inputs.data": "x"}, {"inputs.data": "y"}], ["inputs.data=x", "inputs.data=y"]),
         ([{"seed": 0}, {"seed": 0, "other.seed": 1}], ["other.seed=None", "other.seed=1"]),
         ([{"seed": 0}, {"seed": 0}], ["", ""]),
     ):
-        assert distinguished(settings) == expected
+        assert [", ".join(one.values()) for one in differences(settings)] == expected
 
 
 def sweep_of(root: Path, *runs: dict[str, object], **columns: object) -> pd.DataFrame:

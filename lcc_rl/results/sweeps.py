@@ -1,0 +1,122 @@
+"""Runs of a sweep as one evaluation: a row per setting, and what is missing or has no effect."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from lcc_rl.config import NOT_IDENTITY
+from lcc_rl.errors import ResultsError, require
+from lcc_rl.io.tensors import checksums
+from lcc_rl.results.loading import SHARD, listed, load
+from lcc_rl.results.names import ON_FRONT
+from lcc_rl.results.runs import CONFIG, POLICY, differences, flat_settings
+from lcc_rl.runs.plans import choices_of
+from lcc_rl.runs.states import run_folders
+
+# Settings in which the parts and the seeds of one study differ.
+SHARED = tuple(f"{key}." for key in (*NOT_IDENTITY, "seed", SHARD))
+TRAINING = ["strategy", "training_seed"]
+EPISODE = [*TRAINING, "profile_id", "driver_id", "repeat", "case", "run_id", "follower"]
+Choices = Mapping[str, Any]  # of a run, by dotted key
+
+
+def load_sweep(root: str | Path) -> pd.DataFrame:
+    """Read the rows of all runs below a folder as those of one evaluation.
+
+    Strategies are named by the settings in which the runs differ (:func:`labels`); the seeds of a
+    training share a name. A strategy that no run trained, with the same rows in all of them, occurs
+    once. ``attrs["remarks"]`` has sentences on missing runs and settings without effect,
+    ``attrs["first"]`` the folder of the first run.
+
+    Raises:
+        ConfigError: if the runs have different leaders, or a training occurs twice.
+        ResultsError: as :func:`load`.
+    """
+    root = Path(root)
+    loaded = load(root, settings=())
+    rows = loaded.assign(run=loaded["run"].astype(str), strategy=loaded["strategy"].astype(str))
+    runs = {name: _own(_settings(root / name)) for name in rows["run"].unique()}
+    for strategy, part in rows.groupby("strategy"):
+        first, *others = (one.drop(columns="run") for _, one in part.groupby("run"))
+        equal = (first.reset_index(drop=True).equals(x.reset_index(drop=True)) for x in others)
+        if part["training_seed"].isna().any() and all(equal):
+            rows = rows.drop(index=part.index.difference(first.index))
+        else:
+            names = list(dict.fromkeys(part["run"]))
+            words = labels([runs[name] for name in names], [root / name for name in names])
+            plain, mark, limit = str(strategy).partition(ON_FRONT)
+            named = {
+                name: f"{plain} {', '.join(word.values())}".strip() + mark + limit
+                for name, word in zip(names, words, strict=True)
+            }
+            rows.loc[part.index, "strategy"] = part["run"].map(named)
+    rows = rows.drop_duplicates([name for name in rows if name != "run"])
+    _check_one_study(root, rows)
+    found = rows.drop(columns="run").reset_index(drop=True)
+    missing = loaded.attrs.get("unfinished", {}) | loaded.attrs.get("damaged", {})
+    remarks = [f"Without rows: {listed(missing)}."] * bool(missing) + without_effect(root)
+    found.attrs |= {"remarks": remarks, "first": str(root / next(iter(runs)))}
+    return found
+
+
+def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str, str]]:
+    """Return for each run the words by which it differs, ``efficiency.weight=0.5``, by key.
+
+    They are on what the commands varied; or on stored settings, if no command started the runs or
+    that does not tell them apart.
+    """
+    typed = [_own(choices_of(folder)) for folder in folders]
+    kinds = {(str(one), str(other)) for one, other in zip(typed, stored, strict=True)}
+    exact = len(kinds) == len(set(map(str, typed))) == len(set(map(str, stored)))
+    return differences(typed if exact and len(set(map(tuple, typed))) == 1 else stored)
+
+
+def _own(settings: Choices) -> Choices:
+    return {key: x for key, x in settings.items() if not f"{key}.".startswith(SHARED)}
+
+
+def _settings(folder: Path) -> dict[str, Any]:
+    """Return the settings of a run; none if they cannot be read."""
+    with suppress(ResultsError):
+        return flat_settings(folder / CONFIG)
+    return {}
+
+
+def without_effect(root: Path) -> list[str]:
+    """Return sentences on settings with which trainings of one seed have the same weights."""
+    folders = [folder for folder in run_folders(root) if (folder / POLICY).is_file()]
+    stored = [_settings(folder) for folder in folders]
+    words, equal = labels(list(map(_own, stored)), folders), defaultdict(list)
+    for folder, settings, word in zip(folders, stored, words, strict=True):
+        weights = checksums(folder / POLICY) or folder  # those of a damaged file equal no others
+        equal[settings.get("seed"), weights].append(word)
+    found: dict[str, set[str]] = {}
+    for first, *others in equal.values():
+        if keys := [key for key in first if any(one[key] != first[key] for one in others)]:
+            names = " and ".join(", ".join(one.values()) for one in (first, *others))
+            found.setdefault(", ".join(keys), set()).add(names)
+    return [
+        f"{keys} had no effect: the networks of equal seeds are the same with {one}"
+        + f" (and in {len(names) - 1} more cases)" * bool(names)
+        + "."
+        for keys, (one, *names) in sorted((keys, sorted(names)) for keys, names in found.items())
+    ]
+
+
+def _check_one_study(root: Path, rows: pd.DataFrame) -> None:
+    if "leader_speed_mps" in rows:
+        leaders = rows.groupby("profile_id")["leader_speed_mps"].nunique()
+        require(
+            leaders.max() == 1,
+            f"{root}: its runs have different leaders (profile_id {leaders.idxmax()}); "
+            f"lcc_rl.results.load({str(root)!r}) reads them",
+        )
+    twice = rows[rows.duplicated([key for key in EPISODE if key in rows])]
+    which = [f"{strategy}, seed {seed}" for strategy, seed in twice[TRAINING].to_numpy()[:1]]
+    require(not which, f"{root}: it contains a training twice: {''.join(which)}")

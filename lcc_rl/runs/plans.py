@@ -1,0 +1,69 @@
+"""Plans of sweeps: their cells, the settings of each, and runs without results."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import islice, product
+from pathlib import Path
+
+from lcc_rl.config import key_of
+from lcc_rl.errors import ResultsError
+from lcc_rl.io.settings import parse_yaml, read_json, read_text
+from lcc_rl.runs.states import HYDRA_FOLDER, run_folders, survey
+
+PLAN = "sweep.json"
+MOST_RUNS = 100_000  # most runs of a sweep: Hydra holds all of them in memory
+
+
+@dataclass(frozen=True)
+class SweepPlan:
+    """Plan of a sweep.
+
+    Args:
+        runs: number of runs; 0 if unknown.
+        varied: dotted keys of settings that differ between runs.
+        values: values of each of them; its cells are all combinations.
+    """
+
+    runs: int = 0
+    varied: list[str] = field(default_factory=list)
+    values: list[list[str]] = field(default_factory=list)
+
+
+def read_plan(folder: Path) -> SweepPlan:
+    """Return the plan of the sweep in a folder; an empty one if there is none."""
+    try:
+        plan = SweepPlan(**read_json(folder / PLAN))
+        values = [[str(value) for value in some] for some in plan.values]
+        return SweepPlan(int(plan.runs), [str(key) for key in plan.varied], values)
+    except (ResultsError, ValueError, TypeError, OverflowError):
+        return SweepPlan()
+
+
+def choices_of(folder: Path) -> dict[str, str]:
+    """Return the settings of a run's command by key; empty for a run without a command."""
+    path = folder / HYDRA_FOLDER / "overrides.yaml"
+    try:
+        words = parse_yaml(f"words:\n{read_text(path)}", str(path))["words"]
+        return {key_of(str(word)): str(word).partition("=")[2] for word in words}
+    except (ResultsError, TypeError):
+        return {}
+
+
+def unfinished(root: Path) -> dict[str, str]:
+    """Return the state of each run without results at or below a folder, by name.
+
+    Cells of a plan without a folder are ``waiting``.
+    """
+    found = {run.name: str(run) for run in survey(root) if run.state != "finished"}
+    sweeps: dict[Path, set[tuple[str | None, ...]]] = {root: set()}
+    for run in (run for run in run_folders(root) if run != root):
+        choices, varied = choices_of(run), read_plan(run.parent).varied
+        sweeps.setdefault(run.parent, set()).add(tuple(map(choices.get, varied)))
+    for sweep, begun in sweeps.items():
+        plan = read_plan(sweep)
+        for cell in islice(product(*plan.values), MOST_RUNS) if plan.values else ():
+            if cell not in begun:
+                name = "+".join(f"{key}={x}" for key, x in zip(plan.varied, cell, strict=False))
+                found[str((sweep / name).relative_to(root))] = "waiting"
+    return found
