@@ -31,6 +31,7 @@ from lcc_rl.runs.interrupts import was_interrupted
 LOCK, ERROR, PROGRESS, HYDRA_FOLDER = ".lock", "error.txt", "progress.json", ".hydra"
 # The last table of a run: of a training or evaluation, of a calibration.
 RESULT_TABLES = ("episodes.parquet", "drivers.parquet")
+PARQUET = b"PAR1"  # first and last bytes of a parquet file
 CONFIG = "config.yaml"
 MARKS = {CONFIG, ERROR, LOCK, *RESULT_TABLES}
 MOST_NAMED = 3  # most runs or tables in a message
@@ -188,6 +189,14 @@ def is_finished(folder: Path) -> bool:
     return any((folder / table).exists() for table in RESULT_TABLES)
 
 
+def _is_whole(table: Path) -> bool:
+    """Whether a parquet file begins and ends with its mark; its rows are not read."""
+    with open(table, "rb") as file:
+        first = file.read(len(PARQUET))
+        file.seek(-min(len(PARQUET), file.seek(0, os.SEEK_END)), os.SEEK_END)
+        return first == file.read() == PARQUET
+
+
 def inspect_run(folder: Path, name: str | None = None) -> RunState:
     """Return the state of the run in a folder; failed if the folder cannot be read."""
     name = folder.name if name is None else name
@@ -206,7 +215,9 @@ def _inspected(folder: Path, name: str) -> RunState:
         with suppress(ResultsError):
             lines = read_text(folder / ERROR).splitlines()
             return RunState(name, "failed", done, total, error=one_line(lines[0] if lines else ""))
-    if is_finished(folder):
+    for table in filter(Path.exists, (folder / table for table in RESULT_TABLES)):
+        if not _is_whole(table):
+            return RunState(name, "failed", done, total, error=f"{table.name} is cut or damaged")
         return RunState(name, "finished", done, total)
     return RunState(name, "stopped", done, total)
 
