@@ -122,8 +122,6 @@ def test_gradients_are_finite_through_contact_and_standstill() -> None:
         assert all(torch.isfinite(weight.grad).all() for weight in network.parameters())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("fleet", [(), TRUCKS, ("scenario.string={size: 6, penetration: 0.5}",)])
 def test_a_damaged_file_of_torchs_cache_is_no_traceback(capfd) -> None:
     Compiled(abs, "a number", compiled=True)
     try:
@@ -133,6 +131,8 @@ def test_a_damaged_file_of_torchs_cache_is_no_traceback(capfd) -> None:
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("fleet", [(), TRUCKS, ("scenario.string={size: 6, penetration: 0.5}",)])
 @pytest.mark.filterwarnings("ignore")  # the compiler warns of much
 def test_compiled_equals_eager_over_an_episode(fleet) -> None:
     if which(os.environ.get("CXX", "g++")) is None:
