@@ -149,6 +149,19 @@ def test_fast_windows_are_left_out(table) -> None:
     assert list(slow.windows.names) == kept
 
 
+def test_a_file_of_esmini_is_read(tmp_path) -> None:
+    time, speed = "TimeStamp [s]", "#1 Current_Speed [m/s]"
+    first = "Version: 2, OpenDRIVE: a.xodr, OpenSCENARIO: b.xosc, vehicles: 1"
+    rows = [f"{k}, {k / 100:.3f}, Ego, {15 + abs(k % 800 - 400) / 200:.3f}, " for k in range(6000)]
+    text = "\n".join([first, f"Index [-] , {time} , #1 Entitity_Name [-] , {speed} , ", *rows, ""])
+    (tmp_path / "esmini.csv").write_text(text)
+    leaders = DriveLeaders(
+        path=str(tmp_path / "esmini.csv"), columns={"drive": None, "time": time, "speed": speed}
+    ).load(0.1, 100)
+    assert len(leaders.training.record(0)) + 200 == pytest.approx(600, abs=2)
+    assert leaders.training.record(0).mean() == pytest.approx(16.0, abs=0.2)
+
+
 def test_impossible_drives() -> None:
     cases = [
         ({"columns": {"sped": "v"}}, "'sped'.*Did you mean 'speed'"),
