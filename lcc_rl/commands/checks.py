@@ -32,7 +32,6 @@ from lcc_rl.runs.loggers import Silent
 MESSAGES = "communication"  # name of the piece with messages between connected vehicles
 MEASURED = {"episodes": ("ttc", "time_gap", "power"), "vehicles": (MESSAGES,)}
 KEPT_MOMENTS = 24  # copies of every entry per step of a training, including gradients
-ACTOR_COPIES, CRITIC_COPIES = 4, 6  # of weights: gradient and two moments; with both targets
 RECORD_BYTES = 4096  # size of an iteration's row in the record [bytes]
 
 
@@ -96,7 +95,7 @@ def training_bytes(cfg: StudyConfig, moment: TensorDictBase) -> dict[str, float]
     if isinstance(hidden := agent.get("hidden"), list):
         sizes = [moment[OBSERVATION].shape[-1], *hidden, 1]
         weights = sum((before + 1) * after for before, after in pairwise(sizes))
-        copies = ACTOR_COPIES + CRITIC_COPIES * ("buffer_size" in agent)
+        copies = 10 if "buffer_size" in agent else 4  # gradient, two moments; critic, targets
         needs[f"agent.hidden={hidden}"] = 4.0 * copies * weights
     if "buffer_size" in agent:
         played = KEPT_MOMENTS * moment.bytes() + 2 * cfg.scenario.horizon * vehicles * transition

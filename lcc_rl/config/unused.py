@@ -69,7 +69,7 @@ def _of_road(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
 def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
     """Yield settings of roles without vehicles, and why they have no effect."""
     for group in ("controllers", "start", "filters", "actuators", "sensors"):
-        for role in getattr(cfg.scenario, group):
+        for role in {*getattr(cfg.scenario, group)} & {*cfg.scenario.controllers}:
             if role not in cfg.scenario.vehicles.names:
                 yield f"scenario.{group}.{role}", f"no vehicle of the string is {role}"
     for name, node in cfg.scenario.fleet.items():

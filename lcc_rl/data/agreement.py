@@ -226,9 +226,8 @@ def _mistaken(
         f"{-b:.2f} m"
     )
     if not pair["clear"]:
-        relative = own >= LEAST_WAY and abs(ahead - pair["grown"]) < STRAY * own
         words = f"by their speeds, the follower drives {own:.4g} m, the leader {ahead:.4g} m"
-        if relative:
+        if own >= LEAST_WAY and abs(ahead - pair["grown"]) < STRAY * own:
             question = "is the leader's speed relative to the follower's? Add the follower's"
             return [(pair["row"], "leader", f"{words}; {question}")]
         if max(own, ahead) < LEAST_WAY or abs(apart) < log(max_mismatch):

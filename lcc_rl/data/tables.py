@@ -66,10 +66,8 @@ UNIT_WORDS = {
     },
     "length": {"ft": "ft|feet|foot", "cm": "cm", "km": "km"},
 }
-APART = (
-    "no row has all columns: interpolate signals at their own times to common times first, such as "
-    "by pandas: table.set_index({time!r}).interpolate('index').dropna()"
-)
+APART = "no row has all columns: merge signals at their own times, such as by table.set_index"
+APART += "({time!r}).interpolate('index').dropna() of pandas"
 Cells = Any  # a pyarrow array, chunked or not
 Names = Mapping[str, str | None]  # names of columns in a file, by key
 Units = Mapping[str, str]  # units of columns, by key
@@ -261,10 +259,8 @@ class TableFile:
         unit, name = units.get(column.key, SI.get(column.quantity, "")), self.names[column.key]
         scale = (unit and unit_size(column.quantity, unit)) or 1.0
         if column.quantity == "speed" and is_relative(name):
-            raise DataError(
-                f"{self.path}: column {name!r} holds a relative speed; expected the car's own: add "
-                "the other car's, or rename the column"
-            )
+            words = f"column {name!r} holds a relative speed; add the other car's, or rename it"
+            raise DataError(f"{self.path}: {words}")
         named = named_unit(name, column.quantity)
         if option and named and UNITS[column.quantity][named] != scale:
             where = f"{option.removesuffix('columns')}units.{column.key}={named}"
@@ -282,10 +278,8 @@ class TableFile:
         """
         for name in names:
             if self.header.count(name) > 1:
-                raise DataError(
-                    f"{self.path}: has column {name!r} twice; expected it once, and signals at "
-                    "common times"
-                )
+                words = f"has column {name!r} twice; expected it once, and common times"
+                raise DataError(f"{self.path}: {words}")
         for rows, before in self._rows([name for name in names if name not in self.folders]):
             for name in (name for name in names if name in self.folders):
                 cells = pa.array([self.folders[name]] * rows.num_rows, pa.string())

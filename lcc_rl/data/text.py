@@ -29,8 +29,7 @@ UTF16 = b"\xff\xfe", b"\xfe\xff"
 NUMBER = r"^-?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI][nN][fF]|[nN][aA][nN])$"
 RELATIVE = r"\b(rel|relative|delta|closing|range rate|dv)\b"  # in names of columns of speeds
 OF_POSITIONS = (
-    "; gaps of positions are those of data=table, by a row per vehicle and time: data.columns="
-    "{vehicle: …, time: …, speed: …, position: …, lane: …, length: …}"
+    "; data=table has gaps of positions: data.columns={vehicle: …, position: …, length: …}"
 )
 # Other formats by their first bytes, with the remedy.
 OTHER_FORMATS = {
@@ -43,9 +42,7 @@ OTHER_FORMATS = {
 }
 NO_TABLE = {
     b"version https://git-lfs": "a Git LFS pointer in place of the file: run git lfs pull",
-    **dict.fromkeys(
-        (b"<?xml", b"<fcd-export"), "XML; save the table as CSV (SUMO: --fcd-output fcd.csv)"
-    ),
+    b"<": "XML or HTML; save the table as CSV (SUMO: --fcd-output fcd.csv)",
 }
 
 
@@ -132,11 +129,8 @@ def cells_of(line: bytes, separator: str) -> list[str]:
 
 
 def preamble(content: bytes) -> tuple[dict[str, str], bytes]:
-    """Return the lines before the header of a native OpenACC file by first cell, and the rest.
-
-    The first line of esmini's files, with versions and scenario, is left out.
-    """
-    if re.match(rb"Version:.*OpenSCENARIO:", content):
+    """Return the lines before the header of a native OpenACC file by first cell, and the rest."""
+    if re.match(rb"Version:.*OpenSCENARIO:", content):  # the first line of esmini's files
         return {}, content.partition(b"\n")[2]
     lines: list[bytes] = []
     rest = content

@@ -178,8 +178,7 @@ def distinguished(settings: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return for each flat mapping the values by which it differs, ``key=value, …``.
 
     As few keys as possible are used, each with as many of its last words as are unique:
-    ``safety.weight=0.5``. Hashes of files are used only if no setting differs. A mapping without a
-    setting, such as that of a run without its class, is not named by it.
+    ``safety.weight=0.5``. Hashes of files are used only if no setting differs.
     """
     every = list(dict.fromkeys(key for one in settings for key in one))
 
@@ -191,9 +190,7 @@ def distinguished(settings: Sequence[Mapping[str, Any]]) -> list[str]:
         rest = [x for x in chosen if x != key]
         chosen = rest if kinds(rest) == kinds(chosen) else chosen
     names = {key: _last_words(key, every) for key in chosen}
-    return [
-        ", ".join(f"{names[key]}={one[key]}" for key in chosen if key in one) for one in settings
-    ]
+    return [", ".join(f"{names[k]}={one[k]}" for k in chosen if k in one) for one in settings]
 
 
 def _last_words(key: str, keys: Sequence[str]) -> str:

@@ -31,7 +31,7 @@ from lcc_rl.runs.interrupts import was_interrupted
 LOCK, ERROR, PROGRESS, HYDRA_FOLDER = ".lock", "error.txt", "progress.json", ".hydra"
 # The last table of a run: of a training or evaluation, of a calibration.
 RESULT_TABLES = ("episodes.parquet", "drivers.parquet")
-PARQUET = b"PAR1"  # first and last bytes of a parquet file
+PARQUET = b"PAR1"  # last bytes of a parquet file
 CONFIG = "config.yaml"
 MARKS = {CONFIG, ERROR, LOCK, *RESULT_TABLES}
 MOST_NAMED = 3  # most runs or tables in a message
@@ -190,11 +190,10 @@ def is_finished(folder: Path) -> bool:
 
 
 def _is_whole(table: Path) -> bool:
-    """Whether a parquet file begins and ends with its mark; its rows are not read."""
+    """Whether a parquet file ends with its mark; its rows are not read."""
     with open(table, "rb") as file:
-        first = file.read(len(PARQUET))
-        file.seek(-min(len(PARQUET), file.seek(0, os.SEEK_END)), os.SEEK_END)
-        return first == file.read() == PARQUET
+        file.seek(-min(len(PARQUET), table.stat().st_size), os.SEEK_END)
+        return file.read() == PARQUET
 
 
 def inspect_run(folder: Path, name: str | None = None) -> RunState:
