@@ -9,11 +9,14 @@ from pathlib import Path
 import pytest
 import yaml
 from helpers import POPULATION, VARIANTS, check_refused, followed_profiles
+from hydra import compose, initialize_config_module
 
 import lcc_rl.conf
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, learns
 from lcc_rl.config import identity, load
+from lcc_rl.config.compose import CONF as MODULE
+from lcc_rl.config.compose import as_meant, composed
 from lcc_rl.config.nodes import as_plain, settings_at, with_defaults, without_defaults
 from lcc_rl.config.schemas import TrainConfig, as_text, parse_config
 from lcc_rl.envs import build_env
@@ -230,3 +233,12 @@ def test_a_node_is_made_once_copied_as_it_is_and_stored_by_its_settings() -> Non
         driver.changed(time_gap=-1.0)
     with pytest.raises(ConfigError, match=r"^drivers: expected .*\.Observation, got .*\.DriverP"):
         drivers.made(Observation)
+
+
+def test_settings_are_applied_as_hydra_applies_them() -> None:
+    words = ("variant=alcc", "seed=3", "agent=td3", "+filter=cbf", "agent.hidden=[8,4]")
+    more = ("+reward.terms.mine={_target_: lcc_rl.pieces.JerkReward}", "~reward.terms.safety")
+    for given in (words, (*words, *more), ("experiment=smoke", "agent.gamma=0.5")):
+        with initialize_config_module(MODULE, version_base="1.3"):
+            expected = compose("train", overrides=as_meant(given))
+        assert composed("train", given) == expected, given

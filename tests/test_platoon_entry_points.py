@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 import torch
 from commands import AGENT, HORIZON
-from helpers import slow_but
+from helpers import check_refused, slow_but
 
 from lcc_rl.api import Run
 from lcc_rl.commands import evaluation, training
@@ -30,6 +30,14 @@ def trained(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("trained") / "hcfs"
     training.run(tiny("train", "hcfs"), folder, quiet=True)
     return folder
+
+
+def test_a_string_without_automated_vehicles_is_refused(tmp_path) -> None:
+    calls = {"train": training.run, "evaluate": evaluation.run}
+    check_refused(
+        lambda entry: calls[entry](tiny(entry, "cacc", "scenario.string=human*3"), tmp_path),
+        [(entry, "needs an automated vehicle in scenario.string") for entry in calls],
+    )
 
 
 def test_hcfs_trains_its_parent_first(trained, tmp_path) -> None:

@@ -57,7 +57,8 @@ def take_step(optimizer: torch.optim.Adam) -> None:
         averages, squares, steps = (
             [state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step")
         )
-        torch._foreach_add_(steps, 1)
+        for step in steps:
+            step += 1
         torch._fused_adam_(
             parameters,
             [parameter.grad for parameter in parameters],

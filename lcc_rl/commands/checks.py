@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -54,14 +55,13 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
     trial = any_leader(cfg)
     horizon, time_step = cfg.scenario.horizon, cfg.scenario.time_step
     profiles = constant_profiles(10.0, horizon, time_step, ["trial"])
+    env = build_env(deployed(trial), profiles, population, 1, 0, cfg.device, nominal=True)
     if learns(cfg):
+        require_memory(training_bytes(cfg, env.reset()), cfg.device)
         check_lengths(cfg)
         agent = build_agent(cfg, population, cfg.device)
         trial.training.environments, trial.training.episodes = 2, 2
         make_trainer(trial, agent, profiles, population, folder)
-    env = build_env(deployed(trial), profiles, population, 1, 0, cfg.device, nominal=True)
-    if learns(cfg):
-        require_memory(training_bytes(cfg, env.reset()), cfg.device)
 
 
 def check_evaluation(cfg: StudyConfig, inputs: Inputs) -> None:
@@ -92,6 +92,11 @@ def training_bytes(cfg: StudyConfig, moment: TensorDictBase) -> dict[str, float]
     count, vehicles = settings.environments, moment[OBSERVATION].shape[-2]
     transition = 4 * (2 * moment[OBSERVATION].shape[-1] + 2)  # before, after, action and reward
     needs = {f"training.episodes={settings.episodes}": settings.episodes / count * RECORD_BYTES}
+    if isinstance(hidden := agent.get("hidden"), list):
+        sizes = [moment[OBSERVATION].shape[-1], *hidden, 1]
+        weights = sum((before + 1) * after for before, after in pairwise(sizes))
+        copies = 10 if "buffer_size" in agent else 4  # gradient, two moments; critic, targets
+        needs[f"agent.hidden={hidden}"] = 4.0 * copies * weights
     if "buffer_size" in agent:
         played = KEPT_MOMENTS * moment.bytes() + 2 * cfg.scenario.horizon * vehicles * transition
         learned = 2 * transition + 16 * sum(agent["hidden"])
@@ -168,3 +173,5 @@ def check_measured(cfg: StudyConfig) -> None:
     needed = MEASURED[cfg.evaluation.rows]
     lacking = [name for name in needed if cfg.scenario.pieces.get(name) is None]
     require(not lacking, f"scenario.pieces lacks {lacking}, which the evaluation measures")
+    rewarded = cfg.evaluation.rows == "episodes" or AUTOMATED in cfg.scenario.vehicles.names
+    require(rewarded, "evaluation.rows=vehicles needs an automated vehicle in scenario.string")

@@ -20,7 +20,7 @@ from lcc_rl import results
 from lcc_rl.agents import Analytic
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.checks import check_measured, check_settings
-from lcc_rl.config import NOT_IDENTITY, config_hash, load, top_key, with_inputs
+from lcc_rl.config import NOT_IDENTITY, config_hash, key_of, load, top_key, with_inputs
 from lcc_rl.config.nodes import Node, as_plain
 from lcc_rl.config.schemas import (
     KINDS,
@@ -29,6 +29,7 @@ from lcc_rl.config.schemas import (
     PipelineConfig,
     TrainConfig,
 )
+from lcc_rl.config.unused import BASELINES
 from lcc_rl.data.episodes import SCHEMA
 from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.drivers.calibrator import count_records
@@ -129,10 +130,11 @@ def composed_part(
                 f"{item} has no effect on lcc-rl run, which trains several: use variants=[…]"
             )
     shared = [item for item in overrides if top_key(item) not in JOB_OPTIONS]
+    learned = [item for item in shared if key_of(item) != BASELINES]
     names = cfg.variants or NETWORKS
-    trainings = {name: load("train", [*shared, f"variant={name}"]) for name in names}
+    trainings = {name: load("train", [*learned, f"variant={name}"]) for name in names}
     if cfg.variants is None and trainings[names[-1]].agent.kind is Analytic:
-        trainings = {RULE: load("train", [*shared, f"variant={RULE}"]), **trainings}
+        trainings = {RULE: load("train", [*learned, f"variant={RULE}"]), **trainings}
     final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={names[-1]}"])
     for part in (*trainings.values(), final):
         part.data = cfg.data

@@ -7,13 +7,14 @@ from collections.abc import Set as AbstractSet
 from typing import Any
 
 from lcc_rl.config.nodes import nodes_in, takes_action
-from lcc_rl.config.schemas import AUTO, BaseConfig, EvaluateConfig, StudyConfig
-from lcc_rl.config.words import typed_keys
+from lcc_rl.config.schemas import AUTO, BaseConfig, EvaluateConfig, StudyConfig, TrainConfig
+from lcc_rl.config.words import RECORDED, key_of, typed_keys
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, RING
 from lcc_rl.settings import TARGET
 
 NO_AGENT = ("agent=none", "agent=null")
+BASELINES = "evaluation.baselines"
 
 
 def check_used(
@@ -38,6 +39,9 @@ def check_used(
         reasons |= dict(_of_roles(cfg)) | dict(_of_agent(cfg))
         if isinstance(cfg, EvaluateConfig) and cfg.compare and not cfg.policy and cfg.agent:
             reasons[AUTO] = "compare names every controller, with its own settings"
+        plain = type(cfg) is TrainConfig and BASELINES in map(key_of, overrides)
+        if plain and RECORDED not in cfg.evaluation.baselines:
+            reasons[BASELINES] = "a training evaluates its own policy; lcc-rl evaluate compares"
         reasons["sweep"] = "it names the folder of a sweep, -m"
     if written is not None and cfg.agent is not None and "surrogates" in cfg.agent.settings:
         reasons |= dict(_of_objective(cfg, written["agent"], set().union(*typed.values())))
@@ -65,7 +69,7 @@ def _of_road(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
 def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
     """Yield settings of roles without vehicles, and why they have no effect."""
     for group in ("controllers", "start", "filters", "actuators", "sensors"):
-        for role in getattr(cfg.scenario, group):
+        for role in {*getattr(cfg.scenario, group)} & {*cfg.scenario.controllers}:
             if role not in cfg.scenario.vehicles.names:
                 yield f"scenario.{group}.{role}", f"no vehicle of the string is {role}"
     for name, node in cfg.scenario.fleet.items():

@@ -28,6 +28,7 @@ GAIN, FLOOR = 6.0, 2e-4  # factor on the residual by which a lag is accepted; th
 RIDGE = np.diag([1e-6, 1e-6, 0.1])  # [m²]: for a bias of speeds, unknown in steady traffic
 LEAST_WAY = 50.0  # least distance from which the unit of a speed is concluded [m]
 NEAR_MISTAKE, ALIKE = 1.25, 1.05  # largest factors to a mistake's coefficients; between mistakes
+STRAY = 0.2  # largest distance left of a relative speed, as a share of the follower's
 LOUD, LOUD_RATE, LOUD_FACTOR = 0.3, 0.3, 1.15  # reported: lag [s], bias of a speed [m/s], factor
 STANDING, LEAST_STANDING = 0.5, 300  # speed [m/s], samples
 FAR_STANDING = 15.0  # gap that may be in feet [m]
@@ -226,6 +227,9 @@ def _mistaken(
     )
     if not pair["clear"]:
         words = f"by their speeds, the follower drives {own:.4g} m, the leader {ahead:.4g} m"
+        if own >= LEAST_WAY and abs(ahead - pair["grown"]) < STRAY * own:
+            question = "is the leader's speed relative to the follower's? Add the follower's"
+            return [(pair["row"], "leader", f"{words}; {question}")]
         if max(own, ahead) < LEAST_WAY or abs(apart) < log(max_mismatch):
             return []
     near = []

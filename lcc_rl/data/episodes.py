@@ -10,8 +10,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.data.grid import Places, continuous, cut_by_files, on_grid, places, stretches
-from lcc_rl.data.tables import LARGEST_ID, Column, Names, TableFile, Units, lacking, whole_numbers
-from lcc_rl.data.text import labels
+from lcc_rl.data.tables import LARGEST_ID, Column, Names, TableFile, Units, whole_numbers
+from lcc_rl.data.text import labels, lacking
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
 

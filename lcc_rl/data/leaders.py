@@ -336,17 +336,22 @@ class DriveLeaders(Settings):
         return found.group()
 
     def _by_time(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
-        """Divide a single record; its end is held out."""
-        record, name = profiles.record(0), profiles.names[0]
-        cut = len(record) - round(self.evaluation_share * len(record))
-        if not 1 < cut < len(record) - 1:
-            raise DataError(f"{self.path}: {len(record)} samples cannot be divided")
-        at = f"{name}+{cut * profiles.time_step:g}s"
-        parts = ((record[:cut], name), (record[cut:], at))
-        first, last = (
-            from_records([part], [label], profiles.recordings, profiles.time_step)
-            for part, label in parts
-        )
+        """Divide a single record, or the parts of one, in order of time; its end is held out."""
+        total = int(profiles.lengths.sum())
+        cut = total - round(self.evaluation_share * total)
+        sides: tuple[list[Any], list[Any]] = [], []
+        for index, name in enumerate(profiles.names):
+            record, here = profiles.record(index), max(cut, 0)
+            later = f"{name}+{here * profiles.time_step:g}s" if here else name
+            for side, part, label in zip(
+                sides, (record[:here], record[here:]), (name, later), strict=True
+            ):
+                side += [(part, label, profiles.recordings[index])] if len(part) > 1 else []
+            cut -= len(record)
+        if not all(sides):
+            raise DataError(f"{self.path}: {total} samples cannot be divided")
+        parts = ([[x[k] for x in side] for k in range(3)] for side in sides)
+        first, last = (from_records(x, y, z, profiles.time_step) for x, y, z in parts)
         return first, last
 
 

@@ -20,7 +20,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.data.ngsim_recordings import Group, name_recordings
-from lcc_rl.data.tables import LARGEST_ID, Block, Column, TableFile, lacking
+from lcc_rl.data.tables import LARGEST_ID, Block, Column, TableFile
+from lcc_rl.data.text import lacking
 from lcc_rl.data.trajectories import (
     CAR_LENGTH,
     FOOT,

@@ -149,7 +149,8 @@ class Plausible(Settings):
         )
         if len(kept) < (1 - MOST_JUMPS) * len(table):
             raise DataError(f"{source}: has {words}; expected the gap to one leader")
-        return kept, [f"left out {words}", *cut_line(table, kept, wrong)]
+        lines = [f"left out {words}", *cut_line(table, kept, wrong)]
+        return kept, [*lines, "parts behind another car are records, too: leave out such rows"]
 
     def _check_hard(self, kept: pd.DataFrame, source: str, setting: str, agree: bool) -> list[str]:
         """Check that speeds change as those of cars; ``agree``: the gaps agree with them."""
@@ -179,7 +180,8 @@ class Plausible(Settings):
             if name.endswith("speed_mps"):
                 words = "holds {:g} m/s (is it km/h or ft/s?)"
                 yield name, words, values, "max_speed", values > self.max_speed
-                yield name, "holds {:g} m/s", values, "min_speed", values < self.min_speed
+                words = "holds {:g} m/s (is it relative to another car?)"
+                yield name, words, values, "min_speed", values < self.min_speed
                 rate = np.diff(values, prepend=values[0]) / np.where(step > 0, step, np.inf)
                 rough = np.abs(rate) > self.max_acceleration
                 yield name, "changes by {:g} m/s²", rate, "max_acceleration", rough

@@ -76,8 +76,9 @@ def read_drives(
         time_step: step of the profiles [s]; the records are interpolated to it.
 
     Returns:
-        A profile for each record, sorted by name, and lines on the data. Its recording is the
-        drive, which has several profiles if blank cells, holes or implausible samples divide it.
+        A profile for each record, sorted by name, those of a single one by time, and lines on the
+        data. Its recording is the drive, which has several profiles if blank cells, holes or
+        implausible samples divide it.
 
     Raises:
         DataError: naming file, row and column, if a value is missing or no number, a time is
@@ -94,7 +95,7 @@ def read_drives(
     own = table.groupby("name")["file"].nunique()
     if (own > 1).any():
         raise DataError(f"{path}: drive {own.idxmax()!r} is in several files; expected one")
-    records = table.groupby("name", sort=True)
+    records = table.groupby("name", sort=columns["drive"] is not None)
     speeds = [
         resample(x[TIME_COLUMN].to_numpy(), x[SPEED_COLUMN].to_numpy(), time_step)
         for _, x in records

@@ -27,7 +27,7 @@ from lcc_rl.data.trajectories import (
     listed,
     median_lengths,
 )
-from lcc_rl.errors import Concern, ConfigError, DataError
+from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Positive
 
 TABLE_FIELDS = (
@@ -102,10 +102,13 @@ class TableSource(TrajectorySource):
         if self.columns.get("recording") is None:
             report.notes += cut_by_files(rows, "vehicle", report.files)
         trajectories = to_trajectories(rows, place, report)
+        known = self.columns.get("length") is None or "length" in self.units
         for name, length in median_lengths(trajectories.samples).items():
-            if length > CAR_LENGTH[1]:
-                words = f"recording {name}: the median length of vehicles is {length:.3g} m"
-                report.notes.append(Concern(f"{words}; is it in ft (data.units.length=ft)?"))
+            if length > CAR_LENGTH[1] and not known:
+                raise DataError(
+                    f"{report.source}: recording {name}: the median length of vehicles is "
+                    f"{length:.3g} m; is it in ft? Set data.units.length=ft, or m if it is right"
+                )
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
         remedy = f", smooth it ({SMOOTHING})" if self.columns.get("position") else ""

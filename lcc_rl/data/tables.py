@@ -10,7 +10,6 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from difflib import get_close_matches
 from itertools import chain
 from os.path import expanduser  # pathlib's raises for an unknown user
 from pathlib import Path
@@ -24,8 +23,11 @@ from numpy.typing import NDArray
 
 from lcc_rl.data.text import (
     NO_TABLE,
+    NUMBER,
     SEPARATORS,
     cells_of,
+    is_relative,
+    lacking,
     line_chunks,
     parse_text,
     preamble,
@@ -42,7 +44,6 @@ LARGEST_CELL = 1e12  # in SI: beyond any time or position, and within every type
 LONGEST_TEXT = 1000  # most characters of a name
 LARGEST_ID = 2**53  # larger whole numbers do not fit a float
 THOUSANDS = r"^-?[0-9]{1,3}(,[0-9]{3})+(\.[0-9]*)?$"
-NUMBER = r"^-?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI][nN][fF]|[nN][aA][nN])$"
 NUMERIC_TYPES = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null, pa.types.is_decimal)
 ISO, FRAMES = "iso", "frames/"  # dates and times of ISO 8601; prefix of the frames per second
 CLOCK, CLOCK_TIME = "hh:mm:ss", r"^ *([01]?[0-9]|2[0-3]):[0-5][0-9]:[0-5][0-9]([.,][0-9]+)? *$"
@@ -65,7 +66,8 @@ UNIT_WORDS = {
     },
     "length": {"ft": "ft|feet|foot", "cm": "cm", "km": "km"},
 }
-APART = "no row has all columns: interpolate signals at their own times to common times first"
+APART = "no row has all columns: merge signals at their own times, such as by table.set_index"
+APART += "({time!r}).interpolate('index').dropna() of pandas"
 Cells = Any  # a pyarrow array, chunked or not
 Names = Mapping[str, str | None]  # names of columns in a file, by key
 Units = Mapping[str, str]  # units of columns, by key
@@ -245,7 +247,7 @@ class TableFile:
         row = int(np.argmax(wrong))
         first = self.fault(row, next(key for key in blank if blank[key][row]), "is blank")
         if wrong.all() and not any(column.all() for column in blank.values()):
-            raise DataError(f"{first}; {APART}")
+            raise DataError(f"{first}; {APART.format(time=self.names.get('time'))}")
         if wrong.all():
             raise first
         line = f"left out {int(wrong.sum()):,} rows with a blank cell, the first: {first}"
@@ -256,6 +258,9 @@ class TableFile:
         """Return the size of a column's unit in SI; refuse another unit in its name."""
         unit, name = units.get(column.key, SI.get(column.quantity, "")), self.names[column.key]
         scale = (unit and unit_size(column.quantity, unit)) or 1.0
+        if column.quantity == "speed" and is_relative(name):
+            words = f"column {name!r} holds a relative speed; add the other car's, or rename it"
+            raise DataError(f"{self.path}: {words}")
         named = named_unit(name, column.quantity)
         if option and named and UNITS[column.quantity][named] != scale:
             where = f"{option.removesuffix('columns')}units.{column.key}={named}"
@@ -273,7 +278,8 @@ class TableFile:
         """
         for name in names:
             if self.header.count(name) > 1:
-                raise DataError(f"{self.path}: has column {name!r} twice; expected it once")
+                words = f"has column {name!r} twice; expected it once, and common times"
+                raise DataError(f"{self.path}: {words}")
         for rows, before in self._rows([name for name in names if name not in self.folders]):
             for name in (name for name in names if name in self.folders):
                 cells = pa.array([self.folders[name]] * rows.num_rows, pa.string())
@@ -368,20 +374,6 @@ class Block:
             return self.file.fault(int(self.row[row]), column.key, words)
 
         return checked_cells(self.cells[name], column, fault, scale, self.file.comma)
-
-
-def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: str) -> DataError:
-    """Return the error for missing columns of a table."""
-    folded = {name.lower(): name for name in header}
-    near = get_close_matches(missing[0].lower(), folded, n=1)
-    hint = f" (is it {folded[near[0]]!r}?)" if near else ""
-    how = f"; name the columns by {option}={{…}}" if option else ""
-    if sum(map(bool, header)) == 1 or header[0].startswith(("#", "%")):
-        how = ": is it a title or a comment? The first line must name the columns"
-    if all(re.fullmatch(NUMBER, name) for name in header if name):
-        how = ": is the header missing? The first line must name the columns"
-    shown = ", ".join(header)[:400]
-    return DataError(f"{source}: lacks the column {', '.join(missing)}; it has {shown}{hint}{how}")
 
 
 # -- cells -----------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from codecs import EncodedFile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from difflib import get_close_matches
 from io import BufferedReader
 from itertools import takewhile
 from pathlib import Path
@@ -25,6 +26,11 @@ SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": 
 PREAMBLE = 20  # lines within which the header of a native OpenACC file begins
 BLOCK_BYTES, LONGEST_LINE = 1 << 22, 1 << 24  # bytes per block; longest line
 UTF16 = b"\xff\xfe", b"\xfe\xff"
+NUMBER = r"^-?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI][nN][fF]|[nN][aA][nN])$"
+RELATIVE = r"\b(rel|relative|delta|closing|range rate|dv)\b"  # in names of columns of speeds
+OF_POSITIONS = (
+    "; data=table has gaps of positions: data.columns={vehicle: …, position: …, length: …}"
+)
 # Other formats by their first bytes, with the remedy.
 OTHER_FORMATS = {
     b"PK\x03\x04": " but a spreadsheet (xlsx, ods) or zip archive; save the table as CSV",
@@ -36,7 +42,7 @@ OTHER_FORMATS = {
 }
 NO_TABLE = {
     b"version https://git-lfs": "a Git LFS pointer in place of the file: run git lfs pull",
-    b"<?xml": "XML; save the table as CSV (SUMO: --fcd-output fcd.csv)",
+    b"<": "XML or HTML; save the table as CSV (SUMO: --fcd-output fcd.csv)",
 }
 
 
@@ -124,6 +130,8 @@ def cells_of(line: bytes, separator: str) -> list[str]:
 
 def preamble(content: bytes) -> tuple[dict[str, str], bytes]:
     """Return the lines before the header of a native OpenACC file by first cell, and the rest."""
+    if re.match(rb"Version:.*OpenSCENARIO:", content):  # the first line of esmini's files
+        return {}, content.partition(b"\n")[2]
     lines: list[bytes] = []
     rest = content
     for _ in range(PREAMBLE):
@@ -248,3 +256,27 @@ def _odd_row(
     last = number == len(lines) - 1 and held < width
     place, cut = (f"{place}, the last,", "; is the file cut off?") if last else (place, "")
     return DataError(f"{source}: {place} has {held} columns; expected {width}{cut}")
+
+
+def is_relative(name: str) -> bool:
+    """Return whether the name of a column is that of a relative speed."""
+    words = re.sub(r"(?<=[a-z])(?=[A-Z][a-z])|[^\w/]|_", " ", name).lower()
+    return re.search(RELATIVE, words) is not None
+
+
+def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: str) -> DataError:
+    """Return the error for missing columns of a table."""
+    folded = {name.lower(): name for name in header}
+    near = get_close_matches(missing[0].lower(), folded, n=1)
+    hint = f" (is it {folded[near[0]]!r}?)" if near else ""
+    how = f"; name the columns by {option}={{…}}" if option else ""
+    if relative := next(filter(is_relative, header), None) if "speed" in missing[0] else None:
+        hint = f" ({relative!r} is relative: add the follower's speed)"
+    if "gap_m" in missing and any("pos" in name.lower() for name in header):
+        how = OF_POSITIONS
+    if sum(map(bool, header)) == 1 or header[0].startswith(("#", "%")):
+        how = ": is it a title or a comment? The first line must name the columns"
+    if all(re.fullmatch(NUMBER, name) for name in header if name):
+        how = ": is the header missing? The first line must name the columns"
+    shown = ", ".join(header)[:400]
+    return DataError(f"{source}: lacks the column {', '.join(missing)}; it has {shown}{hint}{how}")

@@ -15,6 +15,7 @@ log = logging.getLogger("lcc_rl")
 
 # Attributes in which an object with a compiled method keeps the environment and its pieces.
 CONSTANT = ("self.env", "self.step", "self.first", "_modules['transforms']._modules[")
+CACHE_LOG = "torch._inductor.codecache"  # prints a traceback for a damaged file, and compiles anew
 
 
 def options(device: torch.device | None) -> dict[str, Any]:
@@ -60,6 +61,8 @@ class Compiled:
     ) -> None:
         self.plain, self.what = function, what
         self.function = self._made(device) if compiled else function
+        if compiled:
+            logging.getLogger(CACHE_LOG).setLevel(logging.ERROR)
 
     def _made(self, device: torch.device | None) -> Callable[..., Any]:
         # One graph for each size: a graph for any size would be slower.

@@ -12,7 +12,7 @@ import torch
 
 from lcc_rl.config import is_sweep
 from lcc_rl.config.inputs import inputs_of
-from lcc_rl.config.nodes import CALLED, Node, as_plain
+from lcc_rl.config.nodes import CALLED, Node, as_plain, nodes_in
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.leaders import Case, TrajectoryLeaders
 from lcc_rl.data.profiles import Profiles, from_records
@@ -175,18 +175,20 @@ def constant_profiles(
     return from_records(records, list(names), list(names), time_step)
 
 
-# Values that this process read last, with their keys, by kind.
-_last: dict[str, tuple[str, Any]] = {}
+# Values that this process read last, with their keys and classes, by kind.
+_last: dict[str, tuple[str, list[Any], Any]] = {}
 SHARED = "data: read by an earlier run of this process, which reported:"
 
 
-def _once(what: str, plain: dict[str, Any], make: Callable[[], Any]) -> tuple[Any, bool]:
-    """Return the value of settings and the files that they name, and whether it was cached."""
-    key = json.dumps([plain, inputs_of(plain)], default=str)
-    known = what in _last and _last[what][0] == key
+def _once(what: str, settings: Any, make: Callable[[], Any]) -> tuple[Any, bool]:
+    """Return the value of settings, with their files and classes, and whether it was cached."""
+    plain = as_plain(settings)
+    key, kinds = json.dumps([plain, inputs_of(plain)], default=str), nodes_in(settings)
+    of = key, [node.kind for node in kinds]  # a notebook may define a class anew
+    known = what in _last and _last[what][:2] == of
     if not known:
-        _last[what] = key, make()
-    return _last[what][1], known
+        _last[what] = *of, make()
+    return _last[what][2], known
 
 
 def shared_inputs(cfg: StudyConfig) -> Inputs:
@@ -195,7 +197,7 @@ def shared_inputs(cfg: StudyConfig) -> Inputs:
     Raises:
         DataError, ConfigError: naming the file, row or option at fault.
     """
-    inputs: Inputs = _once("inputs", as_plain(cfg), lambda: load_inputs(cfg))[0]
+    inputs: Inputs = _once("inputs", cfg, lambda: load_inputs(cfg))[0]
     return inputs
 
 
@@ -210,8 +212,7 @@ def load_episodes(node: Node) -> LoadedEpisodes:
     """
     if not is_sweep():
         return cast(LoadedEpisodes, node.made(LOADS).load())
-    plain = {"data": as_plain(node)}
-    loaded, known = _once("episodes", plain, lambda: node.made(LOADS).load())
+    loaded, known = _once("episodes", {"data": node}, lambda: node.made(LOADS).load())
     return replace(loaded, report=[SHARED, *loaded.report]) if known else loaded
 
 

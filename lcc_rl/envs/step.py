@@ -166,9 +166,23 @@ class Pieces(Compose):
     def pop(self, index: int | None = None) -> Transform:
         """Remove and return a transform; the sum of all terms no longer holds a reward term."""
         found = self.transforms[-1 if index is None else index]
-        if isinstance(found, RewardTerm):
-            self._count([name for name in self._total().terms if name != found.name])
+        self._leave_out([found])
         return super().pop(index)
+
+    def __delitem__(self, index: Any) -> None:
+        found = self.transforms[index]
+        self._leave_out(found if isinstance(index, slice) else [found])
+        super().__delitem__(index)
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        del self[index]
+        self.insert(range(len(self.transforms) + 1)[index], value)
+
+    def _leave_out(self, transforms: Iterable[Transform]) -> None:
+        """Let the sum of all terms no longer hold those of some transforms."""
+        gone = {x.name for x in transforms if isinstance(x, RewardTerm)}
+        if gone and self._total() is not None:
+            self._count([name for name in self._total().terms if name not in gone])
 
     def _bound(self, transform: Any) -> Any:
         """Return a transform; a piece that is not bound yet is bound to the world."""

@@ -40,6 +40,7 @@ RING_TASK = ("variant=alcc", "task=ring-22")
 NOT_ON_PAGE = ("sensors", "actuators", "fleet")
 OF_RING = (*NOT_ON_PAGE, "circumference", "string", "vehicle_length", "initial_speed", "time_step")
 OF_DRIVERS = ("drivers", "controllers.human")
+SHOWN = ("drivers", "energy", *(f"scenario.{name}" for name in (*OF_RING[3:], OF_DRIVERS[1])))
 DRAWS = ("noise", "wiener", "acceleration_noise", "acceleration_noise.before", "driver")
 RING_RULES = ("follower_stopper", "pi_saturation")
 # Layers that the page can compute.
@@ -78,6 +79,9 @@ def page_data(policy: Any, trust: Sequence[str], overrides: Sequence[str]) -> di
         strange.append("drivers (only IDM drivers that share a, b and s0, without gap_noise)")
     if strange or car is None:
         raise ConfigError(f"{policy}: a page of the ring does not support {', '.join(strange)}")
+    for item in overrides:
+        key = key_of(item).removeprefix("controller@")
+        require(key.startswith(SHOWN), f"{item} has no effect: a page shows {', '.join(SHOWN)}")
     rules = {name: Driver(name, scenario.time_step).program.controller for name in RING_RULES}
     count, some = len(vehicles), vehicles.count(AUTOMATED)
     spread = [k * count // some for k in range(some)]

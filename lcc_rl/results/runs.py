@@ -191,7 +191,7 @@ def differences(settings: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
         rest = [x for x in chosen if x != key]
         chosen = rest if kinds(rest) == kinds(chosen) else chosen
     names = {key: _last_words(key, chosen) for key in chosen}
-    return [{key: f"{names[key]}={one.get(key)}" for key in chosen} for one in settings]
+    return [{k: f"{names[k]}={one[k]}" for k in chosen if k in one} for one in settings]
 
 
 def _last_words(key: str, keys: Sequence[str]) -> str:

@@ -98,7 +98,7 @@ def without_effect(root: Path) -> list[str]:
         equal[settings.get("seed"), weights].append(word)
     found: dict[str, set[str]] = {}
     for first, *others in equal.values():
-        if keys := [key for key in first if any(one[key] != first[key] for one in others)]:
+        if keys := [key for key in first if any(one.get(key) != first[key] for one in others)]:
             names = " and ".join(", ".join(one.values()) for one in (first, *others))
             found.setdefault(", ".join(keys), set()).add(names)
     return [

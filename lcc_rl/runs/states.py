@@ -31,6 +31,7 @@ from lcc_rl.runs.interrupts import was_interrupted
 LOCK, ERROR, PROGRESS, HYDRA_FOLDER = ".lock", "error.txt", "progress.json", ".hydra"
 # The last table of a run: of a training or evaluation, of a calibration.
 RESULT_TABLES = ("episodes.parquet", "drivers.parquet")
+PARQUET = b"PAR1"  # last bytes of a parquet file
 CONFIG = "config.yaml"
 MARKS = {CONFIG, ERROR, LOCK, *RESULT_TABLES}
 MOST_NAMED = 3  # most runs or tables in a message
@@ -191,6 +192,13 @@ def is_finished(folder: Path) -> bool:
     return any((folder / table).exists() for table in RESULT_TABLES)
 
 
+def _is_whole(table: Path) -> bool:
+    """Whether a parquet file ends with its mark; its rows are not read."""
+    with open(table, "rb") as file:
+        file.seek(-min(len(PARQUET), table.stat().st_size), os.SEEK_END)
+        return file.read() == PARQUET
+
+
 def inspect_run(folder: Path, name: str | None = None) -> RunState:
     """Return the state of the run in a folder; failed if the folder cannot be read."""
     name = folder.name if name is None else name
@@ -209,7 +217,9 @@ def _inspected(folder: Path, name: str) -> RunState:
         with suppress(ResultsError):
             lines = read_text(folder / ERROR).splitlines()
             return RunState(name, "failed", done, total, error=one_line(lines[0] if lines else ""))
-    if is_finished(folder):
+    for table in filter(Path.exists, (folder / table for table in RESULT_TABLES)):
+        if not _is_whole(table):
+            return RunState(name, "failed", done, total, error=f"{table.name} is cut or damaged")
         return RunState(name, "finished", done, total)
     return RunState(name, "stopped", done, total)
 

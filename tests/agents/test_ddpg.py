@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from lcc_rl.agents import DDPG
 from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.off_policy import leaves
+from lcc_rl.agents.vectors import take_step, vector_adam
 
 
 def transitions(count: int, seed: int) -> TensorDict:
@@ -79,6 +80,22 @@ def test_updates_are_those_of_the_papers_by_hand(fused: bool) -> None:
         for part, expected in zip(found, hand, strict=True):
             for tensor, value in zip(part, expected, strict=True):
                 torch.testing.assert_close(tensor.detach(), value.detach(), rtol=0.0, atol=1e-7)
+
+
+def test_a_step_without_overhead_is_that_of_torchs_optimizer() -> None:
+    for rates in ((0.01, 0.01), (0.01, 0.1)):
+        weights = [torch.linspace(-1.0, 1.0, 7) for _ in range(2)]
+        slopes = [torch.zeros(7) for _ in range(2)]
+        pairs = zip(weights, slopes, strict=True)
+        optimizers = [vector_adam(one, slope, [3, 4], list(rates)) for one, slope in pairs]
+        for step in range(4):
+            for slope in slopes:
+                slope.copy_(torch.sin(torch.arange(7.0) + step))
+            take_step(optimizers[0])
+            optimizers[1].step()
+        assert torch.equal(*weights)
+        states = [one.state_dict()["state"].values() for one in optimizers]
+        assert all(one["step"] == other["step"] == 4 for one, other in zip(*states, strict=True))
 
 
 def test_a_restored_agent_goes_on_bit_for_bit() -> None:

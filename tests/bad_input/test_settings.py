@@ -13,6 +13,7 @@ from helpers import check_refused
 import lcc_rl
 from lcc_rl.agents.controller import ControllerPolicy
 from lcc_rl.commands import calibration, evaluation, training
+from lcc_rl.commands.pipeline import composed_part
 from lcc_rl.config import load
 from lcc_rl.data.leaders import Mixture
 from lcc_rl.errors import ConfigError
@@ -65,6 +66,8 @@ WRONG = {
     # sizes that no machine has
     f"training.environments={HUGE} training.episodes={HUGE}": "training.environments=.* needs",
     f"agent.buffer_size={HUGE}": "agent.buffer_size=.* needs about .* PiB",
+    "agent.hidden=[1000000000000] agent.batch_size=1": "agent.hidden=.* needs about .* TiB",
+    "agent.hidden=[300000,300000]": "agent.hidden=.* needs about .* TiB",
     "scenario.string='automated human*100000000'": "10000 vehicles",
     "+faults=sensors scenario.sensors.automated.delay=1e9": "sensors.automated.delay must be at mo",
     "+faults=sensors scenario.sensors.automated.longest_dropout=200": "dropout must be at most 100",
@@ -79,6 +82,7 @@ IGNORED = {
     "variant=idm training.episodes=20": "variant idm has no agent",
     "variant=alcc scenario.string=human*3 training.episodes=20": "no vehicle .* is automated",
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",
+    "evaluation.baselines=[human]": "a training evaluates its own policy",
     "sweep=mine": "names the folder of a sweep, -m",
 }
 # Settings of terms and surrogates that a training by the gradient ignores, and why.
@@ -131,6 +135,9 @@ def test_options_without_effect_are_refused() -> None:
     cases += [(lambda: lcc_rl.compare("idm_acc", overrides=words[:1]), cases[0][1])]
     check_refused(lambda call: call(), cases, ConfigError)
     assert load("evaluate", [f"{AUTO}.time_gap=1.5", words[1], "variant=idm"]).compare
+    words = ["variants=[alcc]", "evaluation.baselines=[human]"]  # a job compares
+    trainings, final = composed_part(load("pipeline", words), words)
+    assert final.evaluation.baselines == ["human"] != trainings["alcc"].evaluation.baselines
 
 
 def test_programs_are_refused_what_has_no_effect_in_them() -> None:

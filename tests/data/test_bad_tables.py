@@ -11,6 +11,7 @@ from helpers import check_refused
 from ngsim_text import OFFICIAL, cells, csv_text, native_text, pair, portal_text
 from table_text import READERS, long_table, openacc_text, pairs
 
+from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.errors import Concern, DataError
 
 GOOD = csv_text(pair())
@@ -54,7 +55,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
     # Files that are no tables.
     ("ngsim", "", "not a readable table: empty"),
     ("ngsim", OFFICIAL + "\n", "has no rows"),
-    ("ngsim", "<!DOCTYPE html>\n<html>Not found</html>\n", "lacks the column Vehicle_ID"),
+    ("ngsim", "<!DOCTYPE html>\n<html>Not found</html>\n", "is XML or HTML; save"),
     ("ngsim", bytes(range(256)) * 40, "is not UTF-8 text"),
     (
         "ngsim",
@@ -93,6 +94,16 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("table", "id,t,v,ahead,gap,x\n1,0,1,0,2\n1,1,1,0,2,3\n", "row 1 has 5 columns; expected 6$"),
     ("table", csv(TABLE.iloc[:0]), "has a header but no rows"),
     ("episodes", csv(pairs().drop(columns="gap_m")), "lacks the column gap_m.*data.columns="),
+    (
+        "episodes",
+        csv(pairs().drop(columns="gap_m").assign(leader_position_m=0.0)),
+        r"lacks the column gap_m; .*; data=table has gaps of positions: data.columns=\{vehicle: …",
+    ),
+    (
+        "episodes",
+        csv(pairs().rename(columns={"leader_speed_mps": "relSpeed"})),
+        r"lacks the column leader_speed_mps.*'relSpeed' is relative: add the follower's speed",
+    ),
     ("openacc", openacc_text().replace("IVS", "gap"), "lacks IVS1, IVS2"),
     ("openacc", csv(TABLE), "expected a native OpenACC file"),
     ("record", RECORD, "holds 0 samples"),
@@ -128,8 +139,18 @@ BAD: list[tuple[str, str | bytes, str]] = [
         "row 1, .*does this row hold uni",
     ),
     ("record", "version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "run git lfs pull"),
-    ("table", "<?xml version='1.0'?>\n<fcd-export/>\n", "is XML; save the table as CSV"),
-    ("episodes", csv(APART), "row 1, column 'follower_speed_mps' is blank; no row has all columns"),
+    ("table", "<?xml version='1.0'?>\n<fcd-export/>\n", "is XML or HTML; save the table as CSV"),
+    ("table", "<fcd-export>\n</fcd-export>\n", r"is XML or HTML; .*\(SUMO: --fcd-output fcd.csv\)"),
+    (
+        "episodes",
+        csv(APART),
+        r"row 1, column 'follower_speed_mps' is blank; no row has .*set_index\('time_s'\).inter",
+    ),
+    (
+        "episodes",
+        csv(pairs()).replace("leader_position_m", "time_s", 1),
+        "has column 'time_s' twice; .* common times",
+    ),
     ("record", RECORD + "0,1\n1,\n2,1\n", "data row 2, column 'speed_mps' is blank"),
     # Rows that contradict each other, and times.
     ("table", csv(LATE), r"data row 1191, vehicle 3 is 1e\+11 s after the first"),
@@ -174,6 +195,19 @@ ODD = [  # and what is reported
         "left out 2 rows with a blank cell, .*data row 3,",
     ),
 ]
+
+
+def test_a_relative_speed_is_named_by_its_column(tmp_path: Path) -> None:
+    path = tmp_path / "relative.csv"
+
+    def read(name: str) -> None:
+        path.write_text(csv(pairs().rename(columns={"leader_speed_mps": name})))
+        EpisodesSource(path=str(path), columns={"leader_speed": name}).load()
+
+    names = ("rel_speed", "RelativeSpeed", "dV (m/s)", "Range rate", "delta_v")
+    words = "column '{}' holds a relative speed; add the other car's, or rename"
+    check_refused(read, [(x, words.format(re.escape(x))) for x in names], DataError)
+    read("reliable_speed")
 
 
 def test_of_rows_of_a_moment_the_first_is_kept_and_records_are_sorted(tmp_path: Path) -> None:

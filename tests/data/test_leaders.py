@@ -149,6 +149,39 @@ def test_fast_windows_are_left_out(table) -> None:
     assert list(slow.windows.names) == kept
 
 
+def test_a_file_of_esmini_is_read(tmp_path) -> None:
+    time, speed = "TimeStamp [s]", "#1 Current_Speed [m/s]"
+    first = "Version: 2, OpenDRIVE: a.xodr, OpenSCENARIO: b.xosc, vehicles: 1"
+    rows = [f"{k}, {k / 100:.3f}, Ego, {15 + abs(k % 800 - 400) / 200:.3f}, " for k in range(6000)]
+    text = "\n".join([first, f"Index [-] , {time} , #1 Entitity_Name [-] , {speed} , ", *rows, ""])
+    (tmp_path / "esmini.csv").write_text(text)
+    leaders = DriveLeaders(
+        path=str(tmp_path / "esmini.csv"), columns={"drive": None, "time": time, "speed": speed}
+    ).load(0.1, 100)
+    assert len(leaders.training.record(0)) + 200 == pytest.approx(600, abs=2)
+    assert leaders.training.record(0).mean() == pytest.approx(16.0, abs=0.2)
+
+
+def test_a_single_record_that_is_cut_is_divided_in_time(tmp_path) -> None:
+    time = np.arange(0.0, 600.0, 0.1)
+    frame = pd.DataFrame({"time_s": time, "speed_mps": 14.0 + 6.0 * np.sin(time / 9.0)})
+    holes = [(50.0, 70.0), (130.0, 150.0), (500.0, 520.0)]
+    whole = np.logical_and.reduce([(time < a) | (time >= b) for a, b in holes])
+    path = str(tmp_path / "cut.csv")
+    frame[whole].to_csv(path, index=False)
+    for tuning, lengths, first, last in (
+        (False, [500, 600, 2500], "cut+150s+250s", "cut+520s"),
+        (True, [500, 600, 1300], "cut+150s+130s", "cut+150s+130s"),
+    ):
+        leaders = DriveLeaders(path=path, columns={"drive": None}, tuning=tuning).load(0.1, 100)
+        assert leaders.training.lengths.tolist() == lengths, tuning
+        names = leaders.windows.names
+        assert names[0].startswith(first), (tuning, names)
+        assert names[-1].startswith(last), (tuning, names)
+    begins = 14.0 + 6.0 * np.sin((150.0 + 130.0) / 9.0)
+    assert float(leaders.windows.record(0)[0]) == pytest.approx(begins, abs=0.1)
+
+
 def test_impossible_drives() -> None:
     cases = [
         ({"columns": {"sped": "v"}}, "'sped'.*Did you mean 'speed'"),

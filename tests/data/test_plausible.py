@@ -377,6 +377,7 @@ def test_records_are_cut_where_the_gap_jumps_or_is_held() -> None:
             row = int(re.search(r"first: row (\d+), gap_m changes by", said[0])[1])
             assert abs(row - first) <= 2, (words, said)
             assert any("1 of 3 records were cut there" in line for line in lines), words
+            assert any("parts behind another car are records, too" in line for line in lines)
         if "nois" not in words and "metres" not in words:
             assert "lag 0.0 s of " in lines[-1], (words, lines[-1])  # the parts are checked
 
@@ -418,6 +419,16 @@ def test_a_biased_speed_or_a_slow_clock_is_reported_with_its_remedy() -> None:
     for table, words in BIASES:
         loud = " ".join(line for line in judged(table) if isinstance(line, Concern))
         assert re.search(words, loud) if words else not loud, (words, loud)
+
+
+def test_a_relative_speed_is_no_leaders_speed() -> None:
+    table = irregular()
+    relative = table["leader_speed_mps"] - table["follower_speed_mps"]
+    cases = [
+        (table.assign(leader_speed_mps=0.1 * relative), "is the leader's speed relative to the fo"),
+        (table.assign(leader_speed_mps=3 * relative), r"m/s \(is it relative to another car\?\)"),
+    ]
+    check_refused(judged, cases, DataError)
 
 
 def test_two_names_of_one_car_are_refused() -> None:

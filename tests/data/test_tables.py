@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import re
 from functools import partial
 from io import StringIO
 
@@ -22,7 +21,7 @@ from lcc_rl.data.smoothing import SavitzkyGolay
 from lcc_rl.data.sources import EpisodesSource, LoadedEpisodes
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.data.trajectories import FOOT
-from lcc_rl.errors import Concern, ConfigError, DataError
+from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.io.files import write_parquet
 
 BASE = {"vehicle": "id", "time": "t", "speed": "v"}
@@ -436,9 +435,16 @@ def test_a_real_openacc_file(shared_data) -> None:
 def test_lengths_in_feet_and_gaps_that_jump_are_named_in_tables(tmp_path) -> None:
     frame = long_table()
     feet = frame.assign(length=frame["length"] / 0.3048)
-    long = TableSource(path=written(tmp_path, feet), columns=BY_LANE).load()
-    words = r"median length of vehicles is 1\d\.?\d* m; is it in ft \(data\.units\.length=ft\)"
-    assert re.search(words, " ".join(x for x in long.report if isinstance(x, Concern)))
+    path = written(tmp_path, feet, "feet.csv")
+    words = (
+        r"feet\.csv.* the median length of vehicles is 1\d\.?\d* m; .*data\.units\.length=ft, or m"
+    )
+    check_refused(lambda: TableSource(path=path, columns=BY_LANE).load(), [(words,)], DataError)
+    gaps = [
+        TableSource(path=path, columns=BY_LANE, units={"length": x}).load().episodes["gap_m"].mean()
+        for x in ("ft", "m")
+    ]
+    assert gaps[0] == pytest.approx(gaps[1] + (1 / 0.3048 - 1) * frame["length"].mean(), rel=1e-3)
     clean = TableSource(path=written(tmp_path, frame), columns=BY_GAP).load()
     frame.loc[frame["t"].between(20.0, 24.95) & (frame["gap"] > 0), "gap"] = 100.0
     jumps = TableSource(path=written(tmp_path, frame), columns=BY_GAP).load()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import replace
 from shutil import which
@@ -28,6 +29,7 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.agents.actor import make_actor, shared_policy
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import DifferentiableRollout, build_env
+from lcc_rl.envs.compiled import CACHE_LOG, Compiled
 
 WANTED = [("vehicles", name) for name in ("gap", "power", "relative_speed")]
 OBSERVED = [REWARD, (*TERMS, "hdv_energy"), (*TERMS, "safety")]
@@ -118,6 +120,15 @@ def test_gradients_are_finite_through_contact_and_standstill() -> None:
             assert data["next", "terminated"].any()
         sum(data["next"].get(key).mean() for key in WANTED).backward()
         assert all(torch.isfinite(weight.grad).all() for weight in network.parameters())
+
+
+def test_a_damaged_file_of_torchs_cache_is_no_traceback(capfd) -> None:
+    Compiled(abs, "a number", compiled=True)
+    try:
+        raise EOFError
+    except EOFError:  # as torch does, before it compiles anew
+        logging.getLogger(CACHE_LOG).warning("unable to load compiled graph", exc_info=True)
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.slow

@@ -168,6 +168,12 @@ class Wide(Feature):
         return gap.unsqueeze(-2).expand(*gap.shape[:-1], 4, 1)
 
 
+class Misnamed(Wide):
+    """Names a leaf as the group of all vehicles."""
+
+    writes = ("vehicles.vehicles",)
+
+
 class Broken(Feature):
     """Cannot compute on such a string."""
 
@@ -184,6 +190,10 @@ def test_a_piece_that_does_not_fit_is_refused() -> None:
         lambda piece: check(piece),
         [
             (Wide().bind(WORLD), r"Wide writes vehicles\.wide as \[4, 4, 1\] .* expected \[4, 1\]"),
+            (
+                Misnamed().bind(WORLD),
+                r"Misnamed writes vehicles\.vehicles, but 'vehicles' is a group .* another name",
+            ),
             (Broken().bind(WORLD), "Broken does not fit the string of vehicles"),
             (
                 MOTION.bind(WORLD),

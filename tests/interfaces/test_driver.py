@@ -7,6 +7,7 @@ import re
 from functools import cache
 from importlib.resources import files
 from time import perf_counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.evaluation.strategies import baseline, trained
 from lcc_rl.interfaces.driver import MEASURED, Driver
+from lcc_rl.interfaces.sumo import Bridge
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.base import SEED
 from lcc_rl.results.policies import load_policy
@@ -228,6 +230,26 @@ def test_no_driver_takes_a_measurement_that_is_no_number() -> None:
             found = Driver(name, 0.1).step({**given, entry: np.array([12.0, np.nan])})
             assert found[1] == pytest.approx(-3.0), (name, entry)
             assert found[0] > -3.0
+
+
+def test_a_bridge_names_the_time_of_a_measurement_or_command_that_is_no_number(monkeypatch) -> None:
+    """With a simulation whose one car measures a speed of NaN, without SUMO."""
+    cars = SimpleNamespace(
+        getIDList=lambda: ("car7", "lead"),
+        getLeader=lambda car, sight: ("lead", 12.0),
+        getFollower=lambda car, sight: None,
+        getMinGap=lambda car: 1.5,
+        getSpeed=lambda car: float("nan") if car == "lead" else 9.0,
+        getAcceleration=lambda car: 0.0,
+    )
+    clock = SimpleNamespace(getDeltaT=lambda: 0.1, getTime=lambda: 4.2)
+    sumo = SimpleNamespace(isLoaded=lambda: True, simulation=clock, vehicle=cars)
+    monkeypatch.setattr("lcc_rl.interfaces.sumo.load_sumo", lambda: sumo)
+    cases = [
+        ("idm_acc", r"ahead\.speed is nan in row 0 of the cars.* at 4\.2 s"),
+        (nothing, r"nothing: the command of car7 is nan at 4\.2 s"),
+    ]
+    check_refused(lambda driver: Bridge(driver, ["car7"]).command(), cases, Diverged)
 
 
 def test_the_example_of_the_page_prints_what_it_shows(capsys) -> None:

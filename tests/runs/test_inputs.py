@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from commands import NO_AGENT, run_command
@@ -14,6 +15,7 @@ from lcc_rl.commands.evaluation import made_by
 from lcc_rl.config import identity, load
 from lcc_rl.config.inputs import inputs_of
 from lcc_rl.drivers.tables import load_drivers
+from lcc_rl.envs.inputs import shared_inputs
 from lcc_rl.io.files import write_parquet
 
 OWN = """import own_helper
@@ -154,3 +156,24 @@ def test_a_file_of_config_dir_is_an_input(place) -> None:
         run_command(*command, cwd=place, check=True)
         kept.append(made_by(place / f"run{accel}" / "episodes.parquet"))
     assert kept[0] != kept[1]
+
+
+OWN_LEADERS = """from lcc_rl.data.leaders import DriveLeaders
+class Own(DriveLeaders):
+    def load(self, *given):
+        return DriveLeaders(path=self.path, evaluation_share=1, fastest=FASTEST).load(*given)
+"""
+
+
+def test_a_class_that_is_defined_anew_is_used(monkeypatch) -> None:
+    """As in a notebook, whose ``__main__`` is no file."""
+    module = ModuleType("cells")
+    monkeypatch.setitem(sys.modules, "cells", module)
+    words = ["experiment=smoke", "leader={_target_: cells.Own, path: udds}"]
+    words += ["evaluation.profiles=null", "scenario.horizon=20"]
+    counts = []
+    for fastest in ("None", "None", "5.0"):
+        if fastest != "None" or not counts:
+            exec(OWN_LEADERS.replace("FASTEST", fastest), vars(module))
+        counts.append(len(shared_inputs(load("train", words)).evaluation))
+    assert counts == [90, 90, 44]

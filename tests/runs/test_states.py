@@ -87,7 +87,10 @@ def test_survey_and_status_of_a_sweep(tmp_path) -> None:
     for name in ("finished", "failed", "stopped", "running", "running/part"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.yaml").write_text("")
-    (tmp_path / "finished" / "episodes.parquet").write_text("")
+    (tmp_path / "finished" / "episodes.parquet").write_bytes(b"PAR1 rows PAR1")
+    for name, content in {"cut": b"PAR1 row", "empty": b""}.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "episodes.parquet").write_bytes(content)
     (tmp_path / "failed" / "error.txt").write_text("[disk] full\nmore")
     for name, done in (("stopped", 2), ("running/part", 4)):
         state = {"done": done, "total": 8, "eta_s": 10.0}
@@ -96,7 +99,10 @@ def test_survey_and_status_of_a_sweep(tmp_path) -> None:
     (tmp_path / "sweep.json").write_text(json.dumps({"runs": 6, "varied": ["seed"]}))
     with claim(tmp_path / "running" / "part"):
         printed = status(tmp_path)
+    damaged = ["episodes.parquet", "is", "cut", "or", "damaged"]
     assert [line.split() for line in printed[:-1]] == [
+        ["failed", "cut", *damaged],
+        ["failed", "empty", *damaged],
         ["failed", "failed", "[disk]", "full"],
         ["finished", "finished"],
         ["running", "4/8", "running/part", "ETA", "0:10"],
@@ -104,7 +110,7 @@ def test_survey_and_status_of_a_sweep(tmp_path) -> None:
     ]
     # The running one has 10 s of 20 s left; two wait and one stopped, 20 s each, one at a time.
     assert printed[-1].endswith(
-        "6 runs: 1 finished, 1 running, 1 stopped, 1 failed, 2 waiting; about 1:10 left"
+        "6 runs: 1 finished, 1 running, 1 stopped, 3 failed; about 0:30 left"
     )
 
 

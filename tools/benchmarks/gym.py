@@ -12,8 +12,8 @@ from benchmarks.harness import Row, Run, installed, rates
 from benchmarks.plain import PlainLoop, training
 from benchmarks.plain_numba import NUMBA, NumbaLoop
 
-SMALL = ["data.platoons=3", "data.recordings=2", "data.vehicles=3", "data.duration_s=[35,45]"]
-SMALL.append("experiment=paper_windows")
+DATA = ("platoons=3", "recordings=2", "vehicles=3", "duration_s=[35,45]")
+SMALL = ["experiment=paper_windows", *(f"data.{setting}" for setting in DATA)]
 MANY, SYNC = 16, "SyncVectorEnv"
 
 
