@@ -18,6 +18,7 @@ from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import after_uncounted
 from lcc_rl.envs.inputs import Inputs, build_energy, second_energy
 from lcc_rl.errors import require
+from lcc_rl.evaluation.metrics import damping_time
 from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.rows import (
     FILTER_ENTRIES,
@@ -197,6 +198,8 @@ class Episodes:
         record, alive = self.player.play(options, named)
         crashed = (alive.unsqueeze(-2) & (record["vehicles", "gap"] <= 0.0)).any(0).any(-2)
         braked = brakings(record, alive, self.cfg.scenario.vehicles)
+        driven = alive[self.begun - self.warm_up :]  # from a handover on, also uncounted steps
+        speed = record["vehicles", "speed"][-len(driven) :]
         record, alive = {key: x[self.begun :] for key, x in record.items()}, alive[self.begun :]
         if self.cfg.scenario.fleet:
             record["vehicles", "length"] = self.energy.lengths(record[CLASS])
@@ -220,6 +223,8 @@ class Episodes:
         measured = measures(groups, alive, time_step, self.energy, recorded, self.second)
         length, free = self.cfg.scenario.vehicle_length, inputs.population.desired_speed[driver]
         measured |= traffic(record, alive, length, time_step, free, self.energy)
+        if self.cfg.scenario.road == RING:
+            measured["damping_time_s"] = damping_time(speed, driven, time_step)
         rows = pd.concat([described, leader, braked, as_frame(measured, crashed)], axis=1)
         rows = rows.iloc[:count]
         inside = [index - block * plan.size for index in sorted(self.samples)]
