@@ -130,7 +130,7 @@ def tasks(reference: Path, docs: Path) -> None:
     with naming_run(reference / "scores"):
         table = board.leaderboard(documents)
     fill(docs / "leaderboard.md", {"board": table})
-    fill(docs / "notes" / "results.md", {"tasks": "\n\n".join(parts)})
+    fill(docs / "notes" / "results.md", {**found, "tasks": "\n\n".join(parts)})
     kept = read_parquet(reference / "averaged.parquet")
     fill(docs / "limits.md", {"averaged": averaged(kept)})
 

@@ -66,6 +66,7 @@ from lcc_rl.runs.states import ERROR, LOCK, claim, forget, record
 LEADER_SOURCES: dict[str, tuple[str, ...]] = {
     "stream": ("data=stream", "drivers=i80"),
     "highway": ("data=highway", "drivers=highway"),
+    "stop_and_go": ("data=stop_and_go", "drivers=highway"),
     "platoons": ("data=platoons", "drivers=highway"),
     "everyday": ("leader=everyday", "drivers=highway"),
 }

@@ -18,6 +18,7 @@ from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import after_uncounted
 from lcc_rl.envs.inputs import Inputs, build_energy, second_energy
 from lcc_rl.errors import require
+from lcc_rl.evaluation.metrics import damping_time
 from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.rows import (
     FILTER_ENTRIES,
@@ -205,6 +206,8 @@ class Episodes:
         terms = {key[-1]: record.pop(key) for key in list(record) if key[:-1] == TERMS}
         crashed = (alive.unsqueeze(-2) & (record["vehicles", "gap"] <= 0.0)).any(0).any(-2)
         braked = brakings(record, alive, self.cfg.scenario.vehicles)
+        driven = alive[self.begun - self.warm_up :]  # from a handover on, also uncounted steps
+        speed = record["vehicles", "speed"][-len(driven) :]
         record, alive = {key: x[self.begun :] for key, x in record.items()}, alive[self.begun :]
         if self.cfg.scenario.fleet:
             record["vehicles", "length"] = self.energy.lengths(record[CLASS])
@@ -232,6 +235,8 @@ class Episodes:
             mean = (term[self.begun :].sum(-2) * alive).sum(0) / alive.sum(0)
             weighted = self.weights[name] * mean
             measured |= {f"mean_reward_{name}": weighted, f"mean_term_{name}": mean}
+        if self.cfg.scenario.road == RING:
+            measured["damping_time_s"] = damping_time(speed, driven, time_step)
         rows = pd.concat([described, leader, braked, as_frame(measured, crashed)], axis=1)
         rows = rows.iloc[:count]
         inside = [index - block * plan.size for index in sorted(self.samples)]

@@ -265,9 +265,8 @@ def string_measures(
         over vehicles (``speed_std_mps``); standard deviation over the vehicles at a time, averaged
         over the episode and over its last tenth (``speed_spread_mps``,
         ``final_speed_spread_mps``); vehicles per hour by mean speed and spacing (``flow_vph``);
-        behind a leader, the deviation in time of the last vehicle divided by the leader's
-        (``string_ratio``); and, on a ring, the time after which the deviation over the vehicles
-        stays below 0.5 m/s (``damping_time_s``; NaN if it does not).
+        and, behind a leader, the deviation in time of the last vehicle divided by the leader's
+        (``string_ratio``).
     """
     here, steps = alive.unsqueeze(-2), alive.sum(0).clamp(min=1)
 
@@ -280,8 +279,7 @@ def string_measures(
     def deviation(entry: Tensor) -> Tensor:
         return average((entry - average(entry)).square()).sqrt()
 
-    # Several times faster than torch's std for few vehicles.
-    spread = (speed - speed.mean(-2, keepdim=True)).square().mean(-2).sqrt()
+    spread = _spread(speed)
     late = torch.arange(len(alive), device=alive.device).view(-1, *[1] * (alive.ndim - 1))
     last = alive & (late >= (0.9 * steps).floor())
     found = {
@@ -291,10 +289,26 @@ def string_measures(
         "final_speed_spread_mps": torch.where(last, spread, 0.0).sum(0) / last.sum(0).clamp(min=1),
     }
     found["flow_vph"] = 3600.0 * found["mean_speed_mps"] / (average(gap).mean(-2) + length)
-    if leader is None:
-        time = (torch.where(spread > CALM, late + 1, 0) * alive).amax(0)
-        found["damping_time_s"] = torch.where(time < steps, time * time_step, torch.nan)
-    else:
+    if leader is not None:
         own = deviation(speed[..., -1, :])
         found["string_ratio"] = own / deviation(leader).clamp(min=1e-3)
     return found
+
+
+def damping_time(speed: Tensor, alive: Tensor, time_step: float) -> Tensor:
+    """Return the time after which the speeds' deviation over the vehicles stays below 0.5 m/s.
+
+    Args:
+        speed, alive, time_step: see :func:`string_measures`.
+
+    Returns:
+        ``[*batch, 1]`` [s]; NaN if it does not stay below.
+    """
+    passed = torch.arange(1, len(alive) + 1, device=alive.device).view(-1, *[1] * (alive.ndim - 1))
+    time = (passed * (alive & (_spread(speed) > CALM))).amax(0)
+    return torch.where(time < alive.sum(0).clamp(min=1), time * time_step, torch.nan)
+
+
+def _spread(speed: Tensor) -> Tensor:
+    """Return the deviation over the vehicles; several times faster than torch's for few."""
+    return (speed - speed.mean(-2, keepdim=True)).square().mean(-2).sqrt()

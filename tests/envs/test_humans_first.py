@@ -71,6 +71,22 @@ def test_an_evaluation_measures_what_follows() -> None:
         assert steps[name].tolist() == played[name].tolist()[200:], name
 
 
+def test_a_damping_time_begins_at_the_handover(monkeypatch) -> None:
+    """It counts the warm-up, too; the other measures do not."""
+    monkeypatch.setattr("lcc_rl.evaluation.metrics.CALM", 0.05)  # [m/s]
+    sizes = ("evaluation.profiles=2", "scenario.circumference=90", "evaluation.humans_first=20")
+    found = []
+    for warm_up in (0, 5):
+        words = (*RING, *sizes, "scenario.horizon=300", f"evaluation.warm_up={warm_up}")
+        cfg = load("evaluate", words)
+        rows, _ = evaluate(baseline(cfg, "follower_stopper"), load_inputs(cfg), None, 8, 0, 1)
+        found.append(rows)
+    times, warm = (rows["damping_time_s"].tolist() for rows in found)
+    assert times == warm
+    assert min(times) > 0.0
+    assert (found[0]["speed_spread_mps"] > found[1]["speed_spread_mps"]).all()
+
+
 def test_rings_differ_in_training_and_not_in_an_evaluation(subtests) -> None:
     for nominal in [False, True]:
         with subtests.test(nominal=nominal):
