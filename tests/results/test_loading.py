@@ -171,7 +171,7 @@ def test_damaged_runs_are_named_in_a_line_each_and_the_rest_is_read(tmp_path, ca
     assert len(lines) == len(DAMAGES)
     assert all("\n" not in line and str(tmp_path) in line for line in lines)
     assert results.load(tmp_path, lazy=True).schema.names == list(frame.columns)
-    with pytest.raises(ResultsError, match=r"foreign/episodes\.parquet"):
+    with pytest.raises(ResultsError, match=r"text \(failed: episodes\.parquet is cut or damaged\)"):
         results.load(tmp_path, strict=True)
     for name in DAMAGES.keys() - {"typed"}:  # which is wrong beside others only
         with pytest.raises(ResultsError, match=f"none is readable: .*{name}"):
