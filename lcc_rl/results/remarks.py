@@ -63,7 +63,7 @@ def flow_note(table: pd.DataFrame) -> str:
 
 def seeds_note(table: pd.DataFrame) -> str:
     """Return sentences on single trainings, and on seeds that comparisons leave out, if any."""
-    rows = table[table["left_out"] != ""]
+    rows = table[(table["left_out"] != "") & table["saving"].notna()]
     names = zip(rows["strategy"], rows["left_out"], strict=True)
     left = [f"for {in_words(str(name))} {seeds}" for name, seeds in names]
     words = [

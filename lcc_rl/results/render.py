@@ -147,10 +147,12 @@ def as_rich(table: pd.DataFrame, shown: Sequence[Shown], title: str, caption: st
     drawn = Table(title=escape(title), caption=escape(caption), **PLAIN)
     for place, column in enumerate(shown):
         drawn.add_column(escape(column.heading), justify="right" if place else "left")
-    words = [len(word) for name in table[shown[0].key] for word in name.split()]
-    drawn.columns[0].min_width = min(max(words, default=0), WIDTH // 2)  # wrapped at spaces
+    texts = [(one.heading, *_short_cells(table, one.key)) for one in shown]
+    first, *others = (max(len(word) for word in " ".join(text).split()) for text in texts)
     drawn.columns[0].overflow = "fold"
-    for row in zip(*(_short_cells(table, column.key) for column in shown), strict=True):
+    if first > WIDTH // 4:  # names are wrapped at spaces, if all columns have room
+        drawn.columns[0].width = max(min(first, WIDTH - sum(others) - len(others)), 1)
+    for row in zip(*(cells for _, *cells in texts), strict=True):
         drawn.add_row(*map(escape, row))
     return drawn
 
