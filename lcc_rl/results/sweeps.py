@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -59,7 +60,9 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
     rows = rows.drop_duplicates([name for name in rows if name != "run"])
     _check_one_study(root, rows)
     found = rows.drop(columns="run").reset_index(drop=True)
-    missing = loaded.attrs.get("unfinished", {}) | loaded.attrs.get("damaged", {})
+    missing = dict(loaded.attrs.get("unfinished", {}))
+    for name, why in loaded.attrs.get("damaged", {}).items():
+        missing[name] = f"damaged: {why.removeprefix(f'{root / name}{os.sep}')}"
     remarks = [f"Without rows: {listed(missing)}."] * bool(missing) + without_effect(root)
     found.attrs |= {"remarks": remarks, "first": str(root / next(iter(runs)))}
     return found

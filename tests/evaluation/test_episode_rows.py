@@ -1,10 +1,13 @@
 """Evaluation by episodes: paired, independent of the batch, and equal to a plain simulation."""
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
 from helpers import POPULATION, compose, steady, string, wavy_profiles
 
+from lcc_rl.agents.actor import shared_policy
+from lcc_rl.agents.factory import build_agent
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.evaluation.episodes import evaluate, pairs
 from lcc_rl.evaluation.strategies import Strategy, baseline
@@ -127,3 +130,21 @@ def test_a_collision_counts_in_the_warm_up() -> None:
     assert (rows["steps"] == 0).any()
     assert rows.loc[rows["steps"] == 0, ["min_gap_m", "total_energy_kj"]].isna().all(axis=None)
     assert len(steps) == rows["steps"].sum()  # of every episode, also of those without any
+
+
+def test_a_learned_policy_has_the_mean_of_each_reward_term_and_other_rows_none() -> None:
+    weights = {"safety": 0.5, "efficiency": 0.0, "hdv_energy": 3.0}
+    words = [f"reward.terms.{name}.weight={weight}" for name, weight in weights.items()]
+    cfg = strategy("alcc", *words).cfg
+    driven = Strategy("alcc", cfg, shared_policy(build_agent(cfg, POPULATION).policy), 0)
+    rows, _ = evaluate(driven, INPUTS, 5, 64, 1)
+    assert cfg.reward.terms["safety"].settings["weight"] == 0.5
+    for name in cfg.reward.terms:
+        own, term = rows[f"mean_reward_{name}"], rows[f"mean_term_{name}"]
+        np.testing.assert_allclose(own, cfg.reward.terms[name].settings["weight"] * term)
+    # A term is −energy/scale of a step of 0.1 s: without a collision its sum is the energy.
+    whole = rows[~rows["collided"]]
+    power = -whole["mean_term_cav_energy"] * whole["steps"] * 20.0
+    np.testing.assert_allclose(power, whole["cav_energy_kj"], rtol=1e-4, atol=1e-3)
+    assert (rows["mean_term_efficiency"] < 0.0).any()
+    assert not run("idm")[0].columns.str.contains("mean_term").any()
