@@ -117,7 +117,8 @@ def test_runs_of_a_sweep_over_two_settings_are_named_without_quotes(tmp_path) ->
 def test_what_was_typed_may_refer_to_settings() -> None:
     typed = ["seed=${agent.gamma},1", "agent.gamma=0.9"]
     config = OmegaConf.create({"hydra": {"overrides": {"task": typed}, "sweeper": {}}})
-    assert sweeps.make_plan(config) == sweeps.SweepPlan(2, ["seed"])
+    values = [["$\\{agent.gamma\\}", "1"]]
+    assert sweeps.make_plan(config) == sweeps.SweepPlan(2, ["seed"], values)
 
 
 def test_a_sweep_of_nothing_is_one_line(tmp_path) -> None:
