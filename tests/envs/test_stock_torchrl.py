@@ -150,7 +150,7 @@ def test_the_recipes_of_the_page_drive(monkeypatch, kind) -> None:
     rows = lcc_rl.compare(space["compared"], overrides=words).rows
     own, human = rows[rows["strategy"] != "human"], rows[rows["strategy"] == "human"]
     assert own["mean_speed_mps"].mean() > 0.8 * human["mean_speed_mps"].mean()
-    assert own["total_distance_m"].mean() > 0.8 * human["total_distance_m"].mean()
+    assert own["cav_distance_m"].mean() > 0.8 * human["cav_distance_m"].mean()
     assert own["collided"].mean() < 0.02
     energy = [part["total_path_energy_kj"].mean() for part in (own, human)]
     assert energy[0] < 2.5 * energy[1]

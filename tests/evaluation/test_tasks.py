@@ -23,6 +23,7 @@ QUICK = ("i80-follow", "ring-22")
 FEW = ("experiment=smoke", "evaluation.profiles=2", "scenario.horizon=12")
 MORE = {
     "i80-follow": [*DATA, "evaluation.drivers=2"],
+    "ring-22": ["evaluation.profiles=1"],  # no interval, as wide as its episodes are short
     "i24-follow5": DATA,
     "i24-fleet": [*DATA, "scenario.string=automated human automated human"],
     "i24-mixed": [*DATA, "scenario.string={size: 8, penetration: 0.25}"],
