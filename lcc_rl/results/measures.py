@@ -137,7 +137,7 @@ MEASURES = [
     _per("co2_g_per_km", "carbon dioxide of it [g/km]", "all_co2_g", 1e3, "{:.1f}"),
     _per("travel_time_s_per_km", "travel time [s/km]", "vehicle_time_s", 1e3),
     _per("delay_s_per_km", "  delay against v0 [s/km]", "delay_s", 1e3),
-    Measure("mean_speed_mps", "mean speed [m/s]", limit="mean\nspeed\n≥ {:.3g}\n[m/s]"),
+    Measure("mean_speed_mps", "mean speed [m/s]", limit="mean\nspeed\n≥ {:g}\n[m/s]"),
     Measure(SPEED_STD, "deviation of a speed in time [m/s]", score=SPEED_STD),
     Measure(FINAL_SPREAD, "spread of speeds at the end [m/s]", score=FINAL_SPREAD),
     Measure(FLOW, "flow [vehicles/h]", "{:.0f}", limit="flow\n≥ {:.0f}\n[1/h]"),
