@@ -28,10 +28,10 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
     "lcc_rl + tools": {"lines": 42_400, "code": 27_800},
-    "tests": {"lines": 22_700},
+    "tests": {"lines": 22_800},
     "conf": {"yaml": 151},
 }
-CASES = 1_100  # ceiling of all quick tests, see tests/tools/test_size.py
+CASES = 1_120  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {"names in several modules": 60, "floors": 10, "circles": 0}
 
 

@@ -34,7 +34,6 @@ from lcc_rl.config import (
 )
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, input_error
-from lcc_rl.results.sweeps import without_effect
 from lcc_rl.runs.interrupts import ending_quietly, was_interrupted
 from lcc_rl.runs.states import CONFIG, Busy, forget, record, withdraw
 from lcc_rl.runs.sweeps import SweepCallback, conclude, run_job
@@ -156,6 +155,8 @@ def sweep(command: Callable[[], Any]) -> None:
     finally:
         folder = SweepCallback.end()
     if folder is not None:
+        from lcc_rl.results.sweeps import without_effect  # loads pandas
+
         for line in without_effect(folder):
             logging.getLogger("lcc_rl").warning(line)
         conclude(folder)

@@ -45,7 +45,7 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
     names = sorted(path.name for path in (tmp_path / "run").iterdir())
     tables = ["drivers.parquet", "twins.parquet"]
     figures = ["calibration.png", "joint_distribution.png", "twins.png"]
-    assert names == sorted(["config.yaml", *tables, *figures])
+    assert names == sorted(["config.yaml", "origin.txt", *tables, *figures])
     written = pd.read_parquet(tmp_path / "run" / "drivers.parquet")
     pd.testing.assert_frame_equal(written, drivers, check_dtype=False)
     metadata = parquet_metadata(tmp_path / "run" / "drivers.parquet")

@@ -21,6 +21,7 @@ import lcc_rl
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.foreign import as_given
 
+pytestmark = pytest.mark.filterwarnings("ignore:(The VecNorm|This) class is to be deprecated")
 EXPERIMENTAL = pytest.mark.filterwarnings("ignore:Support of VecNormV2")
 ROOT, GROUP = (["observation"], ["action"]), (["automated", "observation"], ["automated", "action"])
 SMALL = [*NO_AGENT, "evaluation.baselines=[]"]
