@@ -27,7 +27,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 42_400, "code": 27_800},
+    "lcc_rl + tools": {"lines": 41_800, "code": 27_400},
     "tests": {"lines": 22_800},
     "conf": {"yaml": 151},
 }
