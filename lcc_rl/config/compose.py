@@ -200,7 +200,8 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         require(not item.endswith(f"={MISSING}"), f"{item.removeprefix('++')}: expected a value")
     try:
         # Settings may refer to defaults of classes.
-        whole = OmegaConf.create(with_defaults(OmegaConf.to_container(cfg, resolve=False)))
+        written = OmegaConf.to_container(cfg, resolve=False)
+        whole = OmegaConf.create(with_defaults(written))
         content: Any = OmegaConf.to_container(whole, resolve=True)
     except InterpolationKeyError as error:
         missing = re.search("'[^']+'", str(error))
@@ -227,7 +228,7 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     for name in NEEDED:
         if getattr(tree, name, TARGET) is None:
             raise ConfigError(f"{name}: expected a node with {TARGET}, got None")
-    check_used(tree, overrides, sweep, OmegaConf.to_container(cfg, resolve=False))
+    check_used(tree, overrides, sweep, written)
     return with_inputs(tree)
 
 
