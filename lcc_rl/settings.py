@@ -261,15 +261,29 @@ def find_target(target: str, where: str) -> Any:
         ConfigError: naming its place in the configuration, if there is none.
     """
     module, _, name = target.rpartition(".")
+    where = f"{where}.{TARGET}"
+    found = getattr(load_module(module, where, target), name, None)
+    if not callable(found):
+        what = f"{module} has no {name!r}" if found is None else "it is no class or function"
+        raise ConfigError(f"{where}: cannot find {target!r}: {what}")
+    return found
+
+
+def load_module(module: str, where: str, target: str = "") -> Any:
+    """Return a module, for an object ``target`` in it.
+
+    Raises:
+        ConfigError: naming the place in the configuration, if it cannot be imported.
+    """
     try:
-        found = getattr(import_module(module), name)
+        return import_module(module)
+    except LccError:
+        raise
     except Exception as error:  # a user's module may raise any error
         hint = ""
         if not isinstance(error, (ImportError, AttributeError, ValueError)):
             raise ConfigError(f"{where}: {module} cannot be imported: {error}") from error
         if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("lcc_rl"):
             hint = "; for your own file, export PYTHONPATH=<its folder>"
-        raise ConfigError(f"{where}.{TARGET}: cannot find {target!r}: {error}{hint}") from error
-    if not callable(found):
-        raise ConfigError(f"{where}.{TARGET}: {target!r} is no class or function")
-    return found
+        text = f"{where}: cannot find {target or module!r}: {error}{hint}"
+        raise ConfigError(text) from error

@@ -70,6 +70,7 @@ def configurations() -> Iterator[StudyConfig]:
     yield load("train", ["variant=reference", "scenario=ring", handover, SIZES])
     saturation = "controller@scenario.controllers.automated=pi_saturation"
     yield load("train", ["variant=reference", "energy=mixture", saturation, SIZES])
+    yield load("train", ["variant=reference", saturation.replace("pi_saturation", "calm"), SIZES])
     yield load("train", ["variant=idm", handover.replace("handover", "mpc"), SIZES])
 
 

@@ -46,8 +46,7 @@ from lcc_rl.io.files import read_parquet
 from lcc_rl.io.settings import read_json
 from lcc_rl.results import board
 from lcc_rl.results.fronts import ENERGY, FRONT_KINDS, LONG_SHARE, at_equal_flow, points
-from lcc_rl.results.measures import AT_LEAST, FLOW, Measure
-from lcc_rl.results.measures import SHARE as IS_SHARE
+from lcc_rl.results.measures import FLOW, SIGNS, Measure
 from lcc_rl.results.names import NETWORK, ON_FRONT, in_words, worded
 from lcc_rl.results.render import as_markdown, markdown_row, saved_text, signed
 from lcc_rl.results.runs import naming_run
@@ -204,27 +203,17 @@ def task_table(name: str, table: pd.DataFrame) -> str:
 
 def bounded(measure: Measure, bound: float) -> str:
     """Return a measure and its limit in words."""
-    sign = AT_LEAST if AT_LEAST in measure.limit else "≤"
-    return f"{measure.limited} {sign} {measured(measure, bound)}"
+    return f"{measure.limited} {SIGNS[measure.bound]} {measure.with_unit(bound)}"
 
 
 def broken(task: Task, row: Mapping[Hashable, Any]) -> str:
     """Return the violated limits with their values, or the collisions."""
     found = [
-        f"{one.limited} {measured(one, row[one.key])}"
+        f"{one.limited} {one.with_unit(row[one.key])}"
         for one, bound in task.bounds.items()
         if not one.keeps(row[one.key], bound)
     ]
     return "; ".join(found) or f"{row['collisions']} collisions"
-
-
-def measured(measure: Measure, value: float) -> str:
-    """Return a value of a limited measure with its unit."""
-    if measure.key.startswith(IS_SHARE):
-        return f"{measure.scale * value:.2f} %"
-    if measure.key == FLOW:
-        return f"{value:,.0f} 1/h"
-    return f"{value:.0f} m" if measure.key.endswith("_m") else f"{value:.2f} s"
 
 
 def figure_of_record() -> Figure:

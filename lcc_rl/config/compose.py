@@ -54,6 +54,7 @@ EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "swe
 LATER = (
     *("evaluation.warm_up", "evaluation.front", "evaluation.second_energy"),
     "scenario.fleet",
+    "measures",
 )
 NEEDED = ("data", "split", "drivers", "observation", "calibration")  # required nodes of commands
 NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =

@@ -22,7 +22,7 @@ from lcc_rl.config.words import FILTERED, YAML
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.paths import matching
 from lcc_rl.io.settings import parse_yaml, read_text
-from lcc_rl.settings import TARGET, find_target
+from lcc_rl.settings import TARGET, find_target, load_module
 
 FileHashes = dict[str, dict[str, str]]
 NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
@@ -68,6 +68,9 @@ def _files(last: str, named: bool, holder: Any, name: str) -> Iterator[Path]:
     path = Path(expanduser(name))
     if last in (TARGET, "law", "model"):
         yield from _module(name)
+    elif last == "measures":
+        with suppress(ConfigError):
+            yield from _own_modules(load_module(name, last), set())
     elif named:
         yield from compared_files(name)
     elif last == "path" or not _ours(holder):

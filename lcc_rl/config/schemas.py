@@ -27,6 +27,7 @@ from lcc_rl.settings import (
     Seed,
     Settings,
     Speed,
+    load_module,
     parse,
 )
 
@@ -195,6 +196,16 @@ class StudyConfig(BaseConfig):
     sweep: str | None = None
     policy: str | None = None
     table: Literal["short", "all"] = "short"  # printed table: six columns, or all measures
+    # Modules that register measures, see lcc_rl.evaluation.metrics.register.
+    measures: list[str] = dataclasses.field(default_factory=list)
+
+    def validate(self) -> None:
+        for module in self.measures:
+            load_module(module, "measures")
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)  # in another process, which lacks the modules
+        self.validate()
 
 
 class TrainConfig(StudyConfig):

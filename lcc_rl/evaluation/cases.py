@@ -14,6 +14,7 @@ from lcc_rl.data.leaders import Case
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import build_pieces, world_of
 from lcc_rl.envs.inputs import Inputs
+from lcc_rl.evaluation.metrics import registered, safety_measures
 from lcc_rl.evaluation.rollout import play, reset_options
 from lcc_rl.evaluation.rows import INDEX
 from lcc_rl.evaluation.strategies import Strategy
@@ -41,7 +42,7 @@ def evaluate_cases(
     rows, steps = [], []
     for case in cases_of(cfg, inputs):
         series = drive_runs(strategy, case, inputs, cfg.evaluation.seed, cfg.device)
-        frame = measured_series(series)
+        frame = measured_series(series, cfg.scenario.time_step)
         labels = {
             "strategy": strategy.name,
             "training_seed": pd.array([strategy.seed] * len(frame), dtype="Int64"),
@@ -114,8 +115,8 @@ def drive_runs(
     return series
 
 
-def measured_series(series: CaseSeries) -> pd.DataFrame:
-    """Return one row per run and vehicle.
+def measured_series(series: CaseSeries, time_step: float = 0.1) -> pd.DataFrame:
+    """Return one row per run and vehicle; ``time_step`` [s].
 
     Speed errors are e_v(i,0), as in the paper's tables. ``energy_ratio`` is Σ e_v(i,i−1)² divided
     by that of the vehicle ahead (string stability: at most 1); it is missing for the first vehicle
@@ -146,6 +147,9 @@ def measured_series(series: CaseSeries) -> pd.DataFrame:
     if "winner" in series:
         columns["learned_share"] = series["winner"].double().mean(0)
         columns |= {name: series[name][-1] for _, name in COUNTERS}
+    each = {name: value[..., None, None] for name, value in series.items()}  # a vehicle a batch
+    alive = torch.ones_like(each["jerk"], dtype=torch.bool)
+    columns |= safety_measures(each, alive, time_step, registered())
     runs, vehicles = energy.shape
     frame = pd.DataFrame({name: value.flatten().cpu().numpy() for name, value in columns.items()})
     frame.insert(0, "run_id", np.repeat(np.arange(runs), vehicles))

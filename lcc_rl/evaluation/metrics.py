@@ -11,7 +11,10 @@ import torch
 from torch import Tensor
 
 from lcc_rl.energy import AVERAGED, AVERAGES, Fleet, as_fleet
+from lcc_rl.errors import require, require_known
 from lcc_rl.functional.safety import NEVER
+from lcc_rl.results.measures import MEASURES, Measure
+from lcc_rl.results.platoons import PLATOON
 
 KILO = 1e-3
 UNSAFE_TTC = 4.0  # [s] (A10)
@@ -21,6 +24,9 @@ APART = 1.0  # brakings of a vehicle within this time count as one [s]
 CALM = 0.5  # spread of speeds below which a wave counts as damped [m/s]
 PACE = 1.0  # lower speeds do not count for moving time gaps [m/s]
 ACTS = 0.01  # change of a command above which a filter counts as active [m/s²]
+SERIES = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")  # of every vehicle
+OF_FILTER = ("promised", "safe", "wanted", "command")  # of vehicles behind a safety filter
+Metric = Callable[..., Tensor]
 
 
 def energy_measures(
@@ -176,7 +182,7 @@ def _turned(over: Reductions, safe: Tensor) -> Tensor:
 
 # Measures of the automated vehicles of a string by column of episodes.parquet. Each is a function
 # of the entries that it names, see :func:`safety_measures`. Without an entry there is no column.
-METRICS: dict[str, Callable[..., Tensor]] = {
+METRICS: dict[str, Metric] = {
     "min_gap_m": lambda over, gap: over.lowest(gap),
     "mean_gap_m": lambda over, gap: over.mean(gap),
     "gap_opened_m": lambda over, gap: over.change(gap),
@@ -202,7 +208,7 @@ METRICS: dict[str, Callable[..., Tensor]] = {
     ),
 }
 # Measures of all vehicles of a string, likewise; ``free`` is v0 [m/s].
-ROAD_METRICS: dict[str, Callable[..., Tensor]] = {
+ROAD_METRICS: dict[str, Metric] = {
     "brakings_below_2": lambda over, acceleration: over.begun(acceleration < -2.0),
     "brakings_below_3": lambda over, acceleration: over.begun(acceleration < -3.0),
     "share_time_gap_short": lambda over, time_gap: over.mean(time_gap < SHORT_TIME_GAP),
@@ -211,11 +217,47 @@ ROAD_METRICS: dict[str, Callable[..., Tensor]] = {
 }
 
 
+OURS = frozenset((*(one.key for one in (*MEASURES, *PLATOON)), *METRICS, *ROAD_METRICS))
+
+
+def register(measure: Measure, metric: Metric, every: bool = False) -> None:
+    """Add a measure to all evaluations, tables, figures, limits and files of this process.
+
+    A command imports the modules of ``measures=[…]``, which call this function. A measure of the
+    same key is replaced, so that a notebook may run its cell again.
+
+    Args:
+        measure: its names, unit, aggregation and bound.
+        metric: a function of ``over``, :class:`Reductions`, and of the entries that it names:
+            :data:`SERIES`, :data:`OF_FILTER` and, of every vehicle, ``free``, v0 [m/s]; shapes as
+            for :func:`safety_measures`. Episodes without one of them have no value.
+        every: over all vehicles of a string, not the automated ones. Rows of platoons are of one
+            vehicle each.
+
+    Raises:
+        ConfigError: if the key is one of the package, or an entry is unknown.
+    """
+    require(measure.key not in OURS, f"measure {measure.key}: the package has one of this key")
+    _, *entries = signature(metric).parameters
+    known = (*SERIES, *(("free",) if every else OF_FILTER))
+    require_known(f"entry of the measure {measure.key}", entries, known)
+    for table in (MEASURES, PLATOON):
+        table[:] = [one for one in table if one.key != measure.key] + [measure]
+    for metrics in (METRICS, ROAD_METRICS):
+        metrics.pop(measure.key, None)
+    (ROAD_METRICS if every else METRICS)[measure.key] = metric
+
+
+def registered() -> dict[str, Metric]:
+    """Return the metrics of :func:`register`."""
+    return {key: x for key, x in {**METRICS, **ROAD_METRICS}.items() if key not in OURS}
+
+
 def safety_measures(
     series: Mapping[str, Tensor],
     alive: Tensor,
     time_step: float,
-    metrics: Mapping[str, Callable[..., Tensor]] = METRICS,
+    metrics: Mapping[str, Metric] = METRICS,
 ) -> dict[str, Tensor]:
     """Return measures of safety, efficiency and comfort of vehicles of a string.
 

@@ -19,6 +19,7 @@ from lcc_rl.energy import AVERAGED, BURNT, SECOND, Fleet, as_fleet
 from lcc_rl.evaluation.metrics import (
     KILO,
     ROAD_METRICS,
+    SERIES,
     averaged_energies,
     energy_measures,
     measured_ttc,
@@ -34,7 +35,6 @@ from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.string import COMMAND, WANTED
 from lcc_rl.results.windows import DRIVE, LEADER_COLUMNS, REPEAT, SOURCE
 
-ROW_ENTRIES = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")
 SUMMED = (
     "energy_kj",
     "net_energy_kj",
@@ -56,7 +56,7 @@ SAMPLED = (
     "time_gap_s",
 )
 ROW_KEYS = [("leader", name) for name in ("speed", "acceleration")]
-ROW_KEYS += [("vehicles", name) for name in ROW_ENTRIES]
+ROW_KEYS += [("vehicles", name) for name in SERIES]
 INDEX = (AUTOMATED, "index")
 # Safety filter: steps covered by the guarantee, steps that begin safe, desired and commanded
 # acceleration.

@@ -31,7 +31,7 @@ from lcc_rl.pieces.rewards import (
     TotalReward,
     VelocityReward,
 )
-from lcc_rl.pieces.rules import FollowerStopper, Handover, PISaturation
+from lcc_rl.pieces.rules import Calm, FollowerStopper, Handover, PISaturation
 from lcc_rl.pieces.sensors import Sensors
 from lcc_rl.pieces.start import EquilibriumStart, HeadwayStart, TimeGapStart
 from lcc_rl.pieces.string import RolePlaces, StringMotion

@@ -161,6 +161,34 @@ class PISaturation(Averaging):
         return weight * (share * target + (1.0 - share) * ahead) + (1.0 - weight) * before
 
 
+class Calm(Averaging):
+    """Rule that ends waves of drivers with a reaction time, on rings of 22 cars up to 0.5 s.
+
+    The vehicle drives at the mean v_d of its own speed, faster where the gap Δx is long:
+    v_cmd = min(v_d + k·max(Δx − g, 0), (Δx − s)/T + c·(v_ahead − v)), at least 0. The mean lets the
+    gap take up the wave; the first gain closes what is left of it slowly, and the bound keeps the
+    time gap T. The command is that of :class:`FollowerStopper`.
+    """
+
+    window: Window = 15.0  # length of the mean [s]
+    gain: NonNegative = 0.02  # k, of gaps above ``gap`` [1/s]
+    gap: NonNegative = 15.0  # g [m]
+    standstill_gap: NonNegative = 2.0  # s [m]
+    time_gap: Positive = 1.2  # T, which the speed does not fall below [s]
+    closing: NonNegative = 0.5  # c, factor of the closing speed
+
+    reads = ("self.speed", "self.gap", "ahead.speed")
+
+    def command(
+        self, speed: Tensor, gap: Tensor, ahead: Tensor, step: Tensor, history: Tensor
+    ) -> Any:
+        """Return the commands and the history."""
+        mean, past = self.mean(speed, step, history)
+        wanted = mean + self.gain * (gap - self.gap).clamp(min=0.0)
+        bound = (gap - self.standstill_gap) / self.time_gap + self.closing * (ahead - speed)
+        return self.towards(torch.minimum(wanted, bound).clamp(min=0.0), speed), past
+
+
 class Handover(Controller):
     """Executes one controller until a time of the episode, and another one from then on.
 

@@ -16,8 +16,8 @@ import pandas as pd
 from lcc_rl.arrays import Floats
 from lcc_rl.errors import ResultsError
 from lcc_rl.results.bootstrap import NOTHING, Estimate, Side, estimate, share_saved
-from lcc_rl.results.measures import FLOW, LONG_GAPS, PATH
-from lcc_rl.results.windows import DISTANCE, DRIVE, STRATEGY, TRAINED
+from lcc_rl.results.measures import DISTANCE, FLOW, LONG_GAPS, PATH
+from lcc_rl.results.windows import DRIVE, STRATEGY, TRAINED
 
 FRONT_KINDS = ["variant", "policy"]
 ENERGY, LONG_SHARE = PATH, LONG_GAPS

@@ -1,30 +1,45 @@
-"""Measures of evaluations with their names in tables, limits and scores.
+"""Measures of evaluations: aggregation, unit, bound and names in tables, limits and scores.
 
-A new measure is a function in :mod:`lcc_rl.evaluation.metrics` and a line here.
+:func:`lcc_rl.evaluation.metrics.register` adds one from outside the package.
 """
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from lcc_rl.energy import AVERAGED, AVERAGES, SECOND
-from lcc_rl.results.windows import DAMPING, DISTANCE, WAYS, episode_mean, how
+from lcc_rl.errors import require_known
 
+WAYS = ("cav_distance_m", "hdv_distance_m")  # their sum is the distance of all vehicles
+DISTANCE, DAMPING = "distance_m", "damping_time_s"
 PATH = "total_path_energy_kj"
 PATH_PER_KM = "path_energy_kj_per_km"  # per vehicle and km; falling behind does not lower it
 FASTER, BROKEN = "share_leader_faster", "share_promise_broken"
 REACH = ("cav_share_infeasible", "hdv_share_infeasible")
 FLOW = "flow_vph"
 TTC, LONG_GAPS = "share_ttc_unsafe", "share_time_gap_long_moving"
-SHORT_NAMES = {TTC: "unsafe_ttc_pct", LONG_GAPS: "long_time_gap_pct"}  # columns of short tables
 BARE, TURNED = "share_ttc_unpromised", "share_turned_unsafe"
 SPEED_STD, FINAL_SPREAD = "speed_std_mps", "final_speed_spread_mps"
-AT_LEAST, SHARE, PERCENT = "≥", "share_", "{:.2%}"
+AGGREGATES = ("mean", "sum", "min", "max")
+SIGNS = {"at least": "≥", "at most": "≤"}
+SHARE, COUNT = "%", "{:.0f}"
+# Units of columns by the end of their names.
+SUFFIX_UNITS = {
+    "kj_per_km": "kJ/km",
+    "mps3": "m/s³",
+    "mps": "m/s",
+    "pct": "%",
+    "kj": "kJ",
+    "ms": "ms",
+}
+SUFFIX_UNITS |= {"m": "m", "s": "s", "vph": "1/h", "g_per_km": "g/km", "s_per_km": "s/km"}
+SUFFIX_UNITS |= {"l_per_100km": "L/100 km", "per_100km": "1/100 km"}
+INITIALS = ("cav", "hdv", "ttc", "sd")
 
 
 class Shown(NamedTuple):
@@ -40,26 +55,42 @@ class Measure:
 
     Args:
         key: its name in files; also the column of episodes.parquet, unless ``of`` is given.
-        label: its row in full tables, with the unit; without a label it is in files only.
-        form: format of its number.
-        limit: heading of a limit in a task, with ``≤ {:g}`` or ``≥ {:g}`` for the bound.
-        short: its heading in short tables, with shares in per cent; without it the measure is in
-            full tables only.
+        label: its row in full tables, without the unit; without a label it is in files only.
+        unit: its unit; ``"%"`` for a share of 0 to 1, which limits and short tables give in per
+            cent.
+        form: format of its number in full tables; by default two decimals, ``{:.2%}`` for shares.
+        aggregate: how episodes and windows are combined: ``mean``, ``sum``, ``min`` or ``max``.
+        bound: ``at least`` or ``at most``: what a limit of a task bounds; without it there is none.
+        limit: words for a limit's heading, with line breaks; by default the label.
+        short: its heading in short tables; without it the measure is in full tables only.
+        column: its name in short tables; by default the key, for shares with ``_pct``.
         of: the column of episodes.parquet.
         per: a column; the measure is then the ratio of both totals.
         factor: factor on a ratio.
         score: its name as a task's score.
+
+    Raises:
+        ConfigError: if aggregate or bound is unknown.
     """
 
     key: str
     label: str = ""
-    form: str = "{:.2f}"
+    _: KW_ONLY
+    unit: str = ""
+    form: str = ""
+    aggregate: str = "mean"
+    bound: str = ""
     limit: str = ""
     short: str = ""
+    column: str = ""
     of: str = ""
     per: str = ""
     factor: float = 1.0
     score: str = ""
+
+    def __post_init__(self) -> None:
+        require_known(f"aggregate of {self.key}", self.aggregate, AGGREGATES)
+        require_known(f"bound of {self.key}", self.bound, ("", *SIGNS))
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -69,13 +100,23 @@ class Measure:
     @property
     def shown(self) -> Shown:
         """Its column of short tables."""
-        share = f"{self.key.removeprefix(SHARE)}_pct" if self.scale > 1.0 else self.key
-        return Shown(SHORT_NAMES.get(self.key, share), self.short)
+        share = f"{self.key.removeprefix('share_')}_pct" if self.unit == SHARE else self.key
+        return Shown(self.column or share, self.short)
 
     @property
     def scale(self) -> float:
         """Factor in limits and short columns; 100 for shares."""
-        return 100.0 if self.key.startswith(SHARE) else 1.0
+        return 100.0 if self.unit == SHARE else 1.0
+
+    @property
+    def title(self) -> str:
+        """Its label with the unit; numbers of shares have theirs."""
+        return f"{self.label} [{self.unit}]" if self.unit not in ("", SHARE) else self.label
+
+    @property
+    def number(self) -> str:
+        """The format of its number."""
+        return self.form or ("{:.2%}" if self.unit == SHARE else "{:.2f}")
 
     def value(self, part: pd.DataFrame) -> float:
         """Return its value from a strategy's rows of :func:`lcc_rl.results.windows.windows_of`."""
@@ -85,103 +126,130 @@ class Measure:
         if per:
             whole = episode_mean(part, per[0])
             return self.factor * episode_mean(part, column) / whole if whole else np.nan
-        kind = how(column)
-        return (
-            episode_mean(part, column) if kind == "mean" else float(getattr(part[column], kind)())
-        )
+        if self.aggregate == "mean":
+            return episode_mean(part, column)
+        return float(getattr(part[column], self.aggregate)())
 
     def keeps(self, value: float, bound: float) -> bool:
         """Whether a limit is kept; NaN, the value without such a vehicle, keeps it."""
-        return not (value < bound if AT_LEAST in self.limit else value > bound)
+        return not (value < bound if self.bound == "at least" else value > bound)
 
     def bounded(self, bound: float) -> str:
         """Return the heading of a limit, with line breaks."""
-        return self.limit.format(self.scale * bound)
+        narrow = len(self.unit) < 2
+        unit = f" {self.unit}".rstrip() if narrow else f"\n[{self.unit}]"
+        return f"{self.limit or self.label}\n{SIGNS[self.bound]} {self.scale * bound:.4g}{unit}"
 
     @property
     def limited(self) -> str:
         """The name of its limit, without the bound."""
-        return re.split(r"\s*[≤≥]", self.limit.replace("\n", " "))[0]
+        return " ".join((self.limit or self.label).split())
+
+    def with_unit(self, value: float) -> str:
+        """Return a value with its unit and about three digits, as on pages."""
+        scaled = self.scale * value
+        places = 0 if abs(scaled) >= 10.0 and self.unit != SHARE else 2
+        return f"{scaled:,.{places}f} {self.unit}".rstrip()
 
 
-def _energy(kind: str, label: str = "", score: str = "") -> Measure:
-    """Return the measure of an energy of all vehicles divided by their distance [kJ/km]."""
-    key = f"{kind}kj_per_km" if kind else "kj_per_km"
-    of = f"all_{kind or 'energy_'}kj"
-    return Measure(key, label, "{:.1f}", of=of, per=DISTANCE, factor=1e3, score=score)
-
-
-def _per(key: str, label: str, of: str, factor: float, form: str = "{:.2f}") -> Measure:
-    """Return the measure of a column of all vehicles divided by their distance."""
-    return Measure(key, label, form, of=of, per=DISTANCE, factor=factor)
-
+_kj = partial(Measure, unit="kJ", form="{:.1f}")
+_share = partial(Measure, unit=SHARE, bound="at most")  # of the time
+_least = partial(Measure, aggregate="min", bound="at least")
+_largest = partial(Measure, aggregate="max", bound="at most")
+_braking = partial(Measure, unit="m/s²", form="{:.1f}", aggregate="max")
+# Ratios of a column of all vehicles and their distance.
+_per = partial(Measure, per=DISTANCE, factor=1e3)
+_kj_per_km = partial(_per, unit="kJ", form="{:.1f}")
+_per_100km = partial(Measure, per=DISTANCE, factor=1e5, unit="1/100 km")
 
 MEASURES = [
-    Measure(PATH, "path energy [kJ]", "{:.1f}"),
-    Measure("total_acceleration_loss_kj", "  lost to accelerating [kJ]", "{:.1f}"),
-    _energy("path_energy_", "  path energy per vehicle and km [kJ]", "path_energy"),
+    _kj(PATH, "path energy"),
+    _kj("total_acceleration_loss_kj", "  lost to accelerating"),
+    _kj_per_km(
+        "path_energy_kj_per_km",
+        "  path energy per vehicle and km",
+        of="all_path_energy_kj",
+        score="path_energy",
+    ),
     *(
-        _energy(name.removesuffix("kj"), f"    of speeds averaged over {seconds:g} s [kJ]")
+        _kj_per_km(f"{name}_per_km", f"    of speeds averaged over {seconds:g} s", of=f"all_{name}")
         for name, seconds in zip(AVERAGED, AVERAGES, strict=True)
     ),
-    Measure(DISTANCE, "distance of all vehicles [m]", "{:.0f}"),
-    Measure("total_energy_kj", "energy as drawn [kJ]", "{:.1f}"),
-    Measure("cav_energy_kj", "  CAV [kJ]", "{:.1f}"),
-    Measure("hdv_energy_kj", "  HDV [kJ]", "{:.1f}"),
-    _energy("", "  as drawn, per vehicle and km [kJ]", "energy"),
-    _energy("net_energy_", score="net_energy"),
+    Measure(DISTANCE, "distance of all vehicles", unit="m", form=COUNT),
+    _kj("total_energy_kj", "energy as drawn"),
+    _kj("cav_energy_kj", "  CAV"),
+    _kj("hdv_energy_kj", "  HDV"),
+    _kj_per_km("kj_per_km", "  as drawn, per vehicle and km", of="all_energy_kj", score="energy"),
+    _kj_per_km("net_energy_kj_per_km", of="all_net_energy_kj", score="net_energy"),
     *(Measure(f"{group}_net_energy_kj") for group in ("cav", "hdv", "total")),
     Measure(f"total_{SECOND}"),
-    _energy("second_path_energy_", "path energy, second model, per vehicle and km [kJ]"),
-    _per("fuel_l_per_100km", "fuel [L/100 km]", "all_fuel_l", 1e5),
-    _per("co2_g_per_km", "carbon dioxide of it [g/km]", "all_co2_g", 1e3, "{:.1f}"),
-    _per("travel_time_s_per_km", "travel time [s/km]", "vehicle_time_s", 1e3),
-    _per("delay_s_per_km", "  delay against v0 [s/km]", "delay_s", 1e3),
-    Measure("mean_speed_mps", "mean speed [m/s]", limit="mean\nspeed\n≥ {:g}\n[m/s]"),
-    Measure(SPEED_STD, "deviation of a speed in time [m/s]", score=SPEED_STD),
-    Measure(FINAL_SPREAD, "spread of speeds at the end [m/s]", score=FINAL_SPREAD),
-    Measure(FLOW, "flow [vehicles/h]", "{:.0f}", limit="flow\n≥ {:.0f}\n[1/h]"),
-    Measure("string_ratio", "string ratio", score="string_ratio"),
-    Measure("damped", "episodes that end calm", "{:.0%}"),
-    Measure(DAMPING, "  from when on, mean [s]", "{:.0f}", of="damped_s", per="damped"),
-    Measure("mean_gap_m", "mean gap [m]", "{:.1f}"),
-    Measure("gap_opened_m", "  opened during the counted time [m]", "{:+.1f}"),
-    Measure("min_gap_m", "smallest gap [m]", limit="gap\n≥ {:g}\n[m]"),
-    Measure("max_gap_m", "largest gap [m]", limit="gap\n≤ {:g}\n[m]"),
-    Measure("min_time_gap_s", "shortest time gap [s]", limit="time\ngap\n≥ {:g} s"),
-    Measure("max_time_gap_s", limit="time\ngap\n≤ {:g} s"),
-    Measure("min_ttc_s", "minimum time-to-collision [s]", limit="TTC\n≥ {:g} s"),
-    Measure(TTC, "time with TTC < 4 s", PERCENT, "TTC\n< 4 s\n≤ {:g} %", "TTC\n< 4 s\n[%]"),
-    Measure(BARE, "  of it outside the filter's guarantee", PERCENT, "TTC\nbare\n≤ {:g} %"),
-    Measure(TURNED, "steps that turn unsafe", PERCENT, "turned\nunsafe\n≤ {:g} %"),
-    Measure(BROKEN, "  of them covered by the guarantee", PERCENT),
-    Measure("share_filter_acts", "time in which the filter acts", "{:.1%}"),
-    Measure("share_time_gap_long", "time with time gap > 2.5 s", PERCENT, "long\ngaps\n≤ {:g} %"),
-    Measure(LONG_GAPS, "  above 1 m/s", PERCENT, "long\ngaps\n≤ {:g} %", "long\ngap\n[%]"),
-    Measure(
-        "share_time_gap_short", "time with time gap < 1 s, all", PERCENT, "gap\n< 1 s\n≤ {:g} %"
+    _kj_per_km(
+        f"{SECOND}_per_km", "path energy, second model, per vehicle and km", of=f"all_{SECOND}"
     ),
-    Measure("max_braking_mps2", "hardest braking [m/s²]", "{:.1f}"),
-    Measure("max_leader_braking_mps2", "  of the leader [m/s²]", "{:.1f}"),
-    _per("brakings_below_2_per_100km", "brakings < −2 m/s² [1/100 km]", "brakings_below_2", 1e5),
-    _per("brakings_below_3_per_100km", "  < −3 m/s² [1/100 km]", "brakings_below_3", 1e5),
-    Measure("rms_jerk_mps3", "RMS jerk [m/s³]"),
-    Measure(FASTER, "time with a leader faster than v0", "{:.1%}", "leader\nfaster\n≤ {:g} %"),
-    Measure(REACH[0], "CAV beyond the energy model's reach", "{:.1%}"),
-    Measure(REACH[1], "HDV beyond the energy model's reach", "{:.1%}"),
-    Measure("collisions", "collisions", "{:.0f}"),
-    Measure("episodes", "episodes", "{:.0f}"),
+    _per("fuel_l_per_100km", "fuel", unit="L/100 km", of="all_fuel_l", factor=1e5),
+    _per("co2_g_per_km", "carbon dioxide of it", unit="g/km", form="{:.1f}", of="all_co2_g"),
+    _per("travel_time_s_per_km", "travel time", unit="s/km", of="vehicle_time_s"),
+    _per("delay_s_per_km", "  delay against v0", unit="s/km", of="delay_s"),
+    _least("mean_speed_mps", "mean speed", unit="m/s", aggregate="mean", limit="mean\nspeed"),
+    Measure(SPEED_STD, "deviation of a speed in time", unit="m/s", score=SPEED_STD),
+    Measure(FINAL_SPREAD, "spread of speeds at the end", unit="m/s", score=FINAL_SPREAD),
+    _least(FLOW, "flow", unit="1/h", form=COUNT, aggregate="mean"),
+    Measure("string_ratio", "string ratio", score="string_ratio"),
+    Measure("damped", "episodes that end calm", form="{:.0%}"),
+    Measure(DAMPING, "  from when on, mean", unit="s", form=COUNT, of="damped_s", per="damped"),
+    Measure("mean_gap_m", "mean gap", unit="m", form="{:.1f}"),
+    Measure("gap_opened_m", "  opened during the counted time", unit="m", form="{:+.1f}"),
+    _least("min_gap_m", "smallest gap", unit="m", limit="gap"),
+    _largest("max_gap_m", "largest gap", unit="m", limit="gap"),
+    _least("min_time_gap_s", "shortest time gap", unit="s", limit="time\ngap"),
+    _largest("max_time_gap_s", unit="s", limit="time\ngap"),
+    _least("min_ttc_s", "minimum time-to-collision", unit="s", limit="TTC"),
+    _share(
+        TTC,
+        "time with TTC < 4 s",
+        limit="TTC\n< 4 s",
+        short="TTC\n< 4 s\n[%]",
+        column="unsafe_ttc_pct",
+    ),
+    _share(BARE, "  of it outside the filter's guarantee", limit="TTC\nbare"),
+    _share(TURNED, "steps that turn unsafe", limit="turned\nunsafe"),
+    Measure(BROKEN, "  of them covered by the guarantee", unit=SHARE),
+    Measure("share_filter_acts", "time in which the filter acts", unit=SHARE, form="{:.1%}"),
+    _share("share_time_gap_long", "time with time gap > 2.5 s", limit="long\ngaps"),
+    _share(
+        LONG_GAPS,
+        "  above 1 m/s",
+        limit="long\ngaps",
+        short="long\ngap\n[%]",
+        column="long_time_gap_pct",
+    ),
+    _share("share_time_gap_short", "time with time gap < 1 s, all", limit="gap\n< 1 s"),
+    _braking("max_braking_mps2", "hardest braking"),
+    _braking("max_leader_braking_mps2", "  of the leader"),
+    _per_100km("brakings_below_2_per_100km", "brakings < −2 m/s²", of="brakings_below_2"),
+    _per_100km("brakings_below_3_per_100km", "  < −3 m/s²", of="brakings_below_3"),
+    Measure("rms_jerk_mps3", "RMS jerk", unit="m/s³"),
+    _share(FASTER, "time with a leader faster than v0", form="{:.1%}", limit="leader\nfaster"),
+    Measure(REACH[0], "CAV beyond the energy model's reach", form="{:.1%}"),
+    Measure(REACH[1], "HDV beyond the energy model's reach", form="{:.1%}"),
+    Measure("collisions", "collisions", form=COUNT, aggregate="sum"),
+    Measure("episodes", "episodes", form=COUNT, aggregate="sum"),
 ]
 
 
 def limit_measures() -> dict[str, Measure]:
     """Return the measures that may have a limit, by key."""
-    return {measure.key: measure for measure in MEASURES if measure.limit}
+    return {measure.key: measure for measure in MEASURES if measure.bound}
 
 
 def score_measures() -> dict[str, Measure]:
     """Return the measures that may be a task's score, by its name there."""
     return {measure.score: measure for measure in MEASURES if measure.score}
+
+
+def aggregates() -> dict[str, str]:
+    """Return the aggregation of columns of episodes.parquet; others are averaged."""
+    return {measure.columns[0]: measure.aggregate for measure in MEASURES} | {"drivers": "sum"}
 
 
 def table_columns() -> list[str]:
@@ -197,3 +265,24 @@ def means(windows: pd.DataFrame, keys: tuple[str, ...]) -> pd.DataFrame:
     parts = windows.groupby("strategy", sort=False)
     rows = {name: {x.key: x.value(part) for x in chosen} for name, part in parts}
     return pd.DataFrame.from_dict(rows, orient="index")
+
+
+def episode_mean(part: pd.DataFrame, column: str) -> float:
+    """Return a column's mean over episodes, from windows; NaN without any."""
+    episodes = part["episodes"][part[column].notna()]
+    return float((part[column] * episodes).sum() / episodes.sum()) if len(episodes) else np.nan
+
+
+def heading(column: str) -> str:
+    """Return the heading of a column: its words, and the unit of its measure or of its name.
+
+    Examples:
+        >>> heading("total_energy_kj"), heading("cav_saving_pct")
+        ('total energy [kJ]', 'CAV saving [%]')
+    """
+    suffix = next((end for end in SUFFIX_UNITS if column.endswith(f"_{end}")), "")
+    words = (column.removesuffix(f"_{suffix}") if suffix else column).split("_")
+    text = " ".join(word.upper() if word in INITIALS else word for word in words)
+    known = {measure.key: measure.unit for measure in MEASURES if measure.unit != SHARE}
+    unit = SUFFIX_UNITS[suffix] if suffix else known.get(column)
+    return f"{text} [{unit}]" if unit else text

@@ -1,4 +1,4 @@
-"""Names of strategies, headings and counts in tables, figures and pages."""
+"""Names of strategies, and counts, in tables, figures and pages."""
 
 from __future__ import annotations
 
@@ -10,18 +10,6 @@ from lcc_rl.config.words import FILTERED
 from lcc_rl.errors import require, unknown_name
 from lcc_rl.functional.pattern import HUMAN
 
-# Units of columns by the end of their names.
-SUFFIX_UNITS = {
-    "kj_per_km": "kJ/km",
-    "mps3": "m/s³",
-    "mps": "m/s",
-    "pct": "%",
-    "kj": "kJ",
-    "ms": "ms",
-}
-SUFFIX_UNITS |= {"m": "m", "s": "s", "vph": "1/h", "g_per_km": "g/km", "s_per_km": "s/km"}
-SUFFIX_UNITS |= {"l_per_100km": "L/100 km", "per_100km": "1/100 km"}
-INITIALS = ("cav", "hdv", "ttc", "sd")
 NETWORK = "alcc"
 FILTER_ALONE = "constant_filtered"
 MARKS = "†‡"  # after names in tables: loss of flow; a single training
@@ -113,19 +101,6 @@ def worded(table: pd.DataFrame) -> pd.DataFrame:
     """Return a table with strategies in words, if it has any."""
     names = [name for name in ("strategy", "behind", "against") if name in table]
     return table.assign(**{name: [in_words(str(x)) for x in table[name]] for name in names})
-
-
-def heading(column: str) -> str:
-    """Return the heading of a column.
-
-    Examples:
-        >>> heading("total_energy_kj"), heading("cav_saving_pct")
-        ('total energy [kJ]', 'CAV saving [%]')
-    """
-    suffix = next((end for end in SUFFIX_UNITS if column.endswith(f"_{end}")), "")
-    words = (column.removesuffix(f"_{suffix}") if suffix else column).split("_")
-    text = " ".join(word.upper() if word in INITIALS else word for word in words)
-    return f"{text} [{SUFFIX_UNITS[suffix]}]" if suffix else text
 
 
 def several(count: int, what: str) -> str:

@@ -7,10 +7,10 @@ import pandas as pd
 
 from lcc_rl.errors import require_known
 from lcc_rl.results import bootstrap
-from lcc_rl.results.measures import Measure, Shown
+from lcc_rl.results.measures import COUNT, Measure, Shown
 from lcc_rl.results.report import ALL, Report, shortened
 
-COUNTS = ("switches", "clamps", "cap_interventions")
+PER_RUN = ("switches", "clamps", "cap_interventions")
 
 
 def case_table(episodes: pd.DataFrame, case: str) -> pd.DataFrame:
@@ -52,34 +52,43 @@ def _row(strategy: str, rows: pd.DataFrame) -> dict[str, object]:
         row[f"{name}_sum_{label}"] = per_run(f"{name}_sum").mean()
         row[f"{name}_std_{label}"] = float(np.sqrt(max(spread, 0.0)))
     row |= bootstrap.mean(per_run("reward")).columns("reward")
-    row["min_gap_m"] = rows["min_gap_m"].min()
-    row["max_gap_error_m"] = rows["max_gap_error_m"].max()
-    row["collisions"] = int(rows["collided"].sum())
-    row["peak_jerk_mps3"] = rows["peak_jerk_mps3"].max()
-    row["string_ratio"] = rows["energy_ratio"].max()
+    for one in PLATOON:
+        column = one.columns[0]
+        if one.key not in row:
+            row[one.key] = getattr(rows[column], one.aggregate)() if column in rows else np.nan
     hybrid = "learned_share" in rows and rows["learned_share"].notna().any()
-    row["learned_share"] = rows["learned_share"].mean() if hybrid else np.nan
-    for name in COUNTS:
-        row[name] = per_run(name).mean() if hybrid else np.nan
-    return row
+    return row | {name: per_run(name).mean() if hybrid else np.nan for name in PER_RUN}
 
 
-PLATOON = (
-    Measure("speed_error_sum_mps", "Σ|e_v| [m/s]", short="Σ|e_v|\n[m/s]"),
-    Measure("speed_error_std_mps", "std |e_v| [m/s]", "{:.3f}"),
-    Measure("jerk_sum_mps3", "Σ|jerk| [m/s³]", "{:.1f}", short="Σ|jerk|\n[m/s³]"),
-    Measure("jerk_std_mps3", "std |jerk| [m/s³]"),
+PLATOON = [
+    Measure("speed_error_sum_mps", "Σ|e_v|", unit="m/s", short="Σ|e_v|\n[m/s]"),
+    Measure("speed_error_std_mps", "std |e_v|", unit="m/s", form="{:.3f}"),
+    Measure("jerk_sum_mps3", "Σ|jerk|", unit="m/s³", form="{:.1f}", short="Σ|jerk|\n[m/s³]"),
+    Measure("jerk_std_mps3", "std |jerk|", unit="m/s³"),
     Measure("reward", "Σ reward", short="Σ reward"),
-    Measure("min_gap_m", "smallest gap [m]", short="least\ngap [m]"),
-    Measure("max_gap_error_m", "largest gap error [m]"),
-    Measure("string_ratio", "string ratio, worst", short="string\nratio"),
-    Measure("collisions", "collisions", "{:.0f}", short="colli-\nsions"),
-    Measure("peak_jerk_mps3", "peak |jerk| [m/s³]", "{:.1f}"),
-    Measure("learned_share", "share of DDPG", "{:.0%}"),
-    Measure("switches", "switches", "{:.1f}"),
-    Measure("clamps", "jerk clamps", "{:.1f}"),
-    Measure("cap_interventions", "safe-cap interventions", "{:.1f}"),
-)
+    Measure("min_gap_m", "smallest gap", unit="m", aggregate="min", short="least\ngap [m]"),
+    Measure("max_gap_error_m", "largest gap error", unit="m", aggregate="max"),
+    Measure(
+        "string_ratio",
+        "string ratio, worst",
+        of="energy_ratio",
+        aggregate="max",
+        short="string\nratio",
+    ),
+    Measure(
+        "collisions",
+        "collisions",
+        form=COUNT,
+        of="collided",
+        aggregate="sum",
+        short="colli-\nsions",
+    ),
+    Measure("peak_jerk_mps3", "peak |jerk|", unit="m/s³", form="{:.1f}", aggregate="max"),
+    Measure("learned_share", "share of DDPG", form="{:.0%}"),
+    Measure("switches", "switches", form="{:.1f}"),
+    Measure("clamps", "jerk clamps", form="{:.1f}"),
+    Measure("cap_interventions", "safe-cap interventions", form="{:.1f}"),
+]
 BELOW = "sums over followers and frames, means over runs"
 
 

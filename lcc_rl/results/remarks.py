@@ -13,6 +13,7 @@ from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.results import measures
 from lcc_rl.results.measures import (
     BROKEN,
+    DISTANCE,
     FASTER,
     FLOW,
     LONG_GAPS,
@@ -21,7 +22,7 @@ from lcc_rl.results.measures import (
     REACH,
 )
 from lcc_rl.results.names import HUMAN, NETWORK, RULE_ROWS, counted_windows, in_words, several
-from lcc_rl.results.windows import DISTANCE, savings
+from lcc_rl.results.windows import savings
 
 ONE = " ‡"  # marks a training of one seed beside several
 MUCH = 0.01  # share of time with infeasible accelerations that tables and log mention

@@ -15,8 +15,8 @@ from rich.table import Table
 from rich.text import Text
 
 from lcc_rl.errors import require_known
-from lcc_rl.results.measures import Shown
-from lcc_rl.results.names import heading, in_words
+from lcc_rl.results.measures import Shown, heading
+from lcc_rl.results.names import in_words
 from lcc_rl.results.report import Report
 from lcc_rl.runs.output import PLAIN
 
@@ -178,8 +178,8 @@ def full_rows(report: Report) -> Iterator[tuple[str, list[str]]]:
         values = report.table[one.key].astype(float)
         if values.notna().any():
             known = zip(report.table[one.key], np.isfinite(values), strict=True)
-            cells = (one.form.format(x) if k else DASH for x, k in known)
-            yield one.label, [cell.replace("-", "−") for cell in cells]
+            cells = (one.number.format(x) if k else DASH for x, k in known)
+            yield one.title, [cell.replace("-", "−") for cell in cells]
 
 
 def _side_by_side(report: Report, title: str) -> Group:

@@ -17,11 +17,13 @@ from lcc_rl.results import measures
 from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING
 from lcc_rl.results.fronts import at_equal_flow
 from lcc_rl.results.measures import (
+    DISTANCE,
     FLOW,
     MEASURES,
     PATH,
     PATH_PER_KM,
     SHARE,
+    WAYS,
     Measure,
     Shown,
 )
@@ -50,10 +52,8 @@ from lcc_rl.results.remarks import (
 from lcc_rl.results.task import Task
 from lcc_rl.results.units import burns_one_fuel, check_unit, in_unit
 from lcc_rl.results.windows import (
-    DISTANCE,
     DRIVE,
     TRAINED,
-    WAYS,
     ratio,
     savings,
     seeds_left_out,
@@ -319,28 +319,33 @@ def report(
 def _rows(task: Task | None, against: str | None) -> list[Measure]:
     """Return the rows of the full table."""
     bounds = task.bounds if task else {}
-    kept = [Measure("kept", "keeps the limits (1: yes)", "{:d}")] if task else []
+    kept = [Measure("kept", "keeps the limits (1: yes)", form="{:d}")] if task else []
     return [
         *([Measure(SCORE, task.label)] if task else ()),
-        Measure("saving", f"saved against {in_words(str(against))}", "{:+.2%}"),
-        Measure("saving_low", "  95 % interval, low", "{:+.2%}"),
-        Measure("saving_high", "    high", "{:+.2%}"),
-        Measure(FEW_DRIVES[0], "  over its few drives (t), low", "{:+.2%}"),
-        Measure(FEW_DRIVES[1], "    high", "{:+.2%}"),
-        Measure("second_saving", "  second energy model", "{:+.2%}"),
-        Measure("flow_saving", "  at the recorded drivers' flow, against them", "{:+.2%}"),
-        Measure("rule_saving", "    against the rule", "{:+.2%}"),
-        Measure("drawn_saving", "  as drawn, per episode", "{:+.1%}"),
-        Measure("end_saving", "    of it by start and end of episodes", "{:+.1%}"),
-        Measure("distance_lost", "distance lost", "{:+.2%}"),
-        Measure(FLOW_LOST, "flow lost", "{:+.2%}"),
+        Measure("saving", f"saved against {in_words(str(against))}", form="{:+.2%}"),
+        Measure("saving_low", "  95 % interval, low", form="{:+.2%}"),
+        Measure("saving_high", "    high", form="{:+.2%}"),
+        Measure(FEW_DRIVES[0], "  over its few drives (t), low", form="{:+.2%}"),
+        Measure(FEW_DRIVES[1], "    high", form="{:+.2%}"),
+        Measure("second_saving", "  second energy model", form="{:+.2%}"),
+        Measure("flow_saving", "  at the recorded drivers' flow, against them", form="{:+.2%}"),
+        Measure("rule_saving", "    against the rule", form="{:+.2%}"),
+        Measure("drawn_saving", "  as drawn, per episode", form="{:+.1%}"),
+        Measure("end_saving", "    of it by start and end of episodes", form="{:+.1%}"),
+        Measure("distance_lost", "distance lost", form="{:+.2%}"),
+        Measure(FLOW_LOST, "flow lost", form="{:+.2%}"),
         *(one for one in MEASURES if one.label),
         *(
-            replace(one, label=f"limit: {' '.join(one.bounded(bounds[one]).split())}")
-            for one in sorted(bounds, key=lambda one: one.key.startswith(SHARE))
+            replace(
+                one,
+                label=f"limit: {' '.join(one.bounded(bounds[one]).split())}",
+                unit="",
+                form=one.number,
+            )
+            for one in sorted(bounds, key=lambda one: one.unit == SHARE)
         ),
         *kept,
-        *(Measure(key, label, "{:.0f}") for key, label in COUNTS.items()),
+        *(Measure(key, label, form="{:.0f}") for key, label in COUNTS.items()),
     ]
 
 

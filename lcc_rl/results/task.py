@@ -13,8 +13,8 @@ from pydantic import BeforeValidator
 from lcc_rl.config.words import RECORDED
 from lcc_rl.errors import require_known
 from lcc_rl.results import measures
-from lcc_rl.results.measures import Measure
-from lcc_rl.results.names import HUMAN, heading
+from lcc_rl.results.measures import Measure, heading
+from lcc_rl.results.names import HUMAN
 from lcc_rl.settings import Settings
 
 PERCENT = re.compile(r"\d+(\.\d+)? ?%")

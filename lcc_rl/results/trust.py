@@ -91,6 +91,8 @@ def _named(content: Any) -> Iterator[tuple[str, str]]:
     """Yield the keys and dotted paths of all classes and functions in settings."""
     for key, _, value in settings_at(content):
         last, dotted = key.rpartition(".")[2], "." in str(value)
+        if key.startswith("measures."):
+            yield key, f"{value}.register"
         if last == TARGET or (last == "law" and value) or (last == "model" and dotted):
             yield key, str(value)
         elif key.partition(".")[0] == "compare" and isinstance(value, str):

@@ -14,6 +14,7 @@ import pyarrow as pa
 from lcc_rl.energy import AVERAGED, BURNT, SECOND
 from lcc_rl.io.files import Rows, read_parquet
 from lcc_rl.results.bootstrap import NOTHING, Estimate, estimate, saving, share_saved
+from lcc_rl.results.measures import DAMPING, DISTANCE, MEASURES, SHARE, WAYS, aggregates
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import EPISODES
 
@@ -26,21 +27,12 @@ LEADER_COLUMNS = ("leader_path_energy_kj", "leader_speed_mps")
 STRATEGY, TRAINED = "strategy", "training_seed"
 WINDOW_KEYS = [STRATEGY, TRAINED, "profile_id"]
 PER_WINDOW = ["profile", SOURCE, DRIVE]  # constant within a window
-WAYS = ("cav_distance_m", "hdv_distance_m")  # their sum is the distance of all vehicles
-DISTANCE, DAMPING = "distance_m", "damping_time_s"
 ENERGIES = ("energy_kj", "net_energy_kj", "path_energy_kj", *AVERAGED, *BURNT, SECOND)
 FOLDED = 100_000  # most rows of partial sums before they are added
 PER_KM = "vehicle and km"
 # Distances by which the energies of each group of vehicles are divided.
 DRIVEN = {"cav": WAYS[:1], "hdv": WAYS[1:], "total": WAYS}
-# Aggregation of columns that are not averaged, by first word or whole name.
-HOW = {"min": "min", "max": "max", "worst": "max"}
-HOW |= dict.fromkeys(("episodes", "collisions", "drivers"), "sum")
-
-
-def how(column: str) -> str:
-    """Return the aggregation of a column: ``mean``, ``sum``, ``min`` or ``max``."""
-    return HOW.get(column, HOW.get(column.partition("_")[0], "mean"))
+WORST = "worst_"  # prefix of the largest share of an episode
 
 
 def windows_of(rows: Rows, columns: Sequence[str] = ()) -> pd.DataFrame:
@@ -51,8 +43,8 @@ def windows_of(rows: Rows, columns: Sequence[str] = ()) -> pd.DataFrame:
         columns: columns to aggregate; by default all measures.
 
     Returns:
-        A row per strategy, training seed and window. Columns ``min_…`` and ``max_…`` are the
-        smallest and largest values, ``episodes`` the number of rows, ``drivers`` that of drivers,
+        A row per strategy, training seed and window. Measures have their ``aggregate``; other
+        columns are means, ``episodes`` is the number of rows, ``drivers`` that of drivers,
         ``collisions`` that of rows with a collision, ``worst_share_…`` the largest share of an
         episode.
     """
@@ -60,7 +52,7 @@ def windows_of(rows: Rows, columns: Sequence[str] = ()) -> pd.DataFrame:
 
 
 def fold(rows: Rows, by: Sequence[str], columns: Sequence[str] = ()) -> pd.DataFrame:
-    """Aggregate rows by keys, block by block, see :func:`how`; missing keys are left out.
+    """Aggregate rows by keys, block by block, see :func:`windows_of`; missing keys are left out.
 
     Memory grows with the number of groups, not of rows.
     """
@@ -123,16 +115,17 @@ def _sums(frame: pd.DataFrame, by: Sequence[str], columns: Sequence[str]) -> pd.
         name for name in columns or numbers if name in numbers and name not in (*PAIR_KEYS, TRAINED)
     ]
     if not columns:
-        shares = [name for name in names if name.startswith("share_")]
-        frame = frame.assign(**{f"worst_{name}": frame[name] for name in shares})
-        names += [f"worst_{name}" for name in shares]
+        shares = [one.key for one in MEASURES if one.unit == SHARE and one.key in names]
+        frame = frame.assign(**{f"{WORST}{name}": frame[name] for name in shares})
+        names += [f"{WORST}{name}" for name in shares]
     names = list(dict.fromkeys(["episodes", "drivers", *names]))
     keys = [frame[name] for name in by if name in frame]
     values = frame[names].astype(np.float64)
     groups = values.groupby(keys, sort=False, dropna=False, observed=True)
     kinds: dict[str, list[str]] = {kind: [] for kind in ("sum", "count", "min", "max")}
+    known = aggregates()
     for name in names:
-        kind = how(name)
+        kind = "max" if name.startswith(WORST) else known.get(name, "mean")
         for part in ("sum", "count") if kind == "mean" else (kind,):
             kinds[part].append(name)
     return pd.concat({x: getattr(groups[y], x)() for x, y in kinds.items() if y}, axis=1)
@@ -268,12 +261,6 @@ def _by_window(
     if DRIVE in chosen:
         drives = chosen.groupby("profile_id")[DRIVE].first().reindex(energy.index).tolist()
     return energy, way.loc[energy.index, energy.columns], drives
-
-
-def episode_mean(part: pd.DataFrame, column: str) -> float:
-    """Return the mean of a column of :func:`windows_of` over episodes; NaN without any."""
-    episodes = part["episodes"][part[column].notna()]
-    return float((part[column] * episodes).sum() / episodes.sum()) if len(episodes) else np.nan
 
 
 def by_driver(drivers: pd.DataFrame, column: str) -> pd.DataFrame:

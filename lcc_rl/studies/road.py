@@ -165,7 +165,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
         f"it, over {several(drives, 'recording')}{few}",
         table,
     )
-    shown = [Shown(x.shown.key, fill(x.label, 18)) for x in MEASURES if x.key in DRAWN]
+    shown = [Shown(x.shown.key, fill(x.title, 18)) for x in MEASURES if x.key in DRAWN]
     of = [f"{x:g} %" for x in table["automated_pct"]]
     named = table.assign(of=of, driver=[in_words(str(name)) for name in table["strategy"]])
     one = Report("", table, named, tuple(shown), (), "", "")

@@ -15,6 +15,7 @@ from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.functional.string import advance_string
 from lcc_rl.pieces import (
     Collision,
+    Calm,
     FollowerStopper,
     Observation,
     PISaturation,
@@ -281,6 +282,19 @@ def test_a_handover_switches_at_its_moment() -> None:
     assert torch.equal(commands[1][:, :10], commands[0][:, :10])
     assert not (commands[1][:, :10] == 0.25).any()
     assert (commands[1][:, 10:] == 0.25).all()
+
+
+def test_calm_follows_its_formula() -> None:
+    piece = Calm(window=2.0, max_acceleration=50.0, max_deceleration=50.0)
+    piece = piece.bind(World(time_step=1.0))
+    history, speed = torch.zeros(1, 4, 2), torch.full((1, 4, 1), 4.0)
+    gap = torch.tensor([10.0, 65.0, 5.0, 2.0]).view(1, 4, 1)
+    ahead = torch.tensor([4.0, 4.0, 4.0, 0.0]).view(1, 4, 1)
+    command, past = piece.command(speed, gap, ahead, torch.zeros(1, 1, 1), history)
+    # The mean is 4 m/s; 50 m above 15 m add 1 m/s; 3 m above 2 m allow 2.5 m/s; last, it stops.
+    assert command.flatten().tolist() == pytest.approx([0.0, 1.0, -1.5, -4.0])
+    slower, _ = piece.command(0.5 * speed, gap, ahead, torch.ones(1, 1, 1), past)
+    assert slower.flatten().tolist()[:2] == pytest.approx([1.0, 2.0])  # the mean is now 3 m/s
 
 
 def test_pi_saturation_follows_its_formula() -> None:

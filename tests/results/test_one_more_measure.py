@@ -1,18 +1,25 @@
-"""One more measure is a function in ``METRICS`` and a line in ``MEASURES``: every table has it."""
+"""A measure from outside the package: every table, limit and file has it after one call."""
 
 from __future__ import annotations
 
+import csv
 import json
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
+import numpy as np
 import pytest
-from helpers import slow_but
+from helpers import check_refused, slow_but
 
 from lcc_rl.cli import table
 from lcc_rl.commands import evaluation, score
 from lcc_rl.config import load
-from lcc_rl.evaluation.metrics import METRICS
+from lcc_rl.errors import ResultsError
+from lcc_rl.evaluation.metrics import METRICS, ROAD_METRICS, register
 from lcc_rl.results.measures import MEASURES, Measure
+from lcc_rl.results.names import in_words
+from lcc_rl.results.platoons import PLATOON
 
 SMALL = [
     "scenario.horizon=60",
@@ -20,48 +27,98 @@ SMALL = [
     "evaluation.profiles=3",
     "evaluation.drivers=2",
 ]
+# Neither its key nor its words say how it is aggregated, bounded or measured.
 MINE = Measure(
-    "max_jerk_mps3",
-    "largest jerk [m/s³]",
+    "peak_jerk",
+    "hardest jerk",
+    unit="m/s³",
+    aggregate="max",
+    bound="at most",
+    limit="jerk",
     short="most\njerk",
-    limit="jerk\n≤ {:g}\n[m/s³]",
 )
+MODULE = """
+from lcc_rl.evaluation.metrics import register
+from lcc_rl.results.measures import Measure
+
+register({}, lambda over, jerk: over.highest(jerk.abs()))
+"""
 
 
 @pytest.fixture
-def mine(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setitem(METRICS, MINE.key, lambda over, jerk: over.highest(jerk.abs()))
-    MEASURES.append(MINE)
-    yield
-    MEASURES.remove(MINE)
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Write the module of a user's measure; yield the setting that names it."""
+    (tmp_path / "code").mkdir()
+    (tmp_path / "code" / "my_measures.py").write_text(MODULE.format(repr(MINE)), "utf-8")
+    monkeypatch.syspath_prepend(tmp_path / "code")
+    kept = [(x, x[:]) for x in (MEASURES, PLATOON)]
+    yield "measures=[my_measures]"
+    for place, before in kept:
+        place[:] = before
+    for metrics in (METRICS, ROAD_METRICS):
+        metrics.pop(MINE.key, None)
+    sys.modules.pop("my_measures", None)
 
 
-@pytest.mark.usefixtures("mine", "blank_figures")
+TRUSTED = ["--trust", "my_measures"]
+
+
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize("words", slow_but(["task"], ["task", "variant=idm"]))
-def test_it_stands_in_every_table(words, tmp_path, capsys) -> None:
+def test_it_stands_in_every_table(words, mine, tmp_path, capsys) -> None:
     task = ["task=i80-follow", "compare=[idm_acc]", f"+task.limits.{MINE.key}=1e-3"]
     typed = task if words == "task" else [words]
-    rows = evaluation.run(load("evaluate", [*typed, *SMALL]), tmp_path)
+    folder = tmp_path / "run"
+    rows = evaluation.run(load("evaluate", [*typed, *SMALL, mine]), folder)
     assert rows[MINE.key].max() > 0.01
     assert "jerk" in capsys.readouterr().out  # of a task by its limit
     found = {}
     for form in ("text", "markdown", "latex", "csv"):
-        table.main([str(tmp_path), "--all", "--format", form])
+        table.main([str(folder), "--all", "--format", form, *TRUSTED])
         found[form] = capsys.readouterr().out
-    assert MINE.label in found["text"]
-    assert "max jerk [m/s³]" in found["markdown"]
-    assert "max jerk [m/s³]" in found["latex"]
-    assert MINE.key in found["csv"].splitlines()[0].split(",")
-    table.main([str(tmp_path), "--format", "markdown"])
-    assert "max jerk [m/s³]" in capsys.readouterr().out.splitlines()[0]
+    assert "hardest jerk [m/s³]" in found["text"]
+    assert "peak jerk [m/s³]" in found["markdown"]
+    assert "peak jerk [m/s³]" in found["latex"]
+    cells = list(csv.DictReader(found["csv"].splitlines()))
+    for row in cells:  # of all its episodes
+        own = rows.loc[rows["strategy"].map(in_words) == row["strategy"], MINE.key].max()
+        value = float(row[MINE.key] or "nan")  # without automated vehicles there is none
+        assert value == pytest.approx(own, nan_ok=True)
+    table.main([str(folder), "--format", "markdown", *TRUSTED])
+    assert "peak jerk [m/s³]" in capsys.readouterr().out.splitlines()[0]
     if words == "task":
         assert "limit: jerk ≤ 0.001 [m/s³]" in found["text"]
+        assert "False" in [row["kept"] for row in cells]
+        with pytest.raises(ResultsError, match=r"measures.0 names 'my_measures.register'"):
+            table.main([str(folder)])
+
+
+def test_rows_of_platoons_have_it(mine, tmp_path, capsys) -> None:
+    words = ["variant=cacc", "evaluation.profiles=2", "evaluation.full_length=false", mine]
+    rows = evaluation.run(load("evaluate", words), tmp_path)
+    np.testing.assert_allclose(rows[MINE.key], rows["peak_jerk_mps3"])
+    assert "most" in capsys.readouterr().out
+    table.main([str(tmp_path), "--all", *TRUSTED])
+    assert "hardest jerk [m/s³]" in capsys.readouterr().out
+
+
+REFUSED = [
+    ("min_gap_m", {}, lambda over, gap: gap, "the package has one of this key"),
+    ("mine", {}, lambda over, gapp: gapp, "entry of the measure mine 'gapp'.*'gap'"),
+    ("mine", {"bound": "≥"}, None, "bound of mine '≥'; valid: .*at least"),
+    ("mine", {"aggregate": "maximum"}, None, "aggregate of mine 'maximum'.*'max'"),
+]
+
+
+def test_what_is_unclear_is_refused() -> None:
+    check_refused(lambda key, given, metric: register(Measure(key, **given), metric), REFUSED)
+    words = "measures: cannot find 'no_such': .*export PYTHONPATH"
+    check_refused(lambda word: load("evaluate", [word]), [("measures=[no_such]", words)])
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("mine")
-def test_a_score_has_it(tmp_path) -> None:
+def test_a_score_has_it(mine, tmp_path) -> None:
     words = ["idm_acc", "--task", "i80-follow", "--on", "everyday", "--out", str(tmp_path / "out")]
-    assert score.main([*words, *SMALL]) == 0
+    assert score.main([*words, *SMALL, mine]) == 0
     (row,) = json.loads((tmp_path / "out" / "score.json").read_text("utf-8"))["results"]
     assert row["measures"][MINE.key] > 0.0

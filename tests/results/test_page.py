@@ -20,11 +20,12 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.figures.drawing import new_figure, save
 from lcc_rl.figures.page import Page
 from lcc_rl.io.files import processor, read_parquet, write_parquet
-from lcc_rl.results.names import heading, in_words, worded
+from lcc_rl.results.measures import WAYS, heading
+from lcc_rl.results.names import in_words, worded
 from lcc_rl.results.remarks import sample_of
 from lcc_rl.results.render import as_markdown, terminal
 from lcc_rl.results.report import Report, report, windows_for
-from lcc_rl.results.windows import WAYS, Means, savings
+from lcc_rl.results.windows import Means, savings
 from lcc_rl.studies.results import StudyResults
 
 TABLE = pd.DataFrame(

@@ -243,7 +243,7 @@ def test_all_scores_name_limits_in_words_and_wrap_names_at_spaces_only(capsys) -
     assert {"FollowerStopper", "saturation", "simulated"} <= set(words)
     assert max(map(len, printed.splitlines())) <= 80
     lines = [line.split() for line in printed.splitlines() if "limit:" in line]
-    assert lines[0][:5] == ["limit:", "gap", "≤", "120", "[m]"]
+    assert lines[0][:5] == ["limit:", "gap", "≤", "120", "m"]
     assert lines[2][:9] == ["limit:", "TTC", "<", "4", "s", "≤", "0.05", "%", "0.10%"]
 
 

@@ -12,8 +12,7 @@ import numpy as np
 import pandas as pd
 
 from lcc_rl.results.bootstrap import NOTHING, mean, share_saved
-from lcc_rl.results.measures import PATH
-from lcc_rl.results.names import heading
+from lcc_rl.results.measures import PATH, heading
 from lcc_rl.results.render import DASH
 from lcc_rl.results.report import UNTRAINED
 from lcc_rl.results.windows import LEADER_COLUMNS, SOURCE, by_source, per_seed, savings

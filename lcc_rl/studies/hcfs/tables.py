@@ -13,7 +13,7 @@ from lcc_rl.evaluation.cases import WINDOW_CASES
 from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.results import bootstrap
 from lcc_rl.results.names import in_words
-from lcc_rl.results.platoons import COUNTS, case_table
+from lcc_rl.results.platoons import PER_RUN, case_table
 from lcc_rl.results.windows import DRIVE
 
 LEARNED = "ddpg"  # variant of the hybrid's policy
@@ -32,7 +32,7 @@ GAINED = {
 }
 RUN = ["strategy", "training_seed", "case", "profile", "run_id"]
 SUMS = ["speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "reward", "frames"]
-SUMS += ["collided", *COUNTS]
+SUMS += ["collided", *PER_RUN]
 LARGEST_COLUMNS = ["max_gap_error_m", "peak_jerk_mps3", "energy_ratio"]
 # Stored columns and strategies of runs behind other sources of leaders.
 COMPARED_BY = ["reward", "jerk_sum", "min_gap_m", "max_gap_error_m", "energy_ratio"]
