@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.clock import is_whole, option_specs
-from lcc_rl.envs.rowwise import Array, Rowwise
+from lcc_rl.envs.rowwise import Array, Rows, Rowwise
 from lcc_rl.envs.step import (
     TERMINATED,
     TRUNCATED,
@@ -63,45 +63,38 @@ class ArrayEpisodes:
         self.terms = [str(name) for name in totals[-1].terms]
         self.written = [REWARD, TERMINATED, TRUNCATED, *((*TERMS, name) for name in self.terms)]
         first, seed = self._first(pieces), torch.zeros(1, 1, dtype=torch.int64)
-        self.advance = Rowwise(self._advance, (self._packed(first), torch.zeros(1, 1)), "a step")
+        row = self.rows.packed(first)
+        self.advance = Rowwise(self._advance, (row, torch.zeros(1, 1)), "a step")
         self.begin = Rowwise(self._begin, (seed,), "a reset")
         self.generators = [torch.Generator() for _ in range(self.count)]
         for generator in self.generators:
             generator.seed()  # at random, until a reset gives a seed
         self.observation = np.zeros((self.count, first[OBSERVATION].shape[-1]), np.float32)
-        self.state = np.zeros((self.count, sum(self.sizes)))
+        self.state = np.zeros((self.count, row.shape[-1]))
 
     def _first(self, pieces: Sequence[Any]) -> State:
         """Return the first state of an episode, and choose the entries that a step reads."""
         with torch.no_grad():
             first = self.one_step.begin(torch.zeros(1, 1, dtype=torch.int64))
         read = read_before(pieces)
-        self.keys = [key for key in first if key in read]
-        self.types = [(first[key].shape[1:], first[key].dtype) for key in self.keys]
-        self.sizes = [shape.numel() for shape, _ in self.types]
-        self.step_column = sum(self.sizes[: self.keys.index(STEP)])
+        keys = [key for key in first if key in read]
+        self.rows = Rows(first, keys)
+        self.step_column = sum(self.rows.sizes[: keys.index(STEP)])
         return first
-
-    def _packed(self, moment: State) -> Tensor:
-        """Return the entries that a step reads as rows; double precision represents any seed."""
-        return torch.cat([moment[key].flatten(1).double() for key in self.keys], 1)
 
     def _advance(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return state and observation after a step, and the result of :meth:`step`."""
-        columns = zip(self.keys, self.types, state.split(self.sizes, 1), strict=True)
-        before = {key: x.to(dtype).reshape(-1, *shape) for key, (shape, dtype), x in columns}
-        before[ACTION] = action.unsqueeze(1)
-        reached = self.one_step(before)
+        reached = self.one_step(self.rows.entries(state) | {ACTION: action.unsqueeze(1)})
         seen = reached[OBSERVATION].flatten(1)
         results = [reached[key].flatten(1).to(seen.dtype) for key in self.written]
         total = seen.sum(1, keepdim=True) + results[0]
         finite = (total - total == 0.0).to(seen.dtype)  # False for NaN and infinity
-        return self._packed(reached), seen, torch.cat([*results, finite], 1)
+        return self.rows.packed(reached), seen, torch.cat([*results, finite], 1)
 
     def _begin(self, seeds: Tensor) -> tuple[Tensor, Tensor]:
         """Return state and observation at the start of episodes."""
         first = self.one_step.begin(seeds)
-        return self._packed(first), first[OBSERVATION].flatten(1)
+        return self.rows.packed(first), first[OBSERVATION].flatten(1)
 
     def reset(
         self,
@@ -132,7 +125,7 @@ class ArrayEpisodes:
             every = torch.zeros(self.count, 1, dtype=torch.int64)
             every[places] = torch.cat(drawn)
             moment = entries_of(self.env.reset(options=self._given(every, options)))
-            state = self._packed(moment)[places].numpy()
+            state = self.rows.packed(moment)[places].numpy()
             seen = moment[OBSERVATION[1:]][places].numpy()
         else:
             state, seen = self.begin(torch.cat(drawn).numpy())

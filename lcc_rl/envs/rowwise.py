@@ -18,11 +18,35 @@ from torch import Tensor
 
 from lcc_rl.functional.machine_code import kept
 from lcc_rl.functional.recorder import Recorder, TensorsOnly, Untranslatable
+from lcc_rl.pieces.base import Key, State
 
 log = logging.getLogger("lcc_rl")
 
 Array = np.ndarray[Any, Any]
 TensorFunction = Callable[..., Sequence[Tensor]]
+
+
+class Rows:
+    """Entries of a state, ``[n, …]``, as rows of double precision, which represent any seed.
+
+    Args:
+        state: a state of the episodes.
+        keys: the entries.
+    """
+
+    def __init__(self, state: State, keys: list[Key]) -> None:
+        self.keys = keys
+        self.types = [(state[key].shape[1:], state[key].dtype) for key in keys]
+        self.sizes = [shape.numel() for shape, _ in self.types]
+
+    def packed(self, moment: State) -> Tensor:
+        """Return the entries of a state as rows, ``[n, width]``."""
+        return torch.cat([moment[key].flatten(1).double() for key in self.keys], 1)
+
+    def entries(self, rows: Tensor) -> State:
+        """Return the entries that rows contain."""
+        columns = zip(self.keys, self.types, rows.split(self.sizes, 1), strict=True)
+        return {key: x.to(dtype).reshape(-1, *shape) for key, (shape, dtype), x in columns}
 
 
 class Rowwise:

@@ -43,8 +43,9 @@ from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.rewards import TERMS, RewardTerm
 from lcc_rl.results.measures import FASTER
 
-# Steps of a strategy from which compiling saves more than the 3 to 6 s that it takes.
-COMPILED_STEPS = 20_000_000
+# Steps of a strategy from which machine code saves more than the 2 to 4 s that it takes once, and
+# from which torch's compiler, whose code is three times as fast, does: it takes 10 to 20 s.
+ROWWISE_STEPS, COMPILED_STEPS = 150_000, 10_000_000
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,8 @@ class Episodes:
         seed: seed of the noise.
         sample_episodes: number of episodes to keep as time series.
         device: device of the computation.
-        compiled: compile the step; None: if the plan with all shards is long enough.
+        compiled: compile the step by torch; None: the way that is fastest for the length of the
+            plan with all shards.
     """
 
     def __init__(
@@ -169,8 +171,10 @@ class Episodes:
         self.strategy, self.inputs, self.plan, self.seed = strategy, inputs, plan, seed
         self.cfg, begun, self.warm_up = after_uncounted(any_leader(strategy.cfg))
         self.begun = begun + self.warm_up
+        steps, rowwise = len(plan) * self.cfg.scenario.horizon, False
         if compiled is None:
-            compiled = len(plan) * self.cfg.scenario.horizon >= COMPILED_STEPS
+            compiled = steps >= COMPILED_STEPS
+            rowwise = not compiled and steps >= ROWWISE_STEPS and device == "cpu"
         # Of a learned policy; without their weights, which rows have beside the weighted means.
         terms = self.cfg.reward.terms if strategy.policy is not None else {}
         self.weights = {name: node.settings.get("weight", 1.0) for name, node in terms.items()}
@@ -185,7 +189,7 @@ class Episodes:
         self.terms = [x for x in pieces_of(env) if self.weights and isinstance(x, RewardTerm)]
         read = (key for term in self.terms for _, key in term.needs)
         keys = list(dict.fromkeys([*self.keys, *read]))
-        self.player = Player(env, strategy.policy, keys, strategy.title, compiled)
+        self.player = Player(env, strategy.policy, keys, strategy.title, compiled, rowwise)
         count = min(sample_episodes, len(plan))
         self.samples = set(np.linspace(0, len(plan) - 1, count).round().astype(int).tolist())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -11,7 +12,16 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.clock import option_specs
 from lcc_rl.envs.compiled import Compiled
-from lcc_rl.envs.step import TERMINATED, Step, closure, entries_of, pieces_of, written
+from lcc_rl.envs.rowwise import Rows, Rowwise
+from lcc_rl.envs.step import (
+    TERMINATED,
+    Step,
+    closure,
+    entries_of,
+    pieces_of,
+    read_before,
+    written,
+)
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.finite import require_finite
 from lcc_rl.functional.pattern import HUMAN
@@ -50,6 +60,7 @@ class Player:
         label: name of the strategy in messages.
         compiled: compile the step and the policy; without a compiler the plain step is used, which
             is logged.
+        rowwise: play each episode as a row of numbers, in machine code (:class:`Rowwise`).
 
     Raises:
         ConfigError: if a controller takes an action and there is no policy.
@@ -62,7 +73,9 @@ class Player:
         keys: Sequence[Key],
         label: str = "",
         compiled: bool = False,
+        rowwise: bool = False,
     ) -> None:
+        self.rowwise = rowwise
         self.env, self.policy, self.label, self.horizon = env, policy, label, env.base_env.horizon
         self.pieces = pieces_of(env)
         _check_driven(policy, self.pieces)
@@ -105,6 +118,8 @@ class Player:
                 to keep is not finite.
         """
         state, record = self._begin(given), self.record
+        if self.rowwise:
+            return self._checked(*self._by_rows(state), named)
         running, alive = torch.ones_like(state[TERMINATED]), []
         for step in range(self.horizon):
             alive.append(running)
@@ -116,11 +131,54 @@ class Player:
                 if first and step == 0:
                     record[key][0] = before[key]
                 record[key][step + first] = value
+        return self._checked(record, torch.stack(alive), named)
+
+    def _checked(
+        self, record: Record, alive: Tensor, named: Callable[[int], str]
+    ) -> tuple[Record, Tensor]:
+        """Return the entries to keep, and which steps belong to running episodes."""
         after = {key: record[key][-self.horizon :] for key in self.checked}
-        if require_finite(after, torch.stack(alive), label=self.label, named=named):
+        if require_finite(after, alive, label=self.label, named=named):
             for value in after.values():
                 value.nan_to_num_(0.0, 0.0, 0.0)
-        return {key: record[key] for key in self.kept}, torch.stack(alive)
+        return {key: record[key] for key in self.kept}, alive
+
+    def _by_rows(self, state: State) -> tuple[Record, Tensor]:
+        """Play the episodes from a state as rows of numbers, in machine code."""
+        read = {*read_before(piece for piece, _ in self.step.pieces), *(self.reads or state)}
+        rows, names = (
+            Rows(state, [key for key in state if key in read]),
+            [*self.checked, TERMINATED],
+        )
+
+        def moments(packed: Tensor) -> State:
+            before = rows.entries(packed)
+            before |= self._action(before, packed.shape[:1])
+            return {**before, **self.step(before)}
+
+        def advance(packed: Tensor) -> tuple[Tensor, Tensor]:
+            after = moments(packed)
+            kept = torch.cat([after[key].flatten(1).to(torch.float32) for key in names], 1)
+            return rows.packed(after), kept
+
+        first = rows.packed(state)
+        kernel = Rowwise(advance, (first[:1],), "the evaluation")
+        row = first.numpy()
+        record = np.empty((self.horizon, len(row), kernel.widths[1][0]), np.float32)
+        for step in range(self.horizon):
+            row, record[step] = kernel(row)
+        with torch.no_grad():
+            kinds = [moments(first[:1])[key] for key in names]
+        columns = torch.from_numpy(record).split([kind[0].numel() for kind in kinds], -1)
+        found = {}
+        for key, kind, column in zip(names, kinds, columns, strict=True):
+            value = column.reshape(*column.shape[:2], *kind.shape[1:]).to(kind.dtype)
+            speeds = key[-1] == "speed"
+            found[key] = torch.cat([state[key].unsqueeze(0), value]) if speeds else value
+        ended = found.pop(TERMINATED)
+        alive = torch.ones_like(ended)
+        alive[1:] = ended[:-1].cumsum(0) == 0
+        return found, alive
 
     def _begin(self, given: TensorDictBase) -> State:
         """Return the first state of the episodes."""
@@ -132,17 +190,17 @@ class Player:
 
     def _advance(self, state: State, running: Tensor) -> Advanced:
         """Return the next state, the entries to keep, and which episodes still run."""
-        before = {**state, **self._action(state)}
+        before = {**state, **self._action(state, self.env.batch_size)}
         reached = self.step(before)
         after = {key: reached.get(key, value) for key, value in state.items()}
         shown = {**before, **reached}
         return after, [shown[key] for key in self.checked], running & ~reached[TERMINATED]
 
-    def _action(self, state: State) -> State:
-        """Return the action of the policy; none without a policy."""
+    def _action(self, state: State, batch: torch.Size) -> State:
+        """Return the action of the policy for a batch; none without a policy."""
         if self.policy is None:
             return {}
-        seen = TensorDict(batch_size=self.env.batch_size, device=self.env.device)
+        seen = TensorDict(batch_size=batch, device=self.env.device)
         for key in self.reads or state:
             if key in state:
                 seen.set(key, state[key])

@@ -56,7 +56,13 @@ COMPARISONS = {
     "ne": "{0} != {1}",
 }
 METHODS = ("addmm", "bitwise_not", "clamp", "index", "searchsorted", "where")  # methods of Recorder
-REDUCTIONS = {"sum": "add", "any": "logical_or", "all": "logical_and"}
+REDUCTIONS = {
+    "sum": "add",
+    "any": "logical_or",
+    "all": "logical_and",
+    "amin": "minimum",
+    "amax": "maximum",
+}
 # These move entries and are applied to the numbers of the variables.
 MOVES = {
     "_unsafe_view", "alias", "cat", "clone", "detach", "expand", "flip", "permute", "repeat",

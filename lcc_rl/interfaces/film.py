@@ -45,7 +45,7 @@ class Film:
         require(bool(self.moments), "call reset before render")
         speed, gap, ahead = map(np.asarray, zip(*self.moments, strict=True))
         string, length = self.motion.string, np.array(self.motion.vehicle_length)
-        if CLASS in self.episodes.keys:
+        if CLASS in self.episodes.rows.keys:
             own = self.motion.fleet.lengths(torch.from_numpy(self._look(*CLASS)).long()).numpy()
             length = np.array([own[-1] if string.ring else length, *own])
         lengths = np.broadcast_to(length, len(string) + 1)
@@ -64,6 +64,7 @@ class Film:
 
     def _look(self, *key: str) -> Any:
         """Return an entry of the present state."""
-        place = self.episodes.keys.index(key)
-        first = sum(self.episodes.sizes[:place])
-        return self.episodes.state[self.place, first : first + self.episodes.sizes[place]].copy()
+        rows = self.episodes.rows
+        place = rows.keys.index(key)
+        first = sum(rows.sizes[:place])
+        return self.episodes.state[self.place, first : first + rows.sizes[place]].copy()

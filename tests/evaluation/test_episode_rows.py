@@ -9,7 +9,7 @@ from helpers import POPULATION, compose, steady, string, wavy_profiles
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent
 from lcc_rl.envs import Inputs, build_env
-from lcc_rl.evaluation.episodes import evaluate, pairs
+from lcc_rl.evaluation.episodes import Episodes, Plan, evaluate, pairs
 from lcc_rl.evaluation.strategies import Strategy, baseline
 from lcc_rl.functional.driver_models import simulate_follower
 from lcc_rl.functional.power import motor_power
@@ -148,3 +148,20 @@ def test_a_learned_policy_has_the_mean_of_each_reward_term_and_other_rows_none()
     np.testing.assert_allclose(power, whole["cav_energy_kj"], rtol=1e-4, atol=1e-3)
     assert (rows["mean_term_efficiency"] < 0.0).any()
     assert not run("idm")[0].columns.str.contains("mean_term").any()
+
+
+@pytest.mark.parametrize("variant", ["alcc", "constant_filtered"])
+def test_machine_code_gives_the_same_rows(variant) -> None:
+    cfg, found = strategy("alcc", "+filter=cbf").cfg, {}
+    driven = (
+        Strategy("alcc", cfg, shared_policy(build_agent(cfg, POPULATION).policy), 0)
+        if variant == "alcc"
+        else baseline(cfg, variant)
+    )
+    plan = Plan(len(PROFILES), len(POPULATION.time_gap), 5, 64)
+    for rowwise in (False, True):
+        played = Episodes(driven, INPUTS, plan, 1, compiled=False)
+        played.player.rowwise = rowwise
+        found[rowwise], _ = played.play(0)
+    assert len(found[True]) > 5
+    pd.testing.assert_frame_equal(found[False], found[True], rtol=1e-4, atol=1e-4)
