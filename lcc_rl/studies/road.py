@@ -155,6 +155,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     places = sorted((folder / SHARES_FOLDER).iterdir(), key=lambda place: float(place.name))
     parts = {place.name: windows_for(read_parquet(place / EPISODES)) for place in places}
     table = pd.DataFrame(row for share, part in parts.items() for row in rows_of(share, part))
+    table = table.astype(dict.fromkeys(COUNTED[:2], int))
     windows, cfg = parts[places[0].name], stored_config(places[0])
     drives, scenario, settings = windows[DRIVE].nunique(), cfg["scenario"], cfg["evaluation"]
     few = ", by t since these are few (of one recording over its windows)" * (drives < LEAST_DRIVES)
@@ -165,7 +166,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
         f"{scenario['horizon'] * scenario['time_step']:g} s, the first {settings['warm_up']:g} s "
         "not counted. Brackets: the value of human drivers times the 95 % interval of the ratio to "
         f"it, over {several(drives, 'recording')}{few}",
-        table.astype(dict.fromkeys(COUNTED[:2], int)),
+        table,
     )
     for share, rows in table.groupby("automated_pct"):
         found.blocks += [f"{share:g} % automated: {words}" for words in crashes(rows)]
