@@ -25,6 +25,7 @@ from lcc_rl.io.files import parquet_metadata, read_parquet, write_parquet
 from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING, Estimate
 from lcc_rl.results.measures import MEASURES, Shown
 from lcc_rl.results.names import in_words, several
+from lcc_rl.results.remarks import crashes
 from lcc_rl.results.report import Report, windows_for
 from lcc_rl.results.runs import EPISODES, stored_config
 from lcc_rl.results.windows import DRIVE, savings
@@ -55,6 +56,7 @@ LONGEST = 4000  # most steps of a window
 FUEL = "fuel_l_per_100km"
 DRAWN = (FUEL, "flow_vph", "brakings_below_2_per_100km", "share_time_gap_short")
 COMPARED = (*DRAWN, "co2_g_per_km", "brakings_below_3_per_100km", "travel_time_s_per_km")
+COUNTED = ("collisions", "episodes", "max_leader_braking_mps2", "max_braking_mps2")
 
 
 def run(folder: Path, overrides: Sequence[str], shares: Sequence[str] = ROAD_SHARES) -> None:
@@ -153,6 +155,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     places = sorted((folder / SHARES_FOLDER).iterdir(), key=lambda place: float(place.name))
     parts = {place.name: windows_for(read_parquet(place / EPISODES)) for place in places}
     table = pd.DataFrame(row for share, part in parts.items() for row in rows_of(share, part))
+    table = table.astype(dict.fromkeys(COUNTED[:2], int))
     windows, cfg = parts[places[0].name], stored_config(places[0])
     drives, scenario, settings = windows[DRIVE].nunique(), cfg["scenario"], cfg["evaluation"]
     few = ", by t since these are few (of one recording over its windows)" * (drives < LEAST_DRIVES)
@@ -165,6 +168,8 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
         f"it, over {several(drives, 'recording')}{few}",
         table,
     )
+    for share, rows in table.groupby("automated_pct"):
+        found.blocks += [f"{share:g} % automated: {words}" for words in crashes(rows)]
     shown = [Shown(x.shown.key, fill(x.title, 18)) for x in MEASURES if x.key in DRAWN]
     of = [f"{x:g} %" for x in table["automated_pct"]]
     named = table.assign(of=of, driver=[in_words(str(name)) for name in table["strategy"]])
@@ -182,6 +187,8 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
 def rows_of(share: str, windows: pd.DataFrame) -> Iterator[dict[str, Any]]:
     """Yield a row per strategy: measures, with intervals from those of the ratio to humans'.
 
+    Without automated cars nothing is compared; a controller with collisions has no values.
+
     Args:
         share: share of automated cars [%].
         windows: result of :func:`lcc_rl.results.report.windows_for`.
@@ -189,13 +196,16 @@ def rows_of(share: str, windows: pd.DataFrame) -> Iterator[dict[str, Any]]:
     parts = {str(name): part for name, part in windows.groupby("strategy", sort=False)}
     for name, part in parts.items():
         row: dict[str, Any] = {"automated_pct": float(share), "strategy": name}
+        crashed = name != HUMAN and bool(part["collisions"].sum())
         for one in (one for one in MEASURES if one.key in COMPARED):
             column, *per = one.columns
-            found = NOTHING if name == HUMAN else savings(windows, column, name, HUMAN, per)
+            nothing = crashed or name == HUMAN
+            found = NOTHING if nothing else savings(windows, column, name, HUMAN, per)
             low, high = found.over_drives or (found.low, found.high)
             humans = one.value(parts[HUMAN])
-            left = Estimate(one.value(part), humans * (1.0 - high), humans * (1.0 - low))
+            value = math.nan if crashed else one.value(part)
+            left = Estimate(value, humans * (1.0 - high), humans * (1.0 - low))
             row |= left.columns(one.shown.key, one.scale)
             if one.key == FUEL:
                 row |= Estimate(found.value, low, high).columns("fuel_saved_pct", 100.0)
-        yield row | {"collisions": int(part["collisions"].sum())}
+        yield row | {one.key: one.value(part) for one in MEASURES if one.key in COUNTED}

@@ -8,7 +8,7 @@ import pytest
 from helpers import check_refused
 
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.io.files import read_parquet
+from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.studies import road
 from lcc_rl.studies.reproduce import main
 
@@ -39,6 +39,16 @@ def test_one_command_writes_table_figure_and_reports(tmp_path) -> None:
     assert "## Data\n\n* read 6 episodes" in page
     assert "## Drivers" in page
     assert "RMSPE of 6 " in page
+    rows = read_parquet(tmp_path / "road" / "evaluation" / "25" / "episodes.parquet")
+    rows["collided"] |= rows["strategy"] == "idm_acc"
+    write_parquet(rows, tmp_path / "road" / "evaluation" / "25" / "episodes.parquet")
+    found = road.study_results(tmp_path / "road")
+    crashed, whole = (found.tables["road"].iloc[row] for row in (1, 3))
+    for key in ("fuel_l_per_100km", "fuel_saved_pct", "flow_vph", "flow_vph_low"):
+        assert np.isnan(crashed[key]), key
+        assert np.isfinite(whole[key]), key
+    words = "25 % automated: tuned IDM: 2 of 2 episodes end in a collision"
+    assert [words in block for block in found.blocks].count(True) == 1
     again = read_parquet(tmp_path / "road" / "leaders.parquet")
     assert again.groupby("drive").size().max() == 4209  # seven minutes
     with pytest.raises(ResultsError, match="of other data; choose another folder"):

@@ -1,0 +1,119 @@
+"""Numbers of the pages, recomputed from the rows in outputs/reference by pandas and numpy alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import pytest
+from page_blocks import ROOT
+
+REFERENCE = ROOT / "outputs" / "reference"
+PATH, FLOW, FUEL = "total_path_energy_kj", "flow_vph", 42.4  # kJ per g of petrol
+
+
+def means(file: str, *columns: str, by: str = "strategy", **where: object) -> pd.DataFrame:
+    """Means over the windows of the rows with these values; ``e``: energy per m or km."""
+    rows = pd.read_parquet(REFERENCE / f"{file}.parquet")
+    for name, value in where.items():
+        rows = rows[rows[name] == value]
+    found = rows.groupby(by)[list(columns)].mean()
+    return found.assign(e=found[columns[0]] / found[columns[1]] if len(columns) > 1 else np.nan)
+
+
+def limits() -> list[str]:
+    rows = means("limits_steady", PATH, "distance_m", FLOW, drivers="i80", episodes=60)
+    own, recorded = rows.loc["alcc alcc_limits"], rows.loc["recorded"]
+    flow = own[FLOW] / recorded[FLOW] - 1.0
+    return [f"| {1e3 * own['e']:.0f}, {1.0 - own['e'] / recorded['e']:.1%} (", f"| {flow:+.0%} |"]
+
+
+def at_equal_flow() -> list[str]:
+    rows = means("averaged", PATH, "distance_m", FLOW, source="stop_and_go")
+
+    def energy(kind: str) -> float:
+        front = rows[rows.index.str.startswith(kind)].sort_values(FLOW)
+        return float(np.interp(rows.loc["recorded", FLOW], front[FLOW], front["e"]))
+
+    return [f"network against tuned IDM | {1.0 - energy('alcc') / energy('idm_acc_filtered'):.1%}"]
+
+
+def alcc() -> list[str]:
+    drawn = means("alcc/evaluation/windows", "total_energy_kj")["total_energy_kj"]
+    return [f"| this study | 8 | {100.0 * (1.0 - drawn['alcc'] / drawn['reference']):.2f} ("]
+
+
+def hcfs() -> list[str]:
+    return [
+        f"| I-80 | HCFS | {means('hcfs/sources', 'reward', source='traffic').reward['hcfs']:.2f} ("
+    ]
+
+
+def waves() -> list[str]:
+    columns = ("energy_kj_per_km", "mean_speed_mps")
+    rows = means("tasks/ring_reactions", *columns, delay_s=0.4, noise_mps2=0.4)
+    fuel, speed = rows[columns[0]] / FUEL, rows[columns[1]]
+    return [f"{speed[x]:.2f} m/s, {fuel[x]:.0f} g/km" for x in ("human", "drawn_reactions")]
+
+
+def tasks() -> list[str]:
+    columns = ("all_net_energy_kj", "distance_m", FLOW)
+    rows = means("tasks/warm_up", *columns, task="i24-follow5", horizon_s=100, warm_up_s=20.0)
+    own, humans = rows.loc["alcc"], rows.loc["human"]
+    flow = f"{own[FLOW] / humans[FLOW] - 1.0:.0%}"
+    return [
+        f"saves {1.0 - own['e'] / humans['e']:.1%} (",
+        f"from {humans[FLOW]:,.0f}",
+        f"| {flow} |",
+    ]
+
+
+def fleets() -> list[str]:
+    columns = ("total_net_energy_kj", "distance_m", FLOW)
+    rows = means("tasks/fleets_fronts", *columns, by="variant", setting="drives_taught")
+    own, humans = rows.loc["learned"], rows.loc["human"]
+    flow = f"{own[FLOW]:,.0f}: {own[FLOW] / humans[FLOW] - 1.0:.1%} ("
+    return [f"trained over 400 s | 4% | {1.0 - own['e'] / humans['e']:.1%} (", flow]
+
+
+def road() -> list[str]:
+    columns = ("fuel_l_per_100km", FLOW)
+    own = means("road", *columns, automated_pct=10.0, leaders="platoons").loc["network"]
+    return [f"network | {own[columns[0]]:.2f} (", f"| {own[FLOW]:,.0f} ("]
+
+
+def leaderboard() -> list[str]:
+    stored = json.loads((REFERENCE / "scores" / "idm_acc.json").read_text(encoding="utf-8"))
+    row = next(
+        x for x in stored["results"] if (x["task"], x["source"]) == ("i24-fleet", "everyday")
+    )
+    saved = 100.0 * (1.0 - row["score"] / row["baseline"])
+    return [
+        f"| `idm_acc` | +{saved:.1f} (",
+        f"| {row['flow_vph']:,.0f} | {-100.0 * row['flow_lost']:+.1f} |",
+    ]
+
+
+PAGES: dict[str, tuple[Callable[[], list[str]], str]] = {
+    "limits": (limits, "| network, `pretrained/alcc_limits` | 528,"),
+    "limits, equal flow": (at_equal_flow, "| OpenACC, test track and low speed"),
+    "alcc": (alcc, "| this study |"),
+    "hcfs": (hcfs, "| I-80 | HCFS |"),
+    "waves": (waves, "| 0.4 s, noise 0.4 m/s² |"),
+    "tasks": (tasks, ""),
+    "fleets": (fleets, "| I-24, whole drives, trained over 400 s |"),
+    "road": (road, "| | network | 7.04"),
+    "leaderboard": (leaderboard, "| everyday, 9 drives | `idm_acc`"),
+}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_row_of_the_page_is_that_of_the_kept_rows(name: str) -> None:
+    compute, begins = PAGES[name]
+    page = (ROOT / "docs" / f"{name.split(',')[0]}.md").read_text(encoding="utf-8")
+    rows = " ".join(line for line in page.splitlines() if line.startswith(begins))
+    for words in compute():
+        found = words.replace(" -", " −").replace("%", " %").replace("+-", "−")
+        assert found in rows.replace("**", ""), found
