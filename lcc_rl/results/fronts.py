@@ -61,7 +61,8 @@ def compare_fronts(
 ) -> Estimate:
     """Return a measure of kinds of controllers with its interval.
 
-    It is resampled as in :func:`lcc_rl.results.bootstrap.estimate`.
+    It is resampled as in :func:`lcc_rl.results.bootstrap.estimate`; if all kinds with several
+    training seeds have the same ones, these are resampled together.
 
     Args:
         windows, columns: see :func:`front`.
@@ -69,12 +70,14 @@ def compare_fronts(
         measure: function of the means by limit of each.
     """
     fronts = [front(windows, kind, columns) for kind in kinds]
+    seeds = windows.groupby(FRONT_KINDS)["training_seed"].agg(lambda x: tuple(sorted(set(x))))
+    several = {seeds[tuple(kind)] for kind in kinds if len(seeds[tuple(kind)]) > 1}
     drives = windows.groupby("profile_id")[DRIVE].first().tolist() if DRIVE in windows else None
 
     def statistic(*sides: Curve) -> Any:
         return measure(*({name: x.T for name, x in side.items()} for side in sides))
 
-    return estimate(statistic, *fronts, drives=drives)
+    return estimate(statistic, *fronts, drives=drives, paired=len(several) < 2)
 
 
 def energy_at(

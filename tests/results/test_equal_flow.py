@@ -88,6 +88,12 @@ def test_fronts_are_compared_by_equal_seeds() -> None:
         windows_for(pd.concat(parts)), ["alcc", "alcc X=1"], list(NAMES[:3]), energy, "recorded"
     )
     assert found.value == pytest.approx(1.0 - 100.0 / 104.0)
+    # Trainings that are equal by seed differ by nothing, however much seeds differ.
+    pair, every = ["alcc", "alcc X=1"], pd.concat(parts)
+    twin = every[every["strategy"].isin(pair)].replace({"strategy": {x: f"my {x}" for x in pair}})
+    both = windows_for(pd.concat([every, twin]))
+    found = at_equal_flow(both, pair, [f"my {x}" for x in pair], energy, "recorded")
+    assert found.low == found.value == found.high == 0.0
 
 
 def test_a_strategy_that_collides_has_no_saving_and_no_flow() -> None:
