@@ -34,14 +34,7 @@ OFF_POLICY = (SMOKE, BATCH, NETWORK, "training.segment=10")
 TRAININGS = {
     "analytic": ("variant=alcc", "agent=analytic", SMOKE, NETWORK, "training.segment=10"),
     "limits": ("variant=alcc", "experiment=[limits,smoke]", NETWORK, "training.segment=20"),
-    "rule": ("variant=rule", "experiment=[limits,smoke]", "training.segment=20"),
     "ddpg": ("variant=alcc", *OFF_POLICY),
-    "td3": ("variant=alcc", "agent=td3", *OFF_POLICY),
-    "sac": ("variant=alcc", "agent=sac", *OFF_POLICY),
-    "ppo": ("variant=alcc", "agent=ppo", SMOKE, NETWORK, "training.segment=20"),
-    "own_energy": ("variant=own_energy", *OFF_POLICY),
-    "hcfs": ("variant=hcfs", *OFF_POLICY),
-    "ring": ("task=ring-22", "agent=ppo", SMOKE, NETWORK, "training.segment=20"),
 }
 # Settings that are no part of a training: how it is run, evaluated and written.
 ELSEWHERE = (*NOT_IDENTITY, "data", "evaluation", "inputs", "seed", "task", "deployed", "threads")
