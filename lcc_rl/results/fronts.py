@@ -70,8 +70,8 @@ def compare_fronts(
         measure: function of the means by limit of each.
     """
     fronts = [front(windows, kind, columns) for kind in kinds]
-    seeds = windows.groupby(FRONT_KINDS)["training_seed"].agg(lambda x: tuple(sorted(set(x))))
-    several = {seeds[tuple(kind)] for kind in kinds if len(seeds[tuple(kind)]) > 1}
+    seeds = windows.groupby(FRONT_KINDS)["training_seed"].unique()
+    several = {frozenset(seeds[tuple(kind)]) for kind in kinds if len(seeds[tuple(kind)]) > 1}
     drives = windows.groupby("profile_id")[DRIVE].first().tolist() if DRIVE in windows else None
 
     def statistic(*sides: Curve) -> Any:

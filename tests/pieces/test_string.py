@@ -14,8 +14,8 @@ from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.functional.string import advance_string
 from lcc_rl.pieces import (
-    Collision,
     Calm,
+    Collision,
     FollowerStopper,
     Observation,
     PISaturation,
