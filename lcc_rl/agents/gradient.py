@@ -22,8 +22,8 @@ from lcc_rl.pieces.rewards import RewardTerm
 
 log = logging.getLogger("lcc_rl")
 
-# Iterations from which compiling the simulator pays off.
-COMPILED_ITERATIONS = 100
+# Steps of a training from which compiling the simulator and its gradient, 25 to 40 s, pays off.
+COMPILED_GRADIENT_STEPS = 10_000
 
 
 class GradientLoop(TrainingLoop[Any]):
@@ -50,7 +50,7 @@ class GradientLoop(TrainingLoop[Any]):
 
     def _source(self) -> DifferentiableRollout:
         # The iterations are those of the whole training, so that resuming changes nothing.
-        long = self.iterations >= COMPILED_ITERATIONS
+        long = self.iterations * self.horizon >= COMPILED_GRADIENT_STEPS
         chosen = (self.agent.compiled, self.settings.compiled, long)
         known = set(map(as_key, self.env.full_observation_spec.keys(True, True)))
         return DifferentiableRollout(

@@ -59,7 +59,7 @@ def repeat(folder: Path, target: Path, trust: Sequence[str] = ()) -> None:
         (evaluation if isinstance(cfg, EvaluateConfig) else training).run(cfg, target)
 
 
-def differences(folder: Path, target: Path) -> Iterator[tuple[str, bool]]:
+def compared(folder: Path, target: Path) -> Iterator[tuple[str, bool]]:
     """Yield for each table of a run a sentence, and whether that of the other run equals it."""
     for path in sorted(folder.rglob("*.parquet")):
         name = path.relative_to(folder)
@@ -99,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> Any:
     options = parser.parse_args(arguments)
     target = options.out or options.run.with_name(f"{options.run.name}_repeated")
     repeat(options.run, target, options.trust)
-    found = [*differences(options.run, target)]
+    found = [*compared(options.run, target)]
     print("\n".join(sentence for sentence, _ in found))
     equal = bool(found) and all(same for _, same in found)
     print(f"{target}: {'all rows are equal' if equal else 'rows differ'}")

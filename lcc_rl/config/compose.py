@@ -53,7 +53,7 @@ EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "swe
 # Settings of later versions, which older runs lack.
 LATER = (
     *("evaluation.warm_up", "evaluation.front", "evaluation.second_energy"),
-    "scenario.fleet",
+    *("evaluation.terms", "scenario.fleet"),
     "measures",
 )
 NEEDED = ("data", "split", "drivers", "observation", "calibration")  # required nodes of commands

@@ -143,6 +143,7 @@ class EvaluationConfig(Settings):
     # Further longest time gaps of the safety filter, for savings at equal flow [s].
     front: list[Positive] = dataclasses.field(default_factory=list)
     second_energy: Described = None  # energy model of a second saving
+    terms: bool = False  # means of the reward's terms, of networks
 
     def validate(self) -> None:
         if self.shard >= self.shards:

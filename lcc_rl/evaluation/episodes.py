@@ -40,7 +40,7 @@ from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, RING
 from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.features import CLASS
-from lcc_rl.pieces.rewards import TERMS, RewardTerm
+from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.results.measures import FASTER
 
 # Steps of a strategy from which machine code saves more than the 2 to 4 s that it takes once, and
@@ -175,18 +175,14 @@ class Episodes:
         if compiled is None:
             compiled = steps >= COMPILED_STEPS
             rowwise = not compiled and steps >= ROWWISE_STEPS and device == "cpu"
-        # Of a learned policy; without their weights, which rows have beside the weighted means.
-        terms = self.cfg.reward.terms if strategy.policy is not None else {}
-        self.weights = {name: node.settings.get("weight", 1.0) for name, node in terms.items()}
-        for name, node in terms.items():
-            terms[name] = node.changed(weight=1.0) if "weight" in node.settings else node
         env = build_env(
             self.cfg, inputs.evaluation, inputs.population, plan.size, 0, device, nominal=True
         )
         self.energy, self.second = build_energy(self.cfg), second_energy(self.cfg)
         filtered = self.cfg.scenario.filters.get(AUTOMATED) is not None
         self.keys = [*ROW_KEYS, INDEX, CLASS, *(FILTER_ENTRIES if filtered else ())]
-        self.terms = [x for x in pieces_of(env) if self.weights and isinstance(x, RewardTerm)]
+        learned = strategy.policy is not None and self.cfg.evaluation.terms
+        self.terms = [x for x in pieces_of(env) if learned and isinstance(x, RewardTerm)]
         read = (key for term in self.terms for _, key in term.needs)
         keys = list(dict.fromkeys([*self.keys, *read]))
         self.player = Player(env, strategy.policy, keys, strategy.title, compiled, rowwise)
@@ -210,10 +206,7 @@ class Episodes:
             return f"{number} (profile {name}, driver {met}, seed {int(options[SEED][number])})"
 
         record, alive = self.player.play(options, named)
-        # All steps at once, which is faster than one by one.
-        reached = {key: x[-len(alive) :] for key, x in record.items()}
-        for term in self.terms:
-            term.derive({}, reached)
+        counted = {key: x[self.begun - len(alive) :] for key, x in record.items()}
         record = {key: x for key, x in record.items() if key in self.keys}
         crashed = (alive.unsqueeze(-2) & (record["vehicles", "gap"] <= 0.0)).any(0).any(-2)
         braked = brakings(record, alive, self.cfg.scenario.vehicles)
@@ -242,11 +235,11 @@ class Episodes:
         measured = measures(groups, alive, time_step, self.energy, recorded, self.second)
         length, free = self.cfg.scenario.vehicle_length, inputs.population.desired_speed[driver]
         measured |= traffic(record, alive, length, time_step, free, self.energy)
-        for *_, name in (term.targets[0] for term in self.terms):
-            # Means of a step, sums over vehicles.
-            mean = (reached[*TERMS, name][self.begun :].sum(-2) * alive).sum(0) / alive.sum(0)
-            weighted = self.weights[name] * mean
-            measured |= {f"mean_reward_{name}": weighted, f"mean_term_{name}": mean}
+        for term in self.terms:  # means of a step, sums over vehicles
+            values = term.reward(*term.views(*(counted[key] for _, key in term.needs)))
+            mean = (values.sum(-2) * alive).sum(0) / alive.sum(0)
+            names = (f"mean_reward_{term.name}", f"mean_term_{term.name}")
+            measured |= dict(zip(names, (term.weight * mean, mean), strict=True))
         if self.cfg.scenario.road == RING:
             measured["damping_time_s"] = damping_time(speed, driven, time_step)
         rows = pd.concat([described, leader, braked, as_frame(measured, crashed)], axis=1)

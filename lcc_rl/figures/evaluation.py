@@ -195,7 +195,7 @@ def measures_of(report: Report, seeds: Sequence[Report] = ()) -> Figure:
     table = report.short.assign(of=report.short.get("of", ""))
     names = table["of"] + ": " + table["driver"]
     if "seeds" in {one.key for one in report.shown}:
-        names += [f", {several(count, 'seed')}" for count in table["seeds"]]
+        names += [f", {several(count, 'seed')}" * bool(count) for count in table["seeds"]]
     labels = [fill(name.removeprefix(": "), 28) for name in names]
     places = {tuple(key): place for place, key in enumerate(table[["of", "strategy"]].to_numpy())}
     shown = [one for one in report.shown if is_numeric_dtype(table[one.key])]
@@ -207,7 +207,8 @@ def measures_of(report: Report, seeds: Sequence[Report] = ()) -> Figure:
     figure.supxlabel(note, x=0.01, ha="left", fontsize=6)
     axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
     for axis, (key, head) in zip(axes, shown, strict=True):
-        for own in (one.short.assign(of=one.short.get("of", "")) for one in seeds):
+        every = (one.short.assign(of=one.short.get("of", "")) for one in seeds if key in one.short)
+        for own in every:
             rows = [places[tuple(x)] for x in own[["of", "strategy"]].to_numpy()]
             axis.plot(own[key], rows, "o", color=SOFT, markersize=2)
         bounds = {f"{key}_{end}": table.get(f"{key}_{end}", table[key]) for end in ("low", "high")}

@@ -17,7 +17,7 @@ from lcc_rl.arrays import Floats
 from lcc_rl.errors import ResultsError
 from lcc_rl.results.bootstrap import NOTHING, Estimate, Side, estimate, share_saved
 from lcc_rl.results.measures import DISTANCE, FLOW, LONG_GAPS, PATH
-from lcc_rl.results.windows import DRIVE, STRATEGY, TRAINED
+from lcc_rl.results.windows import DRIVE, STRATEGY, TRAINED, with_equal_seeds
 
 FRONT_KINDS = ["variant", "policy"]
 ENERGY, LONG_SHARE = PATH, LONG_GAPS
@@ -61,7 +61,8 @@ def compare_fronts(
 ) -> Estimate:
     """Return a measure of kinds of controllers with its interval.
 
-    It is resampled as in :func:`lcc_rl.results.bootstrap.estimate`.
+    It is resampled as in :func:`lcc_rl.results.bootstrap.estimate`; if all kinds with several
+    training seeds have the same ones, these are resampled together.
 
     Args:
         windows, columns: see :func:`front`.
@@ -69,12 +70,14 @@ def compare_fronts(
         measure: function of the means by limit of each.
     """
     fronts = [front(windows, kind, columns) for kind in kinds]
+    seeds = windows.groupby(FRONT_KINDS)["training_seed"].unique()
+    several = {frozenset(seeds[tuple(kind)]) for kind in kinds if len(seeds[tuple(kind)]) > 1}
     drives = windows.groupby("profile_id")[DRIVE].first().tolist() if DRIVE in windows else None
 
     def statistic(*sides: Curve) -> Any:
         return measure(*({name: x.T for name, x in side.items()} for side in sides))
 
-    return estimate(statistic, *fronts, drives=drives)
+    return estimate(statistic, *fronts, drives=drives, paired=len(several) < 2)
 
 
 def energy_at(
@@ -148,7 +151,7 @@ def at_equal_flow(
 ) -> Estimate:
     """Return the share of energy per distance saved at the flow of a reference.
 
-    See :func:`saved_at_flow`.
+    See :func:`saved_at_flow`. Trainings are compared by equal seeds.
 
     Args:
         windows: result of :func:`lcc_rl.results.windows.windows_of`.
@@ -167,10 +170,12 @@ def at_equal_flow(
     if not known or not own or not other:
         return NOTHING
     rows = pd.concat(
-        windows[windows[STRATEGY] == name].assign(variant=side, policy="", limit=place)
+        windows[windows[STRATEGY] == name].assign(strategy=side, variant=side, policy="", limit=x)
         for side, names in sides.items()
-        for place, name in enumerate(names)
+        for x, name in enumerate(names)
     )
+    both = with_equal_seeds(rows, *list(sides)[:2])
+    rows = pd.concat([both, rows[rows[STRATEGY] == "reference"]])
     rows[TRAINED] = rows[TRAINED].astype(object).fillna(-1)
     kinds = ((side, "") for side in sides)
     return compare_fronts(rows, *kinds, columns=columns, measure=saved_at_flow)

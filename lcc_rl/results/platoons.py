@@ -45,7 +45,7 @@ def _row(strategy: str, rows: pd.DataFrame) -> dict[str, object]:
         return rows.groupby(seeds)[column].sum() / runs
 
     frames = rows["frames"].sum()
-    row: dict[str, object] = {"strategy": strategy, "trainings": len(runs)}
+    row: dict[str, object] = {"strategy": strategy, "seeds": rows["training_seed"].nunique()}
     for name, label in (("speed_error", "mps"), ("jerk", "mps3")):
         mean = rows[f"{name}_sum"].sum() / frames
         spread = rows[f"{name}_squares"].sum() / frames - mean**2

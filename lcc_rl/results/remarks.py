@@ -87,15 +87,15 @@ def by_ends(table: pd.DataFrame) -> str:
 
 
 def crashes(table: pd.DataFrame) -> list[str]:
-    """Return sentences on strategies with collisions."""
+    """Return a sentence on strategies with collisions, if there are any."""
     found = table[table["collisions"] > 0]
-    columns = ["strategy", "collisions", "episodes", "max_leader_braking_mps2", "max_braking_mps2"]
+    rows = zip(found["strategy"], found["collisions"], found["episodes"], strict=True)
+    names = ", ".join(f"{in_words(str(x))} {some} of {of:,}" for x, some, of in rows)
+    ahead, own = (found[f"max_{x}braking_mps2"].max() for x in ("leader_", ""))
     return [
-        f"{in_words(str(name))}: {collisions} of {episodes:,} episodes end in a collision, so it "
-        f"has no saving and no flow; leaders brake by up to {ahead:.1f} m/s², automated vehicles "
-        f"by up to {own:.1f} m/s²."
-        for name, collisions, episodes, ahead, own in found[columns].itertuples(index=False)
-    ]
+        f"Episodes end in a collision, so that rows have no saving and no flow: {names}; leaders "
+        f"brake by up to {ahead:.1f} m/s², automated vehicles by up to {own:.1f} m/s²."
+    ] * bool(len(found))
 
 
 def few_drives(table: pd.DataFrame) -> str:

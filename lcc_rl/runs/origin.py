@@ -6,7 +6,6 @@ import platform
 import shlex
 import subprocess
 import sys
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from lcc_rl.version import __version__
 ORIGIN = "origin.txt"
 
 
-@cache
 def origin() -> str:
     """Return the lines of ``origin.txt``: command, versions, folder and its commit, if it has one.
 

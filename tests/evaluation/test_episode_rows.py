@@ -133,12 +133,15 @@ def test_a_collision_counts_in_the_warm_up() -> None:
 
 
 def test_a_learned_policy_has_the_mean_of_each_reward_term_and_other_rows_none() -> None:
-    weights = {"safety": 0.5, "efficiency": 0.0, "hdv_energy": 3.0}
+    weights = {"safety": 0.5, "efficiency": 2.0, "hdv_energy": 3.0}
     words = [f"reward.terms.{name}.weight={weight}" for name, weight in weights.items()]
     cfg = strategy("alcc", *words).cfg
     driven = Strategy("alcc", cfg, shared_policy(build_agent(cfg, POPULATION).policy), 0)
+    plain, _ = evaluate(driven, INPUTS, 5, 64, 1)
+    assert not plain.columns.str.contains("mean_term").any()  # the setting is off
+    cfg.evaluation.terms = True
     rows, _ = evaluate(driven, INPUTS, 5, 64, 1)
-    assert cfg.reward.terms["safety"].settings["weight"] == 0.5
+    pd.testing.assert_frame_equal(rows[plain.columns], plain, check_exact=True)
     for name in cfg.reward.terms:
         own, term = rows[f"mean_reward_{name}"], rows[f"mean_term_{name}"]
         np.testing.assert_allclose(own, cfg.reward.terms[name].settings["weight"] * term)

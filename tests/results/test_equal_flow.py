@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -75,6 +77,25 @@ def test_a_strategy_is_compared_at_the_flow_of_the_recorded_drivers() -> None:
     assert np.isnan(saved(["alcc", "alcc X=1"], ["rule X=1"]))
 
 
+def test_fronts_are_compared_by_equal_seeds() -> None:
+    whole, energy = rows(), "total_path_energy_kj"
+    parts = [whole[whole["strategy"] == "recorded"].assign(training_seed=np.nan)]
+    for name, seed in product(NAMES[:-1], range(3)):
+        one = whole[whole["strategy"] == name].assign(training_seed=seed)
+        if seed < 2 or name.startswith("alcc"):  # a third seed has twice the energy
+            parts.append(one.assign(**{energy: one[energy] * (1 + seed // 2)}))
+    found = at_equal_flow(
+        windows_for(pd.concat(parts)), ["alcc", "alcc X=1"], list(NAMES[:3]), energy, "recorded"
+    )
+    assert found.value == pytest.approx(1.0 - 100.0 / 104.0)
+    # Trainings that are equal by seed differ by nothing, however much seeds differ.
+    pair, every = ["alcc", "alcc X=1"], pd.concat(parts)
+    twin = every[every["strategy"].isin(pair)].replace({"strategy": {x: f"my {x}" for x in pair}})
+    both = windows_for(pd.concat([every, twin]))
+    found = at_equal_flow(both, pair, [f"my {x}" for x in pair], energy, "recorded")
+    assert found.low == found.value == found.high == 0.0
+
+
 def test_a_strategy_that_collides_has_no_saving_and_no_flow() -> None:
     one = report(windows_for(rows(collided={"alcc": True})))
     row = one.table.set_index("strategy").loc["alcc"]
@@ -83,10 +104,15 @@ def test_a_strategy_that_collides_has_no_saving_and_no_flow() -> None:
     assert row[names].isna().all()
     assert one.short.set_index("strategy").loc["alcc", ["saved_pct", "flow_pct"]].isna().all()
     sentence = (
-        "network: 8 of 8 episodes end in a collision, so it has no saving and no flow; leaders "
-        "brake by up to 6.0 m/s², automated vehicles by up to 3.0 m/s²."
+        "Episodes end in a collision, so that rows have no saving and no flow: network 8 of 8; "
+        "leaders brake by up to 6.0 m/s², automated vehicles by up to 3.0 m/s²."
     )
     assert sentence in one.remarks
+    several = report(windows_for(rows(collided={"alcc": True, "rule": True}))).remarks
+    named = [line for line in several if "in a collision" in line]  # one sentence for all rows
+    assert len(named) == 1
+    assert "network 8 of 8" in named[0]
+    assert "data 8 of 8" in named[0]
 
 
 def test_what_episodes_end_with_is_told_from_steady_driving() -> None:

@@ -30,7 +30,7 @@ def test_rows_that_differ_are_named(trained, tmp_path) -> None:
     rows.loc[0, "total_energy_kj"] *= 1.25
     write_parquet(rows, other / "episodes.parquet")
     (other / "steps.parquet").unlink()
-    found = dict(repeat.differences(one, other))
+    found = dict(repeat.compared(one, other))
     assert [*found.values()] == [False, False, True]
     first, second, _ = found
     assert re.search(r"1 of \d+ columns differ \(total_energy_kj\), by up to 0\.2$", first)
