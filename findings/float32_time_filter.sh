@@ -1,14 +1,15 @@
 #!/usr/bin/env bash
-# A time in single precision, as SUMO writes it: which rows have time 0.1 s? `==` and `isin` of one
-# library disagree, so do libraries (pandas 3.1.1, polars 2.1.0, pyarrow 25.0.1).
-# Guess before: each library is at least consistent; pyarrow alone finds none. Seen: `==` finds the
-# row in pandas and polars; `isin`/`is_in` and pyarrow do not; a join with times in double
-# precision keeps 20 of 100 rows; `0.1 <= t <= 0.3` is 2 or 3 rows. Hurt: who joins or cuts FCD.
+# A time in single precision, as SUMO writes it: which rows have time 0.1 s? `==` and `isin` of
+# one library disagree, so do libraries (pandas 3.1.1, polars 2.1.0, pyarrow 25.0.1). Guess
+# before: each library is at least consistent; pyarrow alone finds none. Seen: `==` finds the row
+# in pandas and polars; `isin`/`is_in` and pyarrow do not; a join with times in double precision
+# keeps 20 of 100 rows; `0.1 <= t <= 0.3` is 2 or 3 rows. Hurt: who joins or cuts FCD.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv" &&
-    "$folder/venv/bin/python" -m pip install -qq pandas==3.1.1 numpy==2.4.1 polars==2.1.0 pyarrow==25.0.1 || exit 2
+    "$folder/venv/bin/python" -m pip install -qq \
+        pandas==3.1.1 numpy==2.4.1 polars==2.1.0 pyarrow==25.0.1 || exit 2
 cd "$folder"
 venv/bin/python - <<'EOF'
 import sys

@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
-# pandas 3: `to_datetime(milliseconds, unit="ms").astype("int64") / 1e9`, the usual way to seconds,
-# gives a thousandth of them, since the unit is no longer always nanoseconds (pandas 3.1.1).
-# Guess before: nanoseconds, as in pandas 2. Seen: microseconds for whole numbers, nanoseconds for
-# floating ones, and milliseconds in pandas 3.0.0: a step of 0.1 s becomes 0.0001 s.
-# Hurt: who differentiates Global_Time of NGSIM or logger times: accelerations 1,000 times too large.
+# pandas 3: `to_datetime(milliseconds, unit="ms").astype("int64") / 1e9`, the usual way to
+# seconds, gives a thousandth of them, since the unit is no longer always nanoseconds (pandas
+# 3.1.1). Guess before: nanoseconds, as in pandas 2. Seen: microseconds for whole numbers,
+# nanoseconds for floating ones, and milliseconds in pandas 3.0.0: a step of 0.1 s becomes 0.0001
+# s. Hurt: who differentiates Global_Time of NGSIM or logger times: accelerations 1,000 times too
+# large.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
@@ -23,7 +24,8 @@ found = {}
 for name, time in (("whole milliseconds", whole), ("floating seconds", floating)):
     seconds = time.astype("int64") / 1e9
     found[name] = (speed.diff() / seconds.diff()).mean()
-    print(f"{name}: {time.dtype}, step {seconds.diff().mean():.4f} s, acceleration {found[name]:.1f} m/s²")
+    step = seconds.diff().mean()
+    print(f"{name}: {time.dtype}, step {step:.4f} s, acceleration {found[name]:.1f} m/s²")
 right = (speed.diff() / whole.diff().dt.total_seconds()).mean()
 print(f"by dt.total_seconds(): {right:.1f} m/s²")
 changed = abs(found["whole milliseconds"] - 1000) > 1 or abs(found["floating seconds"] - 1) > 0.01

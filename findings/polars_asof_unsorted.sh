@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# polars `join_asof(on=..., by=...)`: rows of a sensor that are not sorted by time within a vehicle
-# are no error, as without `by`; the result has wrong or missing matches (polars 2.1.0).
+# polars `join_asof(on=..., by=...)`: rows of a sensor that are not sorted by time within a
+# vehicle are no error, as without `by`; the result has wrong or missing matches (polars 2.1.0).
 # Guess before: an error, as in pandas and as without `by`. Seen: of four cars' times one is
 # matched, with a row that is two seconds older than the right one; one general warning, which a
 # sorted table gives as well. Hurt: who adds radar or CAN samples to trajectories by vehicle.
@@ -17,7 +17,7 @@ import warnings
 import polars as pl
 
 car = pl.DataFrame({"id": ["a"] * 4, "time": [0.0, 1.0, 2.0, 3.0]})
-radar = pl.DataFrame({"id": ["a"] * 4, "time": [3.0, 0.0, 2.0, 1.0], "gap": [33.0, 30.0, 32.0, 31.0]})
+radar = pl.DataFrame({"id": ["a"] * 4, "time": [3.0, 0.0, 2.0, 1.0], "gap": [33.0, 30, 32, 31]})
 with warnings.catch_warnings(record=True) as unsorted_warning:
     warnings.simplefilter("always")
     found = car.join_asof(radar, on="time", by="id")["gap"].to_list()

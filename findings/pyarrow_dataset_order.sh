@@ -1,14 +1,15 @@
 #!/usr/bin/env bash
-# pyarrow `write_dataset` does not keep the order of rows: a table sorted by run and time comes back
-# with steps back in time within a run, other ones at each call (pyarrow 25).
-# Guess before: order within a run is kept (only folders are sorted anew). Seen: of 20 runs of
-# 100,000 rows some 3 to 11 steps back; none with `preserve_order=True` (False by default).
-# Hurt: who stores trajectories by run and takes differences or windows after reading.
+# pyarrow `write_dataset` does not keep the order of rows: a table sorted by run and time comes
+# back with steps back in time within a run, other ones at each call (pyarrow 25). Guess before:
+# order within a run is kept (only folders are sorted anew). Seen: of 20 runs of 100,000 rows some
+# 3 to 11 steps back; none with `preserve_order=True` (False by default). Hurt: who stores
+# trajectories by run and takes differences or windows after reading.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv" &&
-    "$folder/venv/bin/python" -m pip install -qq pyarrow==25.0.1 numpy==2.4.1 pandas==3.1.1 || exit 2
+    "$folder/venv/bin/python" -m pip install -qq \
+        pyarrow==25.0.1 numpy==2.4.1 pandas==3.1.1 || exit 2
 cd "$folder"
 venv/bin/python - <<'EOF'
 import shutil
@@ -19,7 +20,8 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 
 runs, rows = 20, 100_000
-table = pa.table({"run": np.repeat(np.arange(runs), rows), "time": np.tile(np.arange(rows) / 10, runs)})
+time = np.tile(np.arange(rows) / 10, runs)
+table = pa.table({"run": np.repeat(np.arange(runs), rows), "time": time})
 
 
 def steps_back(**options):

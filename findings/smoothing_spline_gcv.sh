@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
-# scipy `make_smoothing_spline` chooses its smoothing by generalised cross-validation, which takes the
-# errors of a trajectory for motion if neighbouring samples share them (scipy 1.17.0).
-# Guess before: accelerations within a factor of two of the best choice. Seen: as guessed for
+# scipy `make_smoothing_spline` chooses its smoothing by generalised cross-validation, which takes
+# the errors of a trajectory for motion if neighbouring samples share them (scipy 1.17.0). Guess
+# before: accelerations within a factor of two of the best choice. Seen: as guessed for
 # independent errors (0.3 m/s at 10 Hz); with a correlation time of 1 s, as of GPS and video, the
-# error is 0.7 m/s², ten times the best and hardly below no smoothing. Hurt: energy from such data.
+# error is 0.7 m/s², ten times the best and hardly below no smoothing. Hurt: energy from such
+# data.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
@@ -38,9 +39,11 @@ for correlation in (0.0, 1.0):
     rng = np.random.default_rng(0)
     cases = [errors(correlation, rng) for _ in range(8)]
     chosen = np.mean([off(noise) for noise in cases])
-    best = min(np.mean([off(noise, lam) for noise in cases]) for lam in 10.0 ** np.arange(0, 5, 0.5))
+    lambdas = 10.0 ** np.arange(0, 5, 0.5)
+    best = min(np.mean([off(noise, lam) for noise in cases]) for lam in lambdas)
     raw = np.mean([np.std(np.gradient(speed + noise, 0.1) - true) for noise in cases])
     ratios[correlation] = chosen / best
-    print(f"correlation {correlation} s: error {chosen:.2f} m/s², best {best:.2f}, unsmoothed {raw:.2f}")
+    print(f"correlation {correlation} s: error {chosen:.2f} m/s², best {best:.2f}, "
+          f"unsmoothed {raw:.2f}")
 sys.exit(0 if ratios[0.0] < 2 and ratios[1.0] > 5 else 1)
 EOF
