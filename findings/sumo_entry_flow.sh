@@ -1,14 +1,15 @@
 #!/usr/bin/env bash
-# SUMO 1.28: how many cars an hour enter a lane with departSpeed="max" depends on the driver model and
-# on the step: cars of one kind that wait at the entrance, limit 30 m/s, all defaults, sigma 0.
-# Guess before: 1,600 to 1,800 veh/h for both models. Seen: IDM 1,370, Krauss 2,800 at a step of
-# 0.1 s and 2,130 at 1 s. Hurt: who raises demand or the share of automated cars and reads the flow
-# behind the entrance: it is that of the insertion, and part of the demand waits outside.
+# SUMO 1.28: how many cars an hour enter a lane with departSpeed="max" depends on the driver model
+# and on the step: cars of one kind that wait at the entrance, limit 30 m/s, all defaults, sigma
+# 0. Guess before: 1,600 to 1,800 veh/h for both models. Seen: IDM 1,370, Krauss 2,800 at a step
+# of 0.1 s and 2,130 at 1 s. Hurt: who raises demand or the share of automated cars and reads the
+# flow behind the entrance: it is that of the insertion, and part of the demand waits outside.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv" &&
-    "$folder/venv/bin/python" -m pip install -qq eclipse-sumo==1.28.0 libsumo==1.28.0 numpy==2.4.1 || exit 2
+    "$folder/venv/bin/python" -m pip install -qq \
+        eclipse-sumo==1.28.0 libsumo==1.28.0 numpy==2.4.1 || exit 2
 cd "$folder"
 venv/bin/python - <<'EOF'
 import subprocess
