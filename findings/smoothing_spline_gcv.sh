@@ -3,7 +3,7 @@
 # the errors of a trajectory for motion if neighbouring samples share them (scipy 1.17.0). Guess
 # before: accelerations within a factor of two of the best choice. Seen: as guessed for
 # independent errors (0.3 m/s at 10 Hz); with a correlation time of 1 s, as of GPS and video, the
-# error is 0.7 m/s², ten times the best and hardly below no smoothing. Hurt: energy from such
+# error is 0.8 m/s², twenty times the best and hardly below no smoothing. Hurt: energy from such
 # data.
 set -euo pipefail
 folder=$(mktemp -d)
