@@ -46,12 +46,15 @@ def speeds(model, leader, duration):
     return np.array(rows)
 
 
+def braking(t):
+    return 20 - 2 * np.clip(t - 40, 0, 4) + 2 * np.clip(t - 50, 0, 4)
+
+
 sine = speeds("ACC", lambda t: 20 + np.sin(2 * np.pi * t / 20) * (t > 40), 240)[1600:].std(0)
 print("ACC, sine: size of the wave by car ", (sine / sine[0]).round(2).tolist())
 lowest = {}
 for model in ("ACC", "IDM"):
-    brakes = speeds(model, lambda t: 20 - 2 * np.clip(t - 40, 0, 4) + 2 * np.clip(t - 50, 0, 4), 200)
-    lowest[model] = brakes[300:].min(0)
+    lowest[model] = speeds(model, braking, 200)[300:].min(0)
     print(f"{model}, braking: lowest speed by car", lowest[model].round(1).tolist())
 same = sine[-1] / sine[0] < 0.9 and abs(lowest["ACC"][-1] - 5.5) < 1 and lowest["IDM"][-1] > 11
 sys.exit(0 if same else 1)
