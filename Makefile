@@ -52,7 +52,7 @@ benchmarks: $(STAMP)
 	$(BENCHMARK) update train calibrate read loading --repeats 3 --out $(ROWS)/2.parquet $(ARGS) & wait
 	$(BENCHMARK) --page $(ROWS)/1.parquet $(ROWS)/2.parquet | tee $(ROWS)/page.md
 
-# Surprises of other libraries, each in an environment of its own; half an hour, not part of tests.
+# Surprises of other libraries, each in an environment of its own; 20 minutes, not part of tests.
 findings:
 	@status=0; for script in findings/*.sh; do echo "== $$script"; bash $$script; code=$$?; \
 	case $$code in 0) word="as described" ;; 2) word="not installed" ;; *) word=CHANGED ;; esac; \

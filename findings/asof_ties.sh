@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# As-of joins differ at ties: `nearest` takes the earlier sample in pandas and the later one in
-# polars; of two samples with one time stamp pandas takes the last, duckdb the first (pandas
-# 3.1.1, polars 2.1.0, duckdb 2.0.1). Guess before: the earlier sample and, of equal times, the
-# last, everywhere. Seen: where a 20 Hz camera meets a 10 Hz radar every second row is a tie: at 1
-# m/s² the two joins differ by 0.1 m/s in half the rows. Hurt: who compares a pipeline of pandas
-# with one of polars or duckdb.
+# As-of joins differ at ties: `nearest` takes the earlier sample in pandas 3.1.1, the later one in
+# polars 2.1.0; of two samples with one time stamp pandas takes the last, duckdb 2.0.1 the first.
+# Guess before: the earlier one (right for pandas); the last one (wrong for duckdb).
+# Seen: where a 20 Hz camera meets a 10 Hz radar every second row is a tie: at 1 m/s² the joins
+# differ by 0.1 m/s there.
+# Hurt: who compares a pipeline of pandas with one of polars or duckdb.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
 # cvxpy 1.9.3: a solver that runs out of time or iterations raises nothing and leaves values in
-# the variables, as if solved; only the status is `user_limit`, and a warning is printed. With
-# OSQP and a time limit the plan is all zeros: no braking, 130 m through the car ahead within 15
-# s. Guess before: a SolverError, or None as after an infeasible problem. Hurt: who runs model
-# predictive control in real time and tests the variable against None.
+# the variables, as if solved; the status is `user_limit`, and a warning is printed.
+# Guess before: a SolverError.
+# Seen: with OSQP and a time limit the plan is all zeros: no braking, 130 m through the car ahead.
+# Hurt: who runs model predictive control in real time and tests the variable against None.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

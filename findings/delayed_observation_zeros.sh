@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
 # gymnasium `DelayObservation(env, 3)`: the first three observations of each episode are zeros, or
-# the bound next to zero, not the state at the reset (gymnasium 1.4.0). Guess before: the reset
-# observation is repeated, as FrameStackObservation does. Seen: the smallest gap that the space
-# allows and speed 0 m/s. Hurt: who gives a policy a reaction delay: each episode begins with a
-# crash.
+# the bound next to zero, not the state at the reset (gymnasium 1.4.0).
+# Guess before: the reset observation is repeated, as FrameStackObservation does.
+# Seen: the smallest gap that the space allows and speed 0 m/s.
+# Hurt: who gives a policy a reaction delay: each episode begins with a crash.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # gymnasium `DiscretizeAction(env, 5)` takes the centres of five bins: on ±3 m/s² the actions are
 # -2.4, -1.2, 0, 1.2 and 2.4, so full braking and full acceleration are out of reach (1.4.0).
-# Guess before: five values from bound to bound. Seen: also "0" is 1e-7 in single precision. Hurt:
-# who trains DQN beside a continuous agent: it has a fifth less braking, and with an even number
-# of bins it cannot keep its speed.
+# Guess before: five values from bound to bound.
+# Seen: also "0" is 1e-7 in single precision.
+# Hurt: who trains DQN beside a continuous agent: it has a fifth less braking, and with an even
+# number of bins it cannot keep its speed.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # A time in single precision, as SUMO writes it: which rows have time 0.1 s? `==` and `isin` of
-# one library disagree, so do libraries (pandas 3.1.1, polars 2.1.0, pyarrow 25.0.1). Guess
-# before: each library is at least consistent; pyarrow alone finds none. Seen: `==` finds the row
-# in pandas and polars; `isin`/`is_in` and pyarrow do not; a join with times in double precision
-# keeps 20 of 100 rows; `0.1 <= t <= 0.3` is 2 or 3 rows. Hurt: who joins or cuts FCD.
+# one library disagree, so do libraries (pandas 3.1.1, polars 2.1.0, pyarrow 25.0.1).
+# Guess before: pandas and polars find the row, pyarrow does not. Seen: so for `==`; `isin` and
+# `is_in` find none; a join with times in double precision keeps 20 of 100 rows; `0.1 <= t <= 0.3`
+# is 3 rows, or 2 if the file is filtered.
+# Hurt: who joins, cuts or groups SUMO's FCD by time.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

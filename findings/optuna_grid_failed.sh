@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # Optuna `GridSampler`: a grid point whose training failed is never tried again; the search ends,
-# and a second `optimize` on the study repeats a finished point instead (optuna 5.0.0). Guess
-# before: a failed point counts as not visited and is tried again. Seen: of six points five have a
-# value, the failed one was called once; the resumed search draws a point that has a value. Hurt:
-# who resumes a sweep of trainings after a lost node: the table lacks a cell for good.
+# and a second `optimize` on the study repeats a finished point instead (optuna 5.0.0).
+# Guess before: a failed point counts as not visited and is tried again.
+# Seen: of six points five have a value, the failed one was called once; the resumed search draws
+# a point that has a value.
+# Hurt: who resumes a sweep of trainings after a lost node: the table lacks a cell for good.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

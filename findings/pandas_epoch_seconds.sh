@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# pandas 3: `to_datetime(milliseconds, unit="ms").astype("int64") / 1e9`, the usual way to
-# seconds, gives a thousandth of them, since the unit is no longer always nanoseconds (pandas
-# 3.1.1). Guess before: nanoseconds, as in pandas 2. Seen: microseconds for whole numbers,
-# nanoseconds for floating ones, and milliseconds in pandas 3.0.0: a step of 0.1 s becomes 0.0001
-# s. Hurt: who differentiates Global_Time of NGSIM or logger times: accelerations 1,000 times too
+# pandas 3.1.1: `to_datetime(milliseconds, unit="ms").astype("int64") / 1e9`, the usual way to
+# seconds, gives a thousandth of them: the unit is no longer always nanoseconds.
+# Guess before: nanoseconds. Seen: microseconds for whole numbers, nanoseconds for floating ones,
+# milliseconds in pandas 3.0.0: a step of 0.1 s becomes 0.0001 s.
+# Hurt: who differentiates Global_Time of NGSIM or logger times: accelerations 1,000 times too
 # large.
 set -euo pipefail
 folder=$(mktemp -d)

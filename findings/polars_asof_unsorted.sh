@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # polars `join_asof(on=..., by=...)`: rows of a sensor that are not sorted by time within a
 # vehicle are no error, as without `by`; the result has wrong or missing matches (polars 2.1.0).
-# Guess before: an error, as in pandas and as without `by`. Seen: of four cars' times one is
-# matched, with a row that is two seconds older than the right one; one general warning, which a
-# sorted table gives as well. Hurt: who adds radar or CAN samples to trajectories by vehicle.
+# Guess before: an error, as in pandas and as without `by`.
+# Seen: of four cars' times one is matched, with a row that is two seconds older than the right
+# one; one general warning, which a sorted table gives as well.
+# Hurt: who adds radar or CAN samples to trajectories by vehicle.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

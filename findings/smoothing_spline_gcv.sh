@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # scipy `make_smoothing_spline` chooses its smoothing by generalised cross-validation, which takes
-# the errors of a trajectory for motion if neighbouring samples share them (scipy 1.17.0). Guess
-# before: accelerations within a factor of two of the best choice. Seen: as guessed for
-# independent errors (0.3 m/s at 10 Hz); with a correlation time of 1 s, as of GPS and video, the
-# error is 0.8 m/s², twenty times the best and hardly below no smoothing. Hurt: energy from such
-# data.
+# the errors of a trajectory for motion if neighbouring samples share them (scipy 1.17.0).
+# Guess before: accelerations within a factor of two of the best choice.
+# Seen: as guessed for independent errors (0.3 m/s at 10 Hz); with a correlation time of 1 s, as
+# of GPS and video, the error is 0.8 m/s², twenty times the best and hardly below no smoothing.
+# Hurt: energy from such data.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

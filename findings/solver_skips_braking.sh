@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # scipy `solve_ivp` with LSODA or Radau and default settings does not see a leader that brakes for
-# two seconds: the step has grown in steady traffic and goes over it (scipy 1.17.0). Guess before:
-# RK45, the default, misses it too. Seen: of 24 times of braking LSODA and Radau miss nearly all
-# (the follower keeps 20.00 m/s; true: 17.98), RK45 a third; no message, success is True. Hurt: who
-# integrates driver models with a recorded or scripted leader; remedy: max_step.
+# two seconds: the step has grown in steady traffic and goes over it (scipy 1.17.0).
+# Guess before: RK45, the default, misses it too.
+# Seen: of 24 times of braking LSODA and Radau miss nearly all (the follower keeps 20.00 m/s;
+# true: 17.98), RK45 a third; no message, success is True.
+# Hurt: who integrates driver models with a recorded or scripted leader; remedy: max_step.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

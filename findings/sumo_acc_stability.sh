@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# SUMO 1.28, ACC model at its defaults, eight cars: a sine of the leader's speed (±1 m/s, 20 s) dies
-# out along the string, but one braking from 20 to 12 m/s grows from car to car. Guess before: ACC
-# amplifies both, as commercial systems do. Seen: the sine has 0.77 of its size at the eighth car;
-# the lowest speeds fall from 12 to 5.5 m/s. IDM cars keep 12. Hurt: who calls it string stable
-# after a test with small waves, or takes it for the ACC of today's cars in small waves.
+# SUMO 1.28, ACC model at its defaults, eight cars: a sine of the leader's speed (±1 m/s, 20 s)
+# dies out along the string, but one braking from 20 to 12 m/s grows from car to car.
+# Guess before: it amplifies the sine, as commercial systems do; no guess on the braking.
+# Seen: the sine has 0.77 of its size at the eighth car; lowest speeds fall from 12 to 5.5 m/s.
+# Hurt: who calls it string stable after a test with small waves, or takes it for today's ACC.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
 # SUMO 1.28, EIDM: `jerkmax` does not bound the jerk of a following car: with 1, 3 (the default)
-# and 1000 m/s³ a string of five cars drives the same behind a leader that brakes at 4 m/s². Guess
-# before: the acceleration changes by at most jerkmax per second. Seen: 16 m/s³ at the first
-# follower in all three runs, speeds within 0.03 m/s (past the start). Hurt: who takes the EIDM
-# for human drivers of limited jerk, or fits jerkmax to recordings.
+# and 1000 m/s³ a string of five cars drives the same behind a leader that brakes at 4 m/s².
+# Guess before: the acceleration changes by at most jerkmax per second.
+# Seen: 16 m/s³ at the first follower in all three runs, speeds within 0.03 m/s (past the start).
+# Hurt: who takes the EIDM for human drivers of limited jerk, or fits jerkmax to recordings.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
 # SUMO 1.28: its three models of electric cars do not agree on what one wave costs: driven at a
 # steady speed the same kilometre takes 8 % (HBEFA4/PC_BEV), 19 % (Energy) or 25 % (MMPEVEM) less.
-# Guess before: 30, 30 and 35 %, most by HBEFA4, the coarsest. Seen: a factor of three, in the
-# other order; all at their defaults, wave 20-5-20 m/s at 1 m/s². Also steady 20 m/s: 6.0 to 8.8
-# kW. Hurt: who reports the saving of smoother driving for electric cars from one of them.
+# Guess before: 35, 30 and 30 %.
+# Seen: a factor of three, in the other order (defaults; wave 20-5-20 m/s at 1 m/s²).
+# Hurt: who reports the saving of smoother driving for electric cars from one of them.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # SUMO 1.28, `vehicle.setMaxSpeed(id, 20)` of a car at 30 m/s: it brakes at its emergencyDecel of
-# 9 m/s², not at decel, with Krauss and IDM, alone on the road. Guess before: at most decel, 4.5
-# m/s². Seen: 9 m/s² for 1.1 s and a warning on the console; `slowDown(id, 20, 10)` brakes at 1.2.
+# 9 m/s², not at decel, with Krauss and IDM, alone on the road.
+# Guess before: at most decel, 4.5 m/s².
+# Seen: 9 m/s² for 1.1 s and a warning on the console; `slowDown(id, 20, 10)` brakes at 1.2.
 # Hurt: who gives a speed advice (variable limits, eco-driving) by setMaxSpeed and counts energy,
 # emergency braking or collisions behind it.
 set -euo pipefail

@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
-# SUMO 1.28: `minGap` is not the gap at which a car stands behind a leader that has stopped. It is
-# for Krauss and IDM; ACC stops a metre and more before it, W99 two metres beyond, Wiedemann
-# before it. Guess before: within 0.5 m of minGap for all. Seen (minGap 2.5, leader brakes at 1.5
-# m/s² from 20): Krauss 2.5, IDM 2.5, ACC and CACC 3.8, Wiedemann 4.8, W99 0.3 m. Hurt: who
-# compares queues, jam densities and smallest gaps of drivers and automated cars.
+# SUMO 1.28: `minGap` is where Krauss and IDM stand behind a leader that has stopped; ACC stops a
+# metre and more before it, Wiedemann two before it, W99 two beyond it.
+# Guess before: within 0.5 m of minGap for all.
+# Seen (minGap 2.5, leader brakes at 1.5 m/s² from 20): Krauss 2.5, IDM 2.5, ACC and CACC 3.8,
+# Wiedemann 4.8, W99 0.3 m.
+# Hurt: who compares queues, jam densities and smallest gaps of drivers and automated cars.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
-# TorchRL `FrameSkipTransform(4)`, an action held for four steps: an episode that ends in a skipped
-# step does not end (torchrl 0.14.1). Guess before: it stops there and `done` is True, as with
-# action repeat in other libraries. Seen: a car that crashes in the second step drives on to a gap
-# of -7 m, `done` is False; if the environment repeats `done`, the penalty of one crash counts three
-# times (-299 instead of -99). Hurt: who lets a policy act at 1 Hz in a 10 Hz simulation.
+# TorchRL `FrameSkipTransform(4)`, an action held for four steps: an episode that ends in a
+# skipped step does not end (torchrl 0.14.1).
+# Guess before: it stops there and `done` is True.
+# Seen: a car that crashes in the second step drives on to a gap of -7 m, `done` is False; if the
+# environment repeats `done`, one crash is punished three times (-299 instead of -99).
+# Hurt: who lets a policy act at 1 Hz in a 10 Hz simulation.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

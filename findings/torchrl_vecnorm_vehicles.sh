@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
 # TorchRL `VecNorm` and `VecNormV2` on observations [batch, vehicles, features]: each place in the
-# string gets a mean and a deviation of its own (torchrl 0.14.1). Guess before: one per feature,
-# pooled over vehicles. Seen: of two cars with gaps of 20 and 60 m both inputs have mean 0: a
-# network that all cars share cannot tell them apart, and one gap is another input in each place.
+# string gets a mean and a deviation of its own (torchrl 0.14.1).
+# Guess before: one per feature, pooled over vehicles.
+# Seen: of two cars with gaps of 20 and 60 m both inputs have mean 0: a network that all cars
+# share cannot tell them apart, and one gap is another input in each place.
 # Hurt: who trains a shared policy for several cars, or uses it for another number of cars.
 set -euo pipefail
 folder=$(mktemp -d)
