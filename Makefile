@@ -13,7 +13,7 @@ BOTH := -m data=stop_and_go,platoons
 # One thread per process: two trainings run side by side, and results depend on the number.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: install run test test-all extras coverage lint size benchmarks docs clean
+.PHONY: install run test test-all extras coverage lint size benchmarks findings docs clean
 
 install: $(STAMP)
 
@@ -51,6 +51,13 @@ benchmarks: $(STAMP)
 	$(BENCHMARK) env collect string start gym evaluate analytic --repeats 3 --out $(ROWS)/1.parquet $(ARGS) & \
 	$(BENCHMARK) update train calibrate read loading --repeats 3 --out $(ROWS)/2.parquet $(ARGS) & wait
 	$(BENCHMARK) --page $(ROWS)/1.parquet $(ROWS)/2.parquet | tee $(ROWS)/page.md
+
+# Surprises of other libraries, each in an environment of its own; 20 minutes, not part of tests.
+findings:
+	@status=0; for script in findings/*.sh; do echo "== $$script"; bash $$script; code=$$?; \
+	case $$code in 0) word="as described" ;; 2) word="not installed" ;; *) word=CHANGED ;; esac; \
+	test $$code = 0 || status=1; list="$$list$$script: $$word\n"; done; \
+	printf "\n$$list"; exit $$status
 
 # Strict: a broken link or name is an error. Needs no network once the extra is installed.
 # Notebooks run if they have changed, ten minutes; ARGS="-D nb_execution_mode=off" leaves them out.
