@@ -19,7 +19,7 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.clock import Clock, Traffic, batch_shape
 from lcc_rl.envs.inputs import build_energy, shared_inputs
-from lcc_rl.envs.single import SingleAgent
+from lcc_rl.envs.single import MultiAgent, SingleAgent
 from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError, require, require_known
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
@@ -272,7 +272,8 @@ def make_env(
         device: device of the tensors.
         held_out: play the evaluation profiles instead of the training profiles.
         single: show the entries of the one automated vehicle at the root, see
-            :class:`lcc_rl.envs.SingleAgent`; None: if there is exactly one.
+            :class:`lcc_rl.envs.SingleAgent`; None: if there is exactly one, and show several as
+            :class:`lcc_rl.envs.MultiAgent`; False: all entries as the pieces write them.
 
     Raises:
         ConfigError: if the variant or an override is unknown, or with ``single`` there is not
@@ -290,4 +291,6 @@ def make_env(
     count = cfg.scenario.vehicles.count(AUTOMATED)
     if single and count != 1:
         raise ConfigError(f"single=True needs one automated vehicle, the string has {count}")
-    return env.append_transform(SingleAgent()) if count == 1 and single is not False else env
+    if not count or single is False:
+        return env
+    return env.append_transform(SingleAgent() if count == 1 else MultiAgent())

@@ -1,8 +1,8 @@
-"""The single-agent view of a string with one automated vehicle, for stock TorchRL scripts."""
+"""Views of the automated vehicles for stock TorchRL scripts: of one vehicle, and of several."""
 
 from __future__ import annotations
 
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite
 from torchrl.envs.transforms import Transform
 
@@ -11,6 +11,8 @@ from lcc_rl.pieces.base import Entry, Key
 
 # Entries of the group that the view shows at the root, without the dimension of vehicles.
 GROUP_ENTRIES = ("observation", "reward", "reward_terms")
+
+ENDS = ("done", "terminated", "truncated")
 
 
 class SingleAgent(Transform):
@@ -75,6 +77,55 @@ class SingleAgent(Transform):
         return specs
 
 
+class MultiAgent(Transform):
+    """Shows the automated vehicles as a group of agents, as TorchRL's PettingZooWrapper does.
+
+    The TensorDict and the specs of the group have the dimension of vehicles, ``[*batch, n]``, and
+    hold ``"done"``, ``"terminated"`` and ``"truncated"`` of the string for each vehicle, so that
+    losses find them at the shape of the reward. It must be the last transform of an environment.
+    """
+
+    keys = tuple((AUTOMATED, name) for name in ENDS)
+    shows = tuple(Entry(key, "–", f"{key[1]} of the string, for each vehicle") for key in keys)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        group = next_tensordict.get(AUTOMATED, None)
+        if group is None:
+            return next_tensordict
+        size = next(iter(group.values(True, True))).shape[: group.ndim + 1]
+        found = {x: next_tensordict.get(x, None) for x in ENDS}
+        ends = {
+            x: end.unsqueeze(-2).expand(*size, 1) for x, end in found.items() if end is not None
+        }
+        agents = TensorDict({**dict(group.items()), **ends}, size, device=group.device)
+        return next_tensordict.set(AUTOMATED, agents)
+
+    forward = _call
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        return self._grouped(input_spec.clone())
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        output_spec = self._grouped(output_spec.clone())
+        size = output_spec["full_observation_spec", AUTOMATED].shape
+        done = output_spec["full_done_spec"]
+        ends = {x: done[x].unsqueeze(-2).expand(*size, 1).clone() for x in ENDS}
+        done[AUTOMATED] = Composite(ends, shape=size, device=done.device)
+        return output_spec
+
+    def _grouped(self, specs: Composite) -> Composite:
+        for spec in specs.values():
+            if AUTOMATED in spec.keys():  # noqa: SIM118  a spec is no dict
+                group = spec[AUTOMATED]
+                group.shape = next(iter(group.values(True, True))).shape[: group.ndim + 1]
+        return specs
+
+
 def _without(entry: TensorDictBase) -> TensorDictBase:
     """Return a tensor, or every tensor of a TensorDict, without the dimension of vehicles."""
     if isinstance(entry, TensorDictBase):
@@ -87,6 +138,9 @@ def _flat(terms: Composite) -> Composite:
     for name, spec in terms.items():
         flat[name] = spec.squeeze(-2)
     return flat
+
+
+VIEWS = (SingleAgent, MultiAgent)
 
 
 def group_key(key: Key) -> Key:
