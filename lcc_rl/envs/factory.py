@@ -271,9 +271,8 @@ def make_env(
             play different episodes. ``env.set_seed`` sets it anew.
         device: device of the tensors.
         held_out: play the evaluation profiles instead of the training profiles.
-        single: show the entries of the one automated vehicle at the root, see
-            :class:`lcc_rl.envs.SingleAgent`; None: if there is exactly one, and show several as
-            :class:`lcc_rl.envs.MultiAgent`; False: all entries as the pieces write them.
+        single: show the one automated vehicle as :class:`lcc_rl.envs.SingleAgent`; None: so if
+            there is exactly one, and several as :class:`lcc_rl.envs.MultiAgent`; False: neither.
 
     Raises:
         ConfigError: if the variant or an override is unknown, or with ``single`` there is not
@@ -291,6 +290,5 @@ def make_env(
     count = cfg.scenario.vehicles.count(AUTOMATED)
     if single and count != 1:
         raise ConfigError(f"single=True needs one automated vehicle, the string has {count}")
-    if not count or single is False:
-        return env
-    return env.append_transform(SingleAgent() if count == 1 else MultiAgent())
+    view = SingleAgent if count == 1 else MultiAgent
+    return env.append_transform(view()) if count and single is not False else env

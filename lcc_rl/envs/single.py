@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tensordict import TensorDict, TensorDictBase
+from torch import Size
 from torchrl.data import Composite
 from torchrl.envs.transforms import Transform
 
@@ -11,8 +12,7 @@ from lcc_rl.pieces.base import Entry, Key
 
 # Entries of the group that the view shows at the root, without the dimension of vehicles.
 GROUP_ENTRIES = ("observation", "reward", "reward_terms")
-
-ENDS = ("done", "terminated", "truncated")
+ENDS = ("done", "terminated", "truncated")  # of the string, which the group shows, too
 
 
 class SingleAgent(Transform):
@@ -92,38 +92,33 @@ class MultiAgent(Transform):
         group = next_tensordict.get(AUTOMATED, None)
         if group is None:
             return next_tensordict
-        size = next(iter(group.values(True, True))).shape[: group.ndim + 1]
-        found = {x: next_tensordict.get(x, None) for x in ENDS}
-        ends = {
-            x: end.unsqueeze(-2).expand(*size, 1) for x, end in found.items() if end is not None
-        }
-        agents = TensorDict({**dict(group.items()), **ends}, size, device=group.device)
-        return next_tensordict.set(AUTOMATED, agents)
+        size, entries = _agents(group), dict(group.items())
+        for name, end in next_tensordict.select(*ENDS, strict=False).items():
+            entries[name] = end.unsqueeze(-2).expand(*size, 1)
+        return next_tensordict.set(AUTOMATED, TensorDict(entries, size, device=group.device))
 
-    forward = _call
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return self._call(tensordict_reset)
+    forward, _reset = _call, SingleAgent._reset
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         return self._grouped(input_spec.clone())
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        output_spec = self._grouped(output_spec.clone())
-        size = output_spec["full_observation_spec", AUTOMATED].shape
-        done = output_spec["full_done_spec"]
-        ends = {x: done[x].unsqueeze(-2).expand(*size, 1).clone() for x in ENDS}
-        done[AUTOMATED] = Composite(ends, shape=size, device=done.device)
-        return output_spec
+        specs = output_spec.clone()
+        size, done = _agents(specs["full_observation_spec", AUTOMATED]), specs["full_done_spec"]
+        for name in ENDS:
+            done[AUTOMATED, name] = done[name].unsqueeze(-2).expand(*size, 1).clone()
+        return self._grouped(specs)
 
     def _grouped(self, specs: Composite) -> Composite:
         for spec in specs.values():
             if AUTOMATED in spec.keys():  # noqa: SIM118  a spec is no dict
-                group = spec[AUTOMATED]
-                group.shape = next(iter(group.values(True, True))).shape[: group.ndim + 1]
+                spec[AUTOMATED].shape = _agents(spec[AUTOMATED])
         return specs
+
+
+def _agents(group: TensorDictBase | Composite) -> Size:
+    """Return the size of a group with the dimension of vehicles."""
+    return next(iter(group.values(True, True))).shape[: len(group.shape) + 1]
 
 
 def _without(entry: TensorDictBase) -> TensorDictBase:
@@ -134,13 +129,8 @@ def _without(entry: TensorDictBase) -> TensorDictBase:
 
 
 def _flat(terms: Composite) -> Composite:
-    flat = Composite(shape=terms.shape, device=terms.device)
-    for name, spec in terms.items():
-        flat[name] = spec.squeeze(-2)
-    return flat
-
-
-VIEWS = (SingleAgent, MultiAgent)
+    flat = {name: spec.squeeze(-2) for name, spec in terms.items()}
+    return Composite(flat, shape=terms.shape, device=terms.device)
 
 
 def group_key(key: Key) -> Key:
