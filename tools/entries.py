@@ -14,7 +14,7 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.drivers.population import bootstrap
-from lcc_rl.envs import SingleAgent, build_env
+from lcc_rl.envs import MultiAgent, SingleAgent, build_env
 from lcc_rl.envs.clock import Clock, option_specs
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.envs.single import group_key
@@ -29,7 +29,7 @@ PAGE = ROOT / "docs" / "entries.md"
 SPECS = ("observation", "action", "reward", "done")
 WIDEST = 3  # widths of wider entries depend on settings
 CLOCK = declared(Clock)
-ENTRIES = declared(Piece, Clock, SingleAgent)
+ENTRIES = declared(Piece, Clock, SingleAgent, MultiAgent)
 SIZES = "scenario.string=automated*3 human*5"
 HEAD = """# Entries and equations
 
@@ -82,8 +82,9 @@ def environments() -> Iterator[tuple[TransformedEnv, VehicleString]]:
         scenario = cfg.scenario
         profiles = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["constant"])
         env = build_env(cfg, profiles, population, batch_size=7)
-        single = string.count(AUTOMATED) == 1
-        yield env.append_transform(SingleAgent()) if single else env, string
+        if count := string.count(AUTOMATED):
+            env = env.append_transform(SingleAgent() if count == 1 else MultiAgent())
+        yield env, string
 
 
 def entry_key(key: Key, roles: Collection[str]) -> Key:
@@ -119,6 +120,8 @@ def writers(env: TransformedEnv, key: Key) -> list[str]:
         return ["the policy"]
     if group_key(key) != key:
         return [SingleAgent.__name__]
+    if key in MultiAgent.keys:
+        return [MultiAgent.__name__]
     pieces = []
     for piece in pieces_of(env):
         pieces += [piece.before, piece.after] if isinstance(piece, Handover) else []

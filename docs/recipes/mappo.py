@@ -33,14 +33,5 @@ critic = TensorDictModule(network(1, centralised=centralised), [seen], [value])
 keys = {**own, "value": value, "sample_log_prob": ("automated", "log_prob")}
 loss = loss_of(policy, critic, each=(-2,), **keys)  # advantages of each vehicle
 
-
-def batches():
-    for data in Collector(env, policy, **SIZE):
-        for name in ("done", "terminated"):  # of the string; the loss wants one for each vehicle
-            whole = data["next", name].unsqueeze(-2)
-            data["next", "automated", name] = whole.expand(data["next", *own["reward"]].shape)
-        yield data
-
-
-rewards = train(batches(), loss, reward=own["reward"])
+rewards = train(Collector(env, policy, **SIZE), loss, reward=own["reward"])
 print(lcc_rl.compare({"MAPPO": policy}, overrides=[*mixed, "evaluation.drivers=24"]))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lcc_rl.arrays import Floats
 from lcc_rl.data.grid import Place
-from lcc_rl.data.tables import SI, SPEEDS, UNITS, Units
+from lcc_rl.data.tables import FRAMES, SI, SPEEDS, UNITS, Units, unit_size
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.errors import Concern, DataError
 
@@ -32,6 +32,7 @@ STRAY = 0.2  # largest distance left of a relative speed, as a share of the foll
 LOUD, LOUD_RATE, LOUD_FACTOR = 0.3, 0.3, 1.15  # reported: lag [s], bias of a speed [m/s], factor
 STANDING, LEAST_STANDING = 0.5, 300  # speed [m/s], samples
 FAR_STANDING = 15.0  # gap that may be in feet [m]
+RATES = (5, 10, 15, 20, 25, 30, 50, 60)  # frames per second of recordings
 
 
 def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
@@ -144,6 +145,11 @@ def mistakes(units: Units) -> Iterator[tuple[bool, str, str, float, float]]:
                 option = " ".join(f"data.units.{key}={unit}" for key in named)
                 words = f"{subject} in {unit}{option and f' ({option})'}?"
                 yield declared == SI[quantity], signal, words, factor**leader, factor**follower
+    time = units.get("time", "")
+    period = (unit_size("time", time) or 0.0) if time.startswith(FRAMES) else 0.0  # [s]
+    for rate in RATES if period else ():
+        words = f"is the time in frames/{rate} (data.units.time=frames/{rate})?"
+        yield False, "gap", words, 1 / (rate * period), 1 / (rate * period)
 
 
 def check_pairs(

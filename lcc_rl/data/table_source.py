@@ -127,6 +127,10 @@ class TableSource(TrajectorySource):
             for key in (key for key in IDENTIFYING if key in part):
                 if (blank := part[key] == "").any():
                     raise table.fault(int(part["row"][np.argmax(blank)]), key, "is blank")
+            unsized = "gap" not in part and self.vehicle_length is None
+            if unsized and (blank := ~(part["length"] > 0)).any():
+                remedy = "is blank or 0; data.vehicle_length sets such lengths [m]"
+                raise table.fault(int(part["row"][np.argmax(blank)]), "length", remedy)
             _report_blank_gaps(table, part)
             rows = len(part["row"])
             file, recording = np.full(rows, number), np.full(rows, label)

@@ -467,7 +467,8 @@ def numbers_of(cells: Cells, fault: Fault, comma: bool = False) -> NDArray[np.fl
         sound = np.asarray(pc.fill_null(pc.match_substring_regex(cells, NUMBER), True))
         if not sound.all():
             row = int(np.argmin(sound))
-            raise fault(row, f"holds {_shown(given[row])}; expected a number")
+            clock = ", or hh:mm:ss, or a time of ISO 8601" if ":" in str(given[row]) else ""
+            raise fault(row, f"holds {_shown(given[row])}; expected a number{clock}")
     elif not any(kind(cells.type) for kind in NUMERIC_TYPES):
         raise fault(0, f"is of type {cells.type}; expected numbers")
     return np.asarray(pc.cast(cells, pa.float64(), safe=False), dtype=np.float64)

@@ -5,12 +5,13 @@ from lcc_rl.envs.collector import StringCollector
 from lcc_rl.envs.factory import build_env, make_env
 from lcc_rl.envs.inputs import Inputs, load_inputs
 from lcc_rl.envs.rollout import DifferentiableRollout
-from lcc_rl.envs.single import SingleAgent
+from lcc_rl.envs.single import MultiAgent, SingleAgent
 
 __all__ = [
     "Clock",
     "DifferentiableRollout",
     "Inputs",
+    "MultiAgent",
     "SingleAgent",
     "StringCollector",
     "build_env",

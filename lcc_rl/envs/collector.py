@@ -16,7 +16,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import RandomPolicy
 
 from lcc_rl.envs.compiled import Compiled
-from lcc_rl.envs.single import SingleAgent, group_key
+from lcc_rl.envs.single import MultiAgent, SingleAgent, group_key
 from lcc_rl.envs.step import DONE, Step, closure, entries_of, leaf_keys, pieces_of, read_before
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.pieces.base import NEXT, Key, State, as_key, root_key
@@ -42,8 +42,8 @@ class StringCollector(BaseCollector):
 
     Raises:
         ConfigError: if the frames are no multiple of the parallel episodes, no vehicle is
-            automated, or the environment has transforms other than pieces and the single-agent
-            view.
+            automated, or the environment has transforms other than pieces and a view of the
+            automated vehicles.
     """
 
     def __init__(
@@ -69,7 +69,8 @@ class StringCollector(BaseCollector):
             "side by side",
         )
         self.steps = frames_per_batch // episodes
-        self.single = _is_single(env)
+        self.view = _view(env)
+        self.single = isinstance(self.view, SingleAgent)
         actions = [as_key(key) for key in env.full_action_spec.keys(True, True)]
         require(actions, "no vehicle of the string is automated: StringCollector needs an action")
         self.action: Key = actions[0]
@@ -116,7 +117,7 @@ class StringCollector(BaseCollector):
         self.state = {key: value for key, value in begun.items() if key in self.carried}
 
     def _entries(self, td: TensorDictBase) -> State:
-        shown = entries_of(td)
+        shown = entries_of(td.exclude(*MultiAgent.keys))
         return {
             self._inner(key): value.unsqueeze(-2) if self._inner(key) != key else value
             for key, value in shown.items()
@@ -142,6 +143,9 @@ class StringCollector(BaseCollector):
         segment = TensorDict(batch_size=[*batch, self.steps], device=self.env.device)
         for key, values in zip(self.keys, zip(*record, strict=True), strict=True):
             segment.set(key, torch.stack(values, len(batch)))
+        if isinstance(self.view, MultiAgent):
+            self.view(segment)
+            self.view(segment.get(NEXT, TensorDict()))
         return segment
 
     def _act(self, state: State) -> State:
@@ -223,17 +227,17 @@ class StringCollector(BaseCollector):
             self.env.close(raise_if_closed=False)
 
 
-def _is_single(env: TransformedEnv) -> bool:
-    """Whether an environment shows the single-agent view.
+def _view(env: TransformedEnv) -> Any:
+    """Return the view of the automated vehicles that an environment shows, if any.
 
     Raises:
         ConfigError: if it has other transforms, which a collector of pieces would not apply.
     """
     others = [t for t in env.transform if t not in pieces_of(env)]
-    strange = [type(t).__name__ for t in others if not isinstance(t, SingleAgent)]
+    strange = [type(t).__name__ for t in others if not isinstance(t, SingleAgent | MultiAgent)]
     if strange:
         raise ConfigError(
             f"the environment has the transforms {', '.join(strange)}, which StringCollector does "
             "not apply; use torchrl.collectors.Collector (training.collector=torchrl)"
         )
-    return bool(others)
+    return others[0] if others else None

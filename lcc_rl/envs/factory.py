@@ -19,7 +19,7 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.clock import Clock, Traffic, batch_shape
 from lcc_rl.envs.inputs import build_energy, shared_inputs
-from lcc_rl.envs.single import SingleAgent
+from lcc_rl.envs.single import MultiAgent, SingleAgent
 from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError, require, require_known
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
@@ -271,8 +271,8 @@ def make_env(
             play different episodes. ``env.set_seed`` sets it anew.
         device: device of the tensors.
         held_out: play the evaluation profiles instead of the training profiles.
-        single: show the entries of the one automated vehicle at the root, see
-            :class:`lcc_rl.envs.SingleAgent`; None: if there is exactly one.
+        single: show the one automated vehicle as :class:`lcc_rl.envs.SingleAgent`; None: so if
+            there is exactly one, and several as :class:`lcc_rl.envs.MultiAgent`; False: neither.
 
     Raises:
         ConfigError: if the variant or an override is unknown, or with ``single`` there is not
@@ -290,4 +290,5 @@ def make_env(
     count = cfg.scenario.vehicles.count(AUTOMATED)
     if single and count != 1:
         raise ConfigError(f"single=True needs one automated vehicle, the string has {count}")
-    return env.append_transform(SingleAgent()) if count == 1 and single is not False else env
+    view = SingleAgent if count == 1 else MultiAgent
+    return env.append_transform(view()) if count and single is not False else env

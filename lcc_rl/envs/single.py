@@ -1,8 +1,9 @@
-"""The single-agent view of a string with one automated vehicle, for stock TorchRL scripts."""
+"""Views of the automated vehicles for stock TorchRL scripts: of one vehicle, and of several."""
 
 from __future__ import annotations
 
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from torch import Size
 from torchrl.data import Composite
 from torchrl.envs.transforms import Transform
 
@@ -11,6 +12,7 @@ from lcc_rl.pieces.base import Entry, Key
 
 # Entries of the group that the view shows at the root, without the dimension of vehicles.
 GROUP_ENTRIES = ("observation", "reward", "reward_terms")
+ENDS = ("done", "terminated", "truncated")  # of the string, which the group shows, too
 
 
 class SingleAgent(Transform):
@@ -75,6 +77,50 @@ class SingleAgent(Transform):
         return specs
 
 
+class MultiAgent(Transform):
+    """Shows the automated vehicles as a group of agents, as TorchRL's PettingZooWrapper does.
+
+    The TensorDict and the specs of the group have the dimension of vehicles, ``[*batch, n]``, and
+    hold ``"done"``, ``"terminated"`` and ``"truncated"`` of the string for each vehicle, so that
+    losses find them at the shape of the reward. It must be the last transform of an environment.
+    """
+
+    keys = tuple((AUTOMATED, name) for name in ENDS)
+    shows = tuple(Entry(key, "–", f"{key[1]} of the string, for each vehicle") for key in keys)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        group = next_tensordict.get(AUTOMATED, None)
+        if group is None:
+            return next_tensordict
+        size, entries = _agents(group), dict(group.items())
+        for name, end in next_tensordict.select(*ENDS, strict=False).items():
+            entries[name] = end.unsqueeze(-2).expand(*size, 1)
+        return next_tensordict.set(AUTOMATED, TensorDict(entries, size, device=group.device))
+
+    forward, _reset = _call, SingleAgent._reset
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        return self._grouped(input_spec.clone())
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        specs = output_spec.clone()
+        size, done = _agents(specs["full_observation_spec", AUTOMATED]), specs["full_done_spec"]
+        for name in ENDS:
+            done[AUTOMATED, name] = done[name].unsqueeze(-2).expand(*size, 1).clone()
+        return self._grouped(specs)
+
+    def _grouped(self, specs: Composite) -> Composite:
+        for spec in specs.values():
+            if AUTOMATED in spec.keys():  # noqa: SIM118  a spec is no dict
+                spec[AUTOMATED].shape = _agents(spec[AUTOMATED])
+        return specs
+
+
+def _agents(group: TensorDictBase | Composite) -> Size:
+    """Return the size of a group with the dimension of vehicles."""
+    return next(iter(group.values(True, True))).shape[: len(group.shape) + 1]
+
+
 def _without(entry: TensorDictBase) -> TensorDictBase:
     """Return a tensor, or every tensor of a TensorDict, without the dimension of vehicles."""
     if isinstance(entry, TensorDictBase):
@@ -83,10 +129,8 @@ def _without(entry: TensorDictBase) -> TensorDictBase:
 
 
 def _flat(terms: Composite) -> Composite:
-    flat = Composite(shape=terms.shape, device=terms.device)
-    for name, spec in terms.items():
-        flat[name] = spec.squeeze(-2)
-    return flat
+    flat = {name: spec.squeeze(-2) for name, spec in terms.items()}
+    return Composite(flat, shape=terms.shape, device=terms.device)
 
 
 def group_key(key: Key) -> Key:

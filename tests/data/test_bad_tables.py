@@ -124,6 +124,11 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("ngsim", ngsim(Lane_ID="70000"), "data row 3, column 'Lane_ID' holds '70000'"),
     ("table", table(v="fast"), "data row 501, column 'v' holds 'fast'; expected a number"),
     ("table", table(v=1e20), r"data row 501, column 'v' holds '1e\+20'"),
+    (
+        "table",
+        table(t="03/29/2026 9:59:30 AM"),
+        "AM'; expected a number, or hh:mm:ss, or a time of",
+    ),
     ("table", COMMAS.replace(";11,", ";1l,", 1), "column 'v' holds '1l,"),
     ("table", csv(TABLE.assign(v="")), "data row 1, column 'v' is blank"),
     ("table", table(id=""), "data row 501, column 'id' is blank"),

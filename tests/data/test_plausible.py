@@ -127,6 +127,12 @@ MISTAKES = [
     (["gap_m"], 3.28084, {"gap": "m"}, r"; is the gap in ft \(data\.units\.gap=ft\)\?"),
     (["gap_m"], 0.3048, {"gap": "ft"}, r"is the gap in m \(.*\)\? or are both speeds in ft/s\?"),
     (BOTH, 1 / 3.6, {"speed": "km/h"}, r"are both speeds in m/s \(data\.units\.speed=m/s\)\?"),
+    (
+        BOTH,
+        2.5,
+        {"time": "frames/10"},
+        r"is the time in frames/25 \(data\.units\.time=frames/25\)\?;",
+    ),
     (["gap_m"], -1.0, {}, r"by -1\.00 m, where .* by 1\.00 m; are leader and follower exchanged"),
     (
         LEADER,

@@ -12,6 +12,7 @@ import pytest
 from helpers import check_episodes, check_refused
 from table_text import GAP, LENGTH, long_table, openacc_text, pairs, speed, written
 
+from lcc_rl.config import load
 from lcc_rl.data import text
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.episodes import SCHEMA
@@ -439,7 +440,16 @@ def test_lengths_in_feet_and_gaps_that_jump_are_named_in_tables(tmp_path) -> Non
     words = (
         r"feet\.csv.* the median length of vehicles is 1\d\.?\d* m; .*data\.units\.length=ft, or m"
     )
-    check_refused(lambda: TableSource(path=path, columns=BY_LANE).load(), [(words,)], DataError)
+    some = frame.assign(length=frame["length"].where(frame["id"] != 2))
+    blank = written(tmp_path, some, "blank.csv")
+    remedy = r"blank\.csv: data row 401, column 'length' is blank or 0; data\.vehicle_length sets"
+    cases = [(path, words), (blank, remedy)]
+    check_refused(lambda x: TableSource(path=x, columns=BY_LANE).load(), cases, DataError)
+    names = ", ".join(f"{key}: {name}" for key, name in BY_LANE.items())
+    told = ["data=table", f"data.path={path}", f"data.columns={{{names}}}"]
+    with pytest.raises(DataError, match=words):  # as the command line reads it
+        load("calibrate", told).data.made(TableSource).load()
+    load("calibrate", [*told, "data.units.length=ft"]).data.made(TableSource).load()
     gaps = [
         TableSource(path=path, columns=BY_LANE, units={"length": x}).load().episodes["gap_m"].mean()
         for x in ("ft", "m")

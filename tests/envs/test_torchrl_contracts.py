@@ -11,9 +11,11 @@ import pytest
 import torch
 from helpers import check_refused
 from torchrl.envs import AsyncEnvPool, ParallelEnv, SerialEnv, TransformedEnv
-from torchrl.envs.transforms import Compose, StepCounter, Transform
+from torchrl.envs.transforms import Compose, RewardSum, StepCounter, Transform
+from torchrl.envs.utils import check_env_specs
 
 import lcc_rl
+from lcc_rl.envs import StringCollector
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import JerkReward, SafetyReward, TimeGap
 from lcc_rl.pieces.base import SEED, STEP
@@ -99,6 +101,39 @@ def test_a_part_of_a_state_is_refused() -> None:
     ):
         with pytest.raises(ConfigError, match=r"whole state .* lacks .*vehicles\.gap.*options=…"):
             env.reset(given, **how)
+
+
+def test_several_automated_vehicles_are_a_group_of_agents(subtests) -> None:
+    """As in PettingZooWrapper: the dimension of agents, and ends at the shape of the reward."""
+    words = [*WORDS, "scenario.string='automated human automated human'"]
+    several = partial(lcc_rl.make_env, "alcc", (), words)
+    wrappers = {
+        "alone": lambda: lcc_rl.make_env("alcc", 2, words),
+        "serial": lambda: SerialEnv(2, several),
+        "parallel without buffers": lambda: ParallelEnv(2, several, use_buffers=False, **PROCESSES),
+        "threads": lambda: AsyncEnvPool([several, several], backend="threading"),
+    }
+    for name, wrap in wrappers.items():
+        env = wrap()
+        with subtests.test(name=name):
+            if name != "threads":  # whose specs TorchRL does not check
+                check_env_specs(env)
+            counted = TransformedEnv(env, Compose(RewardSum(), StepCounter()), auto_unwrap=False)
+            after = counted.rollout(2 * HORIZON, break_when_any_done=False)["next"]
+            group, ends = after["automated"], ("done", "terminated", "truncated")
+            assert group.batch_size == group["reward_terms"].batch_size == (2, 2 * HORIZON, 2)
+            assert group["reward"].shape == group["done"].shape == (2, 2 * HORIZON, 2, 1)
+            assert group["done"].any()
+            for end in ends:
+                assert (group[end] == after[end].unsqueeze(-2)).all()
+            total = group["reward"][:, :HORIZON].sum(1)
+            torch.testing.assert_close(group["episode_reward"][:, HORIZON - 1], total)
+        env.close(raise_if_closed=False)
+    for keys in (None, [("next", "automated", "reward"), ("next", "done")]):
+        collector = StringCollector(wrappers["alone"](), None, frames_per_batch=4, keys=keys)
+        group = next(iter(collector))["next", "automated"]
+        assert group.batch_size == (2, 2, 2)
+        assert group["done"].shape == group["reward"].shape
 
 
 # -- what users change in an environment -----------------------------------------------------------
