@@ -27,9 +27,9 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 41_800, "code": 27_400},
-    "tests": {"lines": 22_800},
-    "conf": {"yaml": 151},
+    "lcc_rl + tools": {"lines": 42_000, "code": 27_560},
+    "tests": {"lines": 23_300},
+    "conf": {"yaml": 152},
 }
 CASES = 1_120  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {"names in several modules": 60, "floors": 10, "circles": 0}
