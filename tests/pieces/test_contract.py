@@ -130,7 +130,7 @@ ROLES = (
     "hybrid",
     "hybrid",
     "human",
-    *("late", "optimal", "difference", "gipps", "calibrated", "calibrated"),
+    *("late", "optimal", "difference", "gipps", "calibrated", "calibrated", "calm"),
 )
 STRINGS = {
     "open": VehicleString((*ROLES, "recorded")),
