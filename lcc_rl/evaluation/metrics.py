@@ -280,7 +280,10 @@ def safety_measures(
     for name, metric in metrics.items():
         _, *entries = signature(metric).parameters
         if all(entry in series for entry in entries):
-            found[name] = metric(over, *(series[entry] for entry in entries))
+            value = found[name] = metric(over, *(series[entry] for entry in entries))
+            shape, wanted = list(value.shape), list(alive.shape[1:-1])
+            words = f"measure {name}: expected a number of each episode {wanted}, got {shape}"
+            require(shape == wanted, f"{words}; over reduces entries: over.mean, over.highest …")
     return found
 
 

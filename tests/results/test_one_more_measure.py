@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from helpers import check_refused, slow_but
 
 from lcc_rl.cli import table
 from lcc_rl.commands import evaluation, score
 from lcc_rl.config import load
 from lcc_rl.errors import ResultsError
-from lcc_rl.evaluation.metrics import METRICS, ROAD_METRICS, register
+from lcc_rl.evaluation.metrics import METRICS, ROAD_METRICS, register, safety_measures
 from lcc_rl.results.measures import MEASURES, Measure
 from lcc_rl.results.names import in_words
 from lcc_rl.results.platoons import PLATOON
@@ -112,6 +113,9 @@ REFUSED = [
 
 def test_what_is_unclear_is_refused() -> None:
     check_refused(lambda key, given, metric: register(Measure(key, **given), metric), REFUSED)
+    series, alive = {"gap": torch.ones(5, 2, 1, 1)}, torch.ones(5, 2, 1, 1, dtype=torch.bool)
+    whole = [({"mine": lambda over, gap: gap}, r"mine: expected a number .* \[2, 1\], got \[5")]
+    check_refused(lambda metrics: safety_measures(series, alive, 0.1, metrics), whole)
     words = "measures: cannot find 'no_such': .*export PYTHONPATH"
     check_refused(lambda word: load("evaluate", [word]), [("measures=[no_such]", words)])
 
