@@ -17,7 +17,7 @@ from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import MultiAgent, SingleAgent, build_env
 from lcc_rl.envs.clock import Clock, option_specs
 from lcc_rl.envs.inputs import constant_profiles
-from lcc_rl.envs.single import group_key
+from lcc_rl.envs.single import group_key, view_of
 from lcc_rl.envs.step import pieces_of, written
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
@@ -83,7 +83,7 @@ def environments() -> Iterator[tuple[TransformedEnv, VehicleString]]:
         profiles = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["constant"])
         env = build_env(cfg, profiles, population, batch_size=7)
         if count := string.count(AUTOMATED):
-            env = env.append_transform(SingleAgent() if count == 1 else MultiAgent())
+            env = env.append_transform(view_of(count))
         yield env, string
 
 

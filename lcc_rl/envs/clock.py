@@ -14,7 +14,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from lcc_rl.envs.compiled import compile_settings
-from lcc_rl.envs.single import MultiAgent, SingleAgent
+from lcc_rl.envs.single import VIEWS
 from lcc_rl.envs.step import pieces_of, tick, written
 from lcc_rl.errors import LAST_SEED, ConfigError, require
 from lcc_rl.pieces.base import SEED, STEP, Entry, Key, Piece, StepTransform, as_key, require_option
@@ -270,7 +270,7 @@ class Traffic(TransformedEnv):
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         # TorchRL looks up the shape of every reward here, a twentieth of the time of a step. The
         # shapes of pieces' rewards were checked when the environment was built.
-        own = all(isinstance(x, Piece | SingleAgent | MultiAgent) for x in self.transform)
+        own = all(isinstance(x, Piece | VIEWS) for x in self.transform)
         return next_tensordict_out if own else super()._step_proc_data(next_tensordict_out)
 
     def double(self) -> Traffic:

@@ -16,7 +16,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import RandomPolicy
 
 from lcc_rl.envs.compiled import Compiled
-from lcc_rl.envs.single import MultiAgent, SingleAgent, group_key
+from lcc_rl.envs.single import VIEWS, MultiAgent, SingleAgent, group_key
 from lcc_rl.envs.step import DONE, Step, closure, entries_of, leaf_keys, pieces_of, read_before
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.pieces.base import NEXT, Key, State, as_key, root_key
@@ -234,7 +234,7 @@ def _view(env: TransformedEnv) -> Any:
         ConfigError: if it has other transforms, which a collector of pieces would not apply.
     """
     others = [t for t in env.transform if t not in pieces_of(env)]
-    strange = [type(t).__name__ for t in others if not isinstance(t, SingleAgent | MultiAgent)]
+    strange = [type(t).__name__ for t in others if not isinstance(t, VIEWS)]
     if strange:
         raise ConfigError(
             f"the environment has the transforms {', '.join(strange)}, which StringCollector does "

@@ -19,7 +19,7 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.clock import Clock, Traffic, batch_shape
 from lcc_rl.envs.inputs import build_energy, shared_inputs
-from lcc_rl.envs.single import MultiAgent, SingleAgent
+from lcc_rl.envs.single import view_of
 from lcc_rl.envs.step import Pieces
 from lcc_rl.errors import ConfigError, require, require_known
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
@@ -290,5 +290,4 @@ def make_env(
     count = cfg.scenario.vehicles.count(AUTOMATED)
     if single and count != 1:
         raise ConfigError(f"single=True needs one automated vehicle, the string has {count}")
-    view = SingleAgent if count == 1 else MultiAgent
-    return env.append_transform(view()) if count and single is not False else env
+    return env.append_transform(view_of(count)) if count and single is not False else env

@@ -116,6 +116,14 @@ class MultiAgent(Transform):
         return specs
 
 
+def view_of(vehicles: int) -> SingleAgent | MultiAgent:
+    """Return the view of a number of automated vehicles."""
+    return SingleAgent() if vehicles == 1 else MultiAgent()
+
+
+VIEWS = SingleAgent | MultiAgent
+
+
 def _agents(group: TensorDictBase | Composite) -> Size:
     """Return the size of a group with the dimension of vehicles."""
     return next(iter(group.values(True, True))).shape[: len(group.shape) + 1]
