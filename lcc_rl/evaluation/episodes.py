@@ -19,6 +19,7 @@ from lcc_rl.envs.factory import after_uncounted
 from lcc_rl.envs.inputs import Inputs, build_energy, second_energy
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import require
+from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.metrics import damping_time
 from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.rows import (
@@ -174,7 +175,8 @@ class Episodes:
         steps, rowwise = len(plan) * self.cfg.scenario.horizon, False
         if compiled is None:
             compiled = steps >= COMPILED_STEPS
-            rowwise = not compiled and steps >= ROWWISE_STEPS and device == "cpu"
+            pure = device == "cpu" and not isinstance(strategy.policy, GivenPolicy)  # has a memory
+            rowwise = pure and ROWWISE_STEPS <= steps < COMPILED_STEPS
         env = build_env(
             self.cfg, inputs.evaluation, inputs.population, plan.size, 0, device, nominal=True
         )

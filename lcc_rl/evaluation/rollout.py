@@ -60,7 +60,8 @@ class Player:
         label: name of the strategy in messages.
         compiled: compile the step and the policy; without a compiler the plain step is used, which
             is logged.
-        rowwise: play each episode as a row of numbers, in machine code (:class:`Rowwise`).
+        rowwise: play each episode as a row of numbers, in machine code (:class:`Rowwise`); the
+            policy must be a function of its entries, without a memory of its own.
 
     Raises:
         ConfigError: if a controller takes an action and there is no policy.
@@ -76,6 +77,7 @@ class Player:
         rowwise: bool = False,
     ) -> None:
         self.rowwise = rowwise
+        self.machine: tuple[Rows, Rowwise, State] | None = None  # made at the first play
         self.env, self.policy, self.label, self.horizon = env, policy, label, env.base_env.horizon
         self.pieces = pieces_of(env)
         _check_driven(policy, self.pieces)
@@ -145,11 +147,30 @@ class Player:
 
     def _by_rows(self, state: State) -> tuple[Record, Tensor]:
         """Play the episodes from a state as rows of numbers, in machine code."""
-        read = {*read_before(piece for piece, _ in self.step.pieces), *(self.reads or state)}
-        rows, names = (
-            Rows(state, [key for key in state if key in read]),
-            [*self.checked, TERMINATED],
-        )
+        self.machine = self.machine or self._translated(state)
+        rows, kernel, kinds = self.machine
+        row = rows.packed(state).numpy()
+        width, dtype = kernel.widths[1]
+        record = np.empty((self.horizon, len(row), width), dtype)
+        for step in range(self.horizon):
+            row, record[step] = kernel(row)
+        columns = torch.from_numpy(record).split([x[0].numel() for x in kinds.values()], -1)
+        found = {}
+        for (key, kind), column in zip(kinds.items(), columns, strict=True):
+            value = column.reshape(*column.shape[:2], *kind.shape[1:]).to(kind.dtype)
+            speeds = key[-1] == "speed"  # also before the first step
+            found[key] = torch.cat([state[key].unsqueeze(0), value]) if speeds else value
+        ended = found.pop(TERMINATED)
+        alive = torch.ones_like(ended)
+        alive[1:] = ended[:-1].cumsum(0) == 0
+        return found, alive
+
+    def _translated(self, state: State) -> tuple[Rows, Rowwise, State]:
+        """Return the rows of a state, the step of them, and an example of each entry to keep."""
+        read = {*read_before(piece for piece, _ in self.step.pieces), *self.reads}
+        anything = self.policy is not None and not self.reads
+        rows = Rows(state, [key for key in state if anything or key in read])
+        names = [*self.checked, TERMINATED]
 
         def moments(packed: Tensor) -> State:
             before = rows.entries(packed)
@@ -157,28 +178,14 @@ class Player:
             return {**before, **self.step(before)}
 
         def advance(packed: Tensor) -> tuple[Tensor, Tensor]:
-            after = moments(packed)
-            kept = torch.cat([after[key].flatten(1).to(torch.float32) for key in names], 1)
+            after, dtype = moments(packed), torch.get_default_dtype()
+            kept = torch.cat([after[key].flatten(1).to(dtype) for key in names], 1)
             return rows.packed(after), kept
 
-        first = rows.packed(state)
-        kernel = Rowwise(advance, (first[:1],), "the evaluation")
-        row = first.numpy()
-        record = np.empty((self.horizon, len(row), kernel.widths[1][0]), np.float32)
-        for step in range(self.horizon):
-            row, record[step] = kernel(row)
-        with torch.no_grad():
-            kinds = [moments(first[:1])[key] for key in names]
-        columns = torch.from_numpy(record).split([kind[0].numel() for kind in kinds], -1)
-        found = {}
-        for key, kind, column in zip(names, kinds, columns, strict=True):
-            value = column.reshape(*column.shape[:2], *kind.shape[1:]).to(kind.dtype)
-            speeds = key[-1] == "speed"
-            found[key] = torch.cat([state[key].unsqueeze(0), value]) if speeds else value
-        ended = found.pop(TERMINATED)
-        alive = torch.ones_like(ended)
-        alive[1:] = ended[:-1].cumsum(0) == 0
-        return found, alive
+        example = rows.packed(state)[:1]
+        reached = moments(example)
+        kernel = Rowwise(advance, (example,), "the evaluation")
+        return rows, kernel, {key: reached[key] for key in names}
 
     def _begin(self, given: TensorDictBase) -> State:
         """Return the first state of the episodes."""

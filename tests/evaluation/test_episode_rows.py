@@ -10,6 +10,7 @@ from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.evaluation.episodes import Episodes, Plan, evaluate, pairs
+from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.strategies import Strategy, baseline
 from lcc_rl.functional.driver_models import simulate_follower
 from lcc_rl.functional.power import motor_power
@@ -161,10 +162,19 @@ def test_machine_code_gives_the_same_rows(variant) -> None:
         if variant == "alcc"
         else baseline(cfg, variant)
     )
-    plan = Plan(len(PROFILES), len(POPULATION.time_gap), 5, 64)
+    plan = Plan(len(PROFILES), len(POPULATION.time_gap), 5, 4)
     for rowwise in (False, True):
         played = Episodes(driven, INPUTS, plan, 1, compiled=False)
         played.player.rowwise = rowwise
-        found[rowwise], _ = played.play(0)
-    assert len(found[True]) > 5
+        found[rowwise] = pd.concat(played.play(block)[0] for block in range(2))
+    assert len(found[True]) > 4
     pd.testing.assert_frame_equal(found[False], found[True], rtol=1e-4, atol=1e-4)
+
+
+def test_a_policy_with_a_memory_of_its_own_is_not_played_in_machine_code(monkeypatch) -> None:
+    monkeypatch.setattr("lcc_rl.evaluation.episodes.ROWWISE_STEPS", 1)
+    cfg, plan = strategy("alcc").cfg, Plan(len(PROFILES), len(POPULATION.time_gap), 5, 64)
+    own = build_agent(cfg, POPULATION).policy
+    for policy, rowwise in ((GivenPolicy(own, "mine"), False), (shared_policy(own), True)):
+        played = Episodes(Strategy("mine", cfg, policy), INPUTS, plan, 1)
+        assert played.player.rowwise is rowwise
