@@ -90,7 +90,7 @@ class Measure:
 
     def __post_init__(self) -> None:
         require_known(f"aggregate of {self.key}", self.aggregate, AGGREGATES)
-        require_known(f"bound of {self.key}", self.bound, ("", *SIGNS))
+        require_known(f"bound of {self.key}", [self.bound] if self.bound else (), SIGNS)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -138,7 +138,8 @@ class Measure:
         """Return the heading of a limit, with line breaks."""
         narrow = len(self.unit) < 2
         unit = f" {self.unit}".rstrip() if narrow else f"\n[{self.unit}]"
-        return f"{self.limit or self.label}\n{SIGNS[self.bound]} {self.scale * bound:.4g}{unit}"
+        number = float(f"{self.scale * bound:.4g}")
+        return f"{self.limit or self.label}\n{SIGNS[self.bound]} {number:.10g}{unit}"
 
     @property
     def limited(self) -> str:
