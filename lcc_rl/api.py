@@ -158,9 +158,10 @@ def compare(
     policies = {name: policy for name, _, policy in given if policy is not None}
     others = [(name, one) for name, one, policy in given if policy is None]
     if named:
-        cfg.compare = {name: setting_of(one, f"compare.{name}") for name, one in others}
+        spec: Any = {name: setting_of(one, f"compare.{name}") for name, one in others}
     else:
-        cfg.compare = [setting_of(one) for _, one in others]
+        spec = [setting_of(one) for _, one in others]
+    cfg = cfg.with_(compare=spec)
     if not policies:  # these drive with the settings of the variant's controller
         check_used(cfg, overrides)
     rows = evaluation.run(cfg, target, own=False, quiet=True, policies=policies)

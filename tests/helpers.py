@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Sequence
-from copy import deepcopy
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -97,7 +96,7 @@ def composed(*overrides: str) -> TrainConfig:
 
     All seconds count, so that episodes may be short.
     """
-    return deepcopy(_loaded(("evaluation.warm_up=0", *overrides)))
+    return _loaded(("evaluation.warm_up=0", *overrides))
 
 
 def compose(variant: str = "alcc", *overrides: str) -> TrainConfig:

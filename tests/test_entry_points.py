@@ -177,7 +177,7 @@ def test_a_filtered_policy_stands_beside_the_baselines_asked_for(
     rows = evaluation.run(cfg, tmp_path / "run", quiet=True)
     assert list(rows["strategy"].unique()) == [*beside, "human", "alcc"]
     assert f"{trained} was trained with other drivers: use drivers=… as in" in caplog.text
-    cfg.compare = {"reference": str(trained)}
+    cfg = cfg.with_(compare={"reference": str(trained)})
     with pytest.raises(LccError, match="reference, which stands for 'network, own energy'"):
         evaluation.run(cfg, tmp_path / "named")
 

@@ -20,6 +20,7 @@ from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.envs.single import group_key, view_of
 from lcc_rl.envs.step import pieces_of, written
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces import Handover, Piece
 from lcc_rl.pieces.base import ROLE, TERM, Key, as_key, declared
@@ -54,14 +55,12 @@ def configurations() -> Iterator[StudyConfig]:
         cfg = load("train", [f"variant={path.stem}", string])
         yield cfg
         if cfg.deployed is not None:
-            cfg.scenario.controllers["automated"] = cfg.deployed
-            yield cfg
+            yield deployed(cfg)
     knowledge = ["+knowledge=[memory,preview]", "scenario.pieces.memory.kind=stacked"]
     cfg = load("train", ["variant=alcc", SIZES, "+filter=cbf", "+faults=all", *knowledge])
     yield cfg
     for drawn_or_single in ({"size": 6, "penetration": 0.34}, "automated human*4"):
-        cfg.scenario.string = drawn_or_single
-        yield cfg
+        yield cfg.with_(scenario={"string": drawn_or_single})
     human = "scenario.controllers.human"
     late = [f"controller@{human}=ovm", f"{human}.delay=4"]
     late += [f"{human}.{noise}_noise=0.3" for noise in ("acceleration", "gap")]

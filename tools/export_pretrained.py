@@ -32,12 +32,11 @@ def export(run: str | Path, origin: str, folder: Path = FOLDER, name: str | None
         name: name of the file, without suffix; None: the variant's.
     """
     weights, cfg = load_policy(run)
-    for key in LOCAL:
-        setattr(cfg, key, None)
-    cfg.inputs = {
+    inputs = {
         kind: {Path(file).name: found for file, found in files.items()}
         for kind, files in cfg.inputs.items()
     }
+    cfg = cfg.with_(**dict.fromkeys(LOCAL), inputs=inputs)
     path = folder / f"{name or cfg.variant}.pt"
     provenance = f"{origin}; lcc_rl {version('lcc_rl')}"
     content = {"weights": weights, "config": as_text(cfg), "provenance": provenance}

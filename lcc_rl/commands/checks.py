@@ -60,8 +60,8 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
         require_memory(training_bytes(cfg, env.reset()), cfg.device)
         check_lengths(cfg)
         agent = build_agent(cfg, population, cfg.device)
-        trial.training.environments, trial.training.episodes = 2, 2
-        make_trainer(trial, agent, profiles, population, folder)
+        small = trial.with_(training={"environments": 2, "episodes": 2})
+        make_trainer(small, agent, profiles, population, folder)
 
 
 def check_evaluation(cfg: StudyConfig, inputs: Inputs) -> None:

@@ -172,7 +172,7 @@ def main(arguments: list[str]) -> int:
     check_overrides(overrides, SET_BY_BOUND, "the controller is that of --policy")
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
     cfg = load("evaluate", ["variant=alcc", *overrides])
-    cfg.evaluation.drivers = cfg.evaluation.drivers or DRIVER_COUNT
+    cfg = cfg.with_(evaluation={"drivers": cfg.evaluation.drivers or DRIVER_COUNT})
     require(cfg.device == "cpu", "lcc-rl clairvoyant runs on device=cpu")
     folder = own_folder(options.out, "--out", {PROGRESS}.issuperset)
     prepare_torch(cfg)

@@ -97,7 +97,7 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
     with claim(folder):
         if cfg.resume is None:
             trainings, final = composed_part(cfg, overrides)
-            cfg.variants = list(trainings)
+            cfg = cfg.with_(variants=list(trainings))
             check_folder(cfg, folder)
             command = shlex.join(["lcc-rl", "run", *overrides])
         elif (folder / COMMAND_FILE).is_file():
@@ -136,12 +136,10 @@ def composed_part(
     if cfg.variants is None and trainings[names[-1]].agent.kind is Analytic:
         trainings = {RULE: load("train", [*learned, f"variant={RULE}"]), **trainings}
     final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={names[-1]}"])
-    for part in (*trainings.values(), final):
-        part.data = cfg.data
+    trainings = {name: part.with_(data=cfg.data) for name, part in trainings.items()}
     # It reads the policies of these trainings, with classes of the same command.
     own = (module for part in trainings.values() for module in own_modules(part))
-    final.trust = list(dict.fromkeys([*final.trust, *own]))
-    return trainings, final
+    return trainings, final.with_(data=cfg.data, trust=list(dict.fromkeys([*final.trust, *own])))
 
 
 def _run(
@@ -154,18 +152,17 @@ def _run(
     show_headline(f"lcc_rl {__version__}: data, drivers, policies, results into {folder}")
     read_once(cfg, folder)
     drivers = calibrate_once(cfg, folder)
-    for part in (*trainings.values(), final):
-        part.data = _episodes(cfg, folder)
-        part.drivers = Node.of({TARGET: path_of(bootstrap), "path": str(drivers)}, "drivers")
+    population = Node.of({TARGET: path_of(bootstrap), "path": str(drivers)}, "drivers")
+    traffic = {"data": _episodes(cfg, folder), "drivers": population}
+    trainings = {name: part.with_(**traffic) for name, part in trainings.items()}
     show_headline(f"training {', '.join(trainings)}, {cfg.jobs} at a time; details in */train.log")
     try:
         train_all(trainings, folder, cfg.jobs)
     except Interrupted:
         words = f"stopped; complete it with: lcc-rl run resume={folder}{trust_option(final)}"
         raise Interrupted(words) from None
-    final.compare = [
-        str(folder / name) for name in trainings if (folder / name / "policy.pt").exists()
-    ]
+    learned = [name for name in trainings if (folder / name / "policy.pt").exists()]
+    final = final.with_(**traffic, compare=[str(folder / name) for name in learned])
     show_headline("evaluating them and the baselines on held-out windows")
     paged = final.evaluation.rows == "episodes"
     rows = evaluation.run(final, folder / FINAL, own=False, quiet=paged)
@@ -289,7 +286,7 @@ def _train_one(cfg: TrainConfig, folder: str) -> None:
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
     if (target / "checkpoint.pt").exists():
-        cfg.resume = folder
+        cfg = cfg.with_(resume=folder)
     handler = logging.FileHandler(target / "train.log", encoding="utf-8")
     handler.setFormatter(logging.Formatter("[%(asctime)s][%(levelname)s] %(message)s"))
     root = logging.getLogger()

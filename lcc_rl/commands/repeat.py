@@ -51,7 +51,7 @@ def repeat(folder: Path, target: Path, trust: Sequence[str] = ()) -> None:
     if isinstance(cfg, CalibrateConfig):
         calibration.run(cfg, target)
         return
-    cfg.resume = str(target)
+    cfg = cfg.with_(resume=str(target))
     if isinstance(cfg, PipelineConfig):
         shutil.copytree(folder / PARTS, target / PARTS)
         pipeline.run(cfg, target, [])

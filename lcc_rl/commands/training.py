@@ -90,9 +90,7 @@ def _resumed(cfg: TrainConfig, folder: Path) -> TrainConfig:
                 f"{folder}: {table} without {CHECKPOINT} cannot be resumed; lcc-rl repeat {folder} "
                 "begins again in a new folder"
             )
-    if not isinstance(build_logger(cfg), Silent):
-        own.logger = cfg.logger
-    return own
+    return own if isinstance(build_logger(cfg), Silent) else own.with_(logger=cfg.logger)
 
 
 def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
@@ -109,7 +107,7 @@ def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
         strategy = rule(cfg)
         log.info("%s has no agent: evaluating it", strategy.name)
     elif cfg.policy is not None:
-        strategy = _given(cfg, inputs, folder)
+        cfg, strategy = _given(cfg, inputs, folder)
     else:
         agent = build_agent(cfg, inputs.population, cfg.device)
         _train(cfg, agent, inputs, folder, resume)
@@ -120,8 +118,8 @@ def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
     return rows
 
 
-def _given(cfg: TrainConfig, inputs: Inputs, folder: Path) -> Strategy:
-    """Build the strategy of a variant that uses a trained policy."""
+def _given(cfg: TrainConfig, inputs: Inputs, folder: Path) -> tuple[TrainConfig, Strategy]:
+    """Return the configuration and strategy of a variant that uses a trained policy."""
     if cfg.deployed is None:
         raise ConfigError(
             f"policy={cfg.policy}: variant {cfg.variant} uses no trained policy; remove it, "
@@ -129,11 +127,11 @@ def _given(cfg: TrainConfig, inputs: Inputs, folder: Path) -> Strategy:
         )
     weights, own = load_policy(str(cfg.policy), cfg.variant, cfg.trust)
     check_policy(cfg, own)
-    cfg.agent = own.agent
+    cfg = cfg.with_(agent=own.agent)
     save_config(cfg, folder)
     save_policy(weights, cfg, folder / POLICY)
     strategy = with_weights(cfg, weights, own.seed, str(cfg.policy), inputs.population)
-    return Strategy(cfg.variant, deployed(cfg), strategy.policy, own.seed)
+    return cfg, Strategy(cfg.variant, deployed(cfg), strategy.policy, own.seed)
 
 
 def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume: bool) -> None:

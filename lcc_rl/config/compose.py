@@ -234,9 +234,8 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
 
 
 def with_inputs(cfg: Any) -> Any:
-    """Record the present hashes of input files in a configuration; return it."""
-    cfg.inputs = inputs_of(as_plain(cfg))
-    return cfg
+    """Return a configuration with the present hashes of its input files."""
+    return cfg.with_(inputs=inputs_of(as_plain(cfg)))
 
 
 def _learns(content: Mapping[str, Any]) -> bool:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from functools import partial
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, Self
 
 import yaml
 from pydantic import AfterValidator, Field
@@ -29,6 +31,7 @@ from lcc_rl.settings import (
     Speed,
     load_module,
     parse,
+    values,
 )
 
 log = logging.getLogger("lcc_rl")
@@ -46,14 +49,14 @@ def _described(node: Any) -> Any:
     return node
 
 
-def _all_described(nodes: dict[str, Any]) -> dict[str, Any]:
+def _all_described(nodes: dict[str, Any]) -> Mapping[str, Any]:
     for name, node in nodes.items():
         if isinstance(node, Mapping):
             known = ", ".join(key for key in nodes if key != name)
             raise ValueError(f"unknown name {name!r}, which has no {TARGET}; valid: {known}")
         if node is not None and not isinstance(node, Node):
             raise ValueError(f"{name}: expected a node with {TARGET} or null, got {node!r}")
-    return nodes
+    return MappingProxyType(nodes)
 
 
 Described = Annotated[Any, AfterValidator(_described)]  # a node or None
@@ -61,7 +64,51 @@ Nodes = Annotated[dict[str, Any], AfterValidator(_all_described)]
 AUTO = "scenario.controllers.automated"
 
 
-class ScenarioConfig(Settings):
+class Section(Settings):
+    """Base of a configuration and of its sections, none of which changes."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"a configuration does not change; use with_({name}=…)")
+
+    def __deepcopy__(self, memo: Any) -> Self:
+        return self
+
+    def __reduce__(self) -> Any:  # constructed anew in another process
+        plain = {key: dict(x) if _is_nodes(x) else x for key, x in values(self).items()}
+        return partial(type(self), **plain), ()
+
+    def with_(self, **changes: Any) -> Self:
+        """Return the configuration with other settings.
+
+        Args:
+            changes: new values by name; the changes of a section, and of a mapping of nodes, as a
+                mapping, in which None leaves a node out.
+
+        Raises:
+            ConfigError: naming the first unknown or wrong setting.
+
+        Examples:
+            >>> cfg.with_(seed=3, scenario={"filters": {"automated": None}})  # doctest: +SKIP
+        """
+        known = values(self)
+        found = {key: _changed(known.get(key), value) for key, value in changes.items()}
+        return type(self)(**{**known, **found})
+
+
+def _is_nodes(value: Any) -> bool:
+    return isinstance(value, MappingProxyType)
+
+
+def _changed(value: Any, change: Any) -> Any:
+    """Return a value of a configuration after a change, see :meth:`Section.with_`."""
+    if isinstance(value, Section) and isinstance(change, Mapping):
+        return value.with_(**change)
+    if not _is_nodes(value):
+        return change
+    return {key: node for key, node in {**value, **change}.items() if node is not None}
+
+
+class ScenarioConfig(Section):
     """A scenario: clock, string of vehicles and pieces."""
 
     name: str
@@ -92,7 +139,7 @@ class ScenarioConfig(Settings):
         return parse_string(self.string, self.road)
 
 
-class RewardConfig(Settings):
+class RewardConfig(Section):
     """The reward: named terms."""
 
     terms: Nodes
@@ -102,7 +149,7 @@ class RewardConfig(Settings):
             raise ConfigError(f"reward.terms.{name} is null; ~reward.terms.{name} leaves it out")
 
 
-class TrainingConfig(Settings):
+class TrainingConfig(Section):
     """Length and checkpoints of a training; settings of the algorithm belong to the agent."""
 
     episodes: Count
@@ -116,13 +163,13 @@ class TrainingConfig(Settings):
 
     def validate(self) -> None:
         size, wanted = self.environments, self.episodes
-        self.episodes = -(-wanted // size) * size
+        vars(self).update(episodes=-(-wanted // size) * size)
         if self.episodes > wanted:
             text = "training.episodes=%d is rounded up to %d, whole batches of %d environments"
             log.warning(text, wanted, self.episodes, size)
 
 
-class EvaluationConfig(Settings):
+class EvaluationConfig(Section):
     """Size of an evaluation, and the subject of its rows: an episode or a vehicle."""
 
     rows: Literal["episodes", "vehicles"]
@@ -154,7 +201,7 @@ class EvaluationConfig(Settings):
             raise ConfigError("evaluation.warm_up needs evaluation.rows=episodes")
 
 
-class BaseConfig(Settings):
+class BaseConfig(Section):
     """Settings that all commands share."""
 
     seed: Seed
@@ -204,10 +251,6 @@ class StudyConfig(BaseConfig):
         for module in self.measures:
             load_module(module, "measures")
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)  # in another process, which lacks the modules
-        self.validate()
-
 
 class TrainConfig(StudyConfig):
     """``lcc-rl train``."""
@@ -236,7 +279,7 @@ KINDS: dict[str, type[BaseConfig]] = {
     "pipeline": PipelineConfig,
     "calibrate": CalibrateConfig,
 }
-SECTIONS: dict[str, type[Settings]] = {
+SECTIONS: dict[str, type[Section]] = {
     "scenario": ScenarioConfig,
     "reward": RewardConfig,
     "training": TrainingConfig,

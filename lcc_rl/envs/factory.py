@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -120,15 +119,14 @@ def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
         return cfg
     require(cfg.scenario.road == RING, "humans_first needs a ring: a leader's record would end")
     steps = World(time_step=cfg.scenario.time_step).steps(seconds, "humans_first")
-    cfg = deepcopy(cfg)
-    drivers, filters = cfg.scenario.controllers, cfg.scenario.filters
+    drivers, held = cfg.scenario.controllers, cfg.scenario.filters.get(AUTOMATED)
+    changes: dict[str, Any] = {"horizon": cfg.scenario.horizon + steps}
     if drivers[AUTOMATED] != drivers[HUMAN]:
         both = {"before": drivers[HUMAN], "after": drivers[AUTOMATED], "from_s": seconds}
-        drivers[AUTOMATED] = Node.of({TARGET: path_of(Handover), **both}, AUTO)
-    if filters.get(AUTOMATED) is not None:
-        filters[AUTOMATED] = filters[AUTOMATED].changed(from_s=seconds)
-    cfg.scenario.horizon += steps
-    return cfg
+        changes["controllers"] = {AUTOMATED: Node.of({TARGET: path_of(Handover), **both}, AUTO)}
+    if held is not None:
+        changes["filters"] = {AUTOMATED: held.changed(from_s=seconds)}
+    return cfg.with_(scenario=changes)
 
 
 def after_uncounted(cfg: StudyConfig) -> tuple[StudyConfig, int, int]:

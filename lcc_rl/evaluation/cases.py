@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -81,11 +81,10 @@ def check_cases(cfg: StudyConfig, inputs: Inputs) -> None:
 
 def of_case(cfg: StudyConfig, case: Case) -> StudyConfig:
     """Return the configuration of a case; a platoon has the case's number of vehicles."""
-    cfg = deepcopy(cfg)
-    cfg.scenario.horizon = case.horizon
+    changes: dict[str, Any] = {"horizon": case.horizon}
     if set(cfg.scenario.vehicles.names) == {AUTOMATED}:
-        cfg.scenario.string = f"{AUTOMATED}*{case.followers}"
-    return cfg
+        changes["string"] = f"{AUTOMATED}*{case.followers}"
+    return cfg.with_(scenario=changes)
 
 
 def drive_runs(

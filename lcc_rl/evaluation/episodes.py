@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -282,8 +281,7 @@ def evaluate(
 
 def any_leader(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration in which the leader may play any record."""
-    cfg = deepcopy(cfg)
     leader = cfg.scenario.pieces.get("leader")
-    if leader is not None and "profile" in leader.settings:
-        cfg.scenario.pieces["leader"] = leader.changed(profile=None)
-    return cfg
+    if leader is None or leader.settings.get("profile") is None:
+        return cfg
+    return cfg.with_(scenario={"pieces": {"leader": leader.changed(profile=None)}})

@@ -11,7 +11,6 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -83,10 +82,7 @@ def deployed(cfg: StudyConfig) -> StudyConfig:
 
 def driven_by(cfg: StudyConfig, controller: Node) -> StudyConfig:
     """Return a configuration with another controller of the automated vehicles."""
-    cfg = deepcopy(cfg)
-    cfg.scenario.controllers[AUTOMATED] = controller
-    cfg.deployed = None
-    return cfg
+    return cfg.with_(deployed=None, scenario={"controllers": {AUTOMATED: controller}})
 
 
 def baselines(cfg: StudyConfig, further: Mapping[str, Any] | None = None) -> list[Strategy]:
@@ -124,8 +120,7 @@ def baseline(cfg: StudyConfig, name: str, spec: Any = None) -> Strategy:
     if name == RECORDED:
         cfg = by_people(driven_by(cfg, controller_of(name)))
         start = Node.of({TARGET: path_of(TimeGapStart)}, f"scenario.start.{AUTOMATED}")
-        cfg.scenario.start[AUTOMATED] = start
-        return Strategy(name, cfg)
+        return Strategy(name, cfg.with_(scenario={"start": {AUTOMATED: start}}))
     kept = cfg.scenario.filters.get(AUTOMATED)
     named = any(str(word).endswith(FILTERED) for word in (name, spec))
     words = f"{name} needs the safety filter, but there is none (+filter=cbf adds one)"
@@ -136,7 +131,8 @@ def baseline(cfg: StudyConfig, name: str, spec: Any = None) -> Strategy:
         return Strategy(name, driven_by(cfg, controller))
     if cfg.variant == name and _kind(cfg) is controller.kind:
         return Strategy(name, cfg)
-    return Strategy(name, without_filter(driven_by(cfg, controller)))
+    alone = driven_by(cfg, controller).with_(scenario={"filters": {AUTOMATED: None}})
+    return Strategy(name, alone)
 
 
 def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[Strategy]:
@@ -146,8 +142,7 @@ def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[St
     if own is None:
         return []
     names = {one.name for one in strategies}
-    cfg = deepcopy(cfg)
-    cfg.scenario.filters[AUTOMATED] = own
+    cfg = cfg.with_(scenario={"filters": {AUTOMATED: own}})
     return [baseline(cfg, name) for name in cfg.evaluation.behind_filter if name not in names]
 
 
@@ -167,35 +162,22 @@ def front_of(strategies: Sequence[Strategy], time_gaps: Sequence[float]) -> list
     found = []
     for one in behind:
         for time_gap in time_gaps if one.policy is not None or one.name == rule else ():
-            cfg = deepcopy(one.cfg)
-            cfg.scenario.filters[AUTOMATED] = cfg.scenario.filters[AUTOMATED].changed(
-                time_gap=time_gap
-            )
+            other = one.cfg.scenario.filters[AUTOMATED].changed(time_gap=time_gap)
+            cfg = one.cfg.with_(scenario={"filters": {AUTOMATED: other}})
             found.append(replace(one, name=f"{one.name}{ON_FRONT}{time_gap:g}", cfg=cfg))
     return found
 
 
-def without_filter(cfg: StudyConfig) -> StudyConfig:
-    """Return a configuration without a safety filter of the automated vehicles."""
-    cfg = deepcopy(cfg)
-    cfg.scenario.filters.pop(AUTOMATED, None)
-    return cfg
-
-
 def by_people(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration without filter, actuators and sensors of the automated vehicles."""
-    cfg = without_filter(cfg)
-    for group in (cfg.scenario.actuators, cfg.scenario.sensors):
-        group.pop(AUTOMATED, None)
-    return cfg
+    groups = ("filters", "actuators", "sensors")
+    return cfg.with_(scenario={group: {AUTOMATED: None} for group in groups})
 
 
 def without_automated(cfg: StudyConfig) -> StudyConfig:
     """Return a configuration without automated vehicles."""
     roles = [role for role in cfg.scenario.vehicles.roles if role != AUTOMATED]
-    cfg = deepcopy(cfg)
-    cfg.scenario.string = " ".join(roles)
-    return cfg
+    return cfg.with_(scenario={"string": " ".join(roles)})
 
 
 def rule(cfg: StudyConfig) -> Strategy:
@@ -261,15 +243,14 @@ def studied(
 
 def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
     """Return the scenario under study with the agent of ``own``, and its filter if it has none."""
-    cfg = deepcopy(cfg)
-    cfg.agent = own.agent
+    changes: dict[str, Any] = {"agent": own.agent}
     seen = own.observation.made(Piece)
     if isinstance(seen, Observation) and seen.shows_presence(own.scenario.vehicles):
-        cfg.observation = cfg.observation.changed(presence=True)
+        changes["observation"] = cfg.observation.changed(presence=True)
     if cfg.scenario.filters.get(AUTOMATED) is None and own.scenario.filters.get(AUTOMATED):
         log.info("the policy of variant %s keeps the filter of its training", own.variant)
-        cfg.scenario.filters[AUTOMATED] = own.scenario.filters[AUTOMATED]
-    return cfg
+        changes["scenario"] = {"filters": {AUTOMATED: own.scenario.filters[AUTOMATED]}}
+    return cfg.with_(**changes)
 
 
 def hybrids(strategy: Strategy) -> list[Strategy]:
@@ -301,13 +282,18 @@ def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Popu
     """
     weights, own = policy
     check_scenario(path, own, cfg)
-    other = _of_training(replace(cfg, observation=own.observation), own)
-    other.variant = own.variant
-    other.deployed = own.deployed
-    other.scenario.controllers[AUTOMATED] = own.scenario.controllers[AUTOMATED]
-    for name, node in own.scenario.pieces.items():
-        if name in KNOWLEDGE or name not in other.scenario.pieces:
-            other.scenario.pieces[name] = node
+    other = _of_training(cfg.with_(observation=own.observation), own)
+    pieces = {
+        name: node
+        for name, node in own.scenario.pieces.items()
+        if name in KNOWLEDGE or name not in other.scenario.pieces
+    }
+    driver = {AUTOMATED: own.scenario.controllers[AUTOMATED]}
+    other = other.with_(
+        variant=own.variant,
+        deployed=own.deployed,
+        scenario={"controllers": driver, "pieces": pieces},
+    )
     check_action(path, own, other)
     strategy = with_weights(other, weights, own.seed, path, population)
     return replace(strategy, cfg=deployed(other), own=own)

@@ -112,16 +112,19 @@ def ring_of(policy: str | Path, trust: Sequence[str], overrides: Sequence[str]) 
     own, given = load_policy(policy, trust=trust)[1], [key_of(item) for item in overrides]
     if own.scenario.road != RING:
         return cfg
-    for name in OF_RING:
-        value = getattr(own.scenario, name)
-        if value != {} and not any(key.startswith(f"scenario.{name}") for key in given):
-            setattr(cfg.scenario, name, value)
+    ring = {
+        name: getattr(own.scenario, name)
+        for name in OF_RING
+        if getattr(own.scenario, name) != {}
+        and not any(key.startswith(f"scenario.{name}") for key in given)
+    }
+    changes: dict[str, Any] = {}
     if own.drivers is not None and not any(x in key for x in OF_DRIVERS for key in given):
-        cfg.drivers = own.drivers
-        cfg.scenario.controllers[HUMAN] = own.scenario.controllers[HUMAN]
+        changes["drivers"] = own.drivers
+        ring["controllers"] = {HUMAN: own.scenario.controllers[HUMAN]}
     if own.energy is not None and "energy" not in map(top_key, given):
-        cfg.energy = own.energy
-    return cfg
+        changes["energy"] = own.energy
+    return cfg.with_(scenario=ring, **changes)
 
 
 def _human(cfg: StudyConfig) -> dict[str, Any] | None:

@@ -52,9 +52,8 @@ class Scaled(Controller):
 
 def test_a_rule_whose_actions_have_an_unknown_scale_is_refused() -> None:
     cfg = tiny("train", "variant=alcc", "agent=analytic", "agent.policy=idm", agent=False)
-    cfg.scenario.controllers["automated"] = Node.of(
-        {"_target_": f"{__name__}.Scaled", "scale": 2.0}, "automated"
-    )
+    node = Node.of({"_target_": f"{__name__}.Scaled", "scale": 2.0}, "automated")
+    cfg = cfg.with_(scenario={"controllers": {"automated": node}})
     with pytest.raises(ConfigError, match="needs the acceleration of action 1"):
         make_agent(cfg)
 

@@ -107,7 +107,8 @@ GRADIENT = {
 def train_without_data(words: list[str], folder: Path) -> None:
     cfg = load("train", [*NO_AGENT, "variant=alcc", *words])
     if not any(word.startswith("data.") for word in words):
-        cfg.data = load("train", ["data=episodes", "data.path=nowhere.parquet"]).data
+        other = load("train", ["data=episodes", "data.path=nowhere.parquet"])
+        cfg = cfg.with_(data=other.data)
     training.run(cfg, folder, quiet=True)
 
 

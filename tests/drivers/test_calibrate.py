@@ -2,7 +2,6 @@
 
 import io
 from contextlib import chdir
-from copy import deepcopy
 from functools import partial
 
 import pandas as pd
@@ -59,7 +58,8 @@ def test_run_writes_table_and_figures_and_says_what_it_did(cfg, tmp_path):
 @pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize("model", slow_but(["gipps"], list(LAWS)))
 def test_every_model_is_calibrated_and_drives_again(cfg, tmp_path, model):
-    cfg.calibration = cfg.calibration.changed(model=model, objective="both", holdout=0.3)
+    changes = {"model": model, "objective": "both", "holdout": 0.3}
+    cfg = cfg.with_(calibration=cfg.calibration.changed(**changes))
     out = io.StringIO()
     calibration.run(cfg, tmp_path / "run", Console(file=out, width=100))
     for text in ("held out: RMSPE", "gap NRMSE [%], held out", "time gap [s]"):
@@ -77,8 +77,7 @@ def test_bad_input_ends_in_an_error_that_names_it(cfg, tmp_path):
         node, own = getattr(cfg, entry), {last: value}
         for part in path:
             own = {part: node.settings[part] | own}
-        changed = deepcopy(cfg)
-        setattr(changed, entry, node.changed(**own))
+        changed = cfg.with_(**{entry: node.changed(**own)})
         calibration.run(changed, tmp_path / "run", Console(file=io.StringIO()))
 
     cases = [
@@ -121,7 +120,7 @@ def test_drivers_keep_the_names_of_the_data(cfg, tmp_path):
     columns = "{vehicle: id, time: t, speed: v, leader: ahead, gap: gap}"
     path = f"data.path={tmp_path / 'named.csv'}"
     named = load("calibrate", ["data=table", path, f"data.columns={columns}"])
-    cfg.data, cfg.calibration = named.data, cfg.calibration.changed(modes=["local"])
+    cfg = cfg.with_(data=named.data, calibration=cfg.calibration.changed(modes=["local"]))
     calibration.run(cfg, tmp_path / "run", Console(file=io.StringIO()))
     drivers = pd.read_parquet(tmp_path / "run" / "drivers.parquet")
     assert drivers["follower"].tolist() == ["BMW", "Ford"]
@@ -141,7 +140,7 @@ def test_the_report_counts_records_and_drivers(cfg, source, tmp_path):
     table["gap_m"] = table["gap_m"].where(table.index != 438)  # a blank cell in the middle of one
     table.to_parquet(path)
     out, lines = io.StringIO(), []
-    cfg.calibration = cfg.calibration.changed(modes=["local"])
+    cfg = cfg.with_(calibration=cfg.calibration.changed(modes=["local"]))
     emit = lines.extend
     drivers = calibration.run(cfg, tmp_path / "run", Console(file=out, width=100), emit)
     assert len(drivers) == 4

@@ -37,8 +37,9 @@ def test_a_training_takes_over_where_humans_are(tmp_path) -> None:
     source = trainer._source()
     trainer.env.set_seed(3)
     begun = source.skip(source.start(), trainer.agent.burn_in)
-    cfg.scenario.controllers["automated"] = cfg.scenario.controllers["human"]
-    cfg.scenario.filters, cfg.scenario.horizon = {}, 200
+    driver = {"automated": cfg.scenario.controllers["human"]}
+    changes = {"controllers": driver, "filters": {"automated": None}, "horizon": 200}
+    cfg = cfg.with_(scenario=changes)
     people = build_env(cfg, inputs.training, inputs.population, 3, 3)
     reached = people.rollout(200)["next"]
     for key in MOTION:

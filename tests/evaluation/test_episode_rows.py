@@ -1,5 +1,7 @@
 """Evaluation by episodes: paired, independent of the batch, and equal to a plain simulation."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -140,7 +142,8 @@ def test_a_learned_policy_has_the_mean_of_each_reward_term_and_other_rows_none()
     driven = Strategy("alcc", cfg, shared_policy(build_agent(cfg, POPULATION).policy), 0)
     plain, _ = evaluate(driven, INPUTS, 5, 64, 1)
     assert not plain.columns.str.contains("mean_term").any()  # the setting is off
-    cfg.evaluation.terms = True
+    cfg = cfg.with_(evaluation={"terms": True})
+    driven = replace(driven, cfg=cfg)
     rows, _ = evaluate(driven, INPUTS, 5, 64, 1)
     pd.testing.assert_frame_equal(rows[plain.columns], plain, check_exact=True)
     for name in cfg.reward.terms:

@@ -94,8 +94,7 @@ def test_policies_of_one_training_are_named_by_their_files_and_one_file_is_refus
 
 
 def test_a_policy_of_other_settings_is_refused() -> None:
-    cfg = compose("alcc")
-    cfg.policy = "p.pt"
+    cfg = compose("alcc").with_(policy="p.pt")
     check_policy(cfg, compose("alcc"))
     cases = [
         ("reference", "was trained as variant reference"),

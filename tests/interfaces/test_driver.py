@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from time import perf_counter
@@ -39,7 +40,8 @@ def driven(driver: str) -> tuple[dict[str, np.ndarray], np.ndarray]:
     cfg = load("evaluate", words)
     if driver.startswith("pretrained"):
         strategy = trained(cfg, driver, load_policy(driver), POPULATION)
-        strategy.cfg.scenario.filters = strategy.own.scenario.filters
+        filters = {"automated": None, **strategy.own.scenario.filters}
+        strategy = replace(strategy, cfg=strategy.cfg.with_(scenario={"filters": filters}))
     else:
         strategy = baseline(cfg, driver)
     env = build_env(strategy.cfg, wavy_profiles(), POPULATION, CARS, nominal=True)

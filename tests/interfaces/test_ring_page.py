@@ -106,13 +106,14 @@ def driven(
     cfg, actor = load("evaluate", [*RING_TASK, *settings, *more]), None
     human, inputs = cfg.scenario.controllers["human"], load_inputs(cfg)
     human = human.changed(wiener=LOUDER * human.made().wiener)
-    cfg.scenario.controllers["human"] = human
+    cfg = cfg.with_(scenario={"controllers": {"human": human}})
     if driver == "network":
         weights, own = load_policy(policy)
-        own.scenario.name = cfg.scenario.name  # one was trained on an open road
+        own = own.with_(scenario={"name": cfg.scenario.name})  # one of an open road
         strategy = trained(cfg, policy, (weights, own), inputs.population)
         cfg, actor = strategy.cfg, strategy.policy
-        cfg.scenario.filters = own.scenario.filters
+        filters = {"automated": None, **own.scenario.filters}
+        cfg = cfg.with_(scenario={"filters": filters})
     else:
         after = human if driver == "human" else controller_of(driver)
         both = {"before": human, "after": after, "from_s": 0.1 * start}

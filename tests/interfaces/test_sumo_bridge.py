@@ -49,16 +49,16 @@ def leader_speed() -> Tensor:
 def own_motion(driver: str) -> tuple[Tensor, Tensor]:
     """Return speeds and gaps, ``[time + 1, 2]``, in this package's environment."""
     cfg = load("evaluate", ["variant=alcc", "task=i24-follow5", f"scenario.horizon={STEPS}"])
-    cfg.scenario.string = "automated human"
-    cfg.scenario.controllers["human"] = Node.of(HUMAN, "human")
+    drivers = {"human": Node.of(HUMAN, "human")}
+    cfg = cfg.with_(scenario={"string": "automated human", "controllers": drivers})
     policy: Any = None
     if driver.startswith("pretrained"):
         weights, own = load_policy(driver)
         policy = with_weights(own, weights, own.seed, driver, bootstrap()).policy
-        cfg.observation = own.observation
+        cfg = cfg.with_(observation=own.observation)
     else:
-        cfg.scenario.controllers["automated"] = controller_of(driver)
-        cfg.scenario.filters = {}
+        drivers = {"automated": controller_of(driver)}
+        cfg = cfg.with_(scenario={"controllers": drivers, "filters": {"automated": None}})
     profiles = from_records([leader_speed()], ["wave"], ["wave"], STEP)
     env = build_env(cfg, profiles, bootstrap(), 1, nominal=True)
     keys = [("vehicles", "speed"), ("vehicles", "gap")]

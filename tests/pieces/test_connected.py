@@ -76,7 +76,7 @@ def test_cacc_closes_its_gaps() -> None:
     steady = leader(torch.full((401,), 10.0))
     cfg = composed("variant=cacc", "scenario.horizon=400")
     node = cfg.scenario.pieces["leader"].changed(perturbation=0.0)
-    cfg.scenario.pieces["leader"] = node
+    cfg = cfg.with_(scenario={"pieces": {"leader": node}})
     env = build_env(cfg, steady, POPULATION, 4)
     td = env.reset()
     assert (td["vehicles", "gap"] - 5.0).abs().max() > 0.5

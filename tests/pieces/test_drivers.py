@@ -91,7 +91,7 @@ def test_a_delay_makes_a_string_less_stable() -> None:
     for delay in (0, 8):
         cfg = compose("direct", *base, *one, f"scenario.controllers.human.delay={delay}")
         node = cfg.scenario.pieces["leader"].changed(start="first")
-        cfg.scenario.pieces["leader"] = node
+        cfg = cfg.with_(scenario={"pieces": {"leader": node}})
         speed = rolled(cfg, profiles, steps=500, batch=1)["next", "vehicles", "speed"]
         lowest.append(float(speed[..., -1, :].min()))
     assert lowest[1] < lowest[0] - 0.3

@@ -25,7 +25,7 @@ def drive(*overrides: str):
     """Play 20 steps behind two leaders from a chosen sample."""
     cfg = compose("idm", "controller@scenario.controllers.automated=recorded", *overrides)
     node = cfg.scenario.pieces["leader"].changed(start="first")
-    cfg.scenario.pieces["leader"] = node
+    cfg = cfg.with_(scenario={"pieces": {"leader": node}})
     profiles = followed_profiles()
     env = build_env(cfg, profiles, POPULATION, 4, 0, nominal=True)
     return env.rollout(20, break_when_any_done=False), profiles
@@ -51,8 +51,7 @@ def test_a_speedometer_that_errs_leads_nobody_away() -> None:
         "scenario.start.automated={_target_: lcc_rl.pieces.TimeGapStart}",
     )
     node = cfg.scenario.pieces["leader"].changed(start="first")
-    cfg.scenario.pieces["leader"] = node
-    cfg.scenario.horizon = 250
+    cfg = cfg.with_(scenario={"pieces": {"leader": node}, "horizon": 250})
     data = build_env(cfg, biased, POPULATION, 4, 0, nominal=True).rollout(250)
     for episode in range(4):
         recorded = biased.follower(int(data["leader", "profile"][episode, 0]))[:250, 1]
@@ -81,7 +80,7 @@ def test_the_strategy_starts_and_drives_as_recorded() -> None:
     assert applies(cfg, "recorded")
     assert not applies(composed("variant=idm", "scenario.string=human automated"), "recorded")
     assert not applies(composed("variant=reference", "scenario=ring"), "recorded")
-    cfg.evaluation.baselines = ["direct", "recorded"]
+    cfg = cfg.with_(evaluation={"baselines": ["direct", "recorded"]})
     assert [one.name for one in baselines(cfg)] == ["direct", "recorded"]
 
 
@@ -166,7 +165,7 @@ def test_a_recorded_driver_that_cannot_be_played_is_never_silent(words, message,
     cfg = load("evaluate", ["variant=idm", "compare=[recorded]", *words, *small])
     with pytest.raises(ConfigError, match=message):
         strategies_of(cfg)
-    cfg.compare, cfg.evaluation.baselines = [], ["idm", "recorded"]
+    cfg = cfg.with_(compare=[], evaluation={"baselines": ["idm", "recorded"]})
     with caplog.at_level(logging.WARNING, logger="lcc_rl"):
         assert "recorded" not in [one.name for one in strategies_of(cfg)[0]]
     assert "recorded is left out: no driver was recorded behind these leaders" in caplog.text

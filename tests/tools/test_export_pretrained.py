@@ -12,7 +12,7 @@ from lcc_rl.results.policies import save_policy
 
 def test_an_exported_policy_names_its_provenance_and_no_path(tmp_path) -> None:
     cfg = load("train", ["variant=alcc", "data=episodes", "data.path=/home/me"])
-    cfg.inputs = {"data": {"/home/me/a.parquet": "1"}}
+    cfg = cfg.with_(inputs={"data": {"/home/me/a.parquet": "1"}})
     save_policy({"w": torch.ones(1)}, cfg, tmp_path / "policy.pt")
     path = export_pretrained.export(tmp_path / "policy.pt", "a trial", tmp_path / "out")
     content = read_torch(path)

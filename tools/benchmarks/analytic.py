@@ -22,7 +22,7 @@ OWN = "Analytic"
 def analytic(options: Namespace) -> list[Row]:
     """Return iterations/s of the main job's training."""
     cfg = load("train", ["variant=alcc", "experiment=main", *(QUICK if options.quick else ())])
-    cfg.training.compiled = options.compile
+    cfg = cfg.with_(training={"compiled": options.compile})
     inputs = load_inputs(cfg)
     agent, profiles = build_agent(cfg, inputs.population), inputs.to_learn_from()
     agent.take(profiles)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from copy import deepcopy
 from functools import cache
 from typing import Any
 
@@ -45,11 +44,10 @@ def training(options: Namespace, batch: int) -> TransformedEnv:
 def alcc(options: Namespace, batch: int, far: bool = False, followers: int = 1) -> TransformedEnv:
     """Build the ALCC environment; from ``far`` behind the leader no episode ends by a collision."""
     cfg, inputs = study(options.quick)
-    cfg = deepcopy(cfg)
     start = {"standstill_gap": 500.0, "time_gap": 30.0} if far else {}
     own = cfg.scenario.start["automated"].changed(**start, gap_range=[1.0, 1.0])
-    cfg.scenario.start["automated"] = own
-    cfg.scenario.string = f"automated human*{followers}"
+    string = f"automated human*{followers}"
+    cfg = cfg.with_(scenario={"start": {"automated": own}, "string": string})
     return build_env(cfg, inputs.training, inputs.population, batch)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Mapping
-from copy import deepcopy
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -73,9 +72,8 @@ def medium(run: Run) -> Run:
 
 def trainer(options: Namespace, batch: int, steps: int, folder: Path, updates: float = 1.0) -> Run:
     """Return one iteration of the package's training: so many transitions, updates for each."""
-    cfg = deepcopy(study(options.quick)[0])
-    cfg.training.environments, cfg.training.segment = WIDTH, steps // WIDTH
-    cfg.training.episodes, cfg.training.compiled = 10**6, options.compile
+    sizes = {"environments": WIDTH, "segment": steps // WIDTH, "episodes": 10**6}
+    cfg = study(options.quick)[0].with_(training={**sizes, "compiled": options.compile})
     env = alcc(options, WIDTH)
     env.base_env.horizon = steps // WIDTH  # episodes of one segment
     agent = DDPG(batch_size=batch, updates_per_transition=updates)

@@ -140,9 +140,8 @@ def run(study: Study, parts: Sequence[str] = STUDY_PARTS, ablations: Sequence[st
     for folder, (change, runs) in series.items():
         train_all(runs, folder, study.jobs)
         cfg: EvaluateConfig = settings_of_run(study, "evaluate", "alcc", change)
-        cfg.compare = [str(folder)]
         place = study.folder if change is MAIN else folder
-        complete(with_inputs(cfg), place / EVALUATION_FOLDER)
+        complete(with_inputs(cfg.with_(compare=[str(folder)])), place / EVALUATION_FOLDER)
 
 
 def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dict[Path, Change]:
@@ -166,5 +165,4 @@ def _calibration(study: Study, runs: dict[str, TrainConfig]) -> PipelineConfig:
     own = [item for item in study.overrides if top_key(item) not in OF_TRAINING]
     cfg: PipelineConfig = load("pipeline", ["~experiment", "calibration=both", *own])
     first = next(iter(runs.values()))
-    cfg.split, cfg.scenario = first.split, first.scenario
-    return cfg
+    return cfg.with_(split=first.split, scenario=first.scenario)

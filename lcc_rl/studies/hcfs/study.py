@@ -79,7 +79,7 @@ def run(study: Study) -> None:
         own = evaluation(study, f"policy={quoted(folder)}")
         weights, trained = load_policy(folder)
         check_policy(own, trained)
-        own.agent = trained.agent
+        own = own.with_(agent=trained.agent)
         learned = with_weights(own, weights, trained.seed, str(folder), inputs.population)
         _evaluate(hybrid_strategies(own, learned), own, inputs, target / folder.name)
     keep(study.folder, done)
