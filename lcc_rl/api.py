@@ -23,6 +23,7 @@ from lcc_rl.evaluation.named import setting_of
 from lcc_rl.io.files import Rows, read_parquet
 from lcc_rl.results import render
 from lcc_rl.results.report import Report, together
+from lcc_rl.results.runs import STEPS
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class Run:
     @cached_property
     def steps(self) -> pd.DataFrame:
         """Sample episodes as time series."""
-        return read_parquet(self.folder / evaluation.STEPS)
+        return read_parquet(self.folder / STEPS)
 
 
 def learn(

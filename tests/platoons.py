@@ -16,7 +16,7 @@ from torch import Tensor
 from lcc_rl.data.leaders import Case, RecordLeaders, stretch
 from lcc_rl.data.profiles import Profiles, from_records, joined
 from lcc_rl.envs import Inputs, build_env
-from lcc_rl.evaluation.cases import drive_runs
+from lcc_rl.evaluation.cases import CaseRuns
 from lcc_rl.evaluation.strategies import Strategy, deployed
 from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.random import uniform
@@ -109,7 +109,7 @@ def play(profiles: Profiles, driver: Driver, vehicles: int = 6) -> dict[str, Ten
     cfg = deployed(composed(*driver.overrides))
     inputs = Inputs(profiles, profiles, POPULATION)
     case = Case("whole", profiles, vehicles)
-    return drive_runs(Strategy("tested", cfg, driver.policy), case, inputs)
+    return CaseRuns(Strategy("tested", cfg, driver.policy), case, inputs).play()
 
 
 class Actor(TensorDictModuleBase):

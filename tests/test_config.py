@@ -12,7 +12,7 @@ from hydra import compose, initialize_config_module
 
 import lcc_rl.conf
 from lcc_rl.agents.actor import shared_policy
-from lcc_rl.agents.factory import build_agent, learns
+from lcc_rl.agents.factory import build_agent
 from lcc_rl.config import identity, load
 from lcc_rl.config.compose import CONF as MODULE
 from lcc_rl.config.compose import as_meant, composed
@@ -46,7 +46,7 @@ def options(group: str) -> list[str]:
 
 
 def check_drives(cfg: TrainConfig) -> None:
-    policy = shared_policy(build_agent(cfg, POPULATION).policy) if learns(cfg) else None
+    policy = shared_policy(build_agent(cfg, POPULATION).policy) if cfg.learns else None
     env = build_env(cfg, followed_profiles(), POPULATION, 2)
     rows = env.rollout(3, policy, break_when_any_done=False)["next"]
     assert rows["vehicles", "acceleration"].isfinite().all()

@@ -14,7 +14,7 @@ import torch
 from commands import DATA
 
 from lcc_rl.agents.actor import shared_policy
-from lcc_rl.agents.factory import build_agent, check_lengths, make_trainer
+from lcc_rl.agents.factory import build_agent, check_lengths, make_trainer, training_env
 from lcc_rl.config import NOT_IDENTITY, load
 from lcc_rl.config.nodes import as_plain
 from lcc_rl.envs import load_inputs
@@ -108,7 +108,7 @@ def trained(folder: Path, *words: str) -> tuple[str, Any, Any]:
     agent = build_agent(cfg, inputs.population)
     agent.take(profiles)
     rows: list[Mapping[str, Any]] = []
-    trainer = make_trainer(cfg, agent, profiles, inputs.population, folder)
+    trainer = make_trainer(cfg, agent, training_env(cfg, profiles, inputs.population), folder)
     trainer.on_row = rows.append
     trainer.save = lambda *given, **named: None
     trainer.run()
@@ -118,7 +118,7 @@ def trained(folder: Path, *words: str) -> tuple[str, Any, Any]:
     def played() -> str:
         strategy = Strategy(cfg.variant, deployed(cfg), shared_policy(agent.policy), cfg.seed)
         if cfg.evaluation.rows == "vehicles":
-            table, _ = cases.evaluate_cases(strategy, cfg, inputs)
+            table, _ = cases.Cases(strategy, cfg, inputs).play()
         else:
             plan = episodes.plan_of(cfg, inputs)
             player = episodes.Episodes(strategy, inputs, plan, cfg.evaluation.seed, 0)

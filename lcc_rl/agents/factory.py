@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.agent import Agent, Scene
 from lcc_rl.agents.loop import TrainingLoop
@@ -23,18 +24,13 @@ from lcc_rl.pieces import Observation
 from lcc_rl.pieces.controllers import Population
 
 
-def learns(cfg: StudyConfig) -> bool:
-    """Whether the configuration has an agent."""
-    return cfg.agent is not None
-
-
 def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -> Agent:
     """Build the agent of a configuration.
 
     Raises:
         ConfigError: if there is no agent, or naming the option at fault.
     """
-    require(learns(cfg), f"variant {cfg.variant} has no agent")
+    require(cfg.learns, f"variant {cfg.variant} has no agent")
     world = world_of(cfg, population=population)
     observation = cfg.observation.made(Observation).bind(world)
     driver = cfg.scenario.controllers.get(AUTOMATED)
@@ -63,16 +59,20 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
     return learner
 
 
-def make_trainer(
-    cfg: StudyConfig, agent: Agent, profiles: Profiles, population: Population, folder: Path
-) -> TrainingLoop[Any]:
-    """Build the training loop of an agent with its environment.
+def training_env(cfg: StudyConfig, profiles: Profiles, population: Population) -> TransformedEnv:
+    """Build the environment of a training.
 
     Raises:
         ConfigError: naming the option at fault.
     """
-    own = after_humans(cfg, getattr(agent, "humans_first", 0.0))
-    env = build_env(own, profiles, population, cfg.training.environments, 0, cfg.device)
+    driven = after_humans(cfg, getattr(cfg.agent.made(Agent), "humans_first", 0.0))
+    return build_env(driven, profiles, population, cfg.training.environments, 0, cfg.device)
+
+
+def make_trainer(
+    cfg: StudyConfig, agent: Agent, env: TransformedEnv, folder: Path
+) -> TrainingLoop[Any]:
+    """Build the training loop of an agent in an environment, see :func:`training_env`."""
     return agent.loop(agent, env, cfg.training, cfg.seed, folder, identity(cfg))
 
 

@@ -7,24 +7,25 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from tensordict import TensorDictBase
+from torchrl.envs import TransformedEnv
 
-from lcc_rl.agents.factory import build_agent, check_lengths, learns, make_trainer
+from lcc_rl.agents.factory import build_agent, check_lengths, make_trainer, training_env
 from lcc_rl.config import load
 from lcc_rl.config.nodes import CALLED, nodes_in
 from lcc_rl.config.schemas import StudyConfig, TrainConfig
-from lcc_rl.envs import Inputs, build_env
-from lcc_rl.envs.factory import after_uncounted
+from lcc_rl.envs import build_env
+from lcc_rl.envs.factory import moment_bytes
 from lcc_rl.envs.inputs import (
     LOADS,
     build_drivers,
     constant_profiles,
 )
 from lcc_rl.envs.rollout import OBSERVATION
+from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.evaluation.episodes import any_leader, plan_of
-from lcc_rl.evaluation.named import DIRECT, controller_of
-from lcc_rl.evaluation.strategies import Strategy, applies, deployed
+from lcc_rl.evaluation.episodes import any_leader
+from lcc_rl.evaluation.named import DIRECT, PEOPLE, controller_of
+from lcc_rl.evaluation.strategies import applies, deployed
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
 from lcc_rl.runs.loggers import Silent
@@ -52,72 +53,44 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
     cfg.split.made(CALLED)
     population = build_drivers(cfg)
     check_variant(cfg)
-    trial = any_leader(cfg)
+    trial = any_leader(cfg).with_(training={"environments": 2, "episodes": 2})
     horizon, time_step = cfg.scenario.horizon, cfg.scenario.time_step
     profiles = constant_profiles(10.0, horizon, time_step, ["trial"])
-    env = build_env(deployed(trial), profiles, population, 1, 0, cfg.device, nominal=True)
-    if learns(cfg):
-        require_memory(training_bytes(cfg, env.reset()), cfg.device)
+    if not cfg.learns or cfg.deployed is not None:
+        build_env(deployed(trial), profiles, population, 1, 0, cfg.device, nominal=True)
+    if cfg.learns:
         check_lengths(cfg)
+        env = training_env(trial, profiles, population)
+        require_memory(training_bytes(cfg, env), cfg.device)
         agent = build_agent(cfg, population, cfg.device)
-        small = trial.with_(training={"environments": 2, "episodes": 2})
-        make_trainer(small, agent, profiles, population, folder)
+        make_trainer(trial, agent, env, folder)
 
 
-def check_evaluation(cfg: StudyConfig, inputs: Inputs) -> None:
-    """Check that an evaluation fits into memory."""
-    own, profiles = deployed(any_leader(cfg)), inputs.evaluation
-    env = build_env(own, profiles, inputs.population, 1, 0, cfg.device, nominal=True)
-    require_memory(evaluation_bytes(cfg, env.reset(), inputs), cfg.device)
-
-
-def check_strategies(strategies: Sequence[Strategy], inputs: Inputs) -> None:
-    """Check that the controllers of all strategies fit their strings, before files are written.
-
-    Raises:
-        ConfigError: naming the controller and the wrong entry or shape.
-    """
-    for cfg in (any_leader(one.cfg) for one in strategies):
-        build_env(cfg, inputs.evaluation, inputs.population, 1, 0, cfg.device, nominal=True)
-
-
-def training_bytes(cfg: StudyConfig, moment: TensorDictBase) -> dict[str, float]:
+def training_bytes(cfg: StudyConfig, env: TransformedEnv) -> dict[str, float]:
     """Return the least memory that a training needs by option [bytes].
 
     Args:
         cfg: its configuration.
-        moment: the state of one episode.
+        env: its environment, of any batch.
     """
     settings, agent = cfg.training, cfg.agent.settings
-    count, vehicles = settings.environments, moment[OBSERVATION].shape[-2]
-    transition = 4 * (2 * moment[OBSERVATION].shape[-1] + 2)  # before, after, action and reward
+    count, moment = settings.environments, moment_bytes(pieces_of(env))
+    vehicles, width = env.observation_spec[OBSERVATION].shape[-2:]
+    transition = 4 * (2 * width + 2)  # before, after, action and reward
     needs = {f"training.episodes={settings.episodes}": settings.episodes / count * RECORD_BYTES}
     if isinstance(hidden := agent.get("hidden"), list):
-        sizes = [moment[OBSERVATION].shape[-1], *hidden, 1]
+        sizes = [width, *hidden, 1]
         weights = sum((before + 1) * after for before, after in pairwise(sizes))
         copies = 10 if "buffer_size" in agent else 4  # gradient, two moments; critic, targets
         needs[f"agent.hidden={hidden}"] = 4.0 * copies * weights
     if "buffer_size" in agent:
-        played = KEPT_MOMENTS * moment.bytes() + 2 * cfg.scenario.horizon * vehicles * transition
+        played = KEPT_MOMENTS * moment + 2 * cfg.scenario.horizon * vehicles * transition
         learned = 2 * transition + 16 * sum(agent["hidden"])
         needs[f"agent.buffer_size={agent['buffer_size']}"] = agent["buffer_size"] * transition
         needs[f"agent.batch_size={agent['batch_size']}"] = agent["batch_size"] * learned
     else:
-        played = KEPT_MOMENTS * moment.bytes() * settings.segment
+        played = KEPT_MOMENTS * moment * settings.segment
     return {f"training.environments={count}": count * played, **needs}
-
-
-def evaluation_bytes(cfg: StudyConfig, moment: TensorDictBase, inputs: Inputs) -> dict[str, float]:
-    """Return the memory of the largest block of an evaluation by option [bytes]."""
-    settings, count = cfg.evaluation, len(inputs.evaluation)
-    steps = after_uncounted(cfg)[0].scenario.horizon
-    if settings.rows == "episodes":
-        count = plan_of(cfg, inputs).size
-    longest = max((case.horizon for case in inputs.full_length), default=0)
-    if settings.full_length and longest > count * steps:
-        count, steps = 1, longest
-    what = f"an evaluation of {count} episodes of {steps} steps side by side"
-    return {what: count * steps * moment.bytes()}
 
 
 def check_installed(cfg: StudyConfig, compared: Sequence[Any] = ()) -> None:
@@ -128,7 +101,7 @@ def check_installed(cfg: StudyConfig, compared: Sequence[Any] = ()) -> None:
         compared: further controllers, see :func:`lcc_rl.evaluation.named.controller_of`.
     """
     own = [name for name in cfg.evaluation.baselines if applies(cfg, name)]
-    others = [controller_of(spec) for spec in (*own, *compared) if spec != DIRECT]
+    others = [controller_of(spec) for spec in (*own, *compared) if spec not in (DIRECT, PEOPLE)]
     for node in nodes_in([cfg.scenario.controllers, *others]):
         getattr(node.kind, "check_installed", lambda: None)()
 
@@ -153,9 +126,9 @@ def check_variant(cfg: StudyConfig) -> None:
             f"variant={cfg.variant} is of connected vehicles, and scenario {cfg.scenario.name} has "
             "no messages: use task=platoon-us06, task=platoon-highway or scenario=platoon"
         )
-    if learns(cfg) and not learns(own):  # the variant has no automated vehicle, the task has
+    if cfg.learns and not own.learns:  # the variant has no automated vehicle, the task has
         raise ConfigError(f"variant={cfg.variant} has no agent: use compare=[{cfg.variant}]")
-    if learns(own) and not learns(cfg) and _is_driven_as(cfg, own):
+    if own.learns and not cfg.learns and _is_driven_as(cfg, own):
         raise ConfigError(
             f"variant={cfg.variant} is a learned controller, but there is no agent; for a human "
             "driver use variant=idm"

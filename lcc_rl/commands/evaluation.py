@@ -11,14 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from lcc_rl.agents.factory import learns
-from lcc_rl.commands.checks import (
-    check_evaluation,
-    check_installed,
-    check_measured,
-    check_strategies,
-    check_variant,
-)
+from lcc_rl.commands.checks import check_installed, check_measured, check_variant
 from lcc_rl.config import identity, with_inputs
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
@@ -26,8 +19,8 @@ from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.envs import Inputs, build_env, load_inputs
 from lcc_rl.envs.inputs import build_energy, second_energy
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.evaluation import cases, episodes
-from lcc_rl.evaluation.blocks import Store
+from lcc_rl.evaluation.comparison import IDENTITY, Comparison
+from lcc_rl.evaluation.episodes import plan_of
 from lcc_rl.evaluation.fit import check_policy, classes, other_drivers, other_traffic
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import DIRECT, controller_of, is_policy, is_shipped, label_of
@@ -46,7 +39,7 @@ from lcc_rl.evaluation.strategies import (
     trained,
 )
 from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, write_parquet
+from lcc_rl.io.files import FEW, Rows, parquet_metadata
 from lcc_rl.results.names import counted_windows, in_words, several
 from lcc_rl.results.platoons import case_report
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
@@ -57,18 +50,15 @@ from lcc_rl.results.report import (
     report,
     windows_for,
 )
-from lcc_rl.results.runs import EPISODES, STEPS, check_folder, resumed_config, save_config
+from lcc_rl.results.runs import EPISODES, check_folder, resumed_config, save_config
 from lcc_rl.results.task import Task
 from lcc_rl.results.units import OF_FUEL, burns_one_fuel, check_unit
 from lcc_rl.results.windows import by_source
 from lcc_rl.runs.precision import prepare_torch
-from lcc_rl.runs.progress import ProgressReporter
-from lcc_rl.runs.states import CONFIG, check_present, claim, forget, run_folders
+from lcc_rl.runs.states import CONFIG, claim, forget, run_folders
 from lcc_rl.settings import parse
 
 log = logging.getLogger("lcc_rl")
-
-IDENTITY = "lcc_rl.config"
 
 
 def run(
@@ -136,17 +126,17 @@ def _run(
 ) -> Rows:
     prepare_torch(cfg)
     check_measured(cfg)
-    if cfg.policy not in (None, PRETRAINED) and not learns(cfg) and not _nobody_drives(cfg):
+    if cfg.policy not in (None, PRETRAINED) and not cfg.learns and not _nobody_drives(cfg):
         raise ConfigError(f"variant {cfg.variant} has no agent: remove policy={cfg.policy}")
     own = own and not only_named(cfg)
     if own:
         check_variant(cfg)
     strategies, inputs = strategies_of(cfg, own, policies)
-    check_strategies(strategies, inputs)
+    comparison = Comparison(cfg, inputs, strategies)
     if replace:  # rows of other settings must not be in a folder with this configuration
         (folder / EPISODES).unlink(missing_ok=True)
     save_config(cfg, folder)
-    rows = evaluate_and_write(strategies, cfg, inputs, folder, quiet)
+    rows = evaluate_and_write(comparison, inputs, folder, quiet)
     for words in filter(None, (policy.clipped() for policy in policies.values())):
         log.warning(words)
     if not quiet:
@@ -186,7 +176,7 @@ def _task_name(cfg: StudyConfig) -> str | None:
 
 def only_named(cfg: EvaluateConfig) -> bool:
     """True if ``compare=`` names every policy."""
-    return bool(cfg.compare) and cfg.policy is None and learns(cfg)
+    return bool(cfg.compare) and cfg.policy is None and cfg.learns
 
 
 def compared(cfg: EvaluateConfig) -> tuple[dict[str, Any], list[tuple[str, str]]]:
@@ -275,12 +265,11 @@ def strategies_of(
     check_installed(cfg, list(rivals.values()))
     for asked in [] if RECORDED in {*rivals, *cfg.evaluation.baselines} else _held_as_recorded(cfg):
         raise ConfigError(f"{asked}: add {RECORDED} to evaluation.baselines")
-    if own and learns(cfg) and cfg.policy is None:
+    if own and cfg.learns and cfg.policy is None:
         raise no_policy(cfg)
     inputs = load_inputs(cfg)
     for line in filter(None, [*inputs.report, other_drivers(cfg), classes(cfg)]):
         log.info(line)
-    check_evaluation(cfg, inputs)
     strategies = _rules(cfg, rivals, inputs)
     for (name, path), file in zip(paths, policies, strict=True):
         one = trained(cfg, path, file, inputs.population)
@@ -289,13 +278,11 @@ def strategies_of(
         strategies += studied(cfg, policy, inputs.population)
     for name, policy_given in (further or {}).items():
         _check_label(name, "a policy", "")
-        require(learns(cfg), f"{name} is a policy, and variant {cfg.variant} has no agent")
+        require(cfg.learns, f"{name} is a policy, and variant {cfg.variant} has no agent")
         env = build_env(cfg, inputs.evaluation, inputs.population, 1, 0, cfg.device, nominal=True)
         policy_given.tried(env.reset())
         strategies.append(Strategy(name, cfg, policy_given))
     strategies = beside_filtered(cfg, strategies) + strategies
-    for strategy in (s for s in strategies if s.policy is not None):
-        cases.check_cases(strategy.cfg, inputs)
     strategies = named_apart(strategies)
     check_distinct(strategies)
     strategies += front_of(strategies, cfg.evaluation.front)
@@ -315,7 +302,7 @@ def _read_policies(
             log.warning(words)
         return weights, own
 
-    studied_too = cfg.policy is not None and learns(cfg)
+    studied_too = cfg.policy is not None and cfg.learns
     policy = read(of_task(str(cfg.policy), _task_name(cfg))) if studied_too else None
     if policy is not None:
         check_policy(cfg, policy[1])
@@ -350,28 +337,13 @@ def _lacking_record(cfg: EvaluateConfig, inputs: Inputs) -> str:
     return "" if first else "the automated vehicle is not the first behind the leader"
 
 
-def evaluate_and_write(
-    strategies: Sequence[Strategy], cfg: StudyConfig, inputs: Inputs, folder: Path, quiet: bool
-) -> Rows:
-    """Evaluate strategies on the held-out windows, write the rows and print the summary.
-
-    With several blocks each block is written when it is played; blocks in the folder are not
-    played again.
+def evaluate_and_write(comparison: Comparison, inputs: Inputs, folder: Path, quiet: bool) -> Rows:
+    """Play a comparison, write its rows and print the tables.
 
     Returns:
         The rows; many rows as a dataset, which is read on demand.
     """
-    metadata = {IDENTITY: identity(cfg)}
-    if cfg.evaluation.rows == "vehicles":
-        results = [cases.evaluate_cases(strategy, cfg, inputs) for strategy in strategies]
-        rows: Rows = pd.concat([table for table, _ in results], ignore_index=True)
-        steps = pd.concat([trace for _, trace in results], ignore_index=True)
-        check_present(folder)
-        write_parquet(steps, folder / STEPS, metadata)
-        # Last, because it marks a finished run.
-        write_parquet(rows, folder / EPISODES, metadata)
-    else:
-        rows = _by_blocks(strategies, cfg, inputs, folder, metadata)
+    cfg, rows = comparison.cfg, comparison.play(folder)
     if cfg.evaluation.rows == "episodes":
         windows = windows_for(rows)
         for line in [*leader_too_fast(windows, cfg.task is not None), *remarks(windows)]:
@@ -379,55 +351,6 @@ def evaluate_and_write(
     if not quiet:
         show_tables(rows, cfg, inputs)
     return rows
-
-
-def _by_blocks(
-    strategies: Sequence[Strategy],
-    cfg: StudyConfig,
-    inputs: Inputs,
-    folder: Path,
-    metadata: dict[str, str],
-) -> Rows:
-    """Play all episodes, block by block, and write them as one table."""
-    plan = episodes.plan_of(cfg, inputs)
-    store = Store(folder, strategies, plan.own)
-    for place, strategy in enumerate(strategies):
-        _play_missing(place, strategy, store, plan, cfg, inputs, folder)
-    check_present(folder)
-    write_parquet(store.steps(), folder / STEPS, metadata)
-    write_parquet(store.rows(), folder / EPISODES, metadata)  # last, as above
-    store.clear()
-    return next(store.rows()) if len(plan.own) == 1 else as_rows(folder / EPISODES)
-
-
-def _play_missing(
-    place: int,
-    strategy: Strategy,
-    store: Store,
-    plan: episodes.Plan,
-    cfg: StudyConfig,
-    inputs: Inputs,
-    folder: Path,
-) -> None:
-    """Play the blocks of a strategy that are not stored yet."""
-    missing, settings = store.missing(place), cfg.evaluation
-    if not missing:
-        return
-    how = (settings.seed, settings.sample_episodes, cfg.device, settings.compiled)
-    player = episodes.Episodes(strategy, inputs, plan, *how)
-    counts = {block: plan.count(block) for block in plan.own}
-    done = sum(counts.values()) - sum(counts[block] for block in missing)
-    if done:
-        there = len(counts) - len(missing)
-        log.info("%s: %d of %d blocks exist already", strategy.name, there, len(counts))
-    where = folder if len(plan.own) > 1 else None
-    title = f"evaluate {in_words(strategy.name)} ({place + 1} of {len(store.marks)})"
-    with ProgressReporter(title, sum(counts.values()), "episode", done, where) as progress:
-        for block in missing:
-            store.put(place, block, player.play(block))
-            done += counts[block]
-            if where is not None:
-                progress.update(done)
 
 
 def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterator[Report]:
@@ -456,7 +379,7 @@ def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterato
 
 def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
     """Print the tables of an evaluation, short or, with ``table=all``, full."""
-    plan = episodes.plan_of(cfg, inputs)
+    plan = plan_of(cfg, inputs)
     drivers = several(len(plan.chosen), "driver")
     drivers += f" × {plan.repeats} repeats" if plan.repeats > 1 else ""
     drivers += f", shard {plan.shard} of {plan.shards}" if plan.shards > 1 else ""

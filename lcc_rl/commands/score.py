@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from lcc_rl.commands.checks import check_evaluation, check_installed
+from lcc_rl.commands.checks import check_installed
 from lcc_rl.commands.evaluation import evaluate_and_write, task_of
 from lcc_rl.config import check_overrides, choices, identity, load, top_key
 from lcc_rl.config.inputs import compared_files
@@ -39,6 +39,7 @@ from lcc_rl.drivers.population import fixed
 from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.inputs import build_drivers, build_energy, constant_profiles
 from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, require
+from lcc_rl.evaluation.comparison import Comparison
 from lcc_rl.evaluation.episodes import any_leader
 from lcc_rl.evaluation.named import (
     DIRECT,
@@ -173,10 +174,10 @@ def play_source(entrant: Scored, source: str, cfg: EvaluateConfig, folder: Path)
     assert task is not None
     check_installed(cfg)
     inputs = load_inputs(cfg)
-    check_evaluation(cfg, inputs)
     against = [baseline(cfg, name) for name in task.references if name != strategy.name]
+    comparison = Comparison(cfg, inputs, [*against, strategy])
     save_config(cfg, folder)
-    evaluate_and_write([*against, strategy], cfg, inputs, folder, quiet=True)
+    evaluate_and_write(comparison, inputs, folder, quiet=True)
     rows = read_parquet(folder / EPISODES)
     # Further controllers do not count, and "data" is the hash of the contents of files.
     unused = ("evaluation.behind_filter", "inputs.data", "inputs.leader")

@@ -11,14 +11,15 @@ import pandas as pd
 import torch
 
 from lcc_rl.agents.actor import shared_policy
-from lcc_rl.agents.factory import Agent, build_agent, learns, make_trainer
-from lcc_rl.commands.checks import build_logger, check_evaluation, check_settings
+from lcc_rl.agents.factory import Agent, build_agent, make_trainer, training_env
+from lcc_rl.commands.checks import build_logger, check_settings
 from lcc_rl.commands.evaluation import evaluate_and_write, made_by
 from lcc_rl.config import NOT_IDENTITY, identity, with_inputs
 from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
-from lcc_rl.evaluation.cases import WINDOW_CASES, check_cases
+from lcc_rl.evaluation.cases import WINDOW_CASES
+from lcc_rl.evaluation.comparison import Comparison
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import Strategy, deployed, rule, with_weights
 from lcc_rl.io.files import Rows, as_rows
@@ -85,7 +86,7 @@ def _resumed(cfg: TrainConfig, folder: Path) -> TrainConfig:
                 f"{folder}: {table} belongs to another configuration than config.yaml; resume with "
                 "the settings it was started with"
             )
-        if learns(own) and (folder / table).exists() and not (folder / CHECKPOINT).exists():
+        if own.learns and (folder / table).exists() and not (folder / CHECKPOINT).exists():
             raise ResultsError(
                 f"{folder}: {table} without {CHECKPOINT} cannot be resumed; lcc-rl repeat {folder} "
                 "begins again in a new folder"
@@ -99,27 +100,30 @@ def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
     inputs = load_inputs(cfg)
     for line in inputs.report:
         log.info(line)
-    check_cases(deployed(cfg), inputs)
-    check_evaluation(cfg, inputs)
-    if not learns(cfg) or cfg.policy is not None:
-        save_config(cfg, folder)
-    if not learns(cfg):
+    agent = weights = None
+    if not cfg.learns:
         strategy = rule(cfg)
         log.info("%s has no agent: evaluating it", strategy.name)
     elif cfg.policy is not None:
-        cfg, strategy = _given(cfg, inputs, folder)
+        cfg, weights, strategy = _given(cfg, inputs)
     else:
         agent = build_agent(cfg, inputs.population, cfg.device)
-        _train(cfg, agent, inputs, folder, resume)
         strategy = Strategy(cfg.variant, deployed(cfg), shared_policy(agent.policy), cfg.seed)
-    rows = evaluate_and_write([strategy], cfg, inputs, folder, quiet)
+    comparison = Comparison(cfg, inputs, [strategy])  # before a training, which takes long
+    if agent is not None:
+        _train(cfg, agent, inputs, folder, resume)
+    else:
+        save_config(cfg, folder)
+    if weights is not None:
+        save_policy(weights, cfg, folder / POLICY)
+    rows = evaluate_and_write(comparison, inputs, folder, quiet)
     if isinstance(logger := build_logger(cfg), RowLogger):
         logger.log_result(folder, measured(rows))
     return rows
 
 
-def _given(cfg: TrainConfig, inputs: Inputs, folder: Path) -> tuple[TrainConfig, Strategy]:
-    """Return the configuration and strategy of a variant that uses a trained policy."""
+def _given(cfg: TrainConfig, inputs: Inputs) -> tuple[TrainConfig, dict[str, Any], Strategy]:
+    """Return configuration, weights and strategy of a variant that uses a trained policy."""
     if cfg.deployed is None:
         raise ConfigError(
             f"policy={cfg.policy}: variant {cfg.variant} uses no trained policy; remove it, "
@@ -128,17 +132,15 @@ def _given(cfg: TrainConfig, inputs: Inputs, folder: Path) -> tuple[TrainConfig,
     weights, own = load_policy(str(cfg.policy), cfg.variant, cfg.trust)
     check_policy(cfg, own)
     cfg = cfg.with_(agent=own.agent)
-    save_config(cfg, folder)
-    save_policy(weights, cfg, folder / POLICY)
     strategy = with_weights(cfg, weights, own.seed, str(cfg.policy), inputs.population)
-    return cfg, Strategy(cfg.variant, deployed(cfg), strategy.policy, own.seed)
+    return cfg, weights, Strategy(cfg.variant, deployed(cfg), strategy.policy, own.seed)
 
 
 def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume: bool) -> None:
     """Train an agent to the end and write its policy, which the agent then has."""
     profiles = inputs.to_learn_from()
     agent.take(profiles)
-    trainer = make_trainer(cfg, agent, profiles, inputs.population, folder)
+    trainer = make_trainer(cfg, agent, training_env(cfg, profiles, inputs.population), folder)
     first = deepcopy(agent.policy.state_dict())
     if resume:
         trainer.load()

@@ -247,6 +247,11 @@ class StudyConfig(BaseConfig):
     # Modules that register measures, see lcc_rl.evaluation.metrics.register.
     measures: list[str] = dataclasses.field(default_factory=list)
 
+    @property
+    def learns(self) -> bool:
+        """Whether there is an agent."""
+        return self.agent is not None
+
     def validate(self) -> None:
         for module in self.measures:
             load_module(module, "measures")

@@ -81,7 +81,8 @@ def build_env(
     actions: dict[NestedKey, tuple[int, ...]] = {}
     if acts:
         actions[ACTION] = (scenario.vehicles.count(AUTOMATED), 1)
-    require_memory({f"batch_size={batch_size}": _size(pieces, batch_size)}, device or "cpu")
+    size = MOMENTS * moment_bytes(pieces) * math.prod(batch_shape(batch_size))
+    require_memory({f"batch_size={batch_size}": size}, device or "cpu")
     check_pieces(pieces, scenario.horizon, actions)
     clock = Clock(scenario.horizon, batch_size, actions, seed, device)
     acting = Pieces(*pieces)
@@ -157,12 +158,11 @@ def _by_role(scenario: ScenarioConfig, group: str) -> list[tuple[str, Node]]:
     return [(role, nodes[role]) for role in scenario.vehicles.names if nodes.get(role) is not None]
 
 
-def _size(pieces: Sequence[Piece], batch_size: Sequence[int] | int) -> int:
-    """Return the least memory that a step of a batch of episodes needs [bytes]."""
+def moment_bytes(pieces: Sequence[Piece]) -> int:
+    """Return the size of all entries of an episode at one time [bytes]."""
     size = torch.Size([1])
     layouts = [one for piece in pieces for one in piece.layouts(size, piece.targets).values()]
-    moment = sum(shape.numel() * dtype.itemsize for shape, dtype in layouts)
-    return MOMENTS * moment * math.prod(batch_shape(batch_size))
+    return sum(shape.numel() * dtype.itemsize for shape, dtype in layouts)
 
 
 def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,11 @@ from torch import Tensor
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.leaders import Case
 from lcc_rl.envs import build_env
-from lcc_rl.envs.factory import build_pieces, world_of
+from lcc_rl.envs.factory import moment_bytes
 from lcc_rl.envs.inputs import Inputs
+from lcc_rl.envs.step import pieces_of
 from lcc_rl.evaluation.metrics import registered, safety_measures
-from lcc_rl.evaluation.rollout import play, reset_options
+from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.rows import INDEX
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
@@ -31,52 +33,60 @@ CASE_KEYS += [INDEX, WINNER, *COUNTERS]
 CaseSeries = dict[str, Tensor]  # ``[time, runs, vehicles]``
 
 
-def evaluate_cases(
-    strategy: Strategy, cfg: StudyConfig, inputs: Inputs
-) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Evaluate one strategy on all cases, held-out windows and whole records.
+class Cases:
+    """Plays one strategy on all cases, held-out windows and whole records, in one block.
 
-    Returns:
-        One row per run and vehicle, and the time series of the cases.
+    Args:
+        strategy: the strategy.
+        cfg: configuration of the evaluation.
+        inputs: cases, held-out windows and drivers.
     """
-    rows, steps = [], []
-    for case in cases_of(cfg, inputs):
-        series = drive_runs(strategy, case, inputs, cfg.evaluation.seed, cfg.device)
-        frame = measured_series(series, cfg.scenario.time_step)
+
+    def __init__(self, strategy: Strategy, cfg: StudyConfig, inputs: Inputs) -> None:
+        self.strategy, self.cfg, self.inputs = strategy, cfg, inputs
+        windows = Case(WINDOW_CASES, inputs.evaluation, len(cfg.scenario.vehicles))
+        whole = inputs.full_length if cfg.evaluation.full_length else ()
+        cases = (*inputs.cases, windows, *whole)
+        self.drives = [CaseRuns(strategy, case, inputs, cfg.device) for case in cases]
+        self.largest = max((drive.size for drive in self.drives), key=math.prod)
+
+    def count(self, block: int) -> int:
+        """Return the number of runs of all cases."""
+        return sum(len(drive.case.profile) for drive in self.drives)
+
+    def play(self, block: int = 0) -> tuple[pd.DataFrame, pd.DataFrame]:
+        """Play all cases.
+
+        Returns:
+            One row per run and vehicle, and the time series of the cases.
+        """
+        rows, steps, time_step = [], [], self.cfg.scenario.time_step
+        for drive in self.drives:
+            series, case = drive.play(self.cfg.evaluation.seed), drive.case
+            rows.append(self._described(case, measured_series(series, time_step)))
+            if case in self.inputs.cases:
+                drawn = trace(series, time_step)
+                drawn.insert(0, "strategy", self.strategy.name)
+                drawn.insert(1, "case", case.name)
+                steps.append(drawn)
+        trails = pd.concat(steps, ignore_index=True) if steps else pd.DataFrame()
+        return pd.concat(rows, ignore_index=True), trails
+
+    def _described(self, case: Case, frame: pd.DataFrame) -> pd.DataFrame:
+        """Return measures with the names of their strategy, case and profile."""
         labels = {
-            "strategy": strategy.name,
-            "training_seed": pd.array([strategy.seed] * len(frame), dtype="Int64"),
+            "strategy": self.strategy.name,
+            "training_seed": pd.array([self.strategy.seed] * len(frame), dtype="Int64"),
             "case": case.name,
             "profile": [case.profile.names[i] for i in frame["run_id"]],
             DRIVE: [case.profile.recordings[i] for i in frame["run_id"]],
             "followers": int(frame["follower"].max()),
         }
         frame = pd.concat([pd.DataFrame(labels), frame], axis=1)
-        if inputs.evaluation.sources:
+        if self.inputs.evaluation.sources:
             own = case.profile.sources or [""] * len(case.profile)
             frame[SOURCE] = [own[i] for i in frame["run_id"]]
-        rows.append(frame)
-        if case in inputs.cases:
-            drawn = trace(series, cfg.scenario.time_step)
-            drawn.insert(0, "strategy", strategy.name)
-            drawn.insert(1, "case", case.name)
-            steps.append(drawn)
-    trails = pd.concat(steps, ignore_index=True) if steps else pd.DataFrame()
-    return pd.concat(rows, ignore_index=True), trails
-
-
-def cases_of(cfg: StudyConfig, inputs: Inputs) -> list[Case]:
-    """Return the cases of an evaluation, its held-out windows and its whole records."""
-    windows = Case(WINDOW_CASES, inputs.evaluation, len(cfg.scenario.vehicles))
-    return [*inputs.cases, windows, *(inputs.full_length if cfg.evaluation.full_length else ())]
-
-
-def check_cases(cfg: StudyConfig, inputs: Inputs) -> None:
-    """Check that the vehicles of a configuration can follow the fastest leader."""
-    if cfg.evaluation.rows == "vehicles":
-        case = max(cases_of(cfg, inputs), key=lambda case: float(case.profile.speeds.max()))
-        own = of_case(cfg, case)
-        build_pieces(own, world_of(own, case.profile, inputs.population, True))
+        return frame
 
 
 def of_case(cfg: StudyConfig, case: Case) -> StudyConfig:
@@ -87,31 +97,45 @@ def of_case(cfg: StudyConfig, case: Case) -> StudyConfig:
     return cfg.with_(scenario=changes)
 
 
-def drive_runs(
-    strategy: Strategy, case: Case, inputs: Inputs, seed: int = 0, device: str = "cpu"
-) -> CaseSeries:
-    """Drive a strategy behind all records of a case in parallel.
+class CaseRuns:
+    """Drives a strategy behind all records of a case in parallel.
 
-    Returns:
-        ``leader`` ``[time + 1, runs, 1]`` and ``speed`` ``[time + 1, runs, N]``; gap, acceleration,
-        jerk, power and errors ``[time, runs, N]``; reward and, for a hybrid, winner and counters,
-        NaN for vehicles that are not automated.
+    Args:
+        strategy: the strategy.
+        case: the records.
+        inputs: the drivers.
+        device: device of the computation.
     """
-    cfg = of_case(strategy.cfg, case)
-    runs = len(case.profile)
-    env = build_env(cfg, case.profile, inputs.population, runs, 0, device, True)
-    ids, drivers = torch.arange(runs, device=env.device), len(inputs.population.time_gap)
-    given = reset_options(env, ids, ids % drivers, seed, drivers)
-    record, _ = play(env, strategy.policy, given, CASE_KEYS, strategy.title)
-    index, vehicles = record.pop(INDEX, None), len(cfg.scenario.vehicles)
-    series = {"leader": record.pop(("leader", "speed"))}
-    for (space, name), entry in record.items():
-        entry = entry.squeeze(-1)
-        if space != "vehicles" and index is not None and entry.shape[-1] != vehicles:
-            full = torch.full((*entry.shape[:-1], vehicles), torch.nan, device=entry.device)
-            entry = full.scatter(-1, index, entry.to(full.dtype))
-        series[name] = entry
-    return series
+
+    def __init__(self, strategy: Strategy, case: Case, inputs: Inputs, device: str = "cpu") -> None:
+        self.case, self.cfg = case, of_case(strategy.cfg, case)
+        self.drivers, self.runs = len(inputs.population.time_gap), len(case.profile)
+        env = build_env(self.cfg, case.profile, inputs.population, self.runs, 0, device, True)
+        self.player = Player(env, strategy.policy, CASE_KEYS, strategy.title)
+        # Episodes side by side, their steps, and the size of the state of one [bytes].
+        self.size = self.runs, self.cfg.scenario.horizon, moment_bytes(pieces_of(env))
+
+    def play(self, seed: int = 0) -> CaseSeries:
+        """Play all runs.
+
+        Returns:
+            ``leader`` ``[time + 1, runs, 1]`` and ``speed`` ``[time + 1, runs, N]``; gap,
+            acceleration, jerk, power and errors ``[time, runs, N]``; reward and, for a hybrid,
+            winner and counters, NaN for vehicles that are not automated.
+        """
+        env, vehicles = self.player.env, len(self.cfg.scenario.vehicles)
+        ids = torch.arange(self.runs, device=env.device)
+        given = reset_options(env, ids, ids % self.drivers, seed, self.drivers)
+        record = dict(self.player.play(given)[0])
+        index = record.pop(INDEX, None)
+        series = {"leader": record.pop(("leader", "speed"))}
+        for (space, name), entry in record.items():
+            entry = entry.squeeze(-1)
+            if space != "vehicles" and index is not None and entry.shape[-1] != vehicles:
+                full = torch.full((*entry.shape[:-1], vehicles), torch.nan, device=entry.device)
+                entry = full.scatter(-1, index, entry.to(full.dtype))
+            series[name] = entry
+        return series
 
 
 def measured_series(series: CaseSeries, time_step: float = 0.1) -> pd.DataFrame:

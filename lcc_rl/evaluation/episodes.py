@@ -14,7 +14,7 @@ from torch import Tensor
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import RECORDED
 from lcc_rl.envs import build_env
-from lcc_rl.envs.factory import after_uncounted
+from lcc_rl.envs.factory import after_uncounted, moment_bytes
 from lcc_rl.envs.inputs import Inputs, build_energy, second_energy
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import require
@@ -179,16 +179,23 @@ class Episodes:
         env = build_env(
             self.cfg, inputs.evaluation, inputs.population, plan.size, 0, device, nominal=True
         )
+        pieces = pieces_of(env)
+        # Episodes side by side, their steps, and the size of the state of one [bytes].
+        self.largest = plan.size, self.cfg.scenario.horizon, moment_bytes(pieces)
         self.energy, self.second = build_energy(self.cfg), second_energy(self.cfg)
         filtered = self.cfg.scenario.filters.get(AUTOMATED) is not None
         self.keys = [*ROW_KEYS, INDEX, CLASS, *(FILTER_ENTRIES if filtered else ())]
         learned = strategy.policy is not None and self.cfg.evaluation.terms
-        self.terms = [x for x in pieces_of(env) if learned and isinstance(x, RewardTerm)]
+        self.terms = [x for x in pieces if learned and isinstance(x, RewardTerm)]
         read = (key for term in self.terms for _, key in term.needs)
         keys = list(dict.fromkeys([*self.keys, *read]))
         self.player = Player(env, strategy.policy, keys, strategy.title, compiled, rowwise)
         count = min(sample_episodes, len(plan))
         self.samples = set(np.linspace(0, len(plan) - 1, count).round().astype(int).tolist())
+
+    def count(self, block: int) -> int:
+        """Return the number of episodes of a block."""
+        return self.plan.count(block)
 
     def play(self, block: int) -> tuple[pd.DataFrame, pd.DataFrame]:
         """Play a block.

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from lcc_rl.agents.actor import shared_policy
-from lcc_rl.agents.factory import build_agent, learns
+from lcc_rl.agents.factory import build_agent
 from lcc_rl.config import NOT_IDENTITY, load
 from lcc_rl.config.nodes import Node, as_plain
 from lcc_rl.config.schemas import StudyConfig
@@ -226,7 +226,7 @@ def studied(
     Raises:
         ConfigError: if the variant needs a policy that is not given.
     """
-    if not learns(cfg):
+    if not cfg.learns:
         strategy = rule(cfg)
         known = cfg.scenario.controllers[AUTOMATED] in _baseline_controllers(cfg)
         same = known and cfg.scenario.filters.get(AUTOMATED) is None and strategy.name != DIRECT

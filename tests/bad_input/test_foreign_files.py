@@ -16,7 +16,7 @@ import yaml
 from commands import run_command, tiny
 from helpers import POPULATION, check_refused, wavy_profiles
 
-from lcc_rl.agents.factory import build_agent, make_trainer
+from lcc_rl.agents.factory import build_agent, make_trainer, training_env
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.commands import evaluation
 from lcc_rl.commands.pipeline import composed_part
@@ -241,9 +241,8 @@ def loops(tmp_path_factory) -> dict[str, TrainingLoop]:
         words = ["variant=alcc", f"agent={agent}", "training.episodes=16"]
         cfg = tiny("train", *words, agent=agent == "ddpg")
         folder = tmp_path_factory.mktemp(agent)
-        made[agent] = make_trainer(
-            cfg, build_agent(cfg, POPULATION), wavy_profiles(), POPULATION, folder
-        )
+        env = training_env(cfg, wavy_profiles(), POPULATION)
+        made[agent] = make_trainer(cfg, build_agent(cfg, POPULATION), env, folder)
         made[agent].run()
     return made
 

@@ -9,7 +9,7 @@ import torch
 from helpers import OBSERVATION, check_refused, compose, make_agent
 from torch import nn
 
-from lcc_rl.agents.factory import make_trainer
+from lcc_rl.agents.factory import make_trainer, training_env
 from lcc_rl.config import load
 from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.factory import after_uncounted
@@ -33,7 +33,8 @@ def test_a_training_takes_over_where_humans_are(tmp_path) -> None:
     sizes = ("agent.humans_first=20", "training.segment=30", "training.environments=3")
     cfg = load("train", [*RING, *SHORT, *sizes, "training.compiled=false"])  # as people drives
     inputs = load_inputs(cfg)
-    trainer = make_trainer(cfg, make_agent(cfg), inputs.training, inputs.population, tmp_path)
+    env = training_env(cfg, inputs.training, inputs.population)
+    trainer = make_trainer(cfg, make_agent(cfg), env, tmp_path)
     source = trainer._source()
     trainer.env.set_seed(3)
     begun = source.skip(source.start(), trainer.agent.burn_in)

@@ -17,7 +17,7 @@ from helpers import slow_but
 from tensordict import TensorDict
 
 from lcc_rl.agents.actor import shared_policy
-from lcc_rl.agents.factory import build_agent, learns
+from lcc_rl.agents.factory import build_agent
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles, from_records
@@ -73,7 +73,7 @@ def recorded_profiles() -> Profiles:
 
 def policy_of(cfg, driver):
     """The policy that drove: a shipped one, one with the weights of seed 0, or a constant."""
-    if not learns(cfg):
+    if not cfg.learns:
         return lambda td: td
     if isinstance(driver, float):
         return lambda td: td.set(("automated", "action"), torch.full((3, 1, 1), driver))

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 import torch
 
 from benchmarks.harness import Row, Run, rates
-from lcc_rl.agents.factory import build_agent, make_trainer
+from lcc_rl.agents.factory import build_agent, make_trainer, training_env
 from lcc_rl.agents.gradient import GradientLoop
 from lcc_rl.config import load
 from lcc_rl.envs import load_inputs
@@ -27,7 +27,8 @@ def analytic(options: Namespace) -> list[Row]:
     agent, profiles = build_agent(cfg, inputs.population), inputs.to_learn_from()
     agent.take(profiles)
     with TemporaryDirectory(prefix="lcc_rl_benchmark_") as folder, torch.enable_grad():
-        trainer = make_trainer(cfg, agent, profiles, inputs.population, Path(folder))
+        env = training_env(cfg, profiles, inputs.population)
+        trainer = make_trainer(cfg, agent, env, Path(folder))
         assert isinstance(trainer, GradientLoop)
         own: Run = partial(trainer._numbers, trainer._source())
         batch = cfg.training.environments

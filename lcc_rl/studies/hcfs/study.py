@@ -15,6 +15,7 @@ from lcc_rl.commands.pipeline import known_settings, train_all
 from lcc_rl.config import identity, load, quoted, top_key, with_inputs
 from lcc_rl.config.schemas import StudyConfig, TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
+from lcc_rl.evaluation.comparison import Comparison
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import (
     Strategy,
@@ -139,6 +140,7 @@ def _evaluate(
     if made_by(folder / EPISODES) == identity(with_inputs(cfg)):
         return
     log.info("evaluating %d strategies into %s", len(strategies), folder)
+    comparison = Comparison(cfg, inputs, strategies)
     (folder / EPISODES).unlink(missing_ok=True)  # never with another configuration
     save_config(cfg, folder)
-    evaluate_and_write(list(strategies), cfg, inputs, folder, quiet=True)
+    evaluate_and_write(comparison, inputs, folder, quiet=True)
