@@ -110,8 +110,8 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
     return parsed(composed(entry, overrides), entry, overrides)
 
 
-def composed(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
-    """Return the configuration that Hydra composes."""
+def composed(entry: str | None, overrides: Sequence[str] = ()) -> DictConfig:
+    """Return the configuration that Hydra composes; without an entry point, of the choices only."""
     hydra, meant = GlobalHydra.instance(), as_meant(overrides)
     try:
         where = str(hydra.config_loader().get_search_path()) if hydra.is_initialized() else ""
@@ -128,7 +128,7 @@ def composed(entry: str, overrides: Sequence[str] = ()) -> DictConfig:
 
 
 @lru_cache(maxsize=512)  # Hydra takes 0.1 s to read and merge the files, settings a hundredth
-def _composed(entry: str, chosen: tuple[str, ...], where: str) -> DictConfig:
+def _composed(entry: str | None, chosen: tuple[str, ...], where: str) -> DictConfig:
     """Compose files; ``where`` is Hydra's search path, empty if Hydra is not initialised."""
     with nullcontext() if where else initialize_config_module(CONF, version_base="1.3"):
         return compose(entry, overrides=list(chosen))

@@ -10,7 +10,9 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from lcc_rl.config import choices, load, own_file
+from omegaconf import OmegaConf
+
+from lcc_rl.config import choices, composed, load, own_file
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.config.words import DOTTED, FILTERED, YAML
@@ -158,14 +160,14 @@ def _files() -> frozenset[str]:
 @cache
 def _shipped() -> dict[str, Node]:
     """Compose all controllers and baselines of the package at once, because composing is slow."""
-    names = sorted(_files() - {"action", "human", "hcfs"})
+    names = sorted(_files() - {"action", "hcfs"})  # these need further settings
     drivers = [f"+controller@scenario.controllers.{name}={name}" for name in names]
     gains = ["+gains=tuned", *(f"+gains@gains.{name}={name}" for name in GAINS)]
-    cfg = load("evaluate", ["variant=idm", *gains, *drivers])
-    found: dict[str, Node] = dict(cfg.scenario.controllers)
-    del found[AUTOMATED], found[PEOPLE]
+    plain: Any = OmegaConf.to_container(composed(None, [*gains, *drivers]), resolve=True)
+    settings = plain["scenario"]["controllers"]
+    found = {x: Node.of(settings[x], f"controller {x}") for x in names if x != PEOPLE}
     found |= {name: found[file].changed(**own) for name, (file, own) in BASELINES.items()}
-    return found | {f"cacc {x}": found["cacc"].changed(**cfg.gains[x]) for x in GAINS}
+    return found | {f"cacc {x}": found["cacc"].changed(**plain["gains"][x]) for x in GAINS}
 
 
 def _described(spec: Any) -> Any:
