@@ -19,12 +19,14 @@ from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.config import identity, load
-from lcc_rl.config.schemas import TrainConfig
+from lcc_rl.config.schemas import EvaluateConfig, TrainConfig
 from lcc_rl.data.episodes import SCHEMA
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.drivers.population import bootstrap, from_table
-from lcc_rl.envs import SingleAgent, build_env
+from lcc_rl.envs import Inputs, SingleAgent, build_env, load_inputs
 from lcc_rl.errors import LccError
+from lcc_rl.evaluation.entrants import Entrants
+from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import read_parquet
 
 PLATOON = ("cacc", "ddpg", "deadbeat", "hcfs")
@@ -89,6 +91,13 @@ def followers(count: int) -> str:
 @cache
 def _loaded(overrides: tuple[str, ...]) -> TrainConfig:
     return load("train", overrides)
+
+
+def strategies_of(cfg: EvaluateConfig) -> tuple[list[Strategy], Inputs]:
+    """Return the strategies of an evaluation, and its inputs."""
+    entrants = Entrants(cfg)
+    inputs = load_inputs(cfg)
+    return entrants.strategies(inputs), inputs
 
 
 def composed(*overrides: str) -> TrainConfig:

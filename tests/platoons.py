@@ -17,7 +17,7 @@ from lcc_rl.data.leaders import Case, RecordLeaders, stretch
 from lcc_rl.data.profiles import Profiles, from_records, joined
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.evaluation.cases import CaseRuns
-from lcc_rl.evaluation.strategies import Strategy, deployed
+from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.random import uniform
 from lcc_rl.pieces.base import SEED, STEP
@@ -100,13 +100,13 @@ def env_of(profiles: Profiles, driver: Driver, vehicles: int = 6, horizon: int |
     """The platoon's environment, a slot for every record, as in an evaluation."""
     horizon = int(profiles.lengths.min()) - 1 if horizon is None else horizon
     own = [f"scenario.horizon={horizon}", string(f"automated*{vehicles}")]
-    cfg = deployed(composed(*driver.overrides, *own))
+    cfg = composed(*driver.overrides, *own).after_training()
     return build_env(cfg, profiles, POPULATION, len(profiles), nominal=True)
 
 
 def play(profiles: Profiles, driver: Driver, vehicles: int = 6) -> dict[str, Tensor]:
     """Drive behind every record from its start to its end."""
-    cfg = deployed(composed(*driver.overrides))
+    cfg = composed(*driver.overrides).after_training()
     inputs = Inputs(profiles, profiles, POPULATION)
     case = Case("whole", profiles, vehicles)
     return CaseRuns(Strategy("tested", cfg, driver.policy), case, inputs).play()

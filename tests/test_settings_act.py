@@ -20,7 +20,7 @@ from lcc_rl.config.nodes import as_plain
 from lcc_rl.envs import load_inputs
 from lcc_rl.errors import LccError
 from lcc_rl.evaluation import cases, episodes
-from lcc_rl.evaluation.strategies import Strategy, deployed
+from lcc_rl.evaluation.strategies import Strategy
 
 SIZE = (
     *("scenario.horizon=20", "training.environments=4", "training.episodes=8"),
@@ -116,7 +116,9 @@ def trained(folder: Path, *words: str) -> tuple[str, Any, Any]:
     record = [{k: x for k, x in row.items() if "second" not in k} for row in rows]
 
     def played() -> str:
-        strategy = Strategy(cfg.variant, deployed(cfg), shared_policy(agent.policy), cfg.seed)
+        strategy = Strategy(
+            cfg.variant, cfg.after_training(), shared_policy(agent.policy), cfg.seed
+        )
         if cfg.evaluation.rows == "vehicles":
             table, _ = cases.Cases(strategy, cfg, inputs).play()
         else:

@@ -20,7 +20,6 @@ from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.envs.single import group_key, view_of
 from lcc_rl.envs.step import pieces_of, written
 from lcc_rl.errors import ConfigError
-from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.pieces import Handover, Piece
 from lcc_rl.pieces.base import ROLE, TERM, Key, as_key, declared
@@ -55,7 +54,7 @@ def configurations() -> Iterator[StudyConfig]:
         cfg = load("train", [f"variant={path.stem}", string])
         yield cfg
         if cfg.deployed is not None:
-            yield deployed(cfg)
+            yield cfg.after_training()
     knowledge = ["+knowledge=[memory,preview]", "scenario.pieces.memory.kind=stacked"]
     cfg = load("train", ["variant=alcc", SIZES, "+filter=cbf", "+faults=all", *knowledge])
     yield cfg

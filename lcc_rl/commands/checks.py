@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,7 @@ from typing import Any
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.factory import build_agent, check_lengths, make_trainer, training_env
-from lcc_rl.config import load
-from lcc_rl.config.nodes import CALLED, nodes_in
+from lcc_rl.config.nodes import CALLED
 from lcc_rl.config.schemas import StudyConfig, TrainConfig
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import moment_bytes
@@ -23,14 +21,12 @@ from lcc_rl.envs.inputs import (
 from lcc_rl.envs.rollout import OBSERVATION
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.evaluation.episodes import any_leader
-from lcc_rl.evaluation.named import DIRECT, PEOPLE, controller_of
-from lcc_rl.evaluation.strategies import applies, deployed
+from lcc_rl.evaluation.entrants import check_installed
+from lcc_rl.evaluation.fit import MESSAGES, check_variant
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
 from lcc_rl.runs.loggers import Silent
 
-MESSAGES = "communication"  # name of the piece with messages between connected vehicles
 MEASURED = {"episodes": ("ttc", "time_gap", "power"), "vehicles": (MESSAGES,)}
 KEPT_MOMENTS = 24  # copies of every entry per step of a training, including gradients
 RECORD_BYTES = 4096  # size of an iteration's row in the record [bytes]
@@ -53,11 +49,11 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
     cfg.split.made(CALLED)
     population = build_drivers(cfg)
     check_variant(cfg)
-    trial = any_leader(cfg).with_(training={"environments": 2, "episodes": 2})
+    trial = cfg.for_any_leader().with_(training={"environments": 2, "episodes": 2})
     horizon, time_step = cfg.scenario.horizon, cfg.scenario.time_step
     profiles = constant_profiles(10.0, horizon, time_step, ["trial"])
     if not cfg.learns or cfg.deployed is not None:
-        build_env(deployed(trial), profiles, population, 1, 0, cfg.device, nominal=True)
+        build_env(trial.after_training(), profiles, population, 1, 0, cfg.device, nominal=True)
     if cfg.learns:
         check_lengths(cfg)
         env = training_env(trial, profiles, population)
@@ -93,52 +89,9 @@ def training_bytes(cfg: StudyConfig, env: TransformedEnv) -> dict[str, float]:
     return {f"training.environments={count}": count * played, **needs}
 
 
-def check_installed(cfg: StudyConfig, compared: Sequence[Any] = ()) -> None:
-    """Refuse controllers that need a missing package, before data are read.
-
-    Args:
-        cfg: configuration of a study, including its baselines.
-        compared: further controllers, see :func:`lcc_rl.evaluation.named.controller_of`.
-    """
-    own = [name for name in cfg.evaluation.baselines if applies(cfg, name)]
-    others = [controller_of(spec) for spec in (*own, *compared) if spec not in (DIRECT, PEOPLE)]
-    for node in nodes_in([cfg.scenario.controllers, *others]):
-        getattr(node.kind, "check_installed", lambda: None)()
-
-
 def build_logger(cfg: TrainConfig) -> Any:
     """Build the logger of the training rows; by default a silent one."""
     return Silent() if cfg.logger is None else cfg.logger.made(("opened",))
-
-
-def check_variant(cfg: StudyConfig) -> None:
-    """Refuse a variant that does not fit the scenario.
-
-    Variant and configuration must both have an agent or none, and connected vehicles need messages.
-    """
-    try:
-        own = load("train", [f"variant={cfg.variant}"])
-    except ConfigError:  # a user's variant that only this command line defines
-        return
-    talks, heard = (MESSAGES in part.scenario.pieces for part in (own, cfg))
-    if talks and not heard:
-        raise ConfigError(
-            f"variant={cfg.variant} is of connected vehicles, and scenario {cfg.scenario.name} has "
-            "no messages: use task=platoon-us06, task=platoon-highway or scenario=platoon"
-        )
-    if cfg.learns and not own.learns:  # the variant has no automated vehicle, the task has
-        raise ConfigError(f"variant={cfg.variant} has no agent: use compare=[{cfg.variant}]")
-    if own.learns and not cfg.learns and _is_driven_as(cfg, own):
-        raise ConfigError(
-            f"variant={cfg.variant} is a learned controller, but there is no agent; for a human "
-            "driver use variant=idm"
-        )
-
-
-def _is_driven_as(cfg: StudyConfig, own: StudyConfig) -> bool:
-    """Whether automated vehicles have the same kind of controller in two configurations."""
-    kinds = [part.scenario.controllers[AUTOMATED].kind for part in (cfg, own)]
-    return cfg.scenario.vehicles.count(AUTOMATED) > 0 and kinds[0] is kinds[1]
 
 
 def check_measured(cfg: StudyConfig) -> None:

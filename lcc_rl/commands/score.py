@@ -28,8 +28,7 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from lcc_rl.commands.checks import check_installed
-from lcc_rl.commands.evaluation import evaluate_and_write, task_of
+from lcc_rl.commands.evaluation import evaluate_and_write
 from lcc_rl.config import check_overrides, choices, identity, load, top_key
 from lcc_rl.config.inputs import compared_files
 from lcc_rl.config.schemas import EvaluateConfig
@@ -40,7 +39,8 @@ from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.inputs import build_drivers, build_energy, constant_profiles
 from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, require
 from lcc_rl.evaluation.comparison import Comparison
-from lcc_rl.evaluation.episodes import any_leader
+from lcc_rl.evaluation.entrants import check_installed
+from lcc_rl.evaluation.fit import task_of
 from lcc_rl.evaluation.named import (
     DIRECT,
     controller_of,
@@ -111,7 +111,7 @@ class Scored(NamedTuple):
             )
             found = baseline(cfg, self.label, self.spec)
         road = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["trial"])
-        build_env(any_leader(found.cfg), road, population, 1, nominal=True)
+        build_env(found.cfg.for_any_leader(), road, population, 1, nominal=True)
         return found
 
     def files(self) -> list[Path]:

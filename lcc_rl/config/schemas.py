@@ -18,7 +18,7 @@ from pydantic import AfterValidator, Field
 
 from lcc_rl.config.nodes import Node, as_nodes, as_plain, check_nodes, check_numbers
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.pattern import VehicleString, parse_string
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString, parse_string
 from lcc_rl.settings import (
     TARGET,
     Count,
@@ -251,6 +251,36 @@ class StudyConfig(BaseConfig):
     def learns(self) -> bool:
         """Whether there is an agent."""
         return self.agent is not None
+
+    @property
+    def automated(self) -> int:
+        """Number of automated vehicles."""
+        return self.scenario.vehicles.count(AUTOMATED)
+
+    def driven_by(self, controller: Node) -> Self:
+        """Return the configuration with another controller of the automated vehicles."""
+        return self.with_(deployed=None, scenario={"controllers": {AUTOMATED: controller}})
+
+    def after_training(self) -> Self:
+        """Return the configuration with the controller that is used after training."""
+        return self if self.deployed is None else self.driven_by(self.deployed)
+
+    def without_equipment(self) -> Self:
+        """Return it without filter, actuators and sensors of the automated vehicles."""
+        groups = ("filters", "actuators", "sensors")
+        return self.with_(scenario={group: {AUTOMATED: None} for group in groups})
+
+    def without_automated(self) -> Self:
+        """Return the configuration without automated vehicles."""
+        roles = [role for role in self.scenario.vehicles.roles if role != AUTOMATED]
+        return self.with_(scenario={"string": " ".join(roles)})
+
+    def for_any_leader(self) -> Self:
+        """Return the configuration with a leader that may play any record."""
+        leader = self.scenario.pieces.get("leader")
+        if leader is None or leader.settings.get("profile") is None:
+            return self
+        return self.with_(scenario={"pieces": {"leader": leader.changed(profile=None)}})
 
     def validate(self) -> None:
         for module in self.measures:

@@ -24,7 +24,7 @@ from lcc_rl.energy import Fleet, as_fleet
 from lcc_rl.envs import DifferentiableRollout, build_env
 from lcc_rl.envs.inputs import Inputs, build_energy
 from lcc_rl.errors import require
-from lcc_rl.evaluation.episodes import any_leader, pairs
+from lcc_rl.evaluation.episodes import pairs
 from lcc_rl.evaluation.metrics import KILO, LONG_TIME_GAP, UNSAFE_TTC
 from lcc_rl.evaluation.rollout import reset_options
 from lcc_rl.evaluation.strategies import Strategy
@@ -119,7 +119,7 @@ def _episodes(
     """Return the environment of all episodes, and their reset options."""
     count = len(inputs.population.time_gap)
     profile, driver = pairs(len(inputs.evaluation), count, drivers)
-    cfg = any_leader(strategy.cfg)
+    cfg = strategy.cfg.for_any_leader()
     env = build_env(cfg, inputs.evaluation, inputs.population, len(profile), nominal=True)
     return env, reset_options(env, profile, driver, seed, count)
 

@@ -169,7 +169,7 @@ class Episodes:
         compiled: bool | None = None,
     ) -> None:
         self.strategy, self.inputs, self.plan, self.seed = strategy, inputs, plan, seed
-        self.cfg, begun, self.warm_up = after_uncounted(any_leader(strategy.cfg))
+        self.cfg, begun, self.warm_up = after_uncounted(strategy.cfg.for_any_leader())
         self.begun = begun + self.warm_up
         steps, rowwise = len(plan) * self.cfg.scenario.horizon, False
         if compiled is None:
@@ -284,11 +284,3 @@ def evaluate(
     episodes = Episodes(strategy, inputs, plan, seed, sample_episodes, device, compiled)
     rows, steps = zip(*map(episodes.play, plan.own), strict=True)
     return pd.concat(rows, ignore_index=True), pd.concat(steps, ignore_index=True)
-
-
-def any_leader(cfg: StudyConfig) -> StudyConfig:
-    """Return a configuration in which the leader may play any record."""
-    leader = cfg.scenario.pieces.get("leader")
-    if leader is None or leader.settings.get("profile") is None:
-        return cfg
-    return cfg.with_(scenario={"pieces": {"leader": leader.changed(profile=None)}})

@@ -1,8 +1,9 @@
-"""Checks that a trained policy fits the variant, observation and action under study."""
+"""Checks that variant, task and trained policies fit the configuration under study."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,62 @@ from tensordict.nn import TensorDictModule
 from lcc_rl.config import load
 from lcc_rl.config.nodes import as_plain
 from lcc_rl.config.schemas import AUTO, StudyConfig
-from lcc_rl.envs.inputs import origin_of
+from lcc_rl.envs.inputs import build_energy, origin_of
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.runs import differing, flatten
+from lcc_rl.results.task import Task
+from lcc_rl.results.units import OF_FUEL, burns_one_fuel, check_unit
+from lcc_rl.settings import parse
 
+MESSAGES = "communication"  # name of the piece with messages between connected vehicles
 FIRST_LAYER = "module.0.0.weight"  # first layer of a policy's network
 TRAFFIC_NODES = ("data", "split", "drivers")
+
+
+def task_of(cfg: StudyConfig) -> Task | None:
+    """Return the task of a configuration; None without one.
+
+    If its unit needs a single fuel and scenario.fleet adds vehicles of another, it is kJ/km.
+    """
+    if cfg.task is None:
+        return None
+    task, energy = parse(Task, cfg.task, "task"), build_energy(cfg)
+    if cfg.scenario.fleet and task.unit in OF_FUEL and not burns_one_fuel(energy):
+        return replace(task, unit="kJ/km")
+    check_unit(task.unit, energy)
+    return task
+
+
+def check_variant(cfg: StudyConfig) -> None:
+    """Refuse a variant that does not fit the scenario.
+
+    Variant and configuration must both have an agent or none, and connected vehicles need messages.
+    """
+    try:
+        own = load("train", [f"variant={cfg.variant}"])
+    except ConfigError:  # a user's variant that only this command line defines
+        return
+    talks, heard = (MESSAGES in part.scenario.pieces for part in (own, cfg))
+    if talks and not heard:
+        raise ConfigError(
+            f"variant={cfg.variant} is of connected vehicles, and scenario {cfg.scenario.name} has "
+            "no messages: use task=platoon-us06, task=platoon-highway or scenario=platoon"
+        )
+    if cfg.learns and not own.learns:  # the variant has no automated vehicle, the task has
+        raise ConfigError(f"variant={cfg.variant} has no agent: use compare=[{cfg.variant}]")
+    if own.learns and not cfg.learns and _is_driven_as(cfg, own):
+        raise ConfigError(
+            f"variant={cfg.variant} is a learned controller, but there is no agent; for a human "
+            "driver use variant=idm"
+        )
+
+
+def _is_driven_as(cfg: StudyConfig, own: StudyConfig) -> bool:
+    """Whether automated vehicles have the same kind of controller in two configurations."""
+    kinds = [part.scenario.controllers[AUTOMATED].kind for part in (cfg, own)]
+    return cfg.automated > 0 and kinds[0] is kinds[1]
 
 
 def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:

@@ -6,19 +6,15 @@ and pieces. They differ in the controller of the automated vehicles and in its o
 
 from __future__ import annotations
 
-import json
 import logging
-import re
-from collections import Counter
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent
-from lcc_rl.config import NOT_IDENTITY, load
-from lcc_rl.config.nodes import Node, as_plain
+from lcc_rl.config import load
+from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.errors import ConfigError, ResultsError, raised_as, require
@@ -34,17 +30,10 @@ from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces import Observation, Piece, TimeGapStart
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.results.names import ON_FRONT, RULE_ROWS
-from lcc_rl.results.runs import POLICY, flatten
-from lcc_rl.results.sweeps import labels
 from lcc_rl.settings import TARGET, path_of
 
 log = logging.getLogger("lcc_rl")
 
-# Settings that do not distinguish trainings: those of other commands, and those of the seed.
-OF_NO_TRAINING = tuple(
-    f"{key}." for key in (*NOT_IDENTITY, "seed", "evaluation", "policy", "inputs.policy")
-)
-DATED = re.compile(r"^\d{4}-\d\d-\d\d_(\d\d-\d\d-\d\d)-\d{6}_.*")
 KNOWLEDGE = ("memory", "preview")  # pieces that belong to a policy's observation
 TrainedPolicy = tuple[dict[str, Any], StudyConfig]  # weights and configuration
 
@@ -73,16 +62,6 @@ class Strategy:
     def title(self) -> str:
         """Name in messages."""
         return f"strategy {self.name}" + (f" (policy={self.source})" if self.source else "")
-
-
-def deployed(cfg: StudyConfig) -> StudyConfig:
-    """Return a configuration with the controller that is used after training."""
-    return cfg if cfg.deployed is None else driven_by(cfg, cfg.deployed)
-
-
-def driven_by(cfg: StudyConfig, controller: Node) -> StudyConfig:
-    """Return a configuration with another controller of the automated vehicles."""
-    return cfg.with_(deployed=None, scenario={"controllers": {AUTOMATED: controller}})
 
 
 def baselines(cfg: StudyConfig, further: Mapping[str, Any] | None = None) -> list[Strategy]:
@@ -114,11 +93,11 @@ def baseline(cfg: StudyConfig, name: str, spec: Any = None) -> Strategy:
         ConfigError: if the controller is unknown, or needs a safety filter that does not exist.
     """
     if name == DIRECT:
-        return Strategy(name, without_automated(cfg))
+        return Strategy(name, cfg.without_automated())
     if name == PEOPLE:
-        return Strategy(name, by_people(driven_by(cfg, cfg.scenario.controllers[HUMAN])))
+        return Strategy(name, cfg.driven_by(cfg.scenario.controllers[HUMAN]).without_equipment())
     if name == RECORDED:
-        cfg = by_people(driven_by(cfg, controller_of(name)))
+        cfg = cfg.driven_by(controller_of(name)).without_equipment()
         start = Node.of({TARGET: path_of(TimeGapStart)}, f"scenario.start.{AUTOMATED}")
         return Strategy(name, cfg.with_(scenario={"start": {AUTOMATED: start}}))
     kept = cfg.scenario.filters.get(AUTOMATED)
@@ -128,10 +107,10 @@ def baseline(cfg: StudyConfig, name: str, spec: Any = None) -> Strategy:
     held = kept is not None and kept.settings.get("time_gap", True) is not None
     controller = controller_of(spec or name, held)
     if named:
-        return Strategy(name, driven_by(cfg, controller))
+        return Strategy(name, cfg.driven_by(controller))
     if cfg.variant == name and _kind(cfg) is controller.kind:
         return Strategy(name, cfg)
-    alone = driven_by(cfg, controller).with_(scenario={"filters": {AUTOMATED: None}})
+    alone = cfg.driven_by(controller).with_(scenario={"filters": {AUTOMATED: None}})
     return Strategy(name, alone)
 
 
@@ -168,18 +147,6 @@ def front_of(strategies: Sequence[Strategy], time_gaps: Sequence[float]) -> list
     return found
 
 
-def by_people(cfg: StudyConfig) -> StudyConfig:
-    """Return a configuration without filter, actuators and sensors of the automated vehicles."""
-    groups = ("filters", "actuators", "sensors")
-    return cfg.with_(scenario={group: {AUTOMATED: None} for group in groups})
-
-
-def without_automated(cfg: StudyConfig) -> StudyConfig:
-    """Return a configuration without automated vehicles."""
-    roles = [role for role in cfg.scenario.vehicles.roles if role != AUTOMATED]
-    return cfg.with_(scenario={"string": " ".join(roles)})
-
-
 def rule(cfg: StudyConfig) -> Strategy:
     """Return the strategy of a configuration without an agent.
 
@@ -192,7 +159,7 @@ def rule(cfg: StudyConfig) -> Strategy:
     except ConfigError:  # a user's variant that only this command line defines
         own = _kind(cfg)
     name = cfg.variant if _kind(cfg) is own else label_of(cfg.scenario.controllers[AUTOMATED])
-    return Strategy(name, deployed(cfg))
+    return Strategy(name, cfg.after_training())
 
 
 def _kind(cfg: StudyConfig) -> Any:
@@ -256,14 +223,14 @@ def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
 def hybrids(strategy: Strategy) -> list[Strategy]:
     """Build a hybrid strategy, its parents and its oracle."""
     cfg = strategy.cfg
-    parent = driven_by(cfg, cfg.scenario.controllers[AUTOMATED])
+    parent = cfg.driven_by(cfg.scenario.controllers[AUTOMATED])
     found = [replace(strategy, name=cfg.agent.name, cfg=parent)]
     parent_rule = cfg.deployed.settings.get("rule")
     if parent_rule is not None and parent_rule not in _baseline_controllers(cfg):
-        found.insert(0, Strategy("cacc", driven_by(cfg, parent_rule)))
-    found.append(replace(strategy, cfg=deployed(cfg)))
+        found.insert(0, Strategy("cacc", cfg.driven_by(parent_rule)))
+    found.append(replace(strategy, cfg=cfg.after_training()))
     if set(cfg.scenario.vehicles.names) == {AUTOMATED}:
-        knowing = driven_by(cfg, cfg.deployed.changed(lookahead="oracle"))
+        knowing = cfg.driven_by(cfg.deployed.changed(lookahead="oracle"))
         found.append(replace(strategy, name=f"{strategy.name} oracle", cfg=knowing))
     return found
 
@@ -296,7 +263,7 @@ def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Popu
     )
     check_action(path, own, other)
     strategy = with_weights(other, weights, own.seed, path, population)
-    return replace(strategy, cfg=deployed(other), own=own)
+    return replace(strategy, cfg=other.after_training(), own=own)
 
 
 def with_weights(
@@ -314,92 +281,3 @@ def with_weights(
     with raised_as(ResultsError, words, RuntimeError):
         agent.policy.load_state_dict(dict(weights))
     return Strategy(cfg.variant, cfg, shared_policy(agent.policy), seed, path)
-
-
-def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
-    """Return strategies with names that differ if their trainings differ by more than the seed.
-
-    If a variant was learned by several kinds of agents, the agent is added to the name. If settings
-    differ otherwise, or a seed occurs twice, the file or folder of the policy is added. Several
-    seeds of one training share a name, that of their folder. If one folder holds several trainings,
-    the settings that differ are added.
-    """
-    kinds = [one.cfg.agent.name if one.policy else "" for one in strategies]
-    found = _where_several(strategies, kinds, kinds)
-    marks = _trainings(found)
-    return _where_several(found, marks, _labels(found, marks))
-
-
-def _where_several(
-    strategies: Sequence[Strategy], marks: Sequence[Hashable], labels: Sequence[str]
-) -> list[Strategy]:
-    different = Counter(
-        name for name, _ in {(s.name, m) for s, m in zip(strategies, marks, strict=True)}
-    )
-    return [
-        replace(one, name=f"{one.name} {label}") if different[one.name] > 1 else one
-        for one, label in zip(strategies, labels, strict=True)
-    ]
-
-
-def _trainings(strategies: Sequence[Strategy]) -> list[tuple[str, int]]:
-    """Return settings, and number among equal seeds, by which policies of a name differ."""
-    found: list[tuple[str, int]] = []
-    of_seed: Counter[Hashable] = Counter()
-    for one in strategies:
-        settings = dict(flatten(as_plain(one.own or one.cfg))) if one.policy else {}
-        kept = {key: x for key, x in settings.items() if not f"{key}.".startswith(OF_NO_TRAINING)}
-        text = json.dumps(kept, sort_keys=True, default=str)
-        of_seed[one.name, text, one.seed] += 1
-        found.append((text, of_seed[one.name, text, one.seed] if one.policy else 0))
-    return found
-
-
-def _labels(strategies: Sequence[Strategy], marks: Sequence[tuple[str, int]]) -> list[str]:
-    """Return the addition to the name of each policy, the same for the seeds of a training."""
-    groups = [(one.name, mark) for one, mark in zip(strategies, marks, strict=True)]
-    places: dict[tuple[str, tuple[str, int]], str] = {}
-    for one, group in zip(strategies, groups, strict=True):
-        places.setdefault(group, _place(one, groups.count(group) > 1))
-    apart = Counter((name, place) for (name, _), place in places.items())
-    differences: dict[tuple[str, str], str] = {}
-    for name in {name for name, _ in groups}:
-        texts = {
-            text: Path(one.source)
-            for one, (own, (text, _)) in zip(strategies, groups, strict=True)
-            if own == name
-        }
-        every = labels([json.loads(text) for text in texts], list(texts.values()))
-        for text, words in zip(texts, every, strict=True):
-            differences[name, text] = ", ".join(words.values())
-    found = []
-    for one, (name, (text, which)) in zip(strategies, groups, strict=True):
-        place = places[name, (text, which)]
-        if apart[name, place] > 1:  # one folder holds several trainings, or one twice
-            twice = (name, (text, 2)) in places or not differences[name, text]
-            place = _place(one, False) if twice else differences[name, text]
-        found.append(place)
-    return found
-
-
-def _place(strategy: Strategy, of_sweep: bool) -> str:
-    """Return the name of a policy's file or run, or of the folder of its runs."""
-    path = Path(strategy.source).absolute()  # a relative path has a folder, too
-    path = path.parent if path.name == POLICY else path
-    name = path.parent.name if of_sweep else path.name.removesuffix(".pt")
-    return DATED.sub(r"\1", name)  # of a run's folder, the time of day
-
-
-def check_distinct(strategies: Sequence[Strategy]) -> None:
-    """Refuse two policies of one name and seed.
-
-    Raises:
-        ConfigError: naming the variant and the seed.
-    """
-    counts = Counter((strategy.name, strategy.seed) for strategy in strategies)
-    for name, seed in (key for key, count in counts.items() if count > 1):
-        which = name if seed is None else f"{name} with training seed {seed}"
-        raise ConfigError(
-            f"policy and compare name two policies called {which}: give them different "
-            "names, 'compare={first: …, second: …}'"
-        )

@@ -6,14 +6,13 @@ from helpers import check_refused, compose, make_agent, slow_but, small_env, ste
 
 import lcc_rl
 from lcc_rl.agents.actor import shared_policy
-from lcc_rl.commands.evaluation import task_of
 from lcc_rl.config import identity, load
 from lcc_rl.config.nodes import as_plain
 from lcc_rl.energy import CirclesFuel, ElectricCar, EnergyModel, Fleet, PaperMotor, VehicleClass
 from lcc_rl.envs import DifferentiableRollout, StringCollector
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError
-from lcc_rl.evaluation.fit import classes
+from lcc_rl.evaluation.fit import classes, task_of
 from lcc_rl.evaluation.rows import traffic
 from lcc_rl.interfaces.exported import program
 from lcc_rl.pieces.features import CLASS

@@ -28,7 +28,6 @@ from lcc_rl.envs import Inputs, build_env, make_env
 from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError
-from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.pattern import parse_string
 from lcc_rl.pieces import (
     Action,
@@ -62,7 +61,7 @@ CACC = (
 def mixture(name: str, batch_size=()):
     variant, overrides = MIXTURES[name]
     overrides = (*overrides, *CACC) if name == "two roles" else overrides
-    cfg = deployed(composed(f"variant={variant}", "scenario.horizon=20", *overrides))
+    cfg = composed(f"variant={variant}", "scenario.horizon=20", *overrides).after_training()
     return build_env(cfg, wavy_profiles(), POPULATION, batch_size)
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pandas as pd
 import pytest
+from helpers import strategies_of
 
-from lcc_rl.commands.evaluation import strategies_of
 from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.envs.inputs import load_inputs

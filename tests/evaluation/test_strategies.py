@@ -14,13 +14,8 @@ from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.named import TUNED
-from lcc_rl.evaluation.strategies import (
-    Strategy,
-    baseline,
-    check_distinct,
-    named_apart,
-    trained,
-)
+from lcc_rl.evaluation.naming import check_distinct, named_apart
+from lcc_rl.evaluation.strategies import Strategy, baseline, trained
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.results.policies import load_policy
 

@@ -12,10 +12,9 @@ from helpers import check_refused, slow_but
 from lcc_rl.api import Run
 from lcc_rl.cli.table import main as table_again
 from lcc_rl.commands import evaluation
-from lcc_rl.commands.evaluation import task_of
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
-from lcc_rl.evaluation.fit import other_drivers
+from lcc_rl.evaluation.fit import other_drivers, task_of
 from lcc_rl.results.names import in_words
 
 TASKS = sorted(path.stem for path in Path("conf/task").glob("*.yaml"))

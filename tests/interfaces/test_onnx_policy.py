@@ -25,7 +25,7 @@ from lcc_rl.errors import LccError
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.named import controller_of, is_policy
 from lcc_rl.evaluation.rollout import play
-from lcc_rl.evaluation.strategies import driven_by, trained
+from lcc_rl.evaluation.strategies import trained
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.interfaces.driver import Driver
 from lcc_rl.interfaces.exported import NetworkController, driving, measuring
@@ -95,7 +95,7 @@ def test_a_program_remembers_what_it_returned(tmp_path) -> None:
     ]
     path = written(tmp_path / "sum.onnx", nodes, takes, makes)
     cfg = load("evaluate", ["variant=idm", "scenario.horizon=3", "evaluation.warm_up=0"])
-    env = build_env(driven_by(cfg, controller_of(path)), wavy_profiles(), POPULATION, 4)
+    env = build_env(cfg.driven_by(controller_of(path)), wavy_profiles(), POPULATION, 4)
     data = env.rollout(3, break_when_any_done=False)
     gaps = data["vehicles", "gap"][:, :, :1].cumsum(1).clamp(max=3.0)
     kept = data["next", "automated", "program"]
@@ -124,7 +124,7 @@ def test_an_exported_policy_that_remembers_drives_as_the_policy(follow) -> None:
     )
     weights = load_policy("pretrained/i24-follow5", "alcc")
     policy = trained(cfg, "pretrained", weights, POPULATION)
-    program = replace(policy, cfg=driven_by(policy.cfg, controller_of(follow)), policy=None)
+    program = replace(policy, cfg=policy.cfg.driven_by(controller_of(follow)), policy=None)
     inputs = Inputs(wavy_profiles(2), wavy_profiles(2), POPULATION)
     shown = ["cav_net_energy_kj", "mean_gap_m", "hdv_distance_m"]
     rows = [evaluate(one, inputs, 2, 10, seed=1)[0][shown] for one in (policy, program)]

@@ -23,7 +23,7 @@ from lcc_rl.envs.inputs import load_inputs
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.named import controller_of
 from lcc_rl.evaluation.rollout import play
-from lcc_rl.evaluation.strategies import by_people, driven_by, trained
+from lcc_rl.evaluation.strategies import trained
 from lcc_rl.functional.pattern import parse_string
 from lcc_rl.interfaces.export import export
 from lcc_rl.interfaces.ring_page import RING_TASK, filter_data, ring_of, ring_page
@@ -117,9 +117,9 @@ def driven(
     else:
         after = human if driver == "human" else controller_of(driver)
         both = {"before": human, "after": after, "from_s": 0.1 * start}
-        cfg = by_people(
-            driven_by(cfg, Node.of({"_target_": "lcc_rl.pieces.Handover", **both}, "own"))
-        )
+        cfg = cfg.driven_by(
+            Node.of({"_target_": "lcc_rl.pieces.Handover", **both}, "own")
+        ).without_equipment()
     env = build_env(cfg, inputs.evaluation, inputs.population, (1,), nominal=True)
     given = TensorDict({SEED: torch.tensor([[EPISODE]])}, batch_size=[1])
     kept = [("vehicles", name) for name in ("speed", "gap", "power")]

@@ -8,9 +8,16 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from helpers import POPULATION, check_episodes, compose, composed, followed_profiles, wavy_profiles
+from helpers import (
+    POPULATION,
+    check_episodes,
+    compose,
+    composed,
+    followed_profiles,
+    strategies_of,
+    wavy_profiles,
+)
 
-from lcc_rl.commands.evaluation import strategies_of
 from lcc_rl.config import load
 from lcc_rl.data.profiles import at_step, from_records, joined, leader_profiles
 from lcc_rl.envs import build_env

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from lcc_rl.config.nodes import Node
 from lcc_rl.envs import build_env
-from lcc_rl.evaluation.strategies import driven_by
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.functional.string import advance_string
@@ -275,7 +274,7 @@ def test_a_handover_switches_at_its_moment() -> None:
         "from_s": 1.0,
     }
     commands = []
-    for cfg in (human, driven_by(human, Node.of(node, "automated"))):
+    for cfg in (human, human.driven_by(Node.of(node, "automated"))):
         env = build_env(cfg, wavy_profiles(), POPULATION, 4)
         commands.append(env.rollout(20)["next", "vehicles", "command"][..., 0, 0])
     # Until then it drives as the human driver would who has the same numbers.

@@ -23,7 +23,6 @@ from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import build_env
-from lcc_rl.evaluation.strategies import deployed
 from lcc_rl.functional.safety import NEVER
 from lcc_rl.results.policies import load_policy
 
@@ -92,7 +91,7 @@ def roll(name: str) -> dict[str, torch.Tensor]:
     """Play a case; every entry by its name, ``[batch, time, …]``."""
     cfg = load("train", CASES[name]["overrides"])
     policy = policy_of(cfg, CASES[name]["driver"])
-    env = build_env(deployed(cfg), recorded_profiles(), bootstrap(), 3, 0)
+    env = build_env(cfg.after_training(), recorded_profiles(), bootstrap(), 3, 0)
     moments, steps = [], []
     with torch.no_grad():
         td = env.reset()

@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 import pandas as pd
 import pytest
+from helpers import strategies_of
 
 from lcc_rl.commands import evaluation
 from lcc_rl.config import load
@@ -145,5 +146,5 @@ def test_a_front_and_a_second_energy_are_evaluated(tmp_path) -> None:
     words.remove("+filter=cbf")
     bare = [*words, "evaluation.baselines=[human]"]
     with pytest.raises(ConfigError, match=r"evaluation\.front needs the safety filter"):
-        evaluation.strategies_of(load("evaluate", bare))
+        strategies_of(load("evaluate", bare))
     np.testing.assert_allclose(found[column], fuel["total_path_energy_kj"], rtol=1e-5)

@@ -20,7 +20,6 @@ from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.strategies import (
     Strategy,
     baselines,
-    driven_by,
     with_weights,
 )
 from lcc_rl.functional.pattern import AUTOMATED
@@ -123,11 +122,11 @@ def hybrid_strategies(cfg: StudyConfig, learned: Strategy) -> list[Strategy]:
         "hcfs literal": {"jerk_bound": 10.0, "clamp": False, "safe_cap": False},
         "hcfs oracle": {"lookahead": "oracle"},
     }
-    alone = driven_by(cfg, cfg.scenario.controllers[AUTOMATED])
+    alone = cfg.driven_by(cfg.scenario.controllers[AUTOMATED])
     return [
         replace(learned, name=LEARNED, cfg=alone),
         *(
-            replace(learned, name=name, cfg=driven_by(cfg, hybrid.changed(**change)))
+            replace(learned, name=name, cfg=cfg.driven_by(hybrid.changed(**change)))
             for name, change in changes.items()
         ),
     ]
