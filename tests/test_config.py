@@ -213,6 +213,30 @@ def test_a_recipe_for_learners_leaves_no_agent_where_nothing_learns() -> None:
     assert load("train", ["variant=idm", "agent=none"]).agent is None
 
 
+def test_a_configuration_does_not_change_and_returns_others() -> None:
+    cfg = load("train", ["variant=alcc", "+filter=cbf"])
+    assignments = (
+        lambda: setattr(cfg, "seed", 3),
+        lambda: setattr(cfg.scenario, "horizon", 20),
+        lambda: cfg.scenario.filters.pop("automated"),
+        lambda: cfg.reward.terms.update(safety=None),
+    )
+    for assign in assignments:
+        with pytest.raises(AttributeError):
+            assign()
+    other = cfg.with_(seed=3, scenario={"horizon": 20, "filters": {"automated": None}})
+    assert (other.seed, other.scenario.horizon, dict(other.scenario.filters)) == (3, 20, {})
+    assert (cfg.seed, cfg.scenario.horizon, [*cfg.scenario.filters]) == (0, 600, ["automated"])
+    assert other.scenario.controllers == cfg.scenario.controllers
+    cases = [
+        ({"sed": 3}, "unknown setting of TrainConfig .*Did you mean 'seed'"),
+        ({"scenario": {"horizon": -1}}, r"ScenarioConfig\.horizon must be greater"),
+        ({"scenario": {"filters": {"automated": 3}}}, "automated: expected a node"),
+        ({"training": {"environments": True}}, r"TrainingConfig\.environments must be .*integer"),
+    ]
+    check_refused(lambda changes: cfg.with_(**changes), cases, ConfigError)
+
+
 def test_a_node_is_made_once_copied_as_it_is_and_stored_by_its_settings() -> None:
     cfg = load("train", ["variant=idm", "drivers=fixed"])
     driver, drivers = cfg.scenario.controllers["automated"], cfg.drivers

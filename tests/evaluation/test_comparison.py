@@ -1,0 +1,57 @@
+"""An evaluation builds each environment once, before files are written."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+import lcc_rl
+from lcc_rl.envs import factory
+from lcc_rl.errors import LccError
+
+SMALL = ("evaluation.profiles=2", "evaluation.drivers=2", "scenario.horizon=40")
+SMALL += ("evaluation.warm_up=0",)
+
+
+@pytest.fixture
+def built(monkeypatch) -> list[int]:
+    """The batch sizes of environments that are built."""
+    found, build = [], factory.build_env
+
+    def counted(*args, **given):
+        found.append(args[3])
+        return build(*args, **given)
+
+    for module in [x for name, x in sys.modules.items() if name.startswith("lcc_rl")]:
+        if getattr(module, "build_env", None) is build:
+            monkeypatch.setattr(module, "build_env", counted)
+    return found
+
+
+def test_a_comparison_builds_one_environment_for_each_strategy(built, tmp_path) -> None:
+    rules = ["idm_acc_filtered", "acc_filtered"]
+    run = lcc_rl.compare(rules, "alcc", ["+filter=cbf", *SMALL], tmp_path / "run")
+    assert len(built) == run.rows["strategy"].nunique()
+
+
+def test_a_training_builds_a_trial_its_own_environment_and_that_of_the_evaluation(
+    built, tmp_path
+) -> None:
+    lcc_rl.learn("alcc", ["experiment=smoke", "training.episodes=20"], tmp_path / "run")
+    assert len(built) == 3
+
+
+class TooWide(lcc_rl.pieces.Controller):
+    """It commands two accelerations of each vehicle."""
+
+    reads = ("self.speed",)
+
+    def command(self, speed):
+        return speed.repeat_interleave(2, -1)
+
+
+def test_a_controller_that_does_not_fit_leaves_no_files(tmp_path) -> None:
+    with pytest.raises(LccError, match="TooWide"):
+        lcc_rl.compare(TooWide, "idm", SMALL, tmp_path / "run")
+    assert not any((tmp_path / "run").rglob("*.*"))
