@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -47,6 +49,11 @@ class Shown(NamedTuple):
 
     key: str
     heading: str
+
+    @property
+    def words(self) -> str:
+        """The heading in one line."""
+        return self.heading.replace("-\n", "").replace("\n", " ")
 
 
 @dataclass(frozen=True)
@@ -272,6 +279,23 @@ def episode_mean(part: pd.DataFrame, column: str) -> float:
     """Return a column's mean over episodes, from windows; NaN without any."""
     episodes = part["episodes"][part[column].notna()]
     return float((part[column] * episodes).sum() / episodes.sum()) if len(episodes) else np.nan
+
+
+def signed(value: float, form: str = "{:+.1f}") -> str:
+    """Return a number with its sign, a typographic minus, and no negative zero.
+
+    Examples:
+        >>> signed(-2.34), signed(2.34), signed(-0.04, "{:.1f}")
+        ('−2.3', '+2.3', '0.0')
+    """
+    text = form.format(value)
+    zero = isfinite(value) and not re.search("[1-9]", text)
+    return (form.format(0) if zero else text).replace("-", "−")
+
+
+def between(low: float, high: float, form: str = "{:.1f}") -> str:
+    """Return the bounds of an interval, see :func:`signed`."""
+    return f"{signed(low, form)} … {signed(high, form)}"
 
 
 def heading(column: str) -> str:
