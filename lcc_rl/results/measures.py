@@ -108,7 +108,8 @@ class Measure:
     def shown(self) -> Shown:
         """Its column of short tables."""
         share = f"{self.key.removeprefix('share_')}_pct" if self.unit == SHARE else self.key
-        return Shown(self.column or share, self.short)
+        bare = self.short and self.unit and "[" not in self.short
+        return Shown(self.column or share, self.short + f"\n[{self.unit}]" * bool(bare))
 
     @property
     def scale(self) -> float:
@@ -305,6 +306,8 @@ def heading(column: str) -> str:
         >>> heading("total_energy_kj"), heading("cav_saving_pct")
         ('total energy [kJ]', 'CAV saving [%]')
     """
+    if column.endswith("]"):
+        return column
     suffix = next((end for end in SUFFIX_UNITS if column.endswith(f"_{end}")), "")
     words = (column.removesuffix(f"_{suffix}") if suffix else column).split("_")
     text = " ".join(word.upper() if word in INITIALS else word for word in words)
