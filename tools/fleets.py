@@ -31,6 +31,7 @@ from lcc_rl.results.fronts import (
     flow_gained,
     saved_at_flow,
 )
+from lcc_rl.results.measures import between, signed
 from lcc_rl.results.names import NETWORK, in_words
 from lcc_rl.results.render import markdown_row
 
@@ -101,8 +102,8 @@ def against(part: pd.DataFrame, name: str, measure: Statistic) -> Estimate:
 
 def percent(found: Estimate) -> str:
     """Return an estimate and its interval in per cent."""
-    value, low, high = (f"{100.0 * x:.1f}" for x in (found.value, found.low, found.high))
-    return f"{value} % ({low} … {high})".replace("-", "−")
+    value, low, high = (100.0 * x for x in (found.value, found.low, found.high))
+    return f"{signed(value, '{:.1f}')} % ({between(low, high)})"
 
 
 @paper

@@ -46,9 +46,9 @@ from lcc_rl.io.files import read_parquet
 from lcc_rl.io.settings import read_json
 from lcc_rl.results import board
 from lcc_rl.results.fronts import ENERGY, FRONT_KINDS, LONG_SHARE, at_equal_flow, points
-from lcc_rl.results.measures import FLOW, SIGNS, Measure
+from lcc_rl.results.measures import FLOW, SIGNS, Measure, signed
 from lcc_rl.results.names import NETWORK, ON_FRONT, in_words, worded
-from lcc_rl.results.render import as_markdown, markdown_row, saved_text, signed
+from lcc_rl.results.render import as_markdown, markdown_row, saved_text
 from lcc_rl.results.runs import naming_run
 from lcc_rl.results.task import Task
 from lcc_rl.studies.alcc.results import narrow

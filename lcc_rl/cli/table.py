@@ -26,7 +26,7 @@ from lcc_rl.api import Run
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.io.files import Rows, as_rows, read_parquet
 from lcc_rl.results.names import rename, worded
-from lcc_rl.results.render import as_latex, as_markdown, chosen, for_print
+from lcc_rl.results.render import as_csv, as_latex, as_markdown, chosen, for_print
 from lcc_rl.results.report import together
 from lcc_rl.results.runs import EPISODES, FINAL, PARTS, load_config, naming_run
 from lcc_rl.results.sweeps import load_sweep
@@ -37,7 +37,7 @@ TABLE_FORMATS: dict[str, Callable[[pd.DataFrame], str]] = {
     "text": as_markdown,
     "markdown": as_markdown,
     "latex": as_latex,
-    "csv": lambda table: table.to_csv(index=False).rstrip(),
+    "csv": as_csv,
 }
 
 
@@ -61,10 +61,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if options.decimal == "comma" and options.format != "csv":
         parser.error("--decimal comma needs --format csv")
-    names = options.columns.split(",") if options.columns else None
-    note, numbers = "", options.format == "csv" and not names
+    names = options.columns.split(",") if options.columns else []
+    note = ""
     if options.run.suffix == ".parquet":
-        table = chosen(worded(read_parquet(options.run)), names or [])
+        table = chosen(worded(read_parquet(options.run)), names)
     else:
         run = read_run(options.run, options.trust)
         for row, label in options.rename or ():
@@ -77,12 +77,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 return
             report = together(run.reports(options.against))
         if options.all:
-            table = chosen(worded(report.table), names or [])
+            table = chosen(worded(report.table), names)
         else:
             note = report.note
-            table = report.short if numbers else for_print(report, names or [])
-    if options.decimal == "comma":
-        print(table.to_csv(index=False, sep=";", decimal=",").rstrip())
+            files = options.format == "csv"
+            table = chosen(report.short, names) if files else for_print(report, names)
+    if options.format == "csv":
+        print(as_csv(table, options.decimal))
     else:
         print(TABLE_FORMATS[options.format](table))
     if note and options.format != "csv":

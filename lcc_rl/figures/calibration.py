@@ -21,7 +21,7 @@ from lcc_rl.figures.drawing import (
     new_figure,
     paper,
 )
-from lcc_rl.results.render import signed
+from lcc_rl.results.measures import signed
 
 MODE_COLOURS = {"local": "#0072b2", "global": "#d55e00"}
 DRIVER_COLOURS = {RECORDED_DRIVERS: INK, TWINS: "#d55e00", REACTING: "#0072b2"}
@@ -211,4 +211,4 @@ def _scatter(
 def _pearson(first: np.ndarray, second: np.ndarray) -> str:
     if len(first) < 3 or first.std() == 0.0 or second.std() == 0.0:
         return "undefined"
-    return signed(np.corrcoef(first, second)[0, 1], ".2f")
+    return signed(np.corrcoef(first, second)[0, 1], "{:.2f}")

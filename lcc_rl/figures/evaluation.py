@@ -35,9 +35,10 @@ from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.bootstrap import Estimate, share_saved
+from lcc_rl.results.measures import between, signed
 from lcc_rl.results.motion import most_varied
 from lcc_rl.results.names import ON_FRONT, RULE, in_words, several
-from lcc_rl.results.render import column_cells, signed
+from lcc_rl.results.render import column_cells
 from lcc_rl.results.report import AGAINST, COUNTS, Report
 from lcc_rl.results.runs import stored_config
 from lcc_rl.results.windows import Means, by_driver
@@ -299,7 +300,7 @@ def _mean_line(axis: Axes, found: Estimate, rows: pd.DataFrame) -> None:
         seeds = min(rows["training_seed"].nunique(), 2)
         over = ("windows", "windows, 1 seed", "windows and seeds")[seeds]
         axis.axhspan(low, high, color=SOFT, alpha=0.3, lw=0)
-        text += f" ({signed(low)} … {signed(high)})\nband: 95 % interval over {over}"
+        text += f" ({between(low, high, '{:+.1f}')})\nband: 95 % interval over {over}"
     else:
         text += " (1 window, 1 training seed: no interval)"
     axis.axhline(value, color=INK, lw=0.8, ls="--")

@@ -17,10 +17,10 @@ from rich.table import Table
 from lcc_rl.errors import require, require_known
 from lcc_rl.results import measures, render
 from lcc_rl.results.bootstrap import LEAST_DRIVES
-from lcc_rl.results.measures import FINAL_SPREAD, FLOW, MEASURES, Shown
+from lcc_rl.results.measures import FINAL_SPREAD, FLOW, MEASURES, Shown, signed
 from lcc_rl.results.names import in_words
 from lcc_rl.results.remarks import FLOW_LOST, FLOW_NAMED
-from lcc_rl.results.render import DASH, markdown_row, saved_text, signed
+from lcc_rl.results.render import DASH, markdown_row, saved_text
 from lcc_rl.results.task import Task
 from lcc_rl.settings import Number, Settings, Whole, parse
 

@@ -15,7 +15,7 @@ import pandas as pd
 
 from lcc_rl.arrays import Floats
 from lcc_rl.errors import ResultsError
-from lcc_rl.results.bootstrap import NOTHING, Estimate, Side, estimate, share_saved
+from lcc_rl.results.bootstrap import NOTHING, Estimate, Side, equal_seeds, estimate, share_saved
 from lcc_rl.results.measures import DISTANCE, FLOW, LONG_GAPS, PATH
 from lcc_rl.results.windows import DRIVE, STRATEGY, TRAINED, with_equal_seeds
 
@@ -61,8 +61,7 @@ def compare_fronts(
 ) -> Estimate:
     """Return a measure of kinds of controllers with its interval.
 
-    It is resampled as in :func:`lcc_rl.results.bootstrap.estimate`; if all kinds with several
-    training seeds have the same ones, these are resampled together.
+    It is resampled as in :func:`lcc_rl.results.bootstrap.estimate`, equal seeds in pairs.
 
     Args:
         windows, columns: see :func:`front`.
@@ -71,13 +70,13 @@ def compare_fronts(
     """
     fronts = [front(windows, kind, columns) for kind in kinds]
     seeds = windows.groupby(FRONT_KINDS)["training_seed"].unique()
-    several = {frozenset(seeds[tuple(kind)]) for kind in kinds if len(seeds[tuple(kind)]) > 1}
+    paired = equal_seeds(*(seeds[tuple(kind)] for kind in kinds))
     drives = windows.groupby("profile_id")[DRIVE].first().tolist() if DRIVE in windows else None
 
     def statistic(*sides: Curve) -> Any:
         return measure(*({name: x.T for name, x in side.items()} for side in sides))
 
-    return estimate(statistic, *fronts, drives=drives, paired=len(several) < 2)
+    return estimate(statistic, *fronts, drives=drives, paired=paired)
 
 
 def energy_at(

@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -47,6 +49,11 @@ class Shown(NamedTuple):
 
     key: str
     heading: str
+
+    @property
+    def words(self) -> str:
+        """The heading in one line."""
+        return self.heading.replace("-\n", "").replace("\n", " ")
 
 
 @dataclass(frozen=True)
@@ -101,7 +108,8 @@ class Measure:
     def shown(self) -> Shown:
         """Its column of short tables."""
         share = f"{self.key.removeprefix('share_')}_pct" if self.unit == SHARE else self.key
-        return Shown(self.column or share, self.short)
+        bare = self.short and self.unit and "[" not in self.short
+        return Shown(self.column or share, self.short + f"\n[{self.unit}]" * bool(bare))
 
     @property
     def scale(self) -> float:
@@ -274,6 +282,23 @@ def episode_mean(part: pd.DataFrame, column: str) -> float:
     return float((part[column] * episodes).sum() / episodes.sum()) if len(episodes) else np.nan
 
 
+def signed(value: float, form: str = "{:+.1f}") -> str:
+    """Return a number with its sign, a typographic minus, and no negative zero.
+
+    Examples:
+        >>> signed(-2.34), signed(2.34), signed(-0.04, "{:.1f}")
+        ('−2.3', '+2.3', '0.0')
+    """
+    text = form.format(value)
+    zero = isfinite(value) and not re.search("[1-9]", text)
+    return (form.format(0) if zero else text).replace("-", "−")
+
+
+def between(low: float, high: float, form: str = "{:.1f}") -> str:
+    """Return the bounds of an interval, see :func:`signed`."""
+    return f"{signed(low, form)} … {signed(high, form)}"
+
+
 def heading(column: str) -> str:
     """Return the heading of a column: its words, and the unit of its measure or of its name.
 
@@ -281,6 +306,8 @@ def heading(column: str) -> str:
         >>> heading("total_energy_kj"), heading("cav_saving_pct")
         ('total energy [kJ]', 'CAV saving [%]')
     """
+    if column.endswith("]"):
+        return column
     suffix = next((end for end in SUFFIX_UNITS if column.endswith(f"_{end}")), "")
     words = (column.removesuffix(f"_{suffix}") if suffix else column).split("_")
     text = " ".join(word.upper() if word in INITIALS else word for word in words)

@@ -52,6 +52,7 @@ LABELS = SEVERAL | {
     "hcfs untuned": "HCFS of the fitted CACC",
     "deadbeat": "dead-beat, nothing learned",
 }
+FORMER: dict[str, str] = {}  # renamed strategies by their words before
 
 
 def in_words(name: str) -> str:
@@ -79,7 +80,8 @@ def strategy_named(given: str, known: Iterable[object]) -> str:
         ConfigError: if there is none, naming the nearest.
     """
     names = list(map(str, known))
-    stored = {in_words(name): name for name in names} | {name: name for name in names}
+    stored = {words: name for words, name in FORMER.items() if name in names}
+    stored |= {in_words(name): name for name in names} | {name: name for name in names}
     name = " ".join(given.split()).rstrip(f" {MARKS}")
     if name not in stored:
         raise unknown_name("strategy", given, names)
@@ -94,7 +96,9 @@ def rename(given: str, label: str, known: Iterable[object]) -> None:
     """
     names = list(map(str, known))
     require(label not in (*LABELS, *names, *map(in_words, names)), f"--rename: {label!r} is in use")
-    LABELS[strategy_named(given, names)] = label
+    name = strategy_named(given, names)
+    FORMER[in_words(name)] = name
+    LABELS[name] = label
 
 
 def worded(table: pd.DataFrame) -> pd.DataFrame:

@@ -20,6 +20,7 @@ from lcc_rl.results.measures import (
     PATH,
     PATH_PER_KM,
     REACH,
+    between,
 )
 from lcc_rl.results.names import HUMAN, NETWORK, RULE_ROWS, counted_windows, in_words, several
 from lcc_rl.results.windows import savings
@@ -86,6 +87,11 @@ def by_ends(table: pd.DataFrame) -> str:
     )
 
 
+def crashed(table: pd.DataFrame) -> pd.Series:
+    """Return which strategies collide, so that they have neither saving nor flow."""
+    return (table["collisions"] > 0) & (table["strategy"] != table["against"])
+
+
 def crashes(table: pd.DataFrame) -> list[str]:
     """Return a sentence on strategies with collisions, if there are any."""
     found = table[table["collisions"] > 0]
@@ -102,8 +108,7 @@ def few_drives(table: pd.DataFrame) -> str:
     """Return a sentence with the intervals over fewer than five drives; empty without any."""
     found = table[table[FEW_DRIVES[0]].notna()]
     rows = zip(found["strategy"], *(100.0 * found[name] for name in FEW_DRIVES), strict=True)
-    words = (f"{in_words(str(name))} {low:.1f} … {high:.1f}" for name, low, high in rows)
-    text = "; ".join(words).replace("-", "−")
+    text = "; ".join(f"{in_words(str(name))} {between(*bounds)}" for name, *bounds in rows)
     return f"Saved [%], t-interval over {table['drives'].max()} drives: {text}." if text else ""
 
 
@@ -162,7 +167,7 @@ def few_windows(windows: int, seconds: float | None = None) -> str:
 
 
 def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> str:
-    """Return a sentence on the result of the network; empty without one.
+    """Return a sentence on the result of the network; empty without one, or if it collides.
 
     If no network has its variant's name, each network has a sentence.
 
@@ -171,7 +176,7 @@ def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> 
         found: their :func:`summary`.
         of_few: whether too few windows are mentioned.
     """
-    cars = found[found[PATH].notna()].to_dict("records")
+    cars = found[found[PATH].notna() & ~crashed(found)].to_dict("records")
     rows: dict[str, Any] = {str(row["strategy"]): row for row in cars}
     other = next((name for name in (*RULE_ROWS, HUMAN) if name in rows), None)
     if other is None:
@@ -202,14 +207,13 @@ def _sentence(windows: pd.DataFrame, rows: Mapping[str, Any], name: str, other: 
         less, saved, low, high = "more", -saved, -high, -low
     within = "" if low > 0.0 else ", within the uncertainty"
     own, theirs = (100.0 * rows[x][LONG_GAPS] for x in (name, other))
-    article = "the " if in_words(name) != name else ""
-    interval = f"({low:.1f} … {high:.1f})".replace("-", "−")
+    article = "the " * in_words(name).startswith("network")
     flows = [f"{rows[x][FLOW]:,.0f}" for x in (name, other, RECORDED) if x in rows]
     flow = f"; flow: {flows[0]} vehicles per hour against {flows[1]}"
     flow += f", {in_words(RECORDED)} {flows[2]}" if len(flows) > 2 else ""
     flow *= bool(np.isfinite(rows[name][FLOW]))
     return (
-        f"With {article}{in_words(name)}, energy per vehicle and km is {saved:.1f} % {interval} "
-        f"{less} than with {in_words(other)}{within}; long time gaps: {own:.2f} % of "
-        f"the time against {theirs:.2f} %{flow}."
+        f"With {article}{in_words(name)}, energy per vehicle and km is {saved:.1f} % "
+        f"({between(low, high)}) {less} than with {in_words(other)}{within}; long "
+        f"time gaps: {own:.2f} % of the time against {theirs:.2f} %{flow}."
     )

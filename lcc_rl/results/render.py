@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lcc_rl.errors import require_known
-from lcc_rl.results.measures import Shown, heading
+from lcc_rl.results.measures import Shown, between, heading, signed
 from lcc_rl.results.names import in_words
 from lcc_rl.results.report import Report
 from lcc_rl.runs.output import PLAIN
@@ -30,16 +30,6 @@ class TableColumn(NamedTuple):
     heading: str
     cells: list[str]
     number: bool
-
-
-def signed(value: float, form: str = "+z.1f") -> str:
-    """Return a number with its sign, a typographic minus, and no negative zero.
-
-    Examples:
-        >>> signed(-2.34), signed(2.34)
-        ('−2.3', '+2.3')
-    """
-    return f"{value:{form}}".replace("-", "−")
 
 
 def columns(frame: pd.DataFrame) -> list[TableColumn]:
@@ -76,6 +66,13 @@ def markdown_row(cells: Iterable[str]) -> str:
     return f"| {' | '.join(escaped)} |"
 
 
+def as_csv(frame: pd.DataFrame, decimal: str = "point") -> str:
+    """Return a table as CSV without negative zeros; a decimal comma separates columns by ``;``."""
+    frame = frame.assign(**(frame.select_dtypes("float") + 0.0))
+    sep, mark = (";", ",") if decimal == "comma" else (",", ".")
+    return frame.to_csv(index=False, sep=sep, decimal=mark).rstrip()
+
+
 def as_latex(frame: pd.DataFrame) -> str:
     """Return a table for LaTeX (package booktabs) with headings and cells of :func:`columns`."""
     shown = columns(frame)
@@ -87,7 +84,8 @@ def as_latex(frame: pd.DataFrame) -> str:
 
 def column_cells(frame: pd.DataFrame, name: str) -> list[str]:
     """Return the cells of a column as text, with its interval if the table has one."""
-    places = frame.attrs.get("decimals", _places(frame[name]))
+    known = [key for key in (name, f"{name}_low", f"{name}_high") if key in frame]
+    places = frame.attrs.get("decimals", min(_places(frame[key]) for key in known))
     cells = [_cell(value, places) for value in frame[name]]
     if f"{name}_low" not in frame:
         return cells
@@ -121,7 +119,7 @@ def _cell(value: object, places: int) -> str:
     if isinstance(value, (int, np.integer)):
         return f"{value:,}"
     if isinstance(value, (float, np.floating)) and np.isfinite(value):
-        return signed(float(value), f"z,.{places}f")  # no negative zero
+        return signed(float(value), f"{{:,.{places}f}}")
     return value if isinstance(value, str) else DASH
 
 
@@ -168,8 +166,7 @@ def saved_text(share: float, low: float, high: float) -> str:
     """Return a saving [%] with sign and interval."""
     if pd.isna(share):
         return DASH
-    within = "" if pd.isna(low) else f" ({low:.1f} … {high:.1f})"
-    return f"{share:+.1f}{within}".replace("-", "−")
+    return signed(share) + ("" if pd.isna(low) else f" ({between(low, high)})")
 
 
 def full_rows(report: Report) -> Iterator[tuple[str, list[str]]]:
@@ -178,8 +175,7 @@ def full_rows(report: Report) -> Iterator[tuple[str, list[str]]]:
         values = report.table[one.key].astype(float)
         if values.notna().any():
             known = zip(report.table[one.key], np.isfinite(values), strict=True)
-            cells = (one.number.format(x) if k else DASH for x, k in known)
-            yield one.title, [cell.replace("-", "−") for cell in cells]
+            yield one.title, [signed(x, one.number) if k else DASH for x, k in known]
 
 
 def _side_by_side(report: Report, title: str) -> Group:
@@ -207,7 +203,7 @@ def _side_by_side(report: Report, title: str) -> Group:
 
 
 def for_print(report: Report, names: Sequence[str] = ()) -> pd.DataFrame:
-    """Return columns of a report with their intervals and readable headings.
+    """Return columns of a report with their intervals and the headings of its short table.
 
     Args:
         report: the report.
@@ -217,7 +213,9 @@ def for_print(report: Report, names: Sequence[str] = ()) -> pd.DataFrame:
         ConfigError: for an unknown column, naming the nearest.
     """
     table = chosen(report.short, names or [column.key for column in report.shown])
-    return table.rename(columns={"driver": "driven by", "score": report.label})
+    ends = ("", "_low", "_high")
+    words = {f"{one.key}{end}": f"{one.words}{end}" for one in report.shown for end in ends}
+    return table.rename(columns=words)
 
 
 def chosen(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:

@@ -42,6 +42,7 @@ from lcc_rl.results.remarks import (
     MARK,
     ONE,
     by_ends,
+    crashed,
     crashes,
     few_drives,
     flow_note,
@@ -212,8 +213,8 @@ def summary(
         row["single"] = kept == 1
         if task:
             row |= {SCORE: score_of(task, part, energy)}
-        crashed = bool(part.get("collisions", pd.Series(dtype=float)).sum())
-        row |= _savings(windows, name, (column, per), None if crashed else against)
+        hit = bool(part.get("collisions", pd.Series(dtype=float)).sum())
+        row |= _savings(windows, name, (column, per), None if hit else against)
         row |= ratio(windows, "all_path_energy_kj", name, [DISTANCE]).columns(PATH_PER_KM, 1e3)
         row |= {measure.key: measure.value(part) for measure in MEASURES}
         rows.append(row)
@@ -223,8 +224,7 @@ def summary(
     whole = table[table["strategy"] == against]
     for key, lost in {"distance_lost": DISTANCE, FLOW_LOST: FLOW}.items():
         table[key] = 1.0 - table[lost] / (whole[lost].iloc[0] if len(whole) else np.nan)
-    hit = (table["collisions"] > 0) & (table["strategy"] != against)
-    table.loc[hit, ["distance_lost", FLOW_LOST, FLOW]] = np.nan
+    table.loc[crashed(table), ["distance_lost", FLOW_LOST, FLOW]] = np.nan
     if task:
         table["kept"] = table["collisions"] == 0
         for one, bound in task.bounds.items():
@@ -304,7 +304,7 @@ def report(
         for key, shown in SAVINGS.items()
         for end in ("", "_low", "_high")
     }
-    percent["distance_pct"] = -100.0 * table["distance_lost"] + 0.0  # no negative zero
+    percent["distance_pct"] = -100.0 * table["distance_lost"]
     every = pd.concat([table, pd.DataFrame(percent)], axis=1)  # in few blocks, for more columns
     made = _of_task(every, task) if task else _of_energy(every, energy, filtered, second)
     short, shown = made.pop("short")

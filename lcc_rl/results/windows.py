@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from lcc_rl.energy import AVERAGED, BURNT, SECOND
 from lcc_rl.io.files import Rows, read_parquet
-from lcc_rl.results.bootstrap import NOTHING, Estimate, estimate, saving, share_saved
+from lcc_rl.results.bootstrap import NOTHING, Estimate, equal_seeds, estimate, saving, share_saved
 from lcc_rl.results.measures import DAMPING, DISTANCE, MEASURES, SHARE, WAYS, aggregates
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import EPISODES
@@ -189,7 +189,7 @@ def savings(
     """Return the share of the baseline's mean energy that a strategy saves.
 
     Tables show ``savings(rows, "total_path_energy_kj", "alcc", "human", per=WAYS)``. Trainings are
-    compared by equal seeds (:func:`with_equal_seeds`).
+    compared by equal seeds (:func:`with_equal_seeds`), which are resampled in pairs.
 
     Args:
         rows: rows of an evaluation, or result of :func:`windows_of`.
@@ -208,7 +208,8 @@ def savings(
     if energy.empty or not {strategy, baseline} <= set(energy.columns.get_level_values(0)):
         return NOTHING
     ours, theirs = ((energy[x].to_numpy(), way[x].to_numpy()) for x in (strategy, baseline))
-    return saving(ours[0], theirs[0], drives=drives, ways=(ours[1], theirs[1]))
+    paired = equal_seeds(energy[strategy].columns, energy[baseline].columns)
+    return saving(ours[0], theirs[0], paired, drives, ways=(ours[1], theirs[1]))
 
 
 def ratio(rows: pd.DataFrame, column: str, strategy: str, per: Sequence[str]) -> Estimate:
@@ -256,7 +257,7 @@ def _by_window(
         means.pivot(index="profile_id", columns=[STRATEGY, TRAINED], values=name)
         for name in (column, "way")
     )
-    energy = energy.dropna(axis=1, how="all").dropna()
+    energy = energy.sort_index(axis=1).dropna(axis=1, how="all").dropna()
     drives = None
     if DRIVE in chosen:
         drives = chosen.groupby("profile_id")[DRIVE].first().reindex(energy.index).tolist()

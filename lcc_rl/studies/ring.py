@@ -15,8 +15,8 @@ from lcc_rl.config import load
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import read_parquet
+from lcc_rl.results.measures import signed
 from lcc_rl.results.names import in_words
-from lcc_rl.results.render import signed
 from lcc_rl.results.runs import EPISODES, STEPS, stored_config
 from lcc_rl.studies.results import StudyResults
 
@@ -89,7 +89,7 @@ def table(rows: pd.DataFrame) -> pd.DataFrame:
             f"{times.mean():.0f} s" if times.notna().all() else f"{times.count()} of {len(times)}"
         )
         ratios = (own / humans).to_dict()
-        changes = (f"{signed(100 * (ratios[x] - 1), '+.1f')} %" for x in ("speed_std_mps", "fuel"))
+        changes = (f"{signed(100 * (ratios[x] - 1))} %" for x in ("speed_std_mps", "fuel"))
         found.append(
             {
                 "driven by": in_words(str(name)),

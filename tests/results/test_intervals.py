@@ -60,6 +60,32 @@ def test_interval_is_that_of_a_plain_loop() -> None:
     assert (found.low, found.high) == pytest.approx((low, high), abs=0.06 * (high - low))
 
 
+def test_equal_seeds_are_resampled_in_pairs() -> None:
+    generator = np.random.default_rng(5)
+    base = generator.uniform(80, 120, (6, 1)) * generator.uniform(0.9, 1.1, (1, 4))
+    own = base * generator.uniform(0.94, 0.96, (6, 4))
+    keys = pd.MultiIndex.from_product([range(6), range(4)], names=["profile_id", "training_seed"])
+    parts = {"alcc a": own, "alcc b": base}
+    rows = pd.concat(
+        pd.DataFrame({"strategy": name, "energy": x.ravel()}, keys).reset_index()
+        for name, x in parts.items()
+    ).sample(frac=1.0, random_state=0)
+    draws = []
+    for _ in range(4000):
+        windows, seeds = generator.integers(0, 6, 5), generator.integers(0, 4, 3)
+        sums = (x[windows][:, seeds].sum() for x in (own, base))
+        draws.append(1.0 - next(sums) / next(sums))
+    low, high = np.quantile(draws, [0.025, 0.975])
+    found = savings(rows, "energy", "alcc a", "alcc b")
+    assert found.value == pytest.approx(1.0 - own.sum() / base.sum())
+    assert (found.low, found.high) == pytest.approx((low, high), abs=0.06 * (high - low))
+    assert savings(rows, "energy", "alcc b", "alcc b").columns("") == {"": 0, "_low": 0, "_high": 0}
+    # Different seeds are independent: the trainings differ more than the saving does.
+    shifted = rows.assign(training_seed=rows["training_seed"] + 9 * (rows["strategy"] == "alcc b"))
+    apart = savings(shifted, "energy", "alcc a", "alcc b")
+    assert apart.high - apart.low > 3.0 * (high - low)
+
+
 def test_energy_and_distance_are_resampled_together() -> None:
     """Who falls back in some windows takes as much less energy there: per km nothing varies."""
     generator = np.random.default_rng(4)

@@ -186,6 +186,13 @@ def test_the_verdict_says_what_came_out_and_how_sure_it_is() -> None:
     assert first == words.splitlines()[0].replace("the network", "near", 1)
     assert second.startswith("With far, energy")
     assert sample_of(frame) == f"12 held-out windows × {frame['driver_id'].nunique()} drivers"
+    # A network that collides is not compared, and a rule that does is no baseline.
+    hit = frame["profile_id"] == 0
+    crashed = said(frame.assign(collided=hit & (frame["strategy"] == "alcc")))
+    assert "With" not in crashed.verdict
+    assert "network" in crashed.note
+    crashed = said(frame.assign(collided=hit & (frame["strategy"] == "rule")))
+    assert "than with simulated drivers" in crashed.verdict.splitlines()[0]
     few = said(frame[frame["profile_id"] < 4]).verdict
     assert few.endswith("; 4 windows are too few for a conclusion.")
     assert "%" not in few

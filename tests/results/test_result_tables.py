@@ -15,7 +15,7 @@ from lcc_rl.energy import as_fleet
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.cases import measured_series
 from lcc_rl.results.platoons import case_table
-from lcc_rl.results.render import as_latex, as_markdown, print_table, terminal
+from lcc_rl.results.render import as_csv, as_latex, as_markdown, print_table, saved_text, terminal
 from lcc_rl.results.report import report, summary, windows_for
 from lcc_rl.results.task import Task
 from lcc_rl.studies.hcfs.tables import win_rates
@@ -272,3 +272,16 @@ def test_signs_of_a_name_stay_in_its_cell() -> None:
     assert [len(re.split(r"(?<!\\)\|", line)) for line in (head, rule, row)] == [4, 4, 4]
     assert r"a\|b_c & 5 % #" in row
     assert r"a|b\_c \& 5 \%" in as_latex(table)
+
+
+def test_no_table_has_a_negative_zero() -> None:
+    table = pd.DataFrame({"saved_pct": [-0.0, -1e-9], "n": [0, 1]})
+    for text in (
+        as_markdown(table),
+        as_latex(table),
+        as_csv(table[:1]),
+        saved_text(-0.04, -0.04, 0),
+    ):
+        assert not re.search(r"[-−]\$?0\.?0*\b", text), text
+    assert saved_text(-0.04, -0.06, 0.0) == "+0.0 (−0.1 … 0.0)"
+    assert as_csv(pd.DataFrame({"x": [-0.0, 1.5]}), "comma").split() == ["x", "0,0", "1,5"]

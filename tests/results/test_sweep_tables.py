@@ -153,13 +153,14 @@ def test_rows_are_settings_and_have_their_seeds(root, capsys) -> None:
 
 def test_a_row_may_have_another_name_everywhere(root, capsys, monkeypatch) -> None:
     monkeypatch.setattr(names, "LABELS", dict(names.LABELS))
+    monkeypatch.setattr(names, "FORMER", {})
     renamed = ["--rename", "network (efficiency.weight=2)", "half", "--against", "half"]
     for words in ([], ["--format=latex"], ["--format=csv"], ["--all"]):
         table.main([str(root), *renamed, *words])
         printed = capsys.readouterr().out
         assert "half" in printed
         assert "network (efficiency.weight=2)" not in printed
-        renamed = ["--against", "half"]
+        renamed = ["--against", "network (efficiency.weight=2)"]  # the name before
     known = ["alcc a=1", "alcc a=2", "rule"]
     cases = [
         ("alcc a=3", "x", "unknown strategy 'alcc a=3'.*Did you mean 'alcc a="),

@@ -25,8 +25,8 @@ from lcc_rl.figures.drawing import (
 )
 from lcc_rl.figures.training import BAND_NOTE, draw_curves
 from lcc_rl.functional.power import motor_power
+from lcc_rl.results.measures import signed
 from lcc_rl.results.names import in_words
-from lcc_rl.results.render import signed
 from lcc_rl.results.windows import by_driver, savings
 from lcc_rl.studies.alcc.paper_tables import (
     BASELINE,
@@ -65,7 +65,7 @@ def power_map() -> Figure:
     filled.set_edgecolor("face")  # no seams in vector formats
     levels = [-150, -100, -50, -20, 0, 20, 50, 100, 150, 200]
     lines = axis.contour(speed, acceleration, power, levels, colors=INK, linewidths=0.7)
-    axis.clabel(lines, fmt=lambda kw: signed(kw, ".0f"), fontsize=6)
+    axis.clabel(lines, fmt=lambda kw: signed(kw, "{:.0f}"), fontsize=6)
     ticks = [-200, -100, 0, 100, 200]
     figure.colorbar(filled, label="electric power [kW]\n(below 0: recuperated)", ticks=ticks)
     axis.set(xlabel="speed [m/s]", ylabel="acceleration [m/s²]")
@@ -193,7 +193,7 @@ def _cut_outliers(axis: Axes, places: np.ndarray, values: np.ndarray) -> None:
     for place, value in zip(places, values, strict=True):
         if abs(value) > limit:
             mark, end, side = ("▲", limit, "top") if value > 0 else ("▼", -limit, "bottom")
-            axis.annotate(f"{signed(value, '+.0f')} % {mark}", (place, end), va=side, **look)
+            axis.annotate(f"{signed(value, '{:+.0f}')} % {mark}", (place, end), va=side, **look)
 
 
 @paper
