@@ -10,13 +10,14 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
 from shutil import which
 from typing import Any, ClassVar, NoReturn
 
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import configure_log
 from hydra.experimental.callback import Callback
@@ -25,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.live import Live
 
-from lcc_rl.config import NOT_IDENTITY, identity, key_of, parsed
+from lcc_rl.config import NOT_IDENTITY, composed, identity, key_of, parsed
 from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.runs.interrupts import BAD_INPUT, was_interrupted
@@ -157,6 +158,8 @@ class SweepCallback(Callback):
         plan = make_plan(config)
         if plan.runs > MOST_RUNS:
             refuse(f"a sweep has at most {MOST_RUNS} runs")
+        if str(config.hydra.sweeper.get("_target_")).endswith(BasicSweeper.__name__):
+            check_cells(config, plan.varied)
         type(self).folder = type(self).target = folder
         with atomic_path(folder / PLAN) as temporary:
             temporary.write_text(json.dumps(asdict(plan)), encoding="utf-8")
@@ -211,16 +214,43 @@ def limit_batches(config: DictConfig) -> None:
             hydra.sweeper.max_batch_size = parallel_jobs(config.threads)
 
 
+def words_of_sweep(config: DictConfig) -> list[str]:
+    """Return the command line of a sweep and the parameters of its sweeper."""
+    params = config.hydra.sweeper.get("params") or {}
+    return [*words_of(config), *(f"{key}={value}" for key, value in params.items())]
+
+
 def make_plan(config: DictConfig) -> SweepPlan:
     """Return the plan of a sweep's configuration."""
-    typed = words_of(config)
-    params = config.hydra.sweeper.get("params") or {}
-    typed += [f"{key}={value}" for key, value in params.items()]
-    parsed = OverridesParser.create().parse_overrides(result_overrides(typed))
-    swept = {item.get_key_element(): item for item in parsed if item.is_sweep_override()}
+    read = OverridesParser.create().parse_overrides(result_overrides(words_of_sweep(config)))
+    swept = {item.get_key_element(): item for item in read if item.is_sweep_override()}
     varied = [key_of(key) for key in swept]
     values = [list(islice(item.sweep_string_iterator(), MOST_RUNS + 1)) for item in swept.values()]
     return SweepPlan(math.prod(map(len, values)), varied, values)
+
+
+def check_cells(config: DictConfig, varied: Collection[str]) -> None:
+    """Log which cells of a sweep will fail, and why; the sweep runs the others.
+
+    Args:
+        config: Hydra's configuration of the sweep.
+        varied: dotted keys that name a cell.
+
+    Raises:
+        SystemExit: for a choice that no file has, with which Hydra does not start a sweep.
+    """
+    read = OverridesParser.create().parse_overrides(words_of_sweep(config))
+    entry = config.hydra.job.config_name
+    for words in BasicSweeper.split_arguments(read, None)[0]:
+        try:
+            cell = composed(entry, words)
+        except ConfigError as error:
+            refuse(error)
+        try:
+            parsed(cell, entry, words, sweep=True)
+        except LccError as error:
+            name = " ".join(item.lstrip("+") for item in words if key_of(item) in varied)
+            log.error("will fail: %s: %s", name, error)
 
 
 def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path) -> Any:

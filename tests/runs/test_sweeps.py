@@ -38,6 +38,8 @@ def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path
     assert "1 of 2 runs failed" in first.stderr
     assert "Traceback" not in first.stderr
     assert f"failed: {GAP}=-1_" in first.stdout
+    begun = first.stdout.index("Launching 2 jobs")
+    assert f"will fail: {GAP}=-1: {GAP} must be greater than 0" in first.stdout[:begun]
     (folder,) = (tmp_path / "outputs" / "train").iterdir()
     (table,) = folder.glob("*/episodes.parquet")
     (error,) = folder.glob("*/error.txt")
@@ -119,6 +121,35 @@ def test_what_was_typed_may_refer_to_settings() -> None:
     config = OmegaConf.create({"hydra": {"overrides": {"task": typed}, "sweeper": {}}})
     values = [["$\\{agent.gamma\\}", "1"]]
     assert sweeps.make_plan(config) == sweeps.SweepPlan(2, ["seed"], values)
+
+
+CELLS = {
+    ("reward.without=null,safty", "seed=0,1"): [
+        f"will fail: reward.without=safty seed={seed}: unknown term of the reward"
+        for seed in (0, 1)
+    ],
+    ("training.episodes=8,none", "seed=3"): [
+        "will fail: training.episodes=none: training.episodes"
+    ],
+    ("seed=0,1",): [],
+}
+
+
+def test_cells_that_will_fail_are_named_before_the_first_run(caplog, capsys) -> None:
+    def check(*words: str) -> None:
+        typed = {"task": ["variant=alcc", "experiment=smoke", *words]}
+        hydra = {"overrides": typed, "sweeper": {}, "job": {"config_name": "train"}}
+        config = OmegaConf.create({"hydra": hydra})
+        sweeps.check_cells(config, sweeps.make_plan(config).varied)
+
+    for words, expected in CELLS.items():
+        caplog.clear()
+        check(*words)
+        assert len(caplog.messages) == len(expected), words
+        assert all(map(str.startswith, caplog.messages, expected)), caplog.messages
+    with pytest.raises(SystemExit):  # Hydra starts no sweep with it
+        check("agent=ddpg,nosuch")
+    assert "unknown choice of agent 'nosuch'" in capsys.readouterr().err
 
 
 def test_a_sweep_of_nothing_is_one_line(tmp_path) -> None:
