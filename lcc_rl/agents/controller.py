@@ -39,6 +39,5 @@ class ControllerPolicy(TensorDictModuleBase):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
         command = self.controller.computed([tensordict.get(key) for key in self.in_keys])
         return tensordict.set(ACTION, (command / self.max_acceleration).clamp(-1.0, 1.0))

@@ -228,7 +228,6 @@ class OffPolicy(Agent):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the result of :meth:`state_dict`."""
         self.count = state["count"]
         self.loss.load_state_dict(state["loss"])
         for name, part in self.optimizers.items():

@@ -62,7 +62,6 @@ class SampledAction(TensorDictModuleBase):
         self.register_buffer("sigma", torch.tensor(1.0))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
         mean, spread = self.head(tensordict.get(OBSERVATION))
         noise = action_noise(mean, tensordict, self.stream)
         return tensordict.set(ACTION, (mean + self.sigma * spread * noise).tanh().clamp(-ONE, ONE))

@@ -15,6 +15,7 @@ from lcc_rl.settings import TARGET
 
 NO_AGENT = ("agent=none", "agent=null")
 BASELINES = "evaluation.baselines"
+OBSERVATION = "lcc_rl.pieces.Observation"
 
 
 def check_used(
@@ -37,6 +38,10 @@ def check_used(
     typed = {item: typed_keys(item) for item in overrides}
     if not sweep:
         reasons |= dict(_of_roles(cfg)) | dict(_of_agent(cfg))
+        seen = cfg.observation.settings
+        if seen[TARGET] == OBSERVATION and "behind" not in (seen.get("scales") or ()):
+            for key in ("visible", "presence"):
+                reasons[f"observation.{key}"] = "observation.scales names no vehicle behind"
         if isinstance(cfg, EvaluateConfig) and cfg.compare and not cfg.policy and cfg.agent:
             reasons[AUTO] = "compare names every controller, with its own settings"
         plain = type(cfg) is TrainConfig and BASELINES in map(key_of, overrides)

@@ -59,7 +59,8 @@ class DifferentiableRollout:
         graded = {as_key(key) for key in wanted} | {OBSERVATION}
         every = graded | {as_key(key) for key in observed} | {TERMINATED}
         needed, self.graded = closure(pieces, every), closure(pieces, graded)
-        recurrent = [piece for piece in needed if _is_recurrent(piece)]
+        # Those that read what they wrote one moment before.
+        recurrent = [x for x in needed if {key for late, key in x.needs if not late} & written([x])]
         inside = closure(needed, {OBSERVATION}, recurrent)
         self.after = [piece for piece in needed if piece not in inside]
         self.step = Step(inside, self.horizon, self.graded)
@@ -232,8 +233,3 @@ class _Motion(torch.autograd.Function):
             given = (column[step] for column in columns)
             later, by_shifts[step], *sums = ctx.pull(later, *given, *held, *sums)
         return None, None, None, None, by_shifts, *sums
-
-
-def _is_recurrent(piece: Piece) -> bool:
-    """Whether a piece reads what it wrote one moment before."""
-    return bool({key for late, key in piece.needs if not late} & written([piece]))

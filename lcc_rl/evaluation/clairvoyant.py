@@ -50,7 +50,6 @@ class Planned:
         self.in_keys = [*policy.in_keys, STEP]
 
     def __call__(self, td: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
         td = self.policy(td)
         shift = self.shifts[int(td.get(STEP).flatten()[0])]
         return td.set(ACTION, (td.get(ACTION) + shift).clamp(-1.0, 1.0))

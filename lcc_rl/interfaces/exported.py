@@ -73,12 +73,10 @@ class NetworkController(Controller):
     reads = (next_key(OBSERVATION),)
 
     def setup(self, world: World) -> None:
-        """Read the observation."""
         self.declare(world)
         self.layers = self.network  # as a part of this module
 
     def command(self, observation: Tensor) -> Tensor:
-        """Return the commands."""
         return self.max_acceleration * self.layers(observation.flatten(1)).unsqueeze(1)
 
 

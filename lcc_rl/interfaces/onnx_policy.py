@@ -164,7 +164,6 @@ class OnnxPolicy(Controller):
         self.program = Program(self.path)
 
     def setup(self, world: World) -> None:
-        """Read the program's inputs and memory."""
         width = self.program.memory
         memory = [Entry("role.program", "–", "memory of the program", width)] * bool(width)
         self.declare(world, self.program.names, remembers=memory)

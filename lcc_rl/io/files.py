@@ -185,11 +185,8 @@ def texts_of(schema: pa.Schema) -> list[str]:
 
 
 def _texts_encoded(schema: pa.Schema) -> pa.Schema:
-    return pa.schema([(x.name, TEXT if _is_text(x.type) else x.type) for x in schema])
-
-
-def _is_text(kind: pa.DataType) -> bool:
-    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
+    texts = (pa.string(), pa.large_string())
+    return pa.schema([(x.name, TEXT if x.type in texts else x.type) for x in schema])
 
 
 def _constants(columns: Mapping[str, Any]) -> ds.Expression:

@@ -29,7 +29,6 @@ class Actuation(RoleTransform):
     kept = Entry("role.actuation", "m/s²", "last acceleration, then commands that do not act yet")
 
     def setup(self, world: World) -> None:
-        """Read the commands of the role."""
         self.response = self.response_in(world, self.name, HARDEST)
         reads = [f"next.{self.name}.command", f"{self.name}.{ACTUATION}"]
         self.declare(world, reads, [self.obeyed, self.kept.wide(1 + self.response.late)])
@@ -45,7 +44,6 @@ class Actuation(RoleTransform):
         return Response.of(late, self.lag, braking, world.time_step)
 
     def compute(self, command: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the accelerations and the memory."""
         line = join([kept[..., 1:], command], -1)
         acceleration = self.response.next(kept[..., :1], line[..., :1])
         return acceleration, join([acceleration, line[..., 1:]], -1)

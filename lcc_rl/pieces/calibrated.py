@@ -23,7 +23,6 @@ class CalibratedDrivers(Drivers):
     kinds: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
-        """Take the drivers' models and parameters."""
         super().setup(world)
         population = world.population
         models = getattr(population, "models", None) or ("idm",) * len(population.time_gap)

@@ -257,11 +257,9 @@ class Corrected(RoleTransform):
     )
 
     def setup(self, world: World) -> None:
-        """Read the actions and commands of the role."""
         self.declare(world, (f"{self.role}.action", f"next.{self.role}.command"))
 
     def compute(self, action: Tensor, command: Tensor) -> Tensor:
-        """Return the correction."""
         return command - self.max_acceleration * action
 
 
@@ -286,7 +284,6 @@ class CBFGuarantee(RoleTransform):
     )
 
     def setup(self, world: World) -> None:
-        """Read the true state and the filter's memories."""
         seen = ["self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration"]
         self.declare(world, [*seen, *self.safety.memories, "episode.step"])
 

@@ -126,7 +126,6 @@ class CACC(Controller):
             self.gains.check_stable(world.time_step)
 
     def command(self, *read: Tensor) -> Tensor:
-        """Return the commands."""
         errors, speed = Errors(*read[: len(PLATOON_ERRORS)]), read[len(PLATOON_ERRORS) :]
         # A hybrid controller uses the command without these limits.
         return cacc_acceleration(errors, self.gains, self.time_step, *speed)
@@ -144,12 +143,10 @@ class DeadBeat(Controller):
     lookahead: Lookahead = "causal"
 
     def setup(self, world: World) -> None:
-        """Read the entries that the look-ahead needs."""
         self.declare(world, ["self.speed", *leader_names(self.lookahead)])
         check_leader(self.lookahead, self)
 
     def command(self, speed: Tensor, *leader: Tensor) -> Tensor:
-        """Return the commands."""
         target = next_leader_speed(leader, self.lookahead, self.time_step)
         return (target - speed) / self.time_step
 

@@ -132,12 +132,10 @@ class Action(Controller):
     reads = (".".join(ACTION),)
 
     def setup(self, world: World) -> None:
-        """Read the role's action."""
         self.declare(world, [f"{self.name}.action"])
         self.limits = None  # the action is clamped when it is read
 
     def command(self, action: Tensor) -> Tensor:
-        """Return the commands."""
         return action * self.max_acceleration
 
 
@@ -149,7 +147,6 @@ class ConstantAcceleration(Controller):
     reads = ("self.speed",)
 
     def command(self, speed: Tensor) -> Tensor:
-        """Return the commands."""
         return torch.full_like(speed, self.acceleration)
 
 
@@ -175,7 +172,6 @@ class Law(Controller):
         self.declare(world, [_entry(name) for name in names])
 
     def command(self, *entries: Tensor) -> Tensor:
-        """Return the commands."""
         return self.function(*entries)
 
 

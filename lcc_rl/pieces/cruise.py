@@ -42,7 +42,6 @@ class Cruise(Controller):
         """
 
     def command(self, speed: Tensor, gap: Tensor, relative_speed: Tensor) -> Tensor:
-        """Return the commands."""
         constants = (getattr(self, name) for name in self.constants_of_rule())
         return self.law(speed, gap, relative_speed, *constants)
 

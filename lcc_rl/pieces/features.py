@@ -64,7 +64,6 @@ class EnergyClasses(StepTransform):
     )
 
     def setup(self, world: World) -> None:
-        """Read the classes and their shares."""
         self.declare(world)
         self.energy = world.given("energy", self.title)
         self.stream = stream_id("vehicles.energy_class")

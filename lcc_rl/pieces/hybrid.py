@@ -120,7 +120,6 @@ class HCFS(Controller):
         last_winner: Tensor,
         rule: Tensor,
     ) -> Decision:
-        """Return the decision."""
         speed, last, gap, speed_error, leader_gap = own
         interval = jerk_interval(last, self.jerk_bound, self.time_step, self.max_acceleration)
         ahead, time_step = speed + speed_error, self.time_step

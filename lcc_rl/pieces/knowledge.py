@@ -45,7 +45,6 @@ class LeaderPreview(Feature):
     columns: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
-        """Read the leader's records."""
         profiles = world.profiles
         self.declare(world, writes=[self.known.wide((1, len(self.horizons)))])
         self.stream = stream_id("preview.noise")
@@ -60,7 +59,6 @@ class LeaderPreview(Feature):
         self.register_buffer("columns", torch.arange(len(steps)))
 
     def compute(self, profile: Tensor, start: Tensor, seed: Tensor, step: Tensor) -> Tensor:
-        """Return the speeds ahead."""
         place = torch.minimum(start + step + self.shift, self.last[profile]).clamp(min=0)
         speed = self.speeds[self.offsets[profile] + place]
         if self.noise:

@@ -75,7 +75,6 @@ class MPC(MPCSettings, Controller):
     writes = (Entry("role.unsolved", "–", "1 where MPC found no solution and brakes fully"),)
 
     def setup(self, world: World) -> None:
-        """Set up the solver."""
         self.check_installed()
         self.declare(world)
         own = {field.name: getattr(self, field.name) for field in fields(MPCSettings)}

@@ -25,11 +25,9 @@ class RangeReward(RewardTerm):
             raise ValueError(f"least={self.least} must be below largest={self.largest}")
 
     def setup(self, world: World) -> None:
-        """Read the entry."""
         self.declare(world, [f"self.{self.entry}"])
 
     def reward(self, entry: Tensor) -> Tensor:
-        """Return the unweighted term."""
         return -self.missed(entry).to(entry.dtype)
 
     def missed(self, entry: Tensor) -> Tensor:
@@ -49,7 +47,6 @@ class SmoothRange(RangeReward):
     width: Positive = 0.05  # range over which the price bends, as a share of a bound
 
     def reward(self, entry: Tensor) -> Tensor:
-        """Return the unweighted term."""
         price = torch.zeros_like(entry)
         if self.least is not None:
             price = price + excess(1.0 + self.margin - entry / self.least, self.width)

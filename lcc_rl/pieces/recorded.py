@@ -48,7 +48,6 @@ class RecordedDriver(Controller):
     def command(
         self, speed: Tensor, gap: Tensor, profile: Tensor, first: Tensor, step: Tensor
     ) -> Tensor:
-        """Return the commands."""
         sample = self.offsets[profile] + first + step
         off = gap - self.records[sample][..., 1].view_as(gap)
         reached = self.records[sample + 1][..., 0].view_as(speed) + off / self.led_back

@@ -53,7 +53,6 @@ class RewardTerm(RewardPiece):
         cls.name = re.sub("(Reward|Penalty)$", "", cls.__name__).lower()
 
     def compute(self, *entries: Tensor) -> Tensor:
-        """Return the weighted term."""
         return self.weight * self.reward(*entries)
 
 
@@ -77,7 +76,6 @@ class SafetyReward(RewardTerm):
             raise ValueError(f"floor={self.floor} must be below threshold={self.threshold}")
 
     def reward(self, gap: Tensor, relative_speed: Tensor) -> Tensor:
-        """Return the unweighted term."""
         room = torch.where(gap > 0.0, (gap - self.margin).clamp(min=TOUCH), gap)
         ttc = time_to_collision(room, -relative_speed, self.floor)
         return (ttc.clamp(max=self.threshold) / self.threshold).log()
@@ -91,7 +89,6 @@ class EfficiencyReward(RewardTerm):
     reads = ("self.time_gap",)
 
     def reward(self, time_gap: Tensor) -> Tensor:
-        """Return the unweighted term."""
         return -(time_gap >= self.threshold).to(time_gap.dtype)
 
 
@@ -114,7 +111,6 @@ class EnergyReward(RewardTerm):
         self.declare(world, [own if self.of == "self" else self.power, *indices])
 
     def reward(self, power: Tensor, *indices: Tensor) -> Tensor:
-        """Return the unweighted term."""
         if self.of == "behind":
             power = self.sections.sum(power, *indices)
         elif self.of == "string":
@@ -139,7 +135,6 @@ class CollisionPenalty(RewardTerm):
         self.declare(world, ["self.gap", "vehicles.gap", *self.sections.keys])
 
     def reward(self, gap: Tensor, gaps: Tensor, *indices: Tensor) -> Tensor:
-        """Return the unweighted term."""
         hit = gap <= 0.0
         if self.behind:
             hit = hit | (self.sections.sum((gaps <= 0.0).to(gap.dtype), *indices) > 0.0)
@@ -155,7 +150,6 @@ class VelocityReward(RewardTerm):
     reads = ("self.leader_speed_error",)
 
     def reward(self, speed_error: Tensor) -> Tensor:
-        """Return the unweighted term."""
         return -speed_error.abs() / self.speed_scale
 
 
@@ -168,7 +162,6 @@ class JerkReward(RewardTerm):
     reads = ("self.jerk",)
 
     def reward(self, jerk: Tensor) -> Tensor:
-        """Return the unweighted term."""
         return -jerk.abs() / self.jerk_scale
 
 
@@ -186,7 +179,6 @@ class SpacingReward(RewardTerm):
     reads = ("self.leader_gap_error",)
 
     def reward(self, gap_error: Tensor) -> Tensor:
-        """Return the unweighted term."""
         return -(gap_error / self.gap_scale).square()
 
 
@@ -201,12 +193,10 @@ class TotalReward(AfterStep, RewardPiece):
     writes = (Entry(REWARD, "–", "sum of the terms"),)
 
     def setup(self, world: World) -> None:
-        """Read the terms."""
         require(self.terms, "reward.terms is empty: an environment needs at least one term")
         self.declare(world, [(*TERMS, name) for name in self.terms])
 
     def compute(self, *entries: Tensor) -> Tensor:
-        """Return the sum."""
         return torch.stack(entries).sum(0)
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:

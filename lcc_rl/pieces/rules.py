@@ -200,7 +200,6 @@ class Handover(Controller):
     from_s: NonNegative  # time of the handover [s]
 
     def setup(self, world: World) -> None:
-        """Read and write the entries of both."""
         both = [inner.bind(world, self.name) for inner in (self.before, self.after)]
         self.before, self.after = both
         self.declare(

@@ -61,7 +61,6 @@ class Sensors(RoleTransform):
             raise ValueError("dropouts and longest_dropout belong together: give both or none")
 
     def setup(self, world: World) -> None:
-        """Read the true state in the views of the role."""
         role, self.time_step = self.name, world.time_step
         self.sensing = self.sensing_in(world, role)
         self.apart = max(1, world.steps(self.error_time, f"scenario.sensors.{role}.error_time"))
@@ -90,7 +89,6 @@ class Sensors(RoleTransform):
         return Sensing(*errors, late, longest)
 
     def compute(self, memory: Tensor, *seen: Tensor) -> tuple[Tensor, ...]:
-        """Return the measurements and the memory."""
         *now, seed, step = seen
         frames = join([*now, memory[..., 1 : -len(TRUE_STATE)]], -1)
         dropped = memory[..., :1] - self.sensing.late

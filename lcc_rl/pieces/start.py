@@ -77,7 +77,6 @@ class EquilibriumStart(Part):
     cap_time_gap: Positive = 3.0
 
     def setup(self, world: World) -> None:
-        """Read the shared parameters."""
         self.drivers = world.population.constants.mean()
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:

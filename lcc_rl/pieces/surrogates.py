@@ -49,7 +49,6 @@ class SmoothSafety(RewardTerm):
     reads = ("self.gap", "self.relative_speed")
 
     def reward(self, gap: Tensor, relative_speed: Tensor) -> Tensor:
-        """Return the unweighted term."""
         room = _log_softplus((gap - self.margin) / self.gap_width) + math.log(self.gap_width)
         rate = _log_softplus(-relative_speed / self.rate_width) + math.log(self.rate_width)
         return -excess(math.log(self.threshold) + rate - room, self.width)
@@ -71,7 +70,6 @@ class SmoothEfficiency(RewardTerm):
     reads = ("self.gap", "self.speed")
 
     def reward(self, gap: Tensor, speed: Tensor) -> Tensor:
-        """Return the unweighted term."""
         longest = self.threshold * speed.clamp(min=self.speed_floor)
         # Negative gaps are never too long.
         return -excess((gap / longest).clamp(min=1e-3).log(), self.width)
@@ -93,7 +91,6 @@ class Smoothness(RewardTerm):
     reads = ("self.jerk",)
 
     def reward(self, jerk: Tensor) -> Tensor:
-        """Return the unweighted term."""
         return -jerk.square()
 
 
@@ -106,7 +103,6 @@ class SpeedSpread(RewardTerm):
     reads = ("vehicles.speed",)
 
     def reward(self, speed: Tensor) -> Tensor:
-        """Return the unweighted term."""
         variance = speed.var(-2, correction=0, keepdim=True)
         return -(variance + self.floor**2).sqrt().expand(*speed.shape[:-2], *self.event_shape)
 
@@ -123,7 +119,6 @@ class Correction(RewardTerm):
     reads = ("automated.correction",)
 
     def reward(self, correction: Tensor) -> Tensor:
-        """Return the unweighted term."""
         return -correction.square()
 
 
@@ -143,7 +138,6 @@ class ExcessSpacing(RewardTerm):
     limit_width: ClassVar = 0.1  # least miss of a limit at which its price changes fastest
 
     def reward(self, gap: Tensor, speed: Tensor) -> Tensor:
-        """Return the unweighted term."""
         return -self.missed(gap, speed)
 
     def missed(self, gap: Tensor, speed: Tensor) -> Tensor:
@@ -179,7 +173,6 @@ class PathEnergy(RewardTerm):
         self.declare(world, [f"{space}.speed", f"{space}.acceleration", *kind, *indices])
 
     def reward(self, speed: Tensor, acceleration: Tensor, *more: Tensor) -> Tensor:
-        """Return the unweighted term."""
         before = speed - acceleration * self.time_step
         kind, indices = (more[0], more[1:]) if self.mixed else (None, more)
         power = self.energy.path_power(before, acceleration, kind) - self.distance_price * before

@@ -73,7 +73,7 @@ def estimate(
         if no resample has a value. With one seed, the interval excludes the variation of seeds.
     """
     value = float(statistic(*({key: x.mean((-2, -1)) for key, x in one.items()} for one in sides)))
-    if not np.isfinite(value) or max(n for one in sides for n in _sizes(one)) < 2:
+    if not np.isfinite(value) or max(max(x.shape[-2:]) for one in sides for x in one.values()) < 2:
         return Estimate(value)
     streams = [
         WITHOUT_WINDOWS if alone else 1 if paired else side for side in range(1, len(sides) + 1)
@@ -109,10 +109,6 @@ def _over_drives(
         left.append(float(statistic(*means)))
     half_width = STUDENT[len(names) - 2] * float(np.std(left)) * (len(names) - 1) ** 0.5
     return value - half_width, value + half_width
-
-
-def _sizes(side: Side) -> tuple[int, ...]:
-    return next(iter(side.values())).shape[-2:]
 
 
 def resampled(table: Floats, stream: int, drives: Sequence[object] | None = None) -> Floats:

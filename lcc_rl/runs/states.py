@@ -124,7 +124,7 @@ def working(folder: Path) -> Iterator[None]:
             raise
         except Exception as error:
             # A finished run remains finished if it could not be repeated.
-            if not is_finished(folder):
+            if not any((folder / table).exists() for table in RESULT_TABLES):
                 record(folder, error)
             raise
 
@@ -185,11 +185,6 @@ def record(folder: Path, error: BaseException) -> None:
 def described_error(error: BaseException) -> str:
     """Return an error in one line, with its type unless it is an input error."""
     return one_line(str(input_error(error) or f"{type(error).__name__}: {error}"))
-
-
-def is_finished(folder: Path) -> bool:
-    """Whether a run's folder holds its last table."""
-    return any((folder / table).exists() for table in RESULT_TABLES)
 
 
 def _is_whole(table: Path) -> bool:

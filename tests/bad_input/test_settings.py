@@ -84,6 +84,7 @@ IGNORED = {
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",
     "evaluation.baselines=[human]": "a training evaluates its own policy",
     "sweep=mine": "names the folder of a sweep, -m",
+    "variant=own_energy observation.visible=2": "scales names no vehicle behind",
 }
 # Settings of terms and surrogates that a training by the gradient ignores, and why.
 GRADIENT = {
