@@ -36,7 +36,7 @@ def export(run: str | Path, origin: str, folder: Path = FOLDER, name: str | None
         kind: {Path(file).name: found for file, found in files.items()}
         for kind, files in cfg.inputs.items()
     }
-    cfg = cfg.with_(**dict.fromkeys(LOCAL), inputs=inputs)
+    cfg = cfg.with_(**dict.fromkeys(x for x in LOCAL if hasattr(cfg, x)), inputs=inputs)
     path = folder / f"{name or cfg.variant}.pt"
     provenance = f"{origin}; lcc_rl {version('lcc_rl')}"
     content = {"weights": weights, "config": as_text(cfg), "provenance": provenance}

@@ -19,7 +19,6 @@ from lcc_rl.pieces.base import (
     OBSERVATION,
     SEED,
     STEP,
-    Piece,
     State,
     StepTransform,
     as_key,
