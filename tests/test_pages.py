@@ -47,7 +47,7 @@ LENGTH, WINDOWS = "scenario.horizon=40", ("evaluation.profiles=2", "evaluation.d
 TRAINING = ("training.episodes=24", "training.environments=8", "training.segment=20")
 SMALL = (
     *(LENGTH, *TRAINING, *WINDOWS, QUICK, *DATA),
-    *("training.checkpoint_every=1", "evaluation.full_length=false"),
+    *("training.checkpoint_every=1", "evaluation.full_length=false", "evaluation.warm_up=0"),
 )
 OF_TRAINING = ("agent.batch_size=64", "agent.population=4")
 # What a page asks for, and what is enough for a try.
@@ -190,7 +190,8 @@ class Runner(Reader):
         if name not in console.HYDRA_COMMANDS or any(word.startswith("resume=") for word in words):
             return []
         self.count += 1
-        place = [] if "-m" in words else [f"hydra.run.dir=outputs/{name}/{self.count}"]
+        own = any(word == "-m" or word.startswith("hydra.run.dir=") for word in words)
+        place = [] if own else [f"hydra.run.dir=outputs/{name}/{self.count}"]
         if "experiment=smoke" in words:  # small by itself
             return place
         typed = settings_of(words, self.folder)
