@@ -12,6 +12,7 @@ from page_blocks import ROOT
 
 REFERENCE = ROOT / "outputs" / "reference"
 PATH, FLOW, FUEL = "total_path_energy_kj", "flow_vph", 42.4  # kJ per g of petrol
+PETROL = "total_second_path_energy_kj"
 
 
 def means(file: str, *columns: str, by: str = "strategy", **where: object) -> pd.DataFrame:
@@ -23,6 +24,50 @@ def means(file: str, *columns: str, by: str = "strategy", **where: object) -> pd
     return found.assign(e=found[columns[0]] / found[columns[1]] if len(columns) > 1 else np.nan)
 
 
+def equal_flow(rows: pd.DataFrame, own: str, other: str, energy: str = "e") -> float:
+    """Saving at the recorded flow, or at the least one that both kinds of strategies have."""
+
+    def front(kind: str) -> tuple[pd.Series, pd.Series]:
+        part = rows[rows.index.str.fullmatch(rf"{kind}( X=.*)?")].sort_values(FLOW)
+        return part[FLOW], part[energy]
+
+    mine, others = front(own), front(other)
+    flow = max(rows.loc["recorded", FLOW], mine[0].min(), others[0].min())
+    return float(1.0 - np.interp(flow, *mine) / np.interp(flow, *others))
+
+
+def readme() -> list[str]:
+    rows = means("main", PATH, "distance_m", FLOW, PETROL)
+    rows["petrol"] = rows[PETROL] / rows["distance_m"]
+    recorded = rows.loc["recorded"]
+    found = []
+    for name in ("human", "rule", "reference", "alcc"):
+        own = rows.loc[name]
+        cells = (
+            f"| {1.0 - own['e'] / recorded['e']:.1%} (",
+            f"| {own[FLOW] / recorded[FLOW] - 1:+.0%} |",
+        )
+        found += (
+            [*cells, f"{equal_flow(rows, name, 'recorded'):.1%} ("] if name != "human" else cells
+        )
+    for name in ("rule", "reference", "alcc"):
+        found.append(f"| {equal_flow(rows, name, 'recorded', 'petrol'):.1%} (")
+    found += [f"| {equal_flow(rows, name, 'rule'):.1%} (" for name in ("reference", "alcc")]
+    energy = pd.read_parquet(REFERENCE / "twins.parquet").groupby("driver").sum(numeric_only=True)
+    energy["e"] = energy["energy_1.1s_j"] / energy["distance_1.1s_m"]
+    found.append(f"use {1.0 - energy['e']['as calibrated'] / energy['e']['recorded']:.0%} less")
+    i80 = means("averaged", PATH, "distance_m", FLOW, source="i80")
+    found.append(f"network needs {equal_flow(i80, 'alcc', 'idm_acc_filtered'):.1%} (")
+    drives = "total_net_energy_kj", "distance_m", FLOW
+    fleets = means("tasks/fleets_fronts", *drives, by="variant", setting="drives_taught")
+    fleet, humans = fleets.loc["learned"], fleets.loc["human"]
+    found.append(f"4% learned cars save {1.0 - fleet['e'] / humans['e']:.1%} (")
+    found.append(f"at {1.0 - fleet[FLOW] / humans[FLOW]:.1%} less flow")
+    rings = pd.read_parquet(REFERENCE / "tasks" / "ring_reactions.parquet")
+    late = rings[(rings["delay_s"] == 0.5) & (rings["strategy"] == "pretrained")]["damping_time_s"]
+    return [*found, f"ends {late.count()} of {len(late)} waves"]
+
+
 def limits() -> list[str]:
     rows = means("limits_steady", PATH, "distance_m", FLOW, drivers="i80", episodes=60)
     own, recorded = rows.loc["alcc alcc_limits"], rows.loc["recorded"]
@@ -32,12 +77,15 @@ def limits() -> list[str]:
 
 def at_equal_flow() -> list[str]:
     rows = means("averaged", PATH, "distance_m", FLOW, source="stop_and_go")
+    return [f"network against tuned IDM | {equal_flow(rows, 'alcc', 'idm_acc_filtered'):.1%}"]
 
-    def energy(kind: str) -> float:
-        front = rows[rows.index.str.startswith(kind)].sort_values(FLOW)
-        return float(np.interp(rows.loc["recorded", FLOW], front[FLOW], front["e"]))
 
-    return [f"network against tuned IDM | {1.0 - energy('alcc') / energy('idm_acc_filtered'):.1%}"]
+def bounds() -> list[str]:
+    found = []
+    for source in ("platoons", "stop_and_go"):
+        rows = means("bounds_at_flow", PATH, "distance_m", FLOW, source=source)
+        found.append(f"needs {equal_flow(rows, 'clairvoyant', 'alcc'):.1%} (")
+    return found
 
 
 def alcc() -> list[str]:
@@ -97,6 +145,8 @@ def leaderboard() -> list[str]:
 
 
 PAGES: dict[str, tuple[Callable[[], list[str]], str]] = {
+    "README": (readme, ""),
+    "limits, bounds": (bounds, ""),
     "limits": (limits, "| network, `pretrained/alcc_limits` | 528,"),
     "limits, equal flow": (at_equal_flow, "| OpenACC, test track and low speed"),
     "alcc": (alcc, "| this study |"),
@@ -112,7 +162,8 @@ PAGES: dict[str, tuple[Callable[[], list[str]], str]] = {
 @pytest.mark.parametrize("name", PAGES)
 def test_a_row_of_the_page_is_that_of_the_kept_rows(name: str) -> None:
     compute, begins = PAGES[name]
-    page = (ROOT / "docs" / f"{name.split(',')[0]}.md").read_text(encoding="utf-8")
+    folder = ROOT if name == "README" else ROOT / "docs"
+    page = (folder / f"{name.split(',')[0]}.md").read_text(encoding="utf-8")
     rows = " ".join(line for line in page.splitlines() if line.startswith(begins))
     for words in compute():
         found = words.replace(" -", " −").replace("%", " %").replace("+-", "−")
