@@ -17,7 +17,7 @@ from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.results.fronts import at_equal_flow
 from lcc_rl.results.report import windows_for
 
-FIRST = 40  # seconds of every record that never count; every full minute from there on counts
+FIRST = 40  # seconds of every record that never count
 WHOLE = 0  # of a protocol: a window is a whole record
 ENERGY, RECORDED = "total_path_energy_kj", "recorded"
 SETTINGS = (
@@ -38,6 +38,7 @@ class Source:
         shortest: length of the shortest record [s].
         drivers: episodes of a window.
         protocols: how the seconds are cut into windows.
+        unit: from ``FIRST`` on, as many multiples of it count as a record has [s].
         most: largest differences of savings, against recorded drivers and then the rule.
         least: smallest savings.
     """
@@ -46,6 +47,7 @@ class Source:
     shortest: int
     drivers: int
     protocols: tuple[Protocol, ...]
+    unit: int
     most: tuple[float, ...]
     least: tuple[float, ...]
 
@@ -59,6 +61,7 @@ SOURCES = {
         160,
         3,
         (*FROM_A_MINUTE, (120, 20)),
+        120,
         (0.005, 0.001),
         (0.05, 0.0),
     ),
@@ -67,14 +70,15 @@ SOURCES = {
         160,
         3,
         FROM_A_MINUTE,
+        60,
         (0.005, 0.001),
         (0.0, -0.001),
     ),
     # Its records are too short for two windows each.
-    "i80": Source((LIMITS, *I80), 100, 6, FROM_A_MINUTE[:2], (0.005, 0.001), (0.05, 0.0)),
+    "i80": Source((LIMITS, *I80), 100, 6, FROM_A_MINUTE[:2], 60, (0.008, 0.001), (0.05, 0.0)),
     # No rule is compared with the paper's network, whose flow is lower.
     "i80, paper": Source(
-        ("policy=pretrained/alcc", *I80), 100, 6, FROM_A_MINUTE[:2], (0.005,), (0.05,)
+        ("policy=pretrained/alcc", *I80), 100, 6, FROM_A_MINUTE[:2], 60, (0.005,), (0.05,)
     ),
 }
 
@@ -86,14 +90,16 @@ def held_out(source: Source, words: list[str]) -> Profiles:
     return cfg.split.made(CALLED)(records.at_least(10 * source.shortest))[1]
 
 
-def windows(records: Profiles, counted: int, before: int) -> Iterator[tuple[int, Profiles]]:
+def windows(
+    records: Profiles, unit: int, counted: int, before: int
+) -> Iterator[tuple[int, Profiles]]:
     """Yield lengths [steps] and windows in which the same seconds of every record count."""
     behind = [records.follower(number) for number in range(len(records))]
     parts: dict[int, list[tuple[int, int]]] = {}
     for number in range(len(records)):
-        minutes = (len(records.record(number)) - 1 - 10 * FIRST) // 600 * 60
-        length = counted or minutes
-        begins = [FIRST - before + x for x in range(0, minutes - length + 1, length)]
+        seconds = (len(records.record(number)) - 1 - 10 * FIRST) // (10 * unit) * unit
+        length = counted or seconds
+        begins = [FIRST - before + x for x in range(0, seconds, length)]
         parts.setdefault(10 * (length + before), []).extend((number, x) for x in begins)
     for steps, chosen in parts.items():
         slices = [(number, slice(10 * x, 10 * x + steps + 1)) for number, x in chosen]
@@ -114,7 +120,7 @@ def evaluated(
 ) -> pd.DataFrame:
     """Rows per strategy and window."""
     made, first = [], 0
-    for steps, profiles in windows(records, *protocol):
+    for steps, profiles in windows(records, source.unit, *protocol):
         cfg = load(
             "evaluate", [*words, f"scenario.horizon={steps}", f"evaluation.warm_up={protocol[1]}"]
         )
