@@ -12,7 +12,7 @@ from page_blocks import ROOT
 
 REFERENCE = ROOT / "outputs" / "reference"
 PATH, FLOW, FUEL = "total_path_energy_kj", "flow_vph", 42.4  # kJ per g of petrol
-PETROL = "total_second_path_energy_kj"
+PETROL, VARIANTS = "total_second_path_energy_kj", ("alcc", "own_energy")
 
 
 def means(file: str, *columns: str, by: str = "strategy", **where: object) -> pd.DataFrame:
@@ -39,33 +39,51 @@ def equal_flow(rows: pd.DataFrame, own: str, other: str, energy: str = "e") -> f
 def readme() -> list[str]:
     rows = means("main", PATH, "distance_m", FLOW, PETROL)
     rows["petrol"] = rows[PETROL] / rows["distance_m"]
-    recorded = rows.loc["recorded"]
     found = []
     for name in ("human", "rule", "reference", "alcc"):
-        own = rows.loc[name]
-        cells = (
-            f"| {1.0 - own['e'] / recorded['e']:.1%} (",
-            f"| {own[FLOW] / recorded[FLOW] - 1:+.0%} |",
-        )
-        found += (
-            [*cells, f"{equal_flow(rows, name, 'recorded'):.1%} ("] if name != "human" else cells
-        )
+        energy, flow = (rows[x][name] / rows[x]["recorded"] - 1.0 for x in ("e", FLOW))
+        found += [f"| {-energy:.1%} (", f"| {flow:+.0%} |"]
     for name in ("rule", "reference", "alcc"):
-        found.append(f"| {equal_flow(rows, name, 'recorded', 'petrol'):.1%} (")
+        kinds = ("e", "petrol")
+        found += [f"| {equal_flow(rows, name, 'recorded', x):.1%} (" for x in kinds]
     found += [f"| {equal_flow(rows, name, 'rule'):.1%} (" for name in ("reference", "alcc")]
-    energy = pd.read_parquet(REFERENCE / "twins.parquet").groupby("driver").sum(numeric_only=True)
-    energy["e"] = energy["energy_1.1s_j"] / energy["distance_1.1s_m"]
-    found.append(f"use {1.0 - energy['e']['as calibrated'] / energy['e']['recorded']:.0%} less")
     i80 = means("averaged", PATH, "distance_m", FLOW, source="i80")
-    found.append(f"network needs {equal_flow(i80, 'alcc', 'idm_acc_filtered'):.1%} (")
-    drives = "total_net_energy_kj", "distance_m", FLOW
-    fleets = means("tasks/fleets_fronts", *drives, by="variant", setting="drives_taught")
-    fleet, humans = fleets.loc["learned"], fleets.loc["human"]
-    found.append(f"4% learned cars save {1.0 - fleet['e'] / humans['e']:.1%} (")
-    found.append(f"at {1.0 - fleet[FLOW] / humans[FLOW]:.1%} less flow")
+    return [
+        *found,
+        *findings(),
+        f"network needs {equal_flow(i80, 'alcc', 'idm_acc_filtered'):.1%} (",
+    ]
+
+
+def findings() -> list[str]:
+    """Numbers of README's section on what was found, and of its figure."""
+    driven = pd.read_parquet(REFERENCE / "twins.parquet").groupby("driver").sum(numeric_only=True)
+    energy = driven["energy_1.1s_j"] / driven["distance_1.1s_m"]
+    net, columns = "total_net_energy_kj", ["variant", "limit"]
+    fleets = pd.read_parquet(REFERENCE / "tasks" / "fleets_fronts.parquet")
+    fleets = fleets[fleets["setting"] == "drives_taught"]
+    fleets = fleets.groupby(columns)[[net, "distance_m", FLOW]].mean().reset_index(level=1)
+    fleets["e"] = fleets[net] / fleets["distance_m"]
+    rule, (own, humans) = (
+        fleets.loc[["idm_acc"]].sort_values(FLOW),
+        (fleets.loc[[x]].mean() for x in ("learned", "human")),
+    )
+    at_its_flow = np.interp(own[FLOW], rule[FLOW], rule["e"])
+    regard = pd.read_parquet(REFERENCE / "limits_true_drivers.parquet")
+    regard = regard[regard["policy"] == "i80_energy"]
+    gaps = "share_time_gap_long_moving"
+    ends = [regard[regard["variant"] == x].groupby("limit")[[gaps, PATH]].mean() for x in VARIANTS]
+    energies = [float(np.interp(0.0115, x[gaps], x[PATH])) for x in ends]
     rings = pd.read_parquet(REFERENCE / "tasks" / "ring_reactions.parquet")
     late = rings[(rings["delay_s"] == 0.5) & (rings["strategy"] == "pretrained")]["damping_time_s"]
-    return [*found, f"ends {late.count()} of {len(late)} waves"]
+    return [
+        f"use {1.0 - energy['as calibrated'] / energy['recorded']:.0%} less",
+        f"4% learned cars save {1.0 - own['e'] / humans['e']:.1%} (",
+        f"at {1.0 - own[FLOW] / humans[FLOW]:.1%} less flow",
+        f"They need {1.0 - own['e'] / at_its_flow:.1%} (",
+        f"driver behind saves {1.0 - energies[0] / energies[1]:.1%} (",
+        f"ends {late.count()} of {len(late)} waves",
+    ]
 
 
 def limits() -> list[str]:
@@ -111,8 +129,9 @@ def tasks() -> list[str]:
     found = []
     for task, windows in (("i24-follow5", 100), ("i24-mixed", 100), ("i24-mixed", 400)):
         rows = means("tasks/warm_up", *columns, task=task, horizon_s=windows, warm_up_s=20.0)
-        own, humans = rows.loc["alcc"], rows.loc["human"]
-        saved, flow = 1.0 - own["e"] / humans["e"], own[FLOW] / humans[FLOW] - 1.0
+        humans = rows.loc["human"]
+        saved, flow = (1.0 - rows[x]["alcc"] / humans[x] for x in ("e", FLOW))
+        flow = -flow
         found += [f"| {saved:.1%} (", f"| {flow:.1%} |" if flow > -0.01 else f"| {flow:.0%} |"]
         if task == "i24-follow5":
             found += [f"saves {saved:.1%} (", f"from {humans[FLOW]:,.0f}"]
@@ -137,13 +156,13 @@ def road() -> list[str]:
 
 
 def everyday() -> list[str]:
-    rows = pd.read_parquet(REFERENCE / "road.parquet").set_index(["leaders", "strategy"])
-    rows = rows.loc["everyday"]
-    crashed, kept = rows[rows["collisions"] > 0], rows.loc[["idm_acc", "network"]]
+    rows = pd.read_parquet(REFERENCE / "road.parquet")
+    rows = rows[rows["leaders"] == "everyday"].set_index("strategy")
+    crashed, found = rows[rows["collisions"] > 0], []
     assert crashed[["fuel_saved_pct", FLOW]].isna().all(axis=None)
-    saved = 1.0 - kept["fuel_l_per_100km"] / rows.loc["human", "fuel_l_per_100km"]
-    flow = kept[FLOW] / rows.loc["human", FLOW] - 1.0
-    found = [f"| {x:.1%} (" for x in saved] + [f"| {x:.1%} (" for x in flow]
+    for name in ("idm_acc", "network"):
+        fuel, flow = (rows[x][name] / rows[x]["human"] - 1.0 for x in ("fuel_l_per_100km", FLOW))
+        found += [f"| {-fuel:.1%} (", f"| {flow:.1%} ("]
     return [*found, *(f"| {x} windows |" for x in crashed["collisions"])]
 
 
