@@ -76,7 +76,7 @@ SOURCES = {
     ),
     # Its records are too short for two windows each.
     "i80": Source((LIMITS, *I80), 100, 6, FROM_A_MINUTE[:2], 60, (0.008, 0.001), (0.05, 0.0)),
-    # No rule is compared with the paper's network, whose flow is lower.
+    # Not against the rule, which has more flow at each of these longest time gaps.
     "i80, paper": Source(
         ("policy=pretrained/alcc", *I80), 100, 6, FROM_A_MINUTE[:2], 60, (0.005,), (0.05,)
     ),
