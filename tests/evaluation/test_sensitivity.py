@@ -62,7 +62,7 @@ SOURCES = {
         3,
         (*FROM_A_MINUTE, (120, 20)),
         120,
-        (0.005, 0.001),
+        (0.003, 0.002),
         (0.05, 0.0),
     ),
     "platoons": Source(
@@ -71,7 +71,7 @@ SOURCES = {
         3,
         FROM_A_MINUTE,
         60,
-        (0.005, 0.001),
+        (0.003, 0.001),
         (0.0, -0.001),
     ),
     # Its records are too short for two windows each.
