@@ -24,6 +24,7 @@ from lcc_rl.errors import Concern, DataError
 BLANK = ["", "NA", "N/A", "n/a", "nan", "NaN", "NAN", "NULL", "null", "None", "-"]
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 PREAMBLE = 20  # lines within which the header of a native OpenACC file begins
+LONG_ROW = 3  # rows with more columns than this multiple of the header's hold several samples
 BLOCK_BYTES, LONGEST_LINE = 1 << 22, 1 << 24  # bytes per block; longest line
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 NUMBER = r"^-?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI][nN][fF]|[nN][aA][nN])$"
@@ -66,14 +67,6 @@ def opened(name: str | Path) -> Iterator[BufferedReader]:
         raise DataError(f"{name}: cannot be read: {error.strerror or error}") from error
 
 
-def is_text(content: bytes) -> bool:
-    """Return whether bytes are UTF-8 text."""
-    try:
-        return b"\0" not in content and (content.isascii() or bool(content.decode("utf-8")))
-    except UnicodeDecodeError:
-        return False
-
-
 def line_chunks(path: Path, notes: list[str]) -> Iterator[bytes]:
     """Yield whole lines of a file as UTF-8, some megabytes at a time.
 
@@ -104,8 +97,9 @@ def line_chunks(path: Path, notes: list[str]) -> Iterator[bytes]:
 
 def _as_utf8(content: bytes, path: Path, notes: list[str]) -> bytes:
     """Return text in UTF-8, converted from Latin-1 if necessary."""
-    if is_text(content):
-        return content
+    with suppress(UnicodeDecodeError):
+        if b"\0" not in content and (content.isascii() or content.decode("utf-8")):
+            return content
     if content.startswith((b"\0", *OTHER_FORMATS)) or b"\0" in content:
         kinds = (kind for start, kind in OTHER_FORMATS.items() if content.startswith(start))
         raise DataError(f"{path}: is not UTF-8 text{next(kinds, '; expected a table')}")
@@ -149,7 +143,7 @@ def preamble(content: bytes) -> tuple[dict[str, str], bytes]:
 def separator_of(content: bytes) -> str:
     """Return the separator that divides the header and the next row equally, into most cells."""
     first, second = [*content.split(b"\n", 2)[:2], b""][:2]
-    best, most = ",", 1
+    best, most, wide = ",", 1, ","
     for separator in SEPARATORS:
         lines = first, second
         if separator == " ":
@@ -160,7 +154,9 @@ def separator_of(content: bytes) -> str:
         blank = second.rstrip(b"\r").endswith(separator.encode())  # a last cell without a name
         if counts[0] > most and (counts[0] in (counts[1], counts[1] - blank) or not second.strip()):
             best, most = separator, counts[0]
-    return best
+        elif counts[1] > LONG_ROW * counts[0] > LONG_ROW and separator != " ":
+            wide = separator
+    return best if most > 1 else wide
 
 
 def stem(file: str | Path) -> str:
@@ -232,11 +228,7 @@ def parse_text(
 
 
 def unended(rows: bytes, place: str) -> list[Concern]:
-    """Return a warning if the last row has no line end, so its last cell may be truncated.
-
-    It is no error: many programs write no last line end, and a truncated number cannot be
-    recognised.
-    """
+    """Return a warning if the last row has no line end, so its last cell may be truncated."""
     if rows.endswith(b"\n"):
         return []
     shown = rows[rows.rfind(b"\n") + 1 :].decode()[-40:]
@@ -255,6 +247,8 @@ def _odd_row(
     place = f"data row {before + number + 1}"
     last = number == len(lines) - 1 and held < width
     place, cut = (f"{place}, the last,", "; is the file cut off?") if last else (place, "")
+    if held > LONG_ROW * width:
+        cut = ": is it a whole trajectory, as in pNEUMA's files? Write a row per vehicle and time"
     return DataError(f"{source}: {place} has {held} columns; expected {width}{cut}")
 
 

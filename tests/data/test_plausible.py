@@ -432,7 +432,10 @@ def test_a_relative_speed_is_no_leaders_speed() -> None:
     relative = table["leader_speed_mps"] - table["follower_speed_mps"]
     cases = [
         (table.assign(leader_speed_mps=0.1 * relative), "is the leader's speed relative to the fo"),
-        (table.assign(leader_speed_mps=3 * relative), r"m/s \(is it relative to another car\?\)"),
+        (
+            table.assign(leader_speed_mps=3 * relative),
+            r"m/s \(is it relative to another car, or ag",
+        ),
     ]
     check_refused(judged, cases, DataError)
 
