@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from lcc_rl.arrays import Floats, Mask
-from lcc_rl.data.agreement import OF_PAIRS, check_pairs
+from lcc_rl.data.agreement import OF_PAIRS, check_pairs, numbers_of_pairs
 from lcc_rl.data.grid import ORIGIN, Place, Places, divided, stretches
 from lcc_rl.data.tables import Units
 from lcc_rl.data.trajectories import FRAME, starts_of
@@ -218,7 +218,8 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
     drift = (gap - way)[ends] - (gap - way)[starts]
     beside = np.logical_or.reduceat(off != 0, starts)
     held = long & (beside | (np.abs(drift) > limit))
-    held &= ~np.isin(starts, starts_of(number)) | ~np.isin(ends, last)  # not the whole record
+    edges = np.flatnonzero(np.diff(numbers_of_pairs(table), prepend=-1, append=-1))
+    held &= ~np.isin(starts, edges) | ~np.isin(ends + 1, edges)  # not all of a pair
     wrong = (off != 0) | np.repeat(held, lengths)
     return np.where(off != 0, off, np.repeat(drift, lengths)), wrong
 

@@ -43,6 +43,7 @@ OTHER_FORMATS = {
 }
 NO_TABLE = {
     b"version https://git-lfs": "a Git LFS pointer in place of the file: run git lfs pull",
+    b"File created on ": "a VBOX file (vbo): save its [data] as CSV, with times as hh:mm:ss",
     b"<": "XML or HTML; save the table as CSV (SUMO: --fcd-output fcd.csv)",
 }
 
@@ -126,17 +127,11 @@ def preamble(content: bytes) -> tuple[dict[str, str], bytes]:
     """Return the lines before the header of a native OpenACC file by first cell, and the rest."""
     if re.match(rb"Version:.*OpenSCENARIO:", content):  # the first line of esmini's files
         return {}, content.partition(b"\n")[2]
-    lines: list[bytes] = []
-    rest = content
-    for _ in range(PREAMBLE):
-        line, found, after = rest.partition(b"\n")
+    lines = content.split(b"\n", PREAMBLE)[:PREAMBLE]
+    for number, line in enumerate(lines):
         if line.startswith(b"Time,") and b",Speed1," in line:
-            cells = (text.decode().strip("\r, ").partition(",") for text in lines)
-            return {name: value for name, _, value in cells}, rest
-        if not found:
-            break
-        lines.append(line)
-        rest = after
+            cells = (text.decode().strip("\r, ").partition(",") for text in lines[:number])
+            return {name: value for name, _, value in cells}, content.split(b"\n", number)[number]
     return {}, content
 
 

@@ -156,6 +156,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
         "row 1, .*does this row hold uni",
     ),
     ("record", "version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "run git lfs pull"),
+    ("record", "File created on 03/05/2023\n\n[header]\n", r"is a VBOX file \(vbo\): save its"),
     ("table", "<?xml version='1.0'?>\n<fcd-export/>\n", "is XML or HTML; save the table as CSV"),
     ("table", "<fcd-export>\n</fcd-export>\n", r"is XML or HTML; .*\(SUMO: --fcd-output fcd.csv\)"),
     (
