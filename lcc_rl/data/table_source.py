@@ -226,7 +226,7 @@ def _check_way(rows: pd.DataFrame, place: Places, report: ReadReport) -> None:
     each = ways.groupby(vehicle.cumsum()).sum()
     far = each.abs().max(axis=1) >= LEAST_WAY
     off = np.abs(np.log(each.way.clip(1.0) / each.driven.clip(1.0)))
-    worst = int(np.argmax(off.mask(each.max(axis=1) < 0, np.inf).where(far, 0.0)))  # both fall
+    worst = int(np.argmax(np.where(far, np.where(each.max(axis=1) < 0, np.inf, off), 0.0)))
     where = place(rows)(int(np.flatnonzero(vehicle)[worst]), "")
     found = [
         (f"the vehicle from {where}, on drives", "its", each.iloc[worst]),
