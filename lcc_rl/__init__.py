@@ -1,8 +1,9 @@
 """Learn and compare car-following controllers in mixed traffic.
 
-``lcc_rl.make_env`` builds a TorchRL environment of a string of vehicles, ``lcc_rl.learn`` trains a
-policy, ``lcc_rl.compare`` evaluates several, ``lcc_rl.export`` writes one for other software and
-``lcc_rl.results`` reads the results of runs. The command is ``lcc-rl``.
+``lcc_rl.simulate`` drives a string of vehicles behind a leader, ``lcc_rl.make_env`` builds a
+TorchRL environment of one, ``lcc_rl.learn`` trains a policy, ``lcc_rl.compare`` evaluates several,
+``lcc_rl.export`` writes one for other software and ``lcc_rl.results`` reads the results of runs.
+The command is ``lcc-rl``.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ from typing import Any
 
 from lcc_rl.version import __version__
 
-__all__ = ["__version__", "compare", "export", "learn", "make_env", "results"]
+__all__ = ["__version__", "compare", "export", "learn", "make_env", "results", "simulate"]
 # Modules of names that load torch.
 LAZY = {
     "make_env": "lcc_rl.envs.factory",
     "learn": "lcc_rl.api",
     "compare": "lcc_rl.api",
     "export": "lcc_rl.interfaces.export",
+    "simulate": "lcc_rl.evaluation.simulation",
 }
 
 

@@ -27,6 +27,7 @@ READERS: dict[str, Callable[[str], object]] = {
     "source": lambda path: NgsimSource(path=path).load(),
     "i-80": lambda path: read_ngsim(path, location="i-80"),
     "table": lambda path: TableSource(path=path, columns={**BY_GAP, "position": "x"}).load(),
+    "lengths": lambda path: TableSource(path=path, columns={**BY_GAP, "length": "length"}).load(),
     "episodes": lambda path: EpisodesSource(path=path).load(),
     "openacc": lambda path: OpenAccSource(path=path).load(),
     "drives": lambda path: read_drives(path, DRIVE_COLUMNS, 0.1),

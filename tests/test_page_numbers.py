@@ -12,6 +12,7 @@ from page_blocks import ROOT
 
 REFERENCE = ROOT / "outputs" / "reference"
 PATH, FLOW, FUEL = "total_path_energy_kj", "flow_vph", 42.4  # kJ per g of petrol
+PETROL, VARIANTS = "total_second_path_energy_kj", ("alcc", "own_energy")
 
 
 def means(file: str, *columns: str, by: str = "strategy", **where: object) -> pd.DataFrame:
@@ -23,6 +24,68 @@ def means(file: str, *columns: str, by: str = "strategy", **where: object) -> pd
     return found.assign(e=found[columns[0]] / found[columns[1]] if len(columns) > 1 else np.nan)
 
 
+def equal_flow(rows: pd.DataFrame, own: str, other: str, energy: str = "e") -> float:
+    """Saving at the recorded flow, or at the least one that both kinds of strategies have."""
+
+    def front(kind: str) -> tuple[pd.Series, pd.Series]:
+        part = rows[rows.index.str.fullmatch(rf"{kind}( X=.*)?")].sort_values(FLOW)
+        return part[FLOW], part[energy]
+
+    mine, others = front(own), front(other)
+    flow = max(rows.loc["recorded", FLOW], mine[0].min(), others[0].min())
+    return float(1.0 - np.interp(flow, *mine) / np.interp(flow, *others))
+
+
+def readme() -> list[str]:
+    rows = means("main", PATH, "distance_m", FLOW, PETROL)
+    rows["petrol"] = rows[PETROL] / rows["distance_m"]
+    found = []
+    for name in ("human", "rule", "reference", "alcc"):
+        energy, flow = (rows[x][name] / rows[x]["recorded"] - 1.0 for x in ("e", FLOW))
+        found += [f"| {-energy:.1%} (", f"| {flow:+.0%} |"]
+    for name in ("rule", "reference", "alcc"):
+        kinds = ("e", "petrol")
+        found += [f"| {equal_flow(rows, name, 'recorded', x):.1%} (" for x in kinds]
+    found += [f"| {equal_flow(rows, name, 'rule'):.1%} (" for name in ("reference", "alcc")]
+    i80 = means("averaged", PATH, "distance_m", FLOW, source="i80")
+    return [
+        *found,
+        *findings(),
+        f"network needs {equal_flow(i80, 'alcc', 'idm_acc_filtered'):.1%} (",
+    ]
+
+
+def findings() -> list[str]:
+    """Numbers of README's section on what was found, and of its figure."""
+    driven = pd.read_parquet(REFERENCE / "twins.parquet").groupby("driver").sum(numeric_only=True)
+    energy = driven["energy_1.1s_j"] / driven["distance_1.1s_m"]
+    net, columns = "total_net_energy_kj", ["variant", "limit"]
+    fleets = pd.read_parquet(REFERENCE / "tasks" / "fleets_fronts.parquet")
+    fleets = fleets[fleets["setting"] == "drives_taught"]
+    fleets = fleets.groupby(columns)[[net, "distance_m", FLOW]].mean().reset_index(level=1)
+    fleets["e"] = fleets[net] / fleets["distance_m"]
+    rule, (own, humans) = (
+        fleets.loc[["idm_acc"]].sort_values(FLOW),
+        (fleets.loc[[x]].mean() for x in ("learned", "human")),
+    )
+    at_its_flow = np.interp(own[FLOW], rule[FLOW], rule["e"])
+    regard = pd.read_parquet(REFERENCE / "limits_true_drivers.parquet")
+    regard = regard[regard["policy"] == "i80_energy"]
+    gaps = "share_time_gap_long_moving"
+    ends = [regard[regard["variant"] == x].groupby("limit")[[gaps, PATH]].mean() for x in VARIANTS]
+    energies = [float(np.interp(0.0115, x[gaps], x[PATH])) for x in ends]
+    rings = pd.read_parquet(REFERENCE / "tasks" / "ring_reactions.parquet")
+    late = rings[(rings["delay_s"] == 0.5) & (rings["strategy"] == "pretrained")]["damping_time_s"]
+    return [
+        f"use {1.0 - energy['as calibrated'] / energy['recorded']:.0%} less",
+        f"4% learned cars save {1.0 - own['e'] / humans['e']:.1%} (",
+        f"at {1.0 - own[FLOW] / humans[FLOW]:.1%} less flow",
+        f"They need {1.0 - own['e'] / at_its_flow:.1%} (",
+        f"driver behind saves {1.0 - energies[0] / energies[1]:.1%} (",
+        f"ends {late.count()} of {len(late)} waves",
+    ]
+
+
 def limits() -> list[str]:
     rows = means("limits_steady", PATH, "distance_m", FLOW, drivers="i80", episodes=60)
     own, recorded = rows.loc["alcc alcc_limits"], rows.loc["recorded"]
@@ -32,12 +95,15 @@ def limits() -> list[str]:
 
 def at_equal_flow() -> list[str]:
     rows = means("averaged", PATH, "distance_m", FLOW, source="stop_and_go")
+    return [f"network against tuned IDM | {equal_flow(rows, 'alcc', 'idm_acc_filtered'):.1%}"]
 
-    def energy(kind: str) -> float:
-        front = rows[rows.index.str.startswith(kind)].sort_values(FLOW)
-        return float(np.interp(rows.loc["recorded", FLOW], front[FLOW], front["e"]))
 
-    return [f"network against tuned IDM | {1.0 - energy('alcc') / energy('idm_acc_filtered'):.1%}"]
+def bounds() -> list[str]:
+    found = []
+    for source in ("platoons", "stop_and_go"):
+        rows = means("bounds_at_flow", PATH, "distance_m", FLOW, source=source)
+        found.append(f"needs {equal_flow(rows, 'clairvoyant', 'alcc'):.1%} (")
+    return found
 
 
 def alcc() -> list[str]:
@@ -60,14 +126,19 @@ def waves() -> list[str]:
 
 def tasks() -> list[str]:
     columns = ("all_net_energy_kj", "distance_m", FLOW)
-    rows = means("tasks/warm_up", *columns, task="i24-follow5", horizon_s=100, warm_up_s=20.0)
-    own, humans = rows.loc["alcc"], rows.loc["human"]
-    flow = f"{own[FLOW] / humans[FLOW] - 1.0:.0%}"
-    return [
-        f"saves {1.0 - own['e'] / humans['e']:.1%} (",
-        f"from {humans[FLOW]:,.0f}",
-        f"| {flow} |",
-    ]
+    found = []
+    for task, windows in (("i24-follow5", 100), ("i24-mixed", 100), ("i24-mixed", 400)):
+        rows = means("tasks/warm_up", *columns, task=task, horizon_s=windows, warm_up_s=20.0)
+        humans = rows.loc["human"]
+        saved, flow = (1.0 - rows[x]["alcc"] / humans[x] for x in ("e", FLOW))
+        flow = -flow
+        found += [f"| {saved:.1%} (", f"| {flow:.1%} |" if flow > -0.01 else f"| {flow:.0%} |"]
+        if task == "i24-follow5":
+            found += [f"saves {saved:.1%} (", f"from {humans[FLOW]:,.0f}"]
+        elif windows == 100:
+            kept = pd.read_parquet(REFERENCE / "tasks" / "i24-mixed.parquet").set_index("strategy")
+            assert kept.loc["alcc", "saving"] == pytest.approx(saved, abs=1e-6)
+    return found
 
 
 def fleets() -> list[str]:
@@ -84,6 +155,17 @@ def road() -> list[str]:
     return [f"network | {own[columns[0]]:.2f} (", f"| {own[FLOW]:,.0f} ("]
 
 
+def everyday() -> list[str]:
+    rows = pd.read_parquet(REFERENCE / "road.parquet")
+    rows = rows[rows["leaders"] == "everyday"].set_index("strategy")
+    crashed, found = rows[rows["collisions"] > 0], []
+    assert crashed[["fuel_saved_pct", FLOW]].isna().all(axis=None)
+    for name in ("idm_acc", "network"):
+        fuel, flow = (rows[x][name] / rows[x]["human"] - 1.0 for x in ("fuel_l_per_100km", FLOW))
+        found += [f"| {-fuel:.1%} (", f"| {flow:.1%} ("]
+    return [*found, *(f"| {x} windows |" for x in crashed["collisions"])]
+
+
 def leaderboard() -> list[str]:
     stored = json.loads((REFERENCE / "scores" / "idm_acc.json").read_text(encoding="utf-8"))
     row = next(
@@ -97,6 +179,8 @@ def leaderboard() -> list[str]:
 
 
 PAGES: dict[str, tuple[Callable[[], list[str]], str]] = {
+    "README": (readme, ""),
+    "limits, bounds": (bounds, ""),
     "limits": (limits, "| network, `pretrained/alcc_limits` | 528,"),
     "limits, equal flow": (at_equal_flow, "| OpenACC, test track and low speed"),
     "alcc": (alcc, "| this study |"),
@@ -105,6 +189,7 @@ PAGES: dict[str, tuple[Callable[[], list[str]], str]] = {
     "tasks": (tasks, ""),
     "fleets": (fleets, "| I-24, whole drives, trained over 400 s |"),
     "road": (road, "| | network | 7.04"),
+    "road, everyday": (everyday, ""),
     "leaderboard": (leaderboard, "| everyday, 9 drives | `idm_acc`"),
 }
 
@@ -112,7 +197,8 @@ PAGES: dict[str, tuple[Callable[[], list[str]], str]] = {
 @pytest.mark.parametrize("name", PAGES)
 def test_a_row_of_the_page_is_that_of_the_kept_rows(name: str) -> None:
     compute, begins = PAGES[name]
-    page = (ROOT / "docs" / f"{name.split(',')[0]}.md").read_text(encoding="utf-8")
+    folder = ROOT if name == "README" else ROOT / "docs"
+    page = (folder / f"{name.split(',')[0]}.md").read_text(encoding="utf-8")
     rows = " ".join(line for line in page.splitlines() if line.startswith(begins))
     for words in compute():
         found = words.replace(" -", " −").replace("%", " %").replace("+-", "−")

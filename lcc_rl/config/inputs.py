@@ -29,8 +29,10 @@ NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
 NAMING_SECTIONS = ("compare", "policy")  # sections that name policies, controllers and classes
 OURS = "lcc_rl."
 FRESH = 2.0  # a file may change again within the resolution of its times [s]
-PLACES = ("stdlib", "platstdlib", "purelib", "platlib")  # folders of installed modules
-INSTALLED = [Path(sysconfig.get_path(x)) for x in PLACES] + [Path(__file__).parents[1]]
+# Folders of Python's own modules and of this package; names of folders of installed ones, of which
+# an environment may see several.
+OURS_AND_PYTHONS = [Path(sysconfig.get_path("stdlib")), Path(__file__).parents[1]]
+INSTALLED = {"site-packages", "dist-packages"}
 
 
 def inputs_of(content: Mapping[str, Any]) -> FileHashes:
@@ -113,7 +115,8 @@ def _module(target: str) -> Iterator[Path]:
 def _own_modules(module: Any, seen: set[Path]) -> Iterator[Path]:
     """Yield the files of a user's module and of its imports."""
     path = Path(getattr(module, "__file__", None) or "")
-    if path.suffix != ".py" or path in seen or any(path.is_relative_to(x) for x in INSTALLED):
+    known = INSTALLED.intersection(path.parts) or any(map(path.is_relative_to, OURS_AND_PYTHONS))
+    if path.suffix != ".py" or path in seen or known:
         return
     seen.add(path)
     yield path

@@ -56,8 +56,7 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
         follower, growth of the gap [m]), constant, rate (growth of the gap beyond that by both
         speeds, fitted with and without the coefficients [m/s]).
     """
-    keys = [name for name in ("recording", "follower_id", "leader_id") if name in episodes]
-    pair = episodes.groupby(keys or ["episode"], sort=False).ngroup().to_numpy()
+    pair = numbers_of_pairs(episodes)
     number, pairs = episodes["episode"].to_numpy(), int(pair.max(initial=-1)) + 1
     width, every, reach = (round(seconds / FRAME) for seconds in (CHANGE_S, EVERY_S, LONGEST_LAG))
     whole = width + 2 * reach
@@ -91,6 +90,12 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
         grown=grown,
         rate=(grown - ahead + own) / (EVERY_S * count).clip(1.0),
     )
+
+
+def numbers_of_pairs(episodes: pd.DataFrame) -> NDArray[np.int64]:
+    """Return the number of the pair of each row, from 0; see :func:`agreement`."""
+    keys = [name for name in ("recording", "follower_id", "leader_id") if name in episodes]
+    return episodes.groupby(keys or ["episode"], sort=False).ngroup().to_numpy(np.int64)
 
 
 def _fit(

@@ -103,10 +103,12 @@ def continuous(
         raise DataError(f"{report.source}: no {what} has two samples: {place(samples)(0, what)}")
     usual = _usual_steps(samples, same, what, report.source)
     steps = np.diff(samples["time_s"], prepend=0.0)
-    hole = is_hole(np.where(same, steps, 0.0), usual) & divide
+    long = same & (steps > HOLE * usual)  # irregular sampling has few
+    hole = divide & (long & (steps > HOLE_S) if long.mean() > MANY_HOLES else long)
     alone = ~(same & ~hole) & np.append(~(same & ~hole)[1:], True)
     if not (hole.any() or alone.any()):
         return samples
+    _check_clock(samples, hole, usual, place(samples), report.source)
     count = samples["episode"].nunique()
     parts = divided(samples, alone, hole, 0.0)
     report.drop("alone between holes", int(alone.sum()))
@@ -154,10 +156,13 @@ def _usual_steps(samples: pd.DataFrame, same: Mask, what: str, source: str) -> F
     steps = samples["time_s"].diff().where(same)
     step = float(steps.median())
     if not SHORTEST_STEP <= step < LONGEST_STEP:
-        unit, node = "s" if step < SHORTEST_STEP else "ms", "leader" if what == "drive" else "data"
+        unit = "ms" if step < 1e3 * LONGEST_STEP else "us" if step < 1e6 * LONGEST_STEP else "ns"
+        unit, node = "s" if step < SHORTEST_STEP else unit, "leader" if what == "drive" else "data"
+        span = "from {:.15g} to {:.15g}".format(*samples["time_s"].agg(["min", "max"]))
         raise DataError(
             f"{source}: samples of a {what} are {step:g} s apart; expected {SHORTEST_STEP:g} to "
-            f"{LONGEST_STEP:g} s; is the time in {unit} ({node}.units.time={unit})?"
+            f"{LONGEST_STEP:g} s; is the time, {span}, in {unit} ({node}.units.time={unit})"
+            f"{', or are rows missing' * (unit != 's')}?"
         )
     if not ((steps - step).abs() > UNEVEN * step).any():
         return np.full(len(samples), step)
@@ -166,10 +171,16 @@ def _usual_steps(samples: pd.DataFrame, same: Mask, what: str, source: str) -> F
     return own.where(many, step).to_numpy()
 
 
-def is_hole(steps: Floats, usual: Floats) -> Mask:
-    """Return which steps [s] are holes; irregular sampling has few."""
-    long = steps > HOLE * usual
-    return long & (steps > HOLE_S) if long.mean() > MANY_HOLES else long
+def _check_clock(rows: pd.DataFrame, hole: Mask, usual: Floats, place: Place, source: str) -> None:
+    """Check that holes are not those of times as numbers of the form hhmmss, at each minute."""
+    time, near = rows["time_s"].to_numpy(np.float64), HOLE * usual
+    ends = hole & (time % 100 < near) & (np.abs(np.roll(time, 1) % 100 - 60 + near / 2) <= near / 2)
+    if ends.sum() > 1 and ends.sum() == hole.sum():
+        row = int(np.argmax(ends))
+        raise DataError(
+            f"{source}: {place(row, 'time_s')}: {time[row - 1]:.15g} s, then {time[row]:.15g} s, "
+            "as at each minute; is the time of the form hhmmss? Write hh:mm:ss"
+        )
 
 
 def divided(table: pd.DataFrame, wrong: Mask, begins: Mask, shortest: float) -> pd.DataFrame:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from lcc_rl.arrays import Floats, Mask
-from lcc_rl.data.agreement import OF_PAIRS, check_pairs
+from lcc_rl.data.agreement import OF_PAIRS, check_pairs, numbers_of_pairs
 from lcc_rl.data.grid import ORIGIN, Place, Places, divided, stretches
 from lcc_rl.data.tables import Units
 from lcc_rl.data.trajectories import FRAME, starts_of
@@ -24,6 +24,10 @@ HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; least sampl
 JUMP_S, HELD_S = 0.5, 1.0  # time in which a gap jumps; longest time without a measurement [s]
 NOISE = 12.0  # least jump, as a multiple of the median change of a gap beyond that by the speeds
 MOST_JUMPS = 0.5  # largest share of samples that jumps of gaps may cost
+WORDS = {
+    "max_speed": "holds {:g} m/s (is it km/h or ft/s?)",
+    "min_speed": "holds {:g} m/s (is it relative to another car, or against an axis?)",
+}
 # Column, words with a place for a number, the numbers ``[rows]``, name of the threshold, and the
 # samples outside of it ``[rows]``.
 Finding = tuple[str, str, NDArray[np.float64], str, Mask]
@@ -82,8 +86,9 @@ class Plausible(Settings):
             DataError: if more than ``max_share`` of the samples, or all, would be left out, or
                 gaps and speeds contradict each other.
         """
-        starts = starts_of(table["episode"].to_numpy())
-        wrong, lines, advice = self._outside(table, starts, place(table), setting, remedy)
+        node, known = setting.split(".")[0], units or {}
+        unit = ", ".join(f"{node}.units.{x}={known[x]}" for x in known if "speed" in x) or "units"
+        wrong, lines, advice = self._outside(table, place(table), setting, remedy, unit)
         kept = divided(table, wrong, np.zeros_like(wrong), SHORTEST_PART)
         lost = 1 - len(kept) / len(table)
         if lost > self.max_share or kept.empty:
@@ -104,21 +109,18 @@ class Plausible(Settings):
             except DataError as error:
                 shown = ", ".join(f"{setting}.{name}={limits[name]:g}" for name in limits)
                 raise DataError(f"{source}: {error} ({shown})") from error
-        more_lines += self._check_hard(kept, source, setting, agree)
+        hint = f"are they in km/h, mph or ft/s ({unit}), or do they need smoothing?"
+        if agree:
+            hint = "gaps agree: are both in another unit, or are such changes real?"
+        more_lines += self._check_hard(kept, source, setting, hint)
         return kept.drop(columns=ORIGIN, errors="ignore"), [*lines, *more_lines, *last]
 
     def _outside(
-        self,
-        table: pd.DataFrame,
-        starts: NDArray[np.intp],
-        place: Place,
-        setting: str,
-        remedy: str,
+        self, table: pd.DataFrame, place: Place, setting: str, remedy: str, unit: str
     ) -> tuple[Mask, list[str], str]:
         """Return samples outside of a threshold, a line for each kind, and advice on the first."""
-        first = np.isin(np.arange(len(table)), starts)
         wrong, lines, advice = np.zeros(len(table), dtype=bool), [], ""
-        for column, words, values, name, found in self._faults(table, first):
+        for column, words, values, name, found in self._faults(table):
             new = found & ~wrong
             if name == "max_acceleration":  # not the change from a sample that is left out
                 new[1:] &= ~wrong[:-1]
@@ -130,7 +132,8 @@ class Plausible(Settings):
             more = remedy if name == "max_acceleration" else ""
             line = f"left out {int(new.sum()):,} implausible sample(s), the first: {example}"
             lines.append(f"{line}{more and '; to keep it'}{more}")
-            advice = advice or f"{example}; correct the file or units{more}, or raise the threshold"
+            fix = unit if column.endswith("speed_mps") else "units"
+            advice = advice or f"{example}; correct the file or {fix}{more}, or raise the threshold"
             wrong |= new
         return wrong, lines, advice
 
@@ -152,13 +155,10 @@ class Plausible(Settings):
         lines = [f"left out {words}", *cut_line(table, kept, wrong)]
         return kept, [*lines, "parts behind another car are records, too: leave out such rows"]
 
-    def _check_hard(self, kept: pd.DataFrame, source: str, setting: str, agree: bool) -> list[str]:
-        """Check that speeds change as those of cars; ``agree``: the gaps agree with them."""
+    def _check_hard(self, kept: pd.DataFrame, source: str, setting: str, hint: str) -> list[str]:
+        """Check that speeds change as those of cars; ``hint``: a probable reason."""
         hard = hard_share(kept)
         if hard is not None and hard > self.max_hard:
-            hint = "are they in km/h, mph or ft/s, or do they need smoothing?"
-            if agree:
-                hint = "gaps agree: are both in another unit, or are such changes real?"
             raise DataError(
                 f"{source}: speeds change by more than {HARD:g} m/s within a second for "
                 f"{100 * hard:.2g} % of the time, {setting}.max_hard={self.max_hard:g}; {hint}"
@@ -166,32 +166,25 @@ class Plausible(Settings):
         few = f"unit of speeds not checked: fewer than {LEAST_SAMPLES} samples"
         return [f"{few} a second apart"] if hard is None else []
 
-    def _faults(self, table: pd.DataFrame, first: Mask) -> Iterator[Finding]:
-        """Yield the checks of all thresholds; ``first`` marks the first row of each record."""
+    def _faults(self, table: pd.DataFrame) -> Iterator[Finding]:
+        """Yield the checks of all thresholds."""
         time = table["time_s"].to_numpy(np.float64)
         step = np.diff(time, prepend=time[0])
-        step[first] = 0.0
+        step[starts_of(table["episode"].to_numpy())] = 0.0
         late = step > self.max_step
         yield "time_s", "is {:g} s after the sample before it", step, "max_step", late
         for name in map(str, table.columns):
             if not name.endswith(("speed_mps", "length_m", "gap_m")):
                 continue
-            values = table[name].to_numpy(np.float64)
-            if name.endswith("speed_mps"):
-                words = "holds {:g} m/s (is it km/h or ft/s?)"
-                yield name, words, values, "max_speed", values > self.max_speed
-                words = "holds {:g} m/s (is it relative to another car?)"
-                yield name, words, values, "min_speed", values < self.min_speed
+            values, kind = table[name].to_numpy(np.float64), name.split("_")[-2]
+            for limit, sign in ((f"max_{kind}", 1), (f"min_{kind}", -1)):
+                outside = sign * values > sign * getattr(self, limit)
+                outside &= (kind != "length") | (values != 0)  # a length of 0 is not given
+                yield name, WORDS.get(limit, "holds {:g} m"), values, limit, outside
+            if kind == "speed":
                 rate = np.diff(values, prepend=values[0]) / np.where(step > 0, step, np.inf)
                 rough = np.abs(rate) > self.max_acceleration
                 yield name, "changes by {:g} m/s²", rate, "max_acceleration", rough
-            elif name == "gap_m":
-                yield name, "holds {:g} m", values, "max_gap", values > self.max_gap
-                yield name, "holds {:g} m", values, "min_gap", values < self.min_gap
-            else:
-                short = (values != 0) & (values < self.min_length)
-                yield name, "holds {:g} m", values, "min_length", short
-                yield name, "holds {:g} m", values, "max_length", values > self.max_length
 
 
 def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
@@ -225,7 +218,8 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
     drift = (gap - way)[ends] - (gap - way)[starts]
     beside = np.logical_or.reduceat(off != 0, starts)
     held = long & (beside | (np.abs(drift) > limit))
-    held &= ~np.isin(starts, starts_of(number)) | ~np.isin(ends, last)  # not the whole record
+    edges = np.flatnonzero(np.diff(numbers_of_pairs(table), prepend=-1, append=-1))
+    held &= ~np.isin(starts, edges) | ~np.isin(ends + 1, edges)  # not all of a pair
     wrong = (off != 0) | np.repeat(held, lengths)
     return np.where(off != 0, off, np.repeat(drift, lengths)), wrong
 

@@ -13,7 +13,7 @@ import pandas as pd
 from lcc_rl.data.grid import continuous, interpolated, places
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
-from lcc_rl.data.sources import SHIPPED_FILES, find_files
+from lcc_rl.data.sources import SHIPPED_FILES, find_files, units_of
 from lcc_rl.data.tables import Column, Names, TableFile, Units
 from lcc_rl.data.text import labels
 from lcc_rl.data.trajectories import ReadReport
@@ -113,8 +113,9 @@ def _read(
     samples, report = _samples(table, columns, units), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
     samples = continuous(samples, "drive", place, report, divide)
+    known = units_of(DRIVE_FIELDS, DRIVE_COLUMNS, units) if divide else {}
     kept, lines = (plausible or Plausible()).select(
-        samples, str(table.path), place, "leader.plausible"
+        samples, str(table.path), place, "leader.plausible", units=known
     )
     kept["drive"] = kept.pop("recording")
     parts = kept.groupby("drive")["episode"].transform("nunique") > 1

@@ -104,10 +104,10 @@ class TableSource(TrajectorySource):
         trajectories = to_trajectories(rows, place, report)
         known = self.columns.get("length") is None or "length" in self.units
         for name, length in median_lengths(trajectories.samples).items():
-            if length > CAR_LENGTH[1] and not known:
+            if not (known or CAR_LENGTH[0] <= length <= CAR_LENGTH[1]):
                 raise DataError(
                     f"{report.source}: recording {name}: the median length of vehicles is "
-                    f"{length:.3g} m; is it in ft? Set data.units.length=ft, or m if it is right"
+                    f"{length:.3g} m; is it in ft or half? Set data.units.length=ft, or m if right"
                 )
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
@@ -224,9 +224,9 @@ def _check_way(rows: pd.DataFrame, place: Places, report: ReadReport) -> None:
     ways = pd.DataFrame({"way": rows.position.diff(), "driven": driven}).mask(first, 0.0)
     jumps = (ways.way - ways.driven).abs() > JUMP
     each = ways.groupby(vehicle.cumsum()).sum()
-    far = each.max(axis=1) >= LEAST_WAY
+    far = each.abs().max(axis=1) >= LEAST_WAY
     off = np.abs(np.log(each.way.clip(1.0) / each.driven.clip(1.0)))
-    worst = int(np.argmax(off * far))
+    worst = int(np.argmax(np.where(far, np.where(each.max(axis=1) < 0, np.inf, off), 0.0)))
     where = place(rows)(int(np.flatnonzero(vehicle)[worst]), "")
     found = [
         (f"the vehicle from {where}, on drives", "its", each.iloc[worst]),
@@ -235,7 +235,8 @@ def _check_way(rows: pd.DataFrame, place: Places, report: ReadReport) -> None:
     for subject, owner, (way, driven) in (
         found if (far & (off < np.log(AGREE[1]))).any() else found[::-1]
     ):
-        if max(way, driven) >= LEAST_WAY and not AGREE[0] * driven <= way <= AGREE[1] * driven:
+        agree = AGREE[0] * driven <= way <= AGREE[1] * driven  # false if both fall
+        if not agree and max(abs(way), abs(driven)) >= LEAST_WAY:
             hint = "check data.units and data.columns of time, speed and position"
             smooth = ways[~jumps].sum()
             low, high = (share * smooth.driven for share in AGREE)

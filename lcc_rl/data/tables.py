@@ -37,7 +37,7 @@ from lcc_rl.data.text import (
     unended,
 )
 from lcc_rl.data.trajectories import FOOT
-from lcc_rl.errors import ConfigError, DataError, raised_as, require_known, unknown_name
+from lcc_rl.errors import Concern, ConfigError, DataError, raised_as, require_known, unknown_name
 
 PARQUET = (".parquet", ".pq")
 LARGEST_CELL = 1e12  # in SI: beyond any time or position, and within every type
@@ -99,8 +99,8 @@ class Column:
     def expected(self) -> str:
         """Description of valid values for messages."""
         unit = f" {SI[self.quantity]}" if self.quantity in SI else ""
-        kind = "a whole number" if self.whole else "a number"
-        return f"{kind} from {self.least:g} to {self.most:g}{unit}"
+        unit += "; is it in ms, us or ns (units.time)?" * (self.quantity == "time")
+        return f"a {'whole ' * self.whole}number from {self.least:g} to {self.most:g}{unit}"
 
 
 def check_map(columns: Iterable[Column], names: Names, units: Units, at: str) -> None:
@@ -261,6 +261,9 @@ class TableFile:
         if column.quantity == "speed" and is_relative(name):
             words = f"column {name!r} holds a relative speed; add the other car's, or rename it"
             raise DataError(f"{self.path}: {words}")
+        if column.key == "gap" and re.search("headway|hdwy|dhw", name.lower()):
+            words = f"{self.path}: column {name!r}: does the gap include the leader's length?"
+            self.notes.append(Concern(f"{words} It is bumper to bumper; subtract the length"))
         named = named_unit(name, column.quantity)
         if option and named and UNITS[column.quantity][named] != scale:
             where = f"{option.removesuffix('columns')}units.{column.key}={named}"

@@ -24,6 +24,7 @@ from lcc_rl.errors import Concern, DataError
 BLANK = ["", "NA", "N/A", "n/a", "nan", "NaN", "NAN", "NULL", "null", "None", "-"]
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 PREAMBLE = 20  # lines within which the header of a native OpenACC file begins
+LONG_ROW = 3  # rows with more columns than this multiple of the header's hold several samples
 BLOCK_BYTES, LONGEST_LINE = 1 << 22, 1 << 24  # bytes per block; longest line
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 NUMBER = r"^-?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI][nN][fF]|[nN][aA][nN])$"
@@ -42,6 +43,7 @@ OTHER_FORMATS = {
 }
 NO_TABLE = {
     b"version https://git-lfs": "a Git LFS pointer in place of the file: run git lfs pull",
+    b"File created on ": "a VBOX file (vbo): save its [data] as CSV, with times as hh:mm:ss",
     b"<": "XML or HTML; save the table as CSV (SUMO: --fcd-output fcd.csv)",
 }
 
@@ -64,14 +66,6 @@ def opened(name: str | Path) -> Iterator[BufferedReader]:
         raise DataError(f"{name}: the compressed file is damaged or cut off: {error}") from error
     except OSError as error:
         raise DataError(f"{name}: cannot be read: {error.strerror or error}") from error
-
-
-def is_text(content: bytes) -> bool:
-    """Return whether bytes are UTF-8 text."""
-    try:
-        return b"\0" not in content and (content.isascii() or bool(content.decode("utf-8")))
-    except UnicodeDecodeError:
-        return False
 
 
 def line_chunks(path: Path, notes: list[str]) -> Iterator[bytes]:
@@ -104,8 +98,9 @@ def line_chunks(path: Path, notes: list[str]) -> Iterator[bytes]:
 
 def _as_utf8(content: bytes, path: Path, notes: list[str]) -> bytes:
     """Return text in UTF-8, converted from Latin-1 if necessary."""
-    if is_text(content):
-        return content
+    with suppress(UnicodeDecodeError):
+        if b"\0" not in content and (content.isascii() or content.decode("utf-8")):
+            return content
     if content.startswith((b"\0", *OTHER_FORMATS)) or b"\0" in content:
         kinds = (kind for start, kind in OTHER_FORMATS.items() if content.startswith(start))
         raise DataError(f"{path}: is not UTF-8 text{next(kinds, '; expected a table')}")
@@ -132,24 +127,18 @@ def preamble(content: bytes) -> tuple[dict[str, str], bytes]:
     """Return the lines before the header of a native OpenACC file by first cell, and the rest."""
     if re.match(rb"Version:.*OpenSCENARIO:", content):  # the first line of esmini's files
         return {}, content.partition(b"\n")[2]
-    lines: list[bytes] = []
-    rest = content
-    for _ in range(PREAMBLE):
-        line, found, after = rest.partition(b"\n")
+    lines = content.split(b"\n", PREAMBLE)[:PREAMBLE]
+    for number, line in enumerate(lines):
         if line.startswith(b"Time,") and b",Speed1," in line:
-            cells = (text.decode().strip("\r, ").partition(",") for text in lines)
-            return {name: value for name, _, value in cells}, rest
-        if not found:
-            break
-        lines.append(line)
-        rest = after
+            cells = (text.decode().strip("\r, ").partition(",") for text in lines[:number])
+            return {name: value for name, _, value in cells}, content.split(b"\n", number)[number]
     return {}, content
 
 
 def separator_of(content: bytes) -> str:
     """Return the separator that divides the header and the next row equally, into most cells."""
     first, second = [*content.split(b"\n", 2)[:2], b""][:2]
-    best, most = ",", 1
+    best, most, wide = ",", 1, ","
     for separator in SEPARATORS:
         lines = first, second
         if separator == " ":
@@ -160,7 +149,9 @@ def separator_of(content: bytes) -> str:
         blank = second.rstrip(b"\r").endswith(separator.encode())  # a last cell without a name
         if counts[0] > most and (counts[0] in (counts[1], counts[1] - blank) or not second.strip()):
             best, most = separator, counts[0]
-    return best
+        elif counts[1] > LONG_ROW * counts[0] > LONG_ROW and separator != " ":
+            wide = separator
+    return best if most > 1 else wide
 
 
 def stem(file: str | Path) -> str:
@@ -232,11 +223,7 @@ def parse_text(
 
 
 def unended(rows: bytes, place: str) -> list[Concern]:
-    """Return a warning if the last row has no line end, so its last cell may be truncated.
-
-    It is no error: many programs write no last line end, and a truncated number cannot be
-    recognised.
-    """
+    """Return a warning if the last row has no line end, so its last cell may be truncated."""
     if rows.endswith(b"\n"):
         return []
     shown = rows[rows.rfind(b"\n") + 1 :].decode()[-40:]
@@ -255,6 +242,8 @@ def _odd_row(
     place = f"data row {before + number + 1}"
     last = number == len(lines) - 1 and held < width
     place, cut = (f"{place}, the last,", "; is the file cut off?") if last else (place, "")
+    if held > LONG_ROW * width:
+        cut = ": is it a whole trajectory, as in pNEUMA's files? Write a row per vehicle and time"
     return DataError(f"{source}: {place} has {held} columns; expected {width}{cut}")
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 FOOT = 0.3048  # m
 FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
-CAR_LENGTH = (2.0, 12.0)  # range of the median length of vehicles on any road [m]
+CAR_LENGTH = (3.0, 12.0)  # range of the median length of vehicles on any road [m]
 SAMPLE_KEYS = ("recording", "vehicle", "frame", "preceding")
 # Columns of trajectories besides the recording.
 SAMPLE_TYPES = {

@@ -47,9 +47,21 @@ def csv(frame: pd.DataFrame) -> str:
     return frame.to_csv(index=False)
 
 
+def later(factor: float, drive: str = "", speed: float = 1.0) -> str:
+    """A table, or the drive of its first car, with other times and speeds."""
+    frame = TABLE.assign(t=factor * TABLE["t"], v=speed * TABLE["v"])
+    names = {"t": "time_s", "v": "speed_mps"} if drive else {}
+    return csv(frame.rename(columns=names)[: 400 if drive else None])
+
+
 LATE = TABLE.assign(t=TABLE["t"].where(TABLE.index < 1190, 1e11 + TABLE["t"]))
 TWICE = csv(pd.concat([pairs(), pairs().assign(gap_m=12.0)]))
 COMMAS = TABLE.to_csv(index=False, sep=";", decimal=",")
+MINUTES = (95930 + TABLE["t"]).where(TABLE["t"] < 29.95, 99970 + TABLE["t"])  # hhmmss
+WIDE = "drive; type; way; mean; y; x; speed_mps; a; b; time_s\n"  # as pNEUMA's files
+WIDE += "".join(
+    f"{k}; Car; 9.1; 9.0" + "; 37.9; 23.7; 9.0; 0.1; 0.0; 0.0" * 9 + "; \n" for k in "12"
+)
 # Reader, content of the file, what is said of it.
 BAD: list[tuple[str, str | bytes, str]] = [
     # Files that are no tables.
@@ -144,6 +156,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
         "row 1, .*does this row hold uni",
     ),
     ("record", "version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "run git lfs pull"),
+    ("record", "File created on 03/05/2023\n\n[header]\n", r"is a VBOX file \(vbo\): save its"),
     ("table", "<?xml version='1.0'?>\n<fcd-export/>\n", "is XML or HTML; save the table as CSV"),
     ("table", "<fcd-export>\n</fcd-export>\n", r"is XML or HTML; .*\(SUMO: --fcd-output fcd.csv\)"),
     (
@@ -171,7 +184,28 @@ BAD: list[tuple[str, str | bytes, str]] = [
     # Values that are implausible, and units.
     ("ngsim", csv_text(pair(v_Length=4.5, Preceding=0)[:20]), "is 4.5 feet; .*data.units=metres"),
     ("source", csv_text(pair(range(200), v_Vel=400)), "holds 121.92 m/s .*max_speed=70"),
-    ("table", csv(TABLE.assign(t=1e3 * TABLE["t"])), "are 100 s apart; .*is the time in ms"),
+    (
+        "table",
+        later(1e3),
+        r"100 s apart; .*from 0 to 39900, in ms \(data\.units\.time=ms\), or are",
+    ),
+    ("table", later(1e6), r"apart; .* in us \(data\.units\.time=us\), or are rows missing\?"),
+    (
+        "drives",
+        later(120, "d"),
+        r"are 12 s apart; .* from 0 to 4788, in ms \(leader\.units\.time=ms",
+    ),
+    ("drives", DRIVES + "a,1.7e12,1\na,1.8e12,1\n", r"'1.7e12'; .* is it in ms, us or ns \(units"),
+    ("table", csv(TABLE.assign(t=MINUTES)), "row 301, .*: 95959.9 s, then 100000 s, .* hh:mm:ss"),
+    ("table", csv(TABLE.assign(x=-TABLE["x"], v=-TABLE["v"])), "must grow in the direction of tr"),
+    ("drives", later(0.6, "d", 4.6), r"\(leader\.units\.speed=m/s\), or do they need smoothing"),
+    (
+        "lengths",
+        csv(TABLE.assign(length=2.3)),
+        r"is 2\.3 m; is it in ft or half\? Set data\.units",
+    ),
+    ("drives", later(1, "d", 6), r"holds 7.* correct .* leader\.units\.speed=m/s, or raise"),
+    ("drives", WIDE, r"row 1 has \d+ columns; expected 10: is it a whole trajectory, as in pNEUMA"),
     ("table", csv(TABLE.assign(v=3.6 * TABLE["v"])), "by their positions the vehicles drive"),
     ("table", csv(TABLE.assign(x=-TABLE["x"])), "must grow in the direction of travel"),
     ("drives", DRIVES + "a,0.1,1\na,0.2,9\n", "recording a, data row 3, .* changes by 80 m/s²"),

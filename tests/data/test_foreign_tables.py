@@ -16,7 +16,7 @@ from table_text import BY_GAP, LENGTH, long_table, written
 from lcc_rl.data.leaders import DriveLeaders
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.data.tables import UNITS, named_unit
-from lcc_rl.errors import DataError
+from lcc_rl.errors import Concern, DataError
 
 NAMED = {
     "Target Speed, mph": "mph",
@@ -58,6 +58,14 @@ def test_the_name_of_a_column_may_say_its_unit(tmp_path) -> None:
             TableSource(path=path, columns=columns).load()
         loaded = TableSource(path=path, columns=columns, units={key: unit}).load()
         assert len(loaded.episodes) == 800, name
+
+
+def test_a_gap_by_the_name_of_a_headway_is_loud(tmp_path) -> None:
+    for name, loud in (("Space_Headway", 1), ("leadDHW", 1), ("space_hdwy", 1), ("hdw", 0)):
+        path = written(tmp_path, long_table(rows=400).rename(columns={"gap": name}))
+        report = TableSource(path=path, columns={**BY_GAP, "gap": name}).load().report
+        found = [x for x in report if isinstance(x, Concern) and f"column {name!r}: does" in x]
+        assert len(found) == loud, (name, report)
 
 
 def test_an_empty_last_column_is_left_out_with_and_without_a_name(tmp_path) -> None:

@@ -388,6 +388,15 @@ def test_records_are_cut_where_the_gap_jumps_or_is_held() -> None:
             assert "lag 0.0 s of " in lines[-1], (words, lines[-1])  # the parts are checked
 
 
+def test_zeros_of_gap_and_leader_for_no_leader_are_cut() -> None:
+    for begin in (0, 300, 450):
+        table = irregular().assign(follower_id=lambda x: x["episode"])
+        table.loc[begin : begin + 149, ["gap_m", "leader_speed_mps"]] = 0.0
+        kept, lines = Plausible().select(table.assign(row=table.index), "f.csv", rows_of)
+        assert 150 <= len(table) - len(kept) <= 160, begin
+        assert "lag 0.0 s of 3 pair(s)" in lines[-1], (begin, lines)
+
+
 def test_jumps_do_not_hide_other_mistakes_and_many_are_refused() -> None:
     cut = with_gap(slice(300, 600), lambda x: x - 8.0)
     flicker = np.where(np.arange(1800) // 50 % 2, 0.0, 100.0)
@@ -432,7 +441,10 @@ def test_a_relative_speed_is_no_leaders_speed() -> None:
     relative = table["leader_speed_mps"] - table["follower_speed_mps"]
     cases = [
         (table.assign(leader_speed_mps=0.1 * relative), "is the leader's speed relative to the fo"),
-        (table.assign(leader_speed_mps=3 * relative), r"m/s \(is it relative to another car\?\)"),
+        (
+            table.assign(leader_speed_mps=3 * relative),
+            r"m/s \(is it relative to another car, or ag",
+        ),
     ]
     check_refused(judged, cases, DataError)
 

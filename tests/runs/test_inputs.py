@@ -89,6 +89,16 @@ def test_a_file_replaced_within_its_size_and_times_has_another_hash(place, monke
         assert found[0] != found[1], aged
 
 
+def test_modules_of_another_environment_are_not_followed(place, monkeypatch) -> None:
+    shared = place / "base" / "site-packages"  # a second folder of installed packages
+    shared.mkdir(parents=True)
+    (shared / "own_helper.py").write_text("WEIGHT = 1\n")
+    (place / "own_helper.py").unlink()
+    monkeypatch.syspath_prepend(shared)
+    found = inputs_of({"compare": ["own_term.Term"]})
+    assert [*found["compare"]] == ["own_term.py"]
+
+
 def test_own_files_of_settings_are_read_anew(place, monkeypatch) -> None:
     own = "# @package _global_\nscenario: {{horizon: {}}}\n"
     words = ["hydra.searchpath=[file://c]", "+knowledge=mine"]

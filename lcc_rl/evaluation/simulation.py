@@ -1,0 +1,257 @@
+"""Simulation of a string of vehicles behind given leaders: tables of their motion."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike, fspath
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from lcc_rl.config import load
+from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
+from lcc_rl.data.speed_records import read_speed_record
+from lcc_rl.drivers.population import bootstrap
+from lcc_rl.envs.factory import build_env
+from lcc_rl.envs.inputs import Inputs, build_drivers, build_energy, constant_profiles
+from lcc_rl.errors import ConfigError, raised_as, require
+from lcc_rl.evaluation.entrants import Entrants
+from lcc_rl.evaluation.foreign import GivenPolicy
+from lcc_rl.evaluation.metrics import energy_measures
+from lcc_rl.evaluation.named import is_policy, setting_of
+from lcc_rl.evaluation.rollout import Player, Record, reset_options
+from lcc_rl.evaluation.rows import INDEX
+from lcc_rl.evaluation.strategies import Strategy
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
+from lcc_rl.pieces.base import Key
+from lcc_rl.pieces.features import CLASS
+
+log = logging.getLogger("lcc_rl")
+
+# Machine code, which takes seconds to compile once, pays from so many steps on; translating more
+# vehicles takes longer than their steps.
+LONG, SHORT_STRING = 2_000, 40
+LEADER: Key = ("leader", "speed")
+MOTION = {
+    "speed": "speed_mps",
+    "gap": "gap_m",
+    "acceleration": "acceleration_mps2",
+    "power": "power_w",
+}
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """The motion of strings of vehicles.
+
+    Args:
+        steps: a row per episode, time and vehicle; vehicle 0 is the leader, the others are from
+            front to back. ``acceleration_mps2`` and ``power_w`` are those of the step that ends at
+            ``time_s``. An episode ends with its first collision, a gap of 0 m or less.
+        vehicles: a row per episode and vehicle: ``mean_speed_mps``, ``min_gap_m``, ``mean_gap_m``,
+            ``collided``, and distance and energies of
+            :func:`lcc_rl.evaluation.metrics.energy_measures`.
+    """
+
+    steps: pd.DataFrame
+    vehicles: pd.DataFrame
+
+
+def simulate(
+    leader: Any,
+    string: str | Mapping[str, float] = "human*10",
+    controller: Any = None,
+    drivers: Any = None,
+    overrides: Sequence[str] = (),
+    time_step: float = 0.1,
+    seconds: float | None = None,
+    repeats: int = 1,
+    seed: int = 0,
+) -> Simulation:
+    """Simulate a string of vehicles behind a leader.
+
+    Args:
+        leader: speeds [m/s] at every time step; a shipped cycle (``"udds"``, ``"us06"``,
+            ``"wltc_3b"``, ``"hwfet"``) or a file with ``time_s`` and ``speed_mps``; a list of
+            these, each an episode of the length of the shortest; None on a ring.
+        string: the vehicles behind the leader from front to back, see docs/strings.md.
+        controller: controller or policy of the automated vehicles, as for
+            :func:`lcc_rl.compare`; None: an IDM driver without noise.
+        drivers: a table of ``lcc-rl calibrate`` or a population of
+            :mod:`lcc_rl.drivers.population`; None: those of ``overrides`` or the shipped ones. The
+            first human is the first driver of it in the first repeat, the second in the next one.
+        overrides: further settings, ``["scenario.controllers.human.noise=0", "+filter=cbf"]``.
+        time_step: duration of a step [s].
+        seconds: duration [s]; None: that of the leader's record. A ring needs one.
+        repeats: episodes behind each leader, with other drivers and noise.
+        seed: seed of the noise.
+
+    Raises:
+        LccError: for any error in settings, data or files, in one line.
+
+    Examples:
+        >>> found = simulate([12.0] * 301, "human*3")
+        >>> found.steps.shape[0], found.vehicles["vehicle"].tolist()
+        (1204, [0, 1, 2, 3])
+    """
+    profiles = _profiles(leader, time_step, seconds)
+    spec = None if controller is None else setting_of(controller, "controller")
+    words = (
+        *("evaluation.baselines=[]", "evaluation.behind_filter=[]", "evaluation.warm_up=0"),
+        *(f"variant={'alcc' if is_policy(spec) else 'idm'}", *overrides),
+        *(f"scenario.string={_words(string)}", f"scenario.time_step={time_step:g}"),
+        f"scenario.horizon={int(profiles.lengths[0]) - 1}",
+    )
+    cfg = load("evaluate", words).with_(compare=[] if spec is None else [spec])
+    require(
+        (cfg.scenario.road == RING) == (leader is None),
+        "simulate: a ring (scenario=ring in overrides) has leader=None, an open road has a leader",
+    )
+    require(cfg.automated or spec is None, "simulate: controller has no vehicle to drive in string")
+    people = build_drivers(cfg)
+    if drivers is not None:
+        people = bootstrap(drivers) if isinstance(drivers, (str, PathLike)) else drivers
+    inputs = Inputs(no_profiles(time_step), profiles, people)
+    strategy = Entrants(cfg, own=spec is None).strategies(inputs)[-1]
+    return _simulated(strategy, inputs, repeats, seed)
+
+
+def _words(string: str | Mapping[str, float]) -> str:
+    """Return a string of vehicles as a word of the command line."""
+    if isinstance(string, str):
+        return f"'{string}'"
+    return f"{{{', '.join(f'{key}: {value}' for key, value in string.items())}}}"
+
+
+def _profiles(leader: Any, time_step: float, seconds: float | None) -> Profiles:
+    """Return the leaders' records, of one length; for a ring one of zeros."""
+    if leader is None:
+        require(seconds is not None, "simulate: a ring has no leader's record; give seconds=…")
+        return constant_profiles(0.0, round((seconds or 0.0) / time_step), time_step, ["ring"])
+    listed = isinstance(leader, (list, tuple)) and len(leader) > 0
+    several = listed and not all(isinstance(x, (int, float, np.number)) for x in leader)
+    records = [_record(one, time_step) for one in (leader if several else [leader])]
+    steps = min((len(record) for record in records), default=0) - 1
+    require(steps > 0, "simulate: leader needs at least two speeds [m/s]")
+    if seconds is not None:
+        words = f"simulate: seconds={seconds:g}, and the leader drives for {steps * time_step:g} s"
+        require(0 < round(seconds / time_step) <= steps, words)
+        steps = round(seconds / time_step)
+    names = [f"leader {number}" for number in range(len(records))]
+    return from_records([x[: steps + 1] for x in records], names, names, time_step)
+
+
+def _record(leader: Any, time_step: float) -> Tensor:
+    """Return a leader's speed at every step, ``[steps + 1]`` [m/s]."""
+    if isinstance(leader, (str, PathLike)):
+        return resample(*read_speed_record(fspath(leader)), time_step)
+    words = "simulate: leader must be speeds [m/s], a shipped cycle or a file"
+    with raised_as(ConfigError, words, ValueError, TypeError):
+        speeds = np.asarray(leader, dtype=np.float32)
+        if speeds.ndim != 1:
+            raise ValueError(f"got an array of shape {list(speeds.shape)}")
+        return torch.from_numpy(speeds.copy())
+
+
+def _simulated(strategy: Strategy, inputs: Inputs, repeats: int, seed: int) -> Simulation:
+    """Drive a strategy behind all leaders side by side."""
+    cfg, leaders, people = strategy.cfg, len(inputs.evaluation), len(inputs.population.time_gap)
+    number = torch.arange(leaders * repeats)
+    profile, repeat, batch = number // repeats, number % repeats, len(number)
+    desired = inputs.population.desired_speed
+    if slow := int((desired < inputs.evaluation.speeds.max()).sum()):
+        words = "the leader exceeds the desired speed of %d of %d human drivers, who fall behind; "
+        log.warning(words + "drivers=highway in overrides has faster ones", slow, people)
+    env = build_env(cfg, inputs.evaluation, inputs.population, batch, 0, cfg.device, nominal=True)
+    fast = cfg.scenario.horizon >= LONG and len(cfg.scenario.vehicles) <= SHORT_STRING
+    fast = fast and not isinstance(strategy.policy, GivenPolicy)  # it has a memory of its own
+    keys = [LEADER, CLASS, INDEX, *(("vehicles", name) for name in MOTION)]
+    player = Player(env, strategy.policy, keys, strategy.title, rowwise=fast)
+    given = reset_options(env, profile, repeat % people, seed, people, repeat // people)
+    start = env.reset(options=given)["vehicles", "gap"].unsqueeze(0)
+    record, alive = player.play(given)
+    return _Motion(cfg, record, start, alive).tables()
+
+
+class _Motion:
+    """The motion of all vehicles, and of the leader if there is one, as arrays.
+
+    Args:
+        cfg: configuration of the simulation.
+        record: entries of a :class:`Player`.
+        start: gaps before the first step, ``[1, episodes, n, 1]`` [m].
+        alive: whether each step belongs to a running episode, ``[steps, episodes, 1]``.
+    """
+
+    def __init__(self, cfg: StudyConfig, record: Record, start: Tensor, alive: Tensor) -> None:
+        self.cfg, self.record, self.alive = cfg, record, alive
+        self.energy, self.time_step = build_energy(cfg), cfg.scenario.time_step
+        own = {name: record["vehicles", name] for name in MOTION}
+        self.groups = [own | {"gap": torch.cat([start, own["gap"]])}]
+        self.kinds = [record[CLASS][0] if CLASS in record else None]
+        if LEADER in record:
+            speed = record[LEADER].unsqueeze(-2)
+            change = speed.diff(dim=0) / self.time_step
+            ahead = {"speed": speed, "gap": torch.full_like(speed, torch.nan)}
+            ahead |= {"acceleration": change, "power": self.energy.power(speed[:-1], change)}
+            self.groups, self.kinds = [ahead, *self.groups], [None, *self.kinds]
+        self.vehicles = np.arange(len(cfg.scenario.vehicles) + 1)[LEADER not in record :]
+
+    def tables(self) -> Simulation:
+        """Return a row per time and vehicle, and a row per vehicle."""
+        running = torch.cat([self.alive[:1], self.alive]).squeeze(-1).T.numpy()
+        episode, time = np.nonzero(running)  # in this order
+        count = len(self.vehicles)
+        columns = {
+            "episode": np.repeat(episode, count),
+            "time_s": np.repeat(time * self.time_step, count),
+            "vehicle": np.tile(self.vehicles, len(time)),
+            "role": self._roles()[episode].flatten(),
+        }
+        for name, column in MOTION.items():
+            columns[column] = self._whole(name)[time, episode].flatten()
+        steps = pd.DataFrame(columns)
+        by_vehicle = steps.groupby(["episode", "vehicle"], sort=False)
+        found = by_vehicle.agg(
+            role=("role", "first"),
+            mean_speed_mps=("speed_mps", "mean"),
+            min_gap_m=("gap_m", "min"),
+            mean_gap_m=("gap_m", "mean"),
+        ).reset_index()
+        found["collided"] = found["min_gap_m"] <= 0.0
+        return Simulation(steps, found.assign(**self._energies()))
+
+    def _whole(self, name: str) -> np.ndarray:
+        """Return a quantity of all vehicles, ``[steps + 1, episodes, n]``; NaN where unknown."""
+        parts = [group[name].squeeze(-1) for group in self.groups]
+        found = torch.cat(parts, -1).numpy()
+        if len(found) == len(self.alive):  # of a step: none before the first one
+            found = np.concatenate([np.full_like(found[:1], np.nan), found])
+        return found
+
+    def _roles(self) -> np.ndarray:
+        """Return the role of each vehicle in each episode, ``[episodes, n]``."""
+        string, episodes = self.cfg.scenario.vehicles, self.alive.shape[1]
+        roles = np.tile(np.array(["leader", *string.roles], dtype=object), (episodes, 1))
+        if string.drawn:
+            roles[:, 1:] = HUMAN
+            index = self.record[INDEX][0].squeeze(-1).numpy() + 1
+            np.put_along_axis(roles, index, AUTOMATED, axis=1)
+        return roles[:, self.vehicles]
+
+    def _energies(self) -> dict[str, np.ndarray]:
+        """Return distance and energies of all vehicles, episode by episode."""
+        here, found = self.alive.unsqueeze(-2), []
+        for group, kind in zip(self.groups, self.kinds, strict=True):
+            how = (here, self.time_step, self.energy, kind)
+            found.append(energy_measures(group["power"], group["speed"], *how))
+        names = [name for name in found[-1] if all(name in part for part in found)]
+        return {
+            name: torch.cat([part[name] for part in found], -2).flatten().numpy() for name in names
+        }

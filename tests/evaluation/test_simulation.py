@@ -1,0 +1,95 @@
+"""A simulation is a table of what an evaluation drives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from helpers import POPULATION, check_refused
+
+import lcc_rl
+from lcc_rl.config import load
+from lcc_rl.data.profiles import from_records, no_profiles
+from lcc_rl.envs import Inputs
+from lcc_rl.evaluation.entrants import Entrants
+from lcc_rl.evaluation.episodes import evaluate
+
+STEPS = 200
+WAVE = 8.0 + 3.0 * np.sin(0.1 * np.arange(STEPS + 1) / 4.0)
+QUICK = ["scenario.horizon=200", "evaluation.baselines=[]", "evaluation.warm_up=0"]
+
+
+@pytest.mark.parametrize("policy", [None, "pretrained/alcc"])
+def test_the_rows_are_those_of_an_evaluation(policy) -> None:
+    string = "automated human*2"
+    found = lcc_rl.simulate([WAVE, WAVE + 2.0], string, policy, repeats=3, seed=5)
+    words = [f"variant={'idm' if policy is None else 'alcc'}", *QUICK, f"scenario.string={string}"]
+    cfg = load("evaluate", words).with_(compare=[] if policy is None else [policy])
+    records = [torch.tensor(x, dtype=torch.float32) for x in (WAVE, WAVE + 2.0)]
+    profiles = from_records(records, ["a", "b"], ["a", "b"], 0.1)
+    inputs = Inputs(no_profiles(0.1), profiles, POPULATION)
+    strategy = Entrants(cfg).strategies(inputs)[-1]
+    rows, _ = evaluate(strategy, inputs, None, 1024, 5)
+    rows = rows[rows["driver_id"] < 3].sort_values(["profile_id", "driver_id"])
+    assert len(rows) == 6
+    for role, group in (("automated", "cav"), ("human", "hdv")):
+        own = found.vehicles[found.vehicles["role"] == role].groupby("episode")
+        for key, unit in (("path_energy_kj", 1e-4), ("distance_m", 1e-5)):
+            np.testing.assert_allclose(own[key].sum(), rows[f"{group}_{key}"], rtol=unit)
+    later = found.steps[(found.steps["vehicle"] == 1) & (found.steps["time_s"] > 0.0)]
+    gaps = later.groupby("episode")["gap_m"].min()
+    np.testing.assert_allclose(gaps, rows["min_gap_m"], rtol=1e-5)
+
+
+def test_the_steps_are_a_motion(subtests) -> None:
+    cases = {
+        "humans": {"leader": WAVE, "string": "human*3"},
+        "a car between": {"leader": WAVE, "string": "human automated human"},
+        "drawn": {"leader": WAVE, "string": {"size": 4, "penetration": 0.5}, "repeats": 2},
+        "ring": {"leader": None, "string": "human*22", "seconds": 5.0},
+    }
+    for name, case in cases.items():
+        ring = ["scenario=ring"] if name == "ring" else []
+        with subtests.test(name=name):
+            steps = lcc_rl.simulate(**case, overrides=ring).steps
+            by = ["episode", "vehicle"]
+            assert not steps.duplicated([*by, "time_s"]).any()
+            speed = steps.groupby(by)["speed_mps"].diff()
+            np.testing.assert_allclose(
+                10.0 * speed.dropna(), steps.loc[speed.notna(), "acceleration_mps2"], atol=2e-3
+            )
+            at = steps.pivot_table(["speed_mps", "gap_m"], ["episode", "time_s"], "vehicle")
+            v, gap = at["speed_mps"].to_numpy(), at["gap_m"].to_numpy()
+            ahead, own = (np.roll(v, 1, 1), v) if name == "ring" else (v[:, :-1], v[:, 1:])
+            moved = 0.05 * ((ahead - own)[1:] + (ahead - own)[:-1])
+            inside = at.index.get_level_values("time_s")[1:] > 0.0
+            np.testing.assert_allclose(np.diff(gap, axis=0)[inside], moved[inside], atol=2e-4)
+            if name == "drawn":
+                assert (steps.drop_duplicates(by)["role"] == "automated").sum() == 4
+
+
+def test_machine_code_drives_the_same(monkeypatch) -> None:
+    monkeypatch.setattr("lcc_rl.evaluation.simulation.LONG", 1)
+    fast = lcc_rl.simulate(WAVE, "automated human", "idm_acc").steps
+    monkeypatch.setattr("lcc_rl.evaluation.simulation.LONG", 10**6)
+    plain = lcc_rl.simulate(WAVE, "automated human", "idm_acc").steps
+    pd.testing.assert_frame_equal(fast, plain, rtol=1e-4, atol=1e-3)
+
+
+def test_wrong_arguments_are_named() -> None:
+    cases = [
+        ({"leader": None}, "a ring has no leader's record; give seconds"),
+        ({"leader": None, "seconds": 5.0}, "a ring .*has leader=None, an open road has a leader"),
+        ({"leader": WAVE, "overrides": ["scenario=ring"]}, "an open road has a leader"),
+        ({"leader": [3.0]}, "at least two speeds"),
+        ({"leader": []}, "at least two speeds"),
+        ({"leader": [3.0, -1.0]}, "speeds must be finite and not negative"),
+        ({"leader": np.ones((2, 3))}, r"leader must be speeds .*shape \[2, 3\]"),
+        ({"leader": "nowhere.csv"}, "nowhere.csv: no such file"),
+        ({"leader": WAVE, "seconds": 99.0}, "seconds=99, and the leader drives for 20 s"),
+        ({"leader": WAVE, "string": "car*3"}, "car"),
+        ({"leader": WAVE, "string": "human", "controller": "idm_acc"}, "no vehicle"),
+        ({"leader": WAVE, "string": "automated", "controller": "nobody"}, "unknown strategy"),
+    ]
+    check_refused(lambda given: lcc_rl.simulate(**given), cases)
