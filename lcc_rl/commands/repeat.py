@@ -1,6 +1,6 @@
 """Repeat a run from its folder and compare the rows.
 
-lcc-rl repeat outputs/train/<run>               # into a new folder beside it
+lcc-rl repeat outputs/train/<run>               # into outputs/repeat/<run>
 lcc-rl repeat outputs/train/<run> --out again
 
 The settings, with those of own classes and configuration files, are in the run's config.yaml, and
@@ -94,10 +94,10 @@ def main(arguments: Sequence[str] | None = None) -> Any:
     """Repeat the run of the command line."""
     parser = Arguments(prog="lcc-rl repeat", description=__doc__)
     parser.add_argument("run", type=Path, help="folder of a training, evaluation, job, calibration")
-    parser.add_argument("--out", type=Path, help="new folder; by default <run>_repeated")
+    parser.add_argument("--out", type=Path, help="new folder; by default outputs/repeat/<run>")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
     options = parser.parse_args(arguments)
-    target = options.out or options.run.with_name(f"{options.run.name}_repeated")
+    target = options.out or Path("outputs", "repeat", options.run.resolve().name)
     repeat(options.run, target, options.trust)
     found = [*compared(options.run, target)]
     print("\n".join(sentence for sentence, _ in found))

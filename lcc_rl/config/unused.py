@@ -110,6 +110,10 @@ def _of_objective(
     for name in {*surrogates, *limits} - {*terms}:
         for key in ("surrogates", "limits"):
             yield f"agent.{key}.{name}", f"the reward has no term {name}"
+    for name, term in terms.items():
+        if name not in surrogates and not getattr(term.kind, "graded", True):
+            for key in term.settings:
+                yield f"reward.terms.{name}.{key}", f"{term.kind.__name__} has no gradient"
     if not limited:
         yield "agent.limit_rate", "agent.limits has no limit"
     for name, own in surrogates.items():

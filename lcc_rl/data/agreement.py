@@ -95,7 +95,8 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
 def numbers_of_pairs(episodes: pd.DataFrame) -> NDArray[np.int64]:
     """Return the number of the pair of each row, from 0; see :func:`agreement`."""
     keys = [name for name in ("recording", "follower_id", "leader_id") if name in episodes]
-    return episodes.groupby(keys or ["episode"], sort=False).ngroup().to_numpy(np.int64)
+    found = episodes.groupby(keys or ["episode"], sort=False).ngroup()
+    return np.asarray(found, np.int64)
 
 
 def _fit(

@@ -45,6 +45,7 @@ class RewardTerm(RewardPiece):
     weight: NonNegative = 1.0  # factor of the term; 0 removes it
 
     writes = (Entry("automated.reward_terms.name", "–", "weighted term of the reward"),)
+    graded: ClassVar[bool] = True  # whether the gradient learner can follow the term
     # Maps the entries read, one row per automated vehicle, to the unweighted term, [*batch, A, 1].
     reward: ClassVar[Callable[..., Tensor]]
 
@@ -128,6 +129,8 @@ class CollisionPenalty(RewardTerm):
 
     weight: NonNegative = 100.0  # must exceed the worst discounted return that remains
     behind: bool = True  # count collisions behind, back to the next automated vehicle, too
+
+    graded = False
 
     def setup(self, world: World) -> None:
         """Find which vehicles are behind."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice, product
 from pathlib import Path
+from typing import Any
 
 from lcc_rl.config import key_of
 from lcc_rl.errors import ResultsError
@@ -23,19 +24,32 @@ class SweepPlan:
         runs: number of runs; 0 if unknown.
         varied: dotted keys of settings that differ between runs.
         values: values of each of them; its cells are all combinations.
+        earlier: plans of other commands that wrote into the same folder.
     """
 
     runs: int = 0
     varied: list[str] = field(default_factory=list)
     values: list[list[str]] = field(default_factory=list)
+    earlier: list[SweepPlan] = field(default_factory=list)
+
+    def after(self, before: SweepPlan) -> SweepPlan:
+        """Return this plan with the cells of the plans before it."""
+        others = [replace(before, earlier=[]), *before.earlier]
+        same = self.varied, self.values
+        return replace(self, earlier=[x for x in others if (x.varied, x.values) != same])
 
 
 def read_plan(folder: Path) -> SweepPlan:
     """Return the plan of the sweep in a folder; an empty one if there is none."""
+
+    def plan(content: Any) -> SweepPlan:
+        found = SweepPlan(**content)
+        values = [[str(value) for value in some] for some in found.values]
+        varied = [str(key) for key in found.varied]
+        return SweepPlan(int(found.runs), varied, values, [plan(x) for x in found.earlier])
+
     try:
-        plan = SweepPlan(**read_json(folder / PLAN))
-        values = [[str(value) for value in some] for some in plan.values]
-        return SweepPlan(int(plan.runs), [str(key) for key in plan.varied], values)
+        return plan(read_json(folder / PLAN))
     except (ResultsError, ValueError, TypeError, OverflowError):
         return SweepPlan()
 
@@ -56,14 +70,16 @@ def unfinished(root: Path) -> dict[str, str]:
     Cells of a plan without a folder are ``waiting``.
     """
     found = {run.name: str(run) for run in survey(root) if run.state != "finished"}
-    sweeps: dict[Path, set[tuple[str | None, ...]]] = {root: set()}
+    sweeps: dict[Path, list[dict[str, str]]] = {root: []}
     for run in (run for run in run_folders(root) if run != root):
-        choices, varied = choices_of(run), read_plan(run.parent).varied
-        sweeps.setdefault(run.parent, set()).add(tuple(map(choices.get, varied)))
-    for sweep, begun in sweeps.items():
-        plan = read_plan(sweep)
-        for cell in islice(product(*plan.values), MOST_RUNS) if plan.values else ():
-            if cell not in begun:
-                name = "+".join(f"{key}={x}" for key, x in zip(plan.varied, cell, strict=False))
-                found[str((sweep / name).relative_to(root))] = "waiting"
+        sweeps.setdefault(run.parent, []).append(choices_of(run))
+    for sweep, runs in sweeps.items():
+        latest = read_plan(sweep)
+        for plan in (latest, *latest.earlier):
+            begun = {tuple(map(choices.get, plan.varied)) for choices in runs}
+            for cell in islice(product(*plan.values), MOST_RUNS) if plan.values else ():
+                if cell not in begun:
+                    each = zip(plan.varied, cell, strict=False)
+                    name = "+".join(f"{key}={value}" for key, value in each)
+                    found[str((sweep / name).relative_to(root))] = "waiting"
     return found

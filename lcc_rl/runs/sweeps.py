@@ -162,7 +162,8 @@ class SweepCallback(Callback):
             check_cells(config, plan.varied)
         type(self).folder = type(self).target = folder
         with atomic_path(folder / PLAN) as temporary:
-            temporary.write_text(json.dumps(asdict(plan)), encoding="utf-8")
+            whole = asdict(plan.after(read_plan(folder)))
+            temporary.write_text(json.dumps(whole), encoding="utf-8")
         words = "sweep of %d runs in %s; watch it with: lcc-rl status %s"
         log.info(words, plan.runs, folder, shlex.quote(str(folder)))
         if not any(state.state == "running" for state in survey(folder)):

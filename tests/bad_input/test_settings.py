@@ -88,6 +88,8 @@ IGNORED = {
 }
 # Settings of terms and surrogates that a training by the gradient ignores, and why.
 GRADIENT = {
+    "reward.terms.collision.weight=9": "CollisionPenalty has no gradient",
+    "reward.terms.collision.behind=false": "CollisionPenalty has no gradient",
     "reward.terms.safety.floor=0.1": r"surrogates.safety \(SmoothSafety\) takes the term's place",
     "reward.terms.hdv_energy.power=vehicles.power": "surrogates.hdv_energy .* takes the term's",
     "reward.terms.safety={_target_:lcc_rl.pieces.JerkReward}": "takes the term's place",

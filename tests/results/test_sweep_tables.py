@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -25,6 +25,7 @@ from lcc_rl.results import names
 from lcc_rl.results.report import report, windows_for
 from lcc_rl.results.runs import EPISODES, save_config
 from lcc_rl.results.sweeps import labels, load_sweep, without_effect
+from lcc_rl.runs.plans import PLAN, SweepPlan, read_plan, unfinished
 
 WEIGHT = "reward.terms.efficiency.weight"
 
@@ -67,6 +68,19 @@ def sweep(root: Path) -> Path:
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
     return sweep(tmp_path_factory.mktemp("sweeps") / "mine")
+
+
+def test_a_later_command_in_a_sweep_s_folder_forgets_no_cell(tmp_path) -> None:
+    first = SweepPlan(4, ["seed", WEIGHT], [["0", "1"], ["1", "2"]])
+    single, again = SweepPlan(1), SweepPlan(2, ["seed"], [["0", "7"]])
+    cell(tmp_path, 0, "1")
+    found = []
+    for plan in (first, single, again, first):
+        plan = plan.after(read_plan(tmp_path))
+        (tmp_path / PLAN).write_text(json.dumps(asdict(plan)))
+        found.append(sorted(unfinished(tmp_path)))
+    waiting = sorted(f"seed={seed}+{WEIGHT}={x}" for seed, x in ((0, 2), (1, 1), (1, 2)))
+    assert found == [waiting, waiting, sorted([*waiting, "seed=7"]), sorted([*waiting, "seed=7"])]
 
 
 def words_of(text: str) -> str:

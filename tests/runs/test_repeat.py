@@ -60,11 +60,12 @@ SLOW = pytest.param("pipeline", JOB, marks=pytest.mark.slow)
 
 @pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize(("command", "words"), [*COMMANDS.items(), SLOW])
-def test_every_command_is_repeated(command, words, tmp_path, capsys) -> None:
+def test_every_command_is_repeated(command, words, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
     here = f"hydra.run.dir={tmp_path / 'run'}"
     run_command(f"lcc_rl.cli.{command}", *words, here, cwd=tmp_path, check=True)
     assert repeat.main([str(tmp_path / "run")]) == 0
-    assert "run_repeated: all rows are equal" in capsys.readouterr().out
+    assert "outputs/repeat/run: all rows are equal" in capsys.readouterr().out
 
 
 def test_a_run_says_where_it_comes_from(evaluated) -> None:
