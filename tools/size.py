@@ -27,8 +27,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 42_000, "code": 27_560},
-    "tests": {"lines": 23_340},
+    "lcc_rl + tools": {"lines": 42_400, "code": 27_830},
+    "tests": {"lines": 23_900},
     "conf": {"yaml": 152},
 }
 CASES = 1_160  # ceiling of all quick tests, see tests/tools/test_size.py
