@@ -249,6 +249,7 @@ def train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
         LccError: the error of the first failed training, after all others ended.
         Interrupted: on SIGINT or SIGTERM, after all running trainings saved their state.
     """
+    parts = {name: with_inputs(cfg) for name, cfg in parts.items()}
     todo = {name: cfg for name, cfg in parts.items() if not _finished(folder / name, cfg)}
     # A new interpreter per training: forking a process with torch's threads can hang.
     context = multiprocessing.get_context("spawn")
@@ -302,7 +303,7 @@ def _train_one(cfg: TrainConfig, folder: str) -> None:
 
 def _finished(folder: Path, cfg: TrainConfig) -> bool:
     """Whether a training is complete; other settings are refused."""
-    check_folder(with_inputs(cfg), folder, *NOT_IDENTITY)
+    check_folder(cfg, folder, *NOT_IDENTITY)
     return (folder / EPISODES).exists()
 
 

@@ -69,7 +69,8 @@ def run(cfg: TrainConfig, folder: str | Path, quiet: bool = False, resume: bool 
             "hydra.run.dir"
         )
     else:
-        check_folder(with_inputs(cfg), folder, *(NOT_IDENTITY if resume else ()))
+        cfg = with_inputs(cfg)
+        check_folder(cfg, folder, *(NOT_IDENTITY if resume else ()))
     with working(folder):
         return _run(cfg, folder, quiet, (folder / CHECKPOINT).exists())
 

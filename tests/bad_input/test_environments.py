@@ -154,7 +154,7 @@ class RememberingFeature(Feature):
 
 def driven_by(group: str, name: str, node: dict) -> None:
     cfg = compose("idm")
-    getattr(cfg.scenario, group)[name] = Node.of(node, name)
+    cfg = cfg.with_(scenario={group: {name: Node.of(node, name)}})
     build_env(cfg, wavy_profiles(), bootstrap(), 2)
 
 

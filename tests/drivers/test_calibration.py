@@ -314,8 +314,8 @@ def test_a_model_of_ones_own_is_calibrated_and_drives(make_episodes):
     assert drivers["time_gap_s"].tolist() == pytest.approx([1.0, 1.5], rel=0.01)
     assert (drivers["gap_gain_hz2"] == 0.2).all()
     cfg = compose("alcc", "controller@scenario.controllers.human=calibrated")
-    nodes = cfg.scenario.controllers
-    nodes["human"] = nodes["human"].changed(noise=0.0)
+    human = cfg.scenario.controllers["human"].changed(noise=0.0)
+    cfg = cfg.with_(scenario={"controllers": {"human": human}})
     data = build_env(cfg, wavy_profiles(), from_table(drivers), 4).rollout(20)
     speed, gap, rate = (data["vehicles", x][..., 1:, :] for x in ("speed", "gap", "relative_speed"))
     own = (data["human", "desired_speed"], data["human", "desired_time_gap"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -64,9 +65,9 @@ def test_an_evaluation_measures_what_follows() -> None:
     inputs = load_inputs(cfg)
     rows, steps = evaluate(baseline(cfg, "follower_stopper"), inputs, None, 8, 0, 1)
     whole = baseline(load("evaluate", [*RING, *sizes, "scenario.horizon=230"]), "handover")
-    drivers = whole.cfg.scenario.controllers
     people = {"from_s": 20.0, "before": cfg.scenario.controllers["human"]}
-    drivers["automated"] = drivers["automated"].changed(**people)
+    driver = whole.cfg.scenario.controllers["automated"].changed(**people)
+    whole = replace(whole, cfg=whole.cfg.driven_by(driver))
     _, played = evaluate(whole, inputs, None, 8, 0, 1)
     assert rows["duration_s"].tolist() == pytest.approx([3.0, 3.0])
     for name in ("cav_speed", "cav_gap", "hdv1_speed"):

@@ -347,7 +347,8 @@ def test_commands_to_automated_vehicles_alone_are_bounded() -> None:
     for node, least in ((hard, -3.0), (harder, -4.0), (handover, (-4.0, -4.0, -3.0))):
         cfg = compose("idm", "scenario.start.human=${scenario.start.automated}")
         drivers = {AUTOMATED: node, "human": hard}
-        cfg.scenario.controllers |= {role: Node.of(own, role) for role, own in drivers.items()}
+        nodes = {role: Node.of(own, role) for role, own in drivers.items()}
+        cfg = cfg.with_(scenario={"controllers": nodes})
         command = build_env(cfg, wavy_profiles(), POPULATION, 2).rollout(3)["next"]
         expected = torch.tensor(least).expand(2, 3)
         assert torch.equal(command[AUTOMATED, "command"][..., 0, 0], expected), node

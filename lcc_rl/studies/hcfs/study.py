@@ -136,7 +136,8 @@ def _evaluate(
     strategies: Sequence[Strategy], cfg: StudyConfig, inputs: Inputs, folder: Path
 ) -> None:
     """Evaluate into a folder, unless this is done."""
-    if made_by(folder / EPISODES) == identity(with_inputs(cfg)):
+    cfg = with_inputs(cfg)
+    if made_by(folder / EPISODES) == identity(cfg):
         return
     log.info("evaluating %d strategies into %s", len(strategies), folder)
     comparison = Comparison(cfg, inputs, strategies)
