@@ -63,15 +63,15 @@ def test_the_structure_of_a_package(monkeypatch, tmp_path) -> None:
         "lcc_rl/base/one.py": "SPEED = 1\n",
         "lcc_rl/base/two.py": "from lcc_rl.base.one import SPEED\n",
         "lcc_rl/above/three.py": "from lcc_rl.base import one\nSPEED: int = 2\n_own = 1\n",
-        "lcc_rl/above/four.py": "import lcc_rl.top.five\n_own = 2\n",
-        "lcc_rl/top/five.py": "def f():\n    from lcc_rl.above.four import g\n",
+        "lcc_rl/above/four.py": "import lcc_rl.top.five\ndef h(cfg, seed): pass\n",
+        "lcc_rl/top/five.py": "def f(x: TrainConfig):\n    from lcc_rl.above.four import g\n",
     }
     for name, text in modules.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     monkeypatch.setattr(size, "ROOT", tmp_path)
     # SPEED stands in two modules; above and top import each other, so they share floor 2.
-    assert list(size.structure(modules).values()) == [1, 2, 1]
+    assert list(size.structure(modules).values()) == [1, 2, 1, 2]
 
 
 def test_a_number_above_its_ceiling_has_a_line() -> None:
