@@ -36,6 +36,7 @@ from lcc_rl.settings import (
 
 log = logging.getLogger("lcc_rl")
 
+TimeStep = Annotated[float, Field(ge=0.001, le=10.0)]
 Device = Annotated[str, Field(pattern=r"^(cpu|cuda)(:\d+)?$")]
 # Each variant has a folder in the job's folder.
 Variants = Annotated[list[Annotated[str, Field(pattern=r"^\w[\w.-]*$")]], Field(min_length=1)]
@@ -113,7 +114,7 @@ class ScenarioConfig(Section):
 
     name: str
     horizon: Million  # steps of an episode
-    time_step: Annotated[float, Field(ge=0.001, le=10.0)]  # [s]
+    time_step: TimeStep  # [s]
     string: str | dict[str, Any]  # roles from front to back, see docs/strings.md
     road: Literal["open", "ring"]
     circumference: Positive | None = None  # circumference of a ring [m]

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.config import load
-from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config.schemas import StudyConfig, TimeStep
 from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.drivers.population import bootstrap
@@ -31,6 +31,7 @@ from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.base import Key
 from lcc_rl.pieces.features import CLASS
+from lcc_rl.settings import Count, Positive, Seed, checked
 
 log = logging.getLogger("lcc_rl")
 
@@ -63,16 +64,17 @@ class Simulation:
     vehicles: pd.DataFrame
 
 
+@checked
 def simulate(
     leader: Any,
-    string: str | Mapping[str, float] = "human*10",
+    string: str | Mapping[str, Any] = "human*10",
     controller: Any = None,
     drivers: Any = None,
     overrides: Sequence[str] = (),
-    time_step: float = 0.1,
-    seconds: float | None = None,
-    repeats: int = 1,
-    seed: int = 0,
+    time_step: TimeStep = 0.1,
+    seconds: Positive | None = None,
+    repeats: Count = 1,
+    seed: Seed = 0,
 ) -> Simulation:
     """Simulate a string of vehicles behind a leader.
 
@@ -105,7 +107,7 @@ def simulate(
     words = (
         *("evaluation.baselines=[]", "evaluation.behind_filter=[]", "evaluation.warm_up=0"),
         *(f"variant={'alcc' if is_policy(spec) else 'idm'}", *overrides),
-        *(f"scenario.string={_words(string)}", f"scenario.time_step={time_step:g}"),
+        *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
     )
     cfg = load("evaluate", words).with_(compare=[] if spec is None else [spec])
@@ -122,7 +124,7 @@ def simulate(
     return _simulated(strategy, inputs, repeats, seed)
 
 
-def _words(string: str | Mapping[str, float]) -> str:
+def _words(string: str | Mapping[str, Any]) -> str:
     """Return a string of vehicles as a word of the command line."""
     if isinstance(string, str):
         return f"'{string}'"
