@@ -125,9 +125,7 @@ def simulate(
     people = build_drivers(cfg)
     if drivers is not None:
         people = bootstrap(drivers) if isinstance(drivers, (str, PathLike)) else drivers
-    require(
-        isinstance(people, DriverPopulation), f"drivers: no table or population: {people!r:.80}"
-    )
+    require(isinstance(people, DriverPopulation), f"drivers: not a population: {people!r:.80}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, own=spec is None).strategies(inputs)[-1]
     return _simulated(strategy, inputs, repeats, seed)

@@ -88,7 +88,7 @@ def test_wrong_arguments_are_named() -> None:
         ({"leader": np.ones((2, 3))}, r"leader must be speeds .*shape \[2, 3\]"),
         ({"leader": 12.0 * WAVE}, r"leader must be speeds .*got 132 m/s; is it in km/h"),
         ({"leader": np.ma.masked_greater(WAVE, 9.0)}, "speeds must be finite"),
-        ({"leader": WAVE, "drivers": {"a": 1}}, "drivers: no table or population: "),
+        ({"leader": WAVE, "drivers": {"a": 1}}, "drivers: not a population: "),
         *(
             ({"leader": WAVE, "overrides": [f"{key}=2"]}, f"{key} has no effect: see the arguments")
             for key in ("scenario.horizon", "scenario.string", "seed", "compare", "leader.path")
