@@ -15,9 +15,11 @@ from torch import Tensor
 
 from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig, TimeStep
+from lcc_rl.config.words import top_key, typed_keys
+from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
-from lcc_rl.drivers.population import bootstrap
+from lcc_rl.drivers.population import DriverPopulation, bootstrap
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import Inputs, build_drivers, build_energy, constant_profiles
 from lcc_rl.errors import ConfigError, raised_as, require
@@ -39,6 +41,8 @@ log = logging.getLogger("lcc_rl")
 # vehicles takes longer than their steps.
 LONG, SHORT_STRING = 2_000, 40
 LEADER: Key = ("leader", "speed")
+SCENE = {f"scenario.{name}" for name in ("string", "time_step", "horizon")}
+OF_ARGUMENTS = SCENE | {"leader", "data", "split", "compare", "policy", "seed", "evaluation"}
 MOTION = {
     "speed": "speed_mps",
     "gap": "gap_m",
@@ -102,6 +106,8 @@ def simulate(
         >>> found.steps.shape[0], found.vehicles["vehicle"].tolist()
         (1204, [0, 1, 2, 3])
     """
+    for key in set().union(*map(typed_keys, overrides)):
+        require(not {key, top_key(key)} & OF_ARGUMENTS, f"{key} has no effect: see the arguments")
     profiles = _profiles(leader, time_step, seconds)
     spec = None if controller is None else setting_of(controller, "controller")
     words = (
@@ -119,6 +125,7 @@ def simulate(
     people = build_drivers(cfg)
     if drivers is not None:
         people = bootstrap(drivers) if isinstance(drivers, (str, PathLike)) else drivers
+    require(isinstance(people, DriverPopulation), f"drivers: not a population: {people!r:.80}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, own=spec is None).strategies(inputs)[-1]
     return _simulated(strategy, inputs, repeats, seed)
@@ -155,9 +162,11 @@ def _record(leader: Any, time_step: float) -> Tensor:
         return resample(*read_speed_record(fspath(leader)), time_step)
     words = "simulate: leader must be speeds [m/s], a shipped cycle or a file"
     with raised_as(ConfigError, words, ValueError, TypeError):
-        speeds = np.asarray(leader, dtype=np.float32)
+        speeds = np.asarray(np.ma.filled(leader, np.nan), dtype=np.float32)
         if speeds.ndim != 1:
             raise ValueError(f"got an array of shape {list(speeds.shape)}")
+        if (speeds > Plausible().max_speed).any():
+            raise ValueError(f"got {speeds.max():g} m/s; is it in km/h?")
         return torch.from_numpy(speeds.copy())
 
 

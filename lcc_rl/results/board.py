@@ -69,6 +69,7 @@ class ScoreRow(Settings):
     distance_lost: Number
     flow_vph: Missing
     flow_lost: Missing
+    string_ratio: Missing
     collisions: Whole
     windows: Whole
     drives: Whole
@@ -230,10 +231,10 @@ def check_row(row: BoardRow, where: str) -> None:
     where = f"{where}: {row['task']} behind {row['source']}"
     require_known(f"limit ({where})", row["limits"], measures.limit_measures())
     value, low, high = (row[key] for key in SAVED_SHARE)
-    inside = value is None or low is None or low <= value <= high
+    inside = low is high is None or (None not in (low, value, high) and low <= value <= high)
     require(inside, f"{where}: the saving {value} is not within its interval {low} … {high}")
     score, baseline = row["score"], row["baseline"]
-    same = value is None or not baseline or isclose(value, 1.0 - score / baseline, abs_tol=1e-4)
+    same = value is None or (baseline and isclose(value, 1.0 - score / baseline, abs_tol=1e-4))
     require(same, f"{where}: the saving {value} is not that of {score} against {baseline}")
     wrong = broken(row)
     require(

@@ -102,7 +102,7 @@ ROW = {"task": "t", "source": "s", "data": "1", "settings": "2", "kept": True, "
 ROW |= {"saving": 0.02, "saving_low": 0.01, "saving_high": 0.03, "limits": LIMITS}
 ROW |= {"score": 98.0, "baseline": 100.0, "measure": "path_energy", "unit": "kJ/km"}
 ROW |= {"against": "human", "distance_lost": 0.0, "flow_vph": None, "flow_lost": None}
-ROW |= {"windows": 20, "drives": 1}
+ROW |= {"windows": 20, "drives": 1, "string_ratio": None}
 BROKEN = {"share_ttc_unsafe": {"bound": 0.01, "value": 0.02}}
 HEADINGS = [({"unit": "g/km"}, "unit"), ({"measure": "net_energy"}, "measure")]
 HEADINGS += [({"against": "idm"}, "against")]
@@ -130,6 +130,9 @@ def test_a_table_of_scores_refuses_what_is_not_alike_or_contradicts_itself() -> 
         ),
         ({"score": 49.0, "baseline": 50.0}, "measured with other baseline"),
         ({"flow_vph": float("nan")}, r"b\.json, row 1.flow_vph must be .*, got nan"),
+        ({"string_ratio": "x"}, r"b\.json, row 1.string_ratio must be .*, got 'x'"),
+        ({"saving_high": None}, "the saving .* is not within its interval .* None"),
+        ({"baseline": None}, "the saving .* is not that of .* against None"),
         ({"collisions": "no"}, r"b\.json, row 1.collisions must be .*, got 'no'"),
         ({"collisions": -3}, r"b\.json, row 1.collisions must be .*, got -3"),
         ({"source": "s\nt"}, r"b\.json, row 1.source must"),

@@ -86,6 +86,13 @@ def test_wrong_arguments_are_named() -> None:
         ({"leader": []}, "at least two speeds"),
         ({"leader": [3.0, -1.0]}, "speeds must be finite and not negative"),
         ({"leader": np.ones((2, 3))}, r"leader must be speeds .*shape \[2, 3\]"),
+        ({"leader": 12.0 * WAVE}, r"leader must be speeds .*got 132 m/s; is it in km/h"),
+        ({"leader": np.ma.masked_greater(WAVE, 9.0)}, "speeds must be finite"),
+        ({"leader": WAVE, "drivers": {"a": 1}}, "drivers: not a population: "),
+        *(
+            ({"leader": WAVE, "overrides": [f"{key}=2"]}, f"{key} has no effect: see the arguments")
+            for key in ("scenario.horizon", "scenario.string", "seed", "compare", "leader.path")
+        ),
         ({"leader": "nowhere.csv"}, "nowhere.csv: no such file"),
         ({"leader": WAVE, "seconds": 99.0}, "seconds=99, and the leader drives for 20 s"),
         ({"leader": WAVE, "seconds": "long"}, r"simulate\.seconds must be a valid number"),
