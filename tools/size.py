@@ -27,8 +27,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 42_420, "code": 27_845},
-    "tests": {"lines": 23_900},
+    "lcc_rl + tools": {"lines": 42_440, "code": 27_860},
+    "tests": {"lines": 23_920},
     "conf": {"yaml": 152},
 }
 CASES = 1_170  # ceiling of all quick tests, see tests/tools/test_size.py

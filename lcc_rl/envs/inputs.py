@@ -25,6 +25,7 @@ from lcc_rl.pieces.controllers import Population
 from lcc_rl.settings import TARGET
 
 BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"  # of a table, by default the shipped one
+POPULATION = ("desired_speed", "time_gap", "constants")  # attributes of human drivers
 LOADS = ("load",)  # method of sources of episodes and of leaders
 MEANT = ("power", "path_power", "stored_energy", "acceleration_loss", "infeasible")
 
@@ -69,8 +70,7 @@ def build_drivers(cfg: StudyConfig) -> Population:
     Raises:
         ConfigError: naming the option at fault.
     """
-    needed = ("desired_speed", "time_gap", "constants")
-    return cast(Population, cfg.drivers.made(needed))
+    return cast(Population, cfg.drivers.made(POPULATION))
 
 
 def build_energy(cfg: StudyConfig) -> Fleet:

@@ -19,9 +19,9 @@ from lcc_rl.config.words import top_key, typed_keys
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
-from lcc_rl.drivers.population import DriverPopulation, bootstrap
+from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
-from lcc_rl.envs.inputs import Inputs, build_drivers, build_energy, constant_profiles
+from lcc_rl.envs.inputs import POPULATION, Inputs, build_drivers, build_energy, constant_profiles
 from lcc_rl.errors import ConfigError, raised_as, require
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.foreign import GivenPolicy
@@ -125,7 +125,8 @@ def simulate(
     people = build_drivers(cfg)
     if drivers is not None:
         people = bootstrap(drivers) if isinstance(drivers, (str, PathLike)) else drivers
-    require(isinstance(people, DriverPopulation), f"drivers: not a population: {people!r:.80}")
+    fits = all(hasattr(people, name) for name in POPULATION)
+    require(fits, f"drivers: not a population: {people!r:.80}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, own=spec is None).strategies(inputs)[-1]
     return _simulated(strategy, inputs, repeats, seed)
