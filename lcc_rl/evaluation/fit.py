@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModule
 from lcc_rl.config import load
 from lcc_rl.config.nodes import as_plain
 from lcc_rl.config.schemas import AUTO, StudyConfig
+from lcc_rl.energy import VehicleClass
 from lcc_rl.envs.inputs import build_energy, origin_of
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
@@ -199,8 +200,9 @@ def other_drivers(cfg: StudyConfig) -> str:
 
 def classes(cfg: StudyConfig) -> str:
     """Return a sentence on the classes of ``scenario.fleet`` and their shares; else nothing."""
-    nodes = {name: node.settings for name, node in cfg.scenario.fleet.items() if node is not None}
-    each = (f"{x['share']:.0%} of {' and '.join(x['roles'])}: {name}" for name, x in nodes.items())
+    nodes = {name: node for name, node in cfg.scenario.fleet.items() if node is not None}
+    found = {name: node.made(VehicleClass) for name, node in nodes.items()}
+    each = (f"{x.share:.0%} of {' and '.join(x.roles)}: {name}" for name, x in found.items())
     return f"Classes of vehicles (scenario.fleet): {', '.join(each)}." if nodes else ""
 
 

@@ -177,7 +177,8 @@ def _simulated(strategy: Strategy, inputs: Inputs, repeats: int, seed: int) -> S
     number = torch.arange(leaders * repeats)
     profile, repeat, batch = number // repeats, number % repeats, len(number)
     desired = inputs.population.desired_speed
-    if slow := int((desired < inputs.evaluation.speeds.max()).sum()):
+    slow = int((desired < inputs.evaluation.speeds.max()).sum())
+    if slow and len(cfg.scenario.vehicles) > cfg.automated:
         words = "the leader exceeds the desired speed of %d of %d human drivers, who fall behind; "
         log.warning(words + "drivers=highway in overrides has faster ones", slow, people)
     env = build_env(cfg, inputs.evaluation, inputs.population, batch, 0, cfg.device, nominal=True)

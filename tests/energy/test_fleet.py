@@ -300,6 +300,10 @@ def test_mistakes_in_classes_are_named() -> None:
             ),
             (built("scenario.fleet={truck: {share: 0.1}}"), r"scenario.fleet.*truck.*_target_"),
             (
+                lambda: classes(load("train", ["+scenario.fleet.t={_target_: builtins.dict}"])),
+                r"scenario\.fleet\.t: expected a subclass of .*VehicleClass",
+            ),
+            (
                 built(
                     *HALF,
                     "+scenario.fleet.van=${scenario.fleet.truck}",
