@@ -26,6 +26,7 @@ from lcc_rl.drivers.population import bootstrap, from_table
 from lcc_rl.envs import Inputs, SingleAgent, build_env, load_inputs
 from lcc_rl.errors import LccError
 from lcc_rl.evaluation.entrants import Entrants
+from lcc_rl.evaluation.rollout import Player, Record
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import read_parquet
 
@@ -98,6 +99,13 @@ def strategies_of(cfg: EvaluateConfig) -> tuple[list[Strategy], Inputs]:
     entrants = Entrants(cfg)
     inputs = load_inputs(cfg)
     return entrants.strategies(inputs), inputs
+
+
+def play(
+    env: TransformedEnv, policy: Any, given: TensorDictBase, keys: Sequence[Any], label: str = ""
+) -> tuple[Record, torch.Tensor]:
+    """Play one batch of episodes to the horizon, see :class:`lcc_rl.evaluation.rollout.Player`."""
+    return Player(env, policy, keys, label).play(given)
 
 
 def composed(*overrides: str) -> TrainConfig:

@@ -89,7 +89,7 @@ def _of_agent(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
         return
     driver = cfg.scenario.controllers.get(AUTOMATED)
     reason = f"variant {cfg.variant} has no agent"
-    if not cfg.scenario.vehicles.count(AUTOMATED):
+    if not cfg.automated:
         reason = "no vehicle of the string is automated"
     elif driver is not None and not takes_action(driver):
         reason += f": {driver.name} drives the automated vehicles and uses no action of a policy"

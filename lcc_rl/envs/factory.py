@@ -80,7 +80,7 @@ def build_env(
     acts = any(key == ACTION for piece in pieces for _, key in piece.needs)
     actions: dict[NestedKey, tuple[int, ...]] = {}
     if acts:
-        actions[ACTION] = (scenario.vehicles.count(AUTOMATED), 1)
+        actions[ACTION] = (cfg.automated, 1)
     size = MOMENTS * moment_bytes(pieces) * math.prod(batch_shape(batch_size))
     require_memory({f"batch_size={batch_size}": size}, device or "cpu")
     check_pieces(pieces, scenario.horizon, actions)
@@ -285,7 +285,7 @@ def make_env(
     inputs = shared_inputs(cfg)
     profiles = inputs.evaluation if held_out else inputs.to_learn_from()
     env = build_env(cfg, profiles, inputs.population, batch_size, seed, device, held_out)
-    count = cfg.scenario.vehicles.count(AUTOMATED)
+    count = cfg.automated
     if single and count != 1:
         raise ConfigError(f"single=True needs one automated vehicle, the string has {count}")
     return env.append_transform(view_of(count)) if count and single is not False else env

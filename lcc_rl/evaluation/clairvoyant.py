@@ -92,7 +92,7 @@ def clairvoyant(
     source = DifferentiableRollout(env, network, keys, (), compiled)
     # Plans minimise the smooth energy; the best one is chosen by the measured energy.
     goal, measured = Goal(strategy.cfg, own), Goal(strategy.cfg, own, exact=True)
-    cars = strategy.cfg.scenario.vehicles.count(AUTOMATED)
+    cars = strategy.cfg.automated
     held = (math.ceil(steps / hold), env.batch_size[0], cars, 1)
     shifts, found = torch.zeros(held, requires_grad=True), Best(env.batch_size[0])
     optimizer = torch.optim.Adam([shifts], betas=(0.9, 0.95))

@@ -39,17 +39,6 @@ Advanced = tuple[State, list[Tensor], Tensor]
 DRIVER = (HUMAN, "driver")
 
 
-def play(
-    env: TransformedEnv,
-    policy: Policy | None,
-    given: TensorDictBase,
-    keys: Sequence[Key],
-    label: str = "",
-) -> tuple[Record, Tensor]:
-    """Play one batch of episodes to the horizon, see :class:`Player`."""
-    return Player(env, policy, keys, label).play(given)
-
-
 class Player:
     """Plays batches of episodes to the horizon, without resets.
 

@@ -231,7 +231,7 @@ def describe(
 def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:
     """Return v0 [m/s] by episode: the strategy's or the driver's; NaN for recorded drivers."""
     controllers = strategy.cfg.scenario.controllers
-    own = controllers.get(AUTOMATED) if strategy.cfg.scenario.vehicles.count(AUTOMATED) else None
+    own = controllers.get(AUTOMATED) if strategy.cfg.automated else None
     given = None if own is None else own.settings.get("desired_speed")
     if strategy.name == RECORDED:
         given = np.nan

@@ -125,8 +125,8 @@ def simulate(
     people = build_drivers(cfg)
     if drivers is not None:
         people = bootstrap(drivers) if isinstance(drivers, (str, PathLike)) else drivers
-    fits = all(hasattr(people, name) for name in POPULATION)
-    require(fits, f"drivers: not a population: {people!r:.80}")
+        fits = all(hasattr(people, name) for name in POPULATION)
+        require(fits, f"drivers: not a population: {people!r:.80}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, own=spec is None).strategies(inputs)[-1]
     return _simulated(strategy, inputs, repeats, seed)

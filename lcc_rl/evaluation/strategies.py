@@ -152,7 +152,7 @@ def rule(cfg: StudyConfig) -> Strategy:
 
     Its name is that of the variant, or of the controller's class if it is not the variant's.
     """
-    if not cfg.scenario.vehicles.count(AUTOMATED):
+    if not cfg.automated:
         return Strategy(DIRECT, cfg)
     try:
         own = _kind(load("evaluate", [f"variant={cfg.variant}"]))

@@ -8,7 +8,7 @@ from collections import deque
 import pytest
 import torch
 from commands import DATA
-from helpers import check_refused, compose, single_env, small_env, wavy_profiles
+from helpers import check_refused, compose, play, single_env, small_env, wavy_profiles
 from tensordict import TensorDict
 from torch import nn
 
@@ -16,7 +16,6 @@ from lcc_rl.config.nodes import Node
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import DifferentiableRollout, StringCollector, build_env, make_env
 from lcc_rl.errors import ConfigError
-from lcc_rl.evaluation.rollout import play
 from lcc_rl.pieces import Controller, Feature
 from lcc_rl.pieces.base import REWARD
 

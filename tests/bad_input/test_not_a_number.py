@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import torch
 from commands import tiny
-from helpers import ACTION, check_refused, compose, network, single_env, small_env
+from helpers import ACTION, check_refused, compose, network, play, single_env, small_env
 from platoons import env_of, hcfs, ramps
 
 from lcc_rl.commands import evaluation, training
@@ -17,7 +17,6 @@ from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.genetic import GeneticSettings
 from lcc_rl.drivers.observed import Selection, observe
 from lcc_rl.errors import DataError, Diverged
-from lcc_rl.evaluation.rollout import play
 from lcc_rl.pieces import IDM, Controller, Feature, MotorPower, RewardTerm
 
 

@@ -7,13 +7,12 @@ import json
 import numpy as np
 import pytest
 import torch
-from helpers import check_refused, small_env
+from helpers import check_refused, play, small_env
 from torch import nn
 
 import lcc_rl
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
-from lcc_rl.evaluation.rollout import play
 from lcc_rl.interfaces.export import main
 from lcc_rl.interfaces.exported import DrivingProgram, program
 from lcc_rl.results.policies import load_policy

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from helpers import POPULATION, check_refused, small_env, wavy_profiles
+from helpers import POPULATION, check_refused, play, small_env, wavy_profiles
 from page_blocks import ROOT, blocks
 from tensordict import TensorDict
 
@@ -24,7 +24,6 @@ from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import LccError
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.named import controller_of, is_policy
-from lcc_rl.evaluation.rollout import play
 from lcc_rl.evaluation.strategies import trained
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.interfaces.driver import Driver

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import check_refused, slow_but
+from helpers import check_refused, play, slow_but
 from tensordict import TensorDict
 
 from lcc_rl.config import load
@@ -22,7 +22,6 @@ from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import load_inputs
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.named import controller_of
-from lcc_rl.evaluation.rollout import play
 from lcc_rl.evaluation.strategies import trained
 from lcc_rl.functional.pattern import parse_string
 from lcc_rl.interfaces.export import export

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers import check_refused
+from helpers import check_refused, play
 from torch import Tensor
 
 from benchmarks import sumo
@@ -22,7 +22,6 @@ from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.named import controller_of
-from lcc_rl.evaluation.rollout import play
 from lcc_rl.evaluation.strategies import with_weights
 from lcc_rl.interfaces.sumo import Bridge
 from lcc_rl.pieces import Controller

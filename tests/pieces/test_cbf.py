@@ -8,12 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 from commands import tiny
-from helpers import ACTION, slow_but, small_env
+from helpers import ACTION, play, slow_but, small_env
 
 from lcc_rl.commands import evaluation
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.metrics import safety_measures
-from lcc_rl.evaluation.rollout import play
 from lcc_rl.functional.actuation import PairState, Response
 from lcc_rl.functional.braking import Braking, safe_command
 from lcc_rl.functional.kinematics import advance_speed

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import torch
-from helpers import ACTION, small_env
-
-from lcc_rl.evaluation.rollout import play
+from helpers import ACTION, play, small_env
 
 ROLE = "automated"
 SETTINGS = (

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers import composed, string
+from helpers import composed, play, string
 from torch import Tensor
 
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import constant_profiles
-from lcc_rl.evaluation.rollout import play
 
 RING = ("variant=reference", "scenario=ring", "agent=none", "drivers=ring")
 SPEED = ("vehicles", "speed")
