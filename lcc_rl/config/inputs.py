@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import hashlib
 import inspect
-import sys
 import sysconfig
 import time
 from collections.abc import Iterator, Mapping
@@ -29,8 +28,7 @@ NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
 NAMING_SECTIONS = ("compare", "policy")  # sections that name policies, controllers and classes
 OURS = "lcc_rl."
 FRESH = 2.0  # a file may change again within the resolution of its times [s]
-# Folders of Python's own modules and of this package; names of folders of installed ones, of which
-# an environment may see several.
+# Folders of Python's own modules and of this package; names of folders of installed ones.
 OURS_AND_PYTHONS = [Path(sysconfig.get_path("stdlib")), Path(__file__).parents[1]]
 INSTALLED = {"site-packages", "dist-packages"}
 
@@ -72,7 +70,7 @@ def _files(last: str, named: bool, holder: Any, name: str) -> Iterator[Path]:
         yield from _module(name)
     elif last == "measures":
         with suppress(ConfigError):
-            yield from _own_modules(load_module(name, last), set())
+            yield from _own_files(load_module(name, last))
     elif named:
         yield from compared_files(name)
     elif last == "path" or not _ours(holder):
@@ -105,31 +103,39 @@ def compared_files(name: str) -> Iterator[Path]:
 
 
 def _module(target: str) -> Iterator[Path]:
-    """Yield the modules of a user's class or function; a notebook has no file."""
+    """Yield the files of a user's class or function; a notebook has no file."""
     if "." in target and "/" not in target and not target.startswith(OURS):
         with suppress(ConfigError, TypeError):
-            module = inspect.getmodule(inspect.unwrap(find_target(target, TARGET)))
-            yield from _own_modules(module, set())
+            yield from _own_files(inspect.getmodule(inspect.unwrap(find_target(target, TARGET))))
 
 
-def _own_modules(module: Any, seen: set[Path]) -> Iterator[Path]:
-    """Yield the files of a user's module and of its imports."""
+def _own_files(module: Any) -> Iterator[Path]:
+    """Yield the file of a user's module and the files beside it that it imports, or they do."""
     path = Path(getattr(module, "__file__", None) or "")
     known = INSTALLED.intersection(path.parts) or any(map(path.is_relative_to, OURS_AND_PYTHONS))
-    if path.suffix != ".py" or path in seen or known:
+    if path.suffix != ".py" or known:
         return
-    seen.add(path)
-    yield path
+    depth = module.__name__.count(".") + (path.name == "__init__.py")
+    found, root = [path], path.parents[depth]
+    for file in found:  # the list grows
+        yield file
+        for name in _imports(file, ".".join(file.parent.relative_to(root).parts)):
+            stem = root.joinpath(*name.split("."))
+            beside = (stem.with_suffix(".py"), stem / "__init__.py")
+            found += [x for x in beside if x.is_file() and x not in found]
+
+
+def _imports(path: Path, package: str) -> set[str]:
+    """Return the names of all modules that a file of a package may import; not this package's."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_bytes())):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             with suppress(ImportError):
-                base = resolve_name("." * node.level + (node.module or ""), module.__package__)
+                base = resolve_name("." * node.level + (node.module or ""), package)
                 names |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
-    for name in sorted(names & sys.modules.keys()):
-        yield from _own_modules(sys.modules[name], seen)
+    return {name for name in names if not f"{name}.".startswith(OURS)}
 
 
 _digests: dict[tuple[object, ...], str] = {}  # once per content of a file and process

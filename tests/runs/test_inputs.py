@@ -99,6 +99,17 @@ def test_modules_of_another_environment_are_not_followed(place, monkeypatch) -> 
     assert [*found["compare"]] == ["own_term.py"]
 
 
+def test_imports_within_functions_and_packages_are_followed(place) -> None:
+    package = place / "own_parts"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "late.py").write_text("import own_helper, torch, lcc_rl, missing\n")
+    (package / "beside.py").write_text("")
+    (package / "term.py").write_text("def Term():\n    from .late import X\n")
+    found = inputs_of({"compare": ["own_parts.term.Term"]})
+    assert [*found["compare"]] == ["term.py", "late.py", "own_helper.py"]
+
+
 def test_own_files_of_settings_are_read_anew(place, monkeypatch) -> None:
     own = "# @package _global_\nscenario: {{horizon: {}}}\n"
     words = ["hydra.searchpath=[file://c]", "+knowledge=mine"]
