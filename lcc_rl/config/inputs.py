@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ast
 import hashlib
-import inspect
-import sys
 import sysconfig
 import time
 from collections.abc import Iterator, Mapping
@@ -18,20 +16,18 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 
 from lcc_rl.config.nodes import settings_at
-from lcc_rl.config.words import FILTERED, YAML
+from lcc_rl.config.words import FILTERED, YAML, module_named
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.paths import matching
 from lcc_rl.io.settings import parse_yaml, read_text
-from lcc_rl.settings import TARGET, find_target, load_module
+from lcc_rl.settings import TARGET, load_module
 
 FileHashes = dict[str, dict[str, str]]
 NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
 NAMING_SECTIONS = ("compare", "policy")  # sections that name policies, controllers and classes
 OURS = "lcc_rl."
 FRESH = 2.0  # a file may change again within the resolution of its times [s]
-# Folders of Python's own modules and of this package; names of folders of installed ones, of which
-# an environment may see several.
-OURS_AND_PYTHONS = [Path(sysconfig.get_path("stdlib")), Path(__file__).parents[1]]
+PYTHON = Path(sysconfig.get_path("stdlib"))
 INSTALLED = {"site-packages", "dist-packages"}
 
 
@@ -50,13 +46,13 @@ def inputs_of(content: Mapping[str, Any]) -> FileHashes:
     """
     found: FileHashes = {}
     for key, holder, value in settings_at(content):
-        section, last = key.partition(".")[0], key.rpartition(".")[2]
+        section = key.partition(".")[0]
         named = section in NAMING_SECTIONS and (holder is content or holder is content[section])
         for name in value if isinstance(value, list) else [value]:
             if section in NOT_READ or not isinstance(name, str):
                 continue
             with suppress(OSError, ValueError, ResultsError):  # the reader raises the error later
-                for path in filter(Path.is_file, _files(last, named, holder, name)):
+                for path in filter(Path.is_file, _files(key, named, holder, name)):
                     digest = _digest(path)
                     known = found.setdefault(section, {})
                     label = path.name if path.suffix == ".py" else str(path)
@@ -65,14 +61,11 @@ def inputs_of(content: Mapping[str, Any]) -> FileHashes:
     return found
 
 
-def _files(last: str, named: bool, holder: Any, name: str) -> Iterator[Path]:
+def _files(key: str, named: bool, holder: Any, name: str) -> Iterator[Path]:
     """Yield the files that a setting names."""
-    path = Path(expanduser(name))
-    if last in (TARGET, "law", "model"):
-        yield from _module(name)
-    elif last == "measures":
-        with suppress(ConfigError):
-            yield from _own_modules(load_module(name, last), set())
+    path, last = Path(expanduser(name)), key.rpartition(".")[2]
+    if module := module_named(key, name):
+        yield from _own_files(module)
     elif named:
         yield from compared_files(name)
     elif last == "path" or not _ours(holder):
@@ -91,7 +84,7 @@ def compared_files(name: str) -> Iterator[Path]:
     if path.is_dir():
         yield from sorted(path.rglob("policy.pt"))
     elif not path.exists():
-        yield from _module(str(path))
+        yield from _own_files(str(path).rpartition(".")[0])
         if HydraConfig.initialized():  # it may be a file of --config-dir
             for source in HydraConfig.get().runtime.config_sources:
                 file = Path(source.path) / "controller" / f"{path}.yaml"
@@ -101,35 +94,39 @@ def compared_files(name: str) -> Iterator[Path]:
         yield path
         if path.suffix in YAML:
             for key, holder, value in settings_at(parse_yaml(read_text(path), str(path))):
-                yield from _files(key.rpartition(".")[2], False, holder, str(value))
+                yield from _files(key, False, holder, str(value))
 
 
-def _module(target: str) -> Iterator[Path]:
-    """Yield the modules of a user's class or function; a notebook has no file."""
-    if "." in target and "/" not in target and not target.startswith(OURS):
-        with suppress(ConfigError, TypeError):
-            module = inspect.getmodule(inspect.unwrap(find_target(target, TARGET)))
-            yield from _own_modules(module, set())
-
-
-def _own_modules(module: Any, seen: set[Path]) -> Iterator[Path]:
-    """Yield the files of a user's module and of its imports."""
-    path = Path(getattr(module, "__file__", None) or "")
-    known = INSTALLED.intersection(path.parts) or any(map(path.is_relative_to, OURS_AND_PYTHONS))
-    if path.suffix != ".py" or path in seen or known:
+def _own_files(module: str) -> Iterator[Path]:
+    """Yield the file of a user's module and the files beside it that it imports, or they do."""
+    path = Path()  # a notebook has no file
+    if not f"{module}.".startswith(OURS) and "/" not in module:
+        with suppress(ConfigError):
+            path = Path(getattr(load_module(module, TARGET), "__file__", None) or "")
+    known = INSTALLED.intersection(path.parts) or path.is_relative_to(PYTHON)
+    if path.suffix != ".py" or known:
         return
-    seen.add(path)
-    yield path
+    depth = module.count(".") + (path.name == "__init__.py")
+    found, root = [path], path.parents[depth]
+    for file in found:  # the list grows
+        yield file
+        for name in _imports(file, ".".join(file.parent.relative_to(root).parts)):
+            stem = root.joinpath(*name.split("."))
+            beside = (stem.with_suffix(".py"), stem / "__init__.py")
+            found += [x for x in beside if x.is_file() and x not in found]
+
+
+def _imports(path: Path, package: str) -> set[str]:
+    """Return the names of all modules that a file of a package may import; not this package's."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_bytes())):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             with suppress(ImportError):
-                base = resolve_name("." * node.level + (node.module or ""), module.__package__)
+                base = resolve_name("." * node.level + (node.module or ""), package)
                 names |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
-    for name in sorted(names & sys.modules.keys()):
-        yield from _own_modules(sys.modules[name], seen)
+    return {name for name in names if not f"{name}.".startswith(OURS)}
 
 
 _digests: dict[tuple[object, ...], str] = {}  # once per content of a file and process

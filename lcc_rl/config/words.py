@@ -8,11 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from lcc_rl.errors import ConfigError, require
+from lcc_rl.settings import TARGET
 
 YAML = (".yaml", ".yml")  # endings of files of controllers
 DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")  # a class or function: my_pieces.PID
 FILTERED = "_filtered"  # suffix of controllers behind the safety filter
 RECORDED = "recorded"  # the recorded driver as a controller, or its value as a limit
+
+
+def module_named(key: str, value: str) -> str:
+    """Return the module that a setting names, itself or by a class or function; "" for none."""
+    first, last = key.partition(".")[0], key.rpartition(".")[2]
+    if first == "measures" or (last == TARGET and "." not in value):
+        return value
+    return value.rpartition(".")[0] if last in (TARGET, "law", "model") else ""
 
 
 def key_of(override: str) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from inspect import signature
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from torch import Tensor
 from lcc_rl.energy import AVERAGED, AVERAGES, Fleet, as_fleet
 from lcc_rl.errors import require, require_known
 from lcc_rl.functional.safety import NEVER
-from lcc_rl.results.measures import MEASURES, Measure
+from lcc_rl.results.measures import MEASURES, SHIPPED, Measure
 from lcc_rl.results.platoons import PLATOON
 
 KILO = 1e-3
@@ -217,14 +218,14 @@ ROAD_METRICS: dict[str, Metric] = {
 }
 
 
-OURS = frozenset((*(one.key for one in (*MEASURES, *PLATOON)), *METRICS, *ROAD_METRICS))
+OURS = frozenset((*SHIPPED, *(one.key for one in PLATOON), *METRICS, *ROAD_METRICS))
 
 
 def register(measure: Measure, metric: Metric, every: bool = False) -> None:
     """Add a measure to all evaluations, tables, figures, limits and files of this process.
 
-    A command imports the modules of ``measures=[…]``, which call this function. A measure of the
-    same key is replaced, so that a notebook may run its cell again.
+    A command imports the modules of ``measures=[…]``, which call this function. A notebook, and a
+    module that is loaded again, replace their measure of the same key.
 
     Args:
         measure: its names, unit, aggregation and bound.
@@ -235,17 +236,29 @@ def register(measure: Measure, metric: Metric, every: bool = False) -> None:
             vehicle each.
 
     Raises:
-        ConfigError: if the key is one of the package, or an entry is unknown.
+        ConfigError: if the key is no word, is one of the package or of another ``register``, or an
+            entry is unknown.
     """
-    require(measure.key not in OURS, f"measure {measure.key}: the package has one of this key")
+    key, known = measure.key, registered().get(measure.key, metric)
+    words = "expected letters, digits and _, as in the name of a column"
+    require(key.isidentifier(), f"measure {key!r}: {words}")
+    require(key not in OURS, f"measure {key}: the package has one of this key; expected another")
+    again = metric.__module__ == "__main__" or _place(known) == _place(metric)
+    words = f"{known.__module__} has registered one of this key; expected another"
+    require(again, f"measure {key}: {words}")
     _, *entries = signature(metric).parameters
-    known = (*SERIES, *(("free",) if every else OF_FILTER))
-    require_known(f"entry of the measure {measure.key}", entries, known)
+    valid = (*SERIES, *(("free",) if every else OF_FILTER))
+    require_known(f"entry of the measure {key}", entries, valid)
     for table in (MEASURES, PLATOON):
-        table[:] = [one for one in table if one.key != measure.key] + [measure]
+        table[:] = [one for one in table if one.key != key] + [measure]
     for metrics in (METRICS, ROAD_METRICS):
-        metrics.pop(measure.key, None)
-    (ROAD_METRICS if every else METRICS)[measure.key] = metric
+        metrics.pop(key, None)
+    (ROAD_METRICS if every else METRICS)[key] = metric
+
+
+def _place(metric: Metric) -> tuple[Any, ...]:
+    """Return module and line of a function."""
+    return metric.__module__, getattr(getattr(metric, "__code__", None), "co_firstlineno", None)
 
 
 def registered() -> dict[str, Metric]:

@@ -144,10 +144,10 @@ class Measure:
 
     def bounded(self, bound: float) -> str:
         """Return the heading of a limit, with line breaks."""
-        narrow = len(self.unit) < 2
-        unit = f" {self.unit}".rstrip() if narrow else f"\n[{self.unit}]"
-        number = float(f"{self.scale * bound:.4g}")
-        return f"{self.limit or self.label}\n{SIGNS[self.bound]} {number:.10g}{unit}"
+        text = self.with_unit(bound)
+        if len(self.unit) > 1:
+            text = f"{text.removesuffix(self.unit).rstrip()}\n[{self.unit}]"
+        return f"{self.limit or self.label}\n{SIGNS[self.bound]} {text}"
 
     @property
     def limited(self) -> str:
@@ -155,10 +155,8 @@ class Measure:
         return " ".join((self.limit or self.label).split())
 
     def with_unit(self, value: float) -> str:
-        """Return a value with its unit and about three digits, as on pages."""
-        scaled = self.scale * value
-        places = 0 if abs(scaled) >= 10.0 and self.unit != SHARE else 2
-        return f"{scaled:,.{places}f} {self.unit}".rstrip()
+        """Return a value in four digits with its unit, as limits and pages name it."""
+        return f"{float(f'{self.scale * value:.4g}'):.10g} {self.unit}".rstrip()
 
 
 _kj = partial(Measure, unit="kJ", form="{:.1f}")
@@ -244,6 +242,7 @@ MEASURES = [
     Measure("collisions", "collisions", form=COUNT, aggregate="sum"),
     Measure("episodes", "episodes", form=COUNT, aggregate="sum"),
 ]
+SHIPPED = frozenset(measure.key for measure in MEASURES)
 
 
 def limit_measures() -> dict[str, Measure]:
@@ -283,15 +282,15 @@ def episode_mean(part: pd.DataFrame, column: str) -> float:
 
 
 def signed(value: float, form: str = "{:+.1f}") -> str:
-    """Return a number with its sign, a typographic minus, and no negative zero.
+    """Return a number with its sign, a typographic minus; a rounded zero without a sign.
 
     Examples:
-        >>> signed(-2.34), signed(2.34), signed(-0.04, "{:.1f}")
+        >>> signed(-2.34), signed(2.34), signed(-0.04)
         ('−2.3', '+2.3', '0.0')
     """
     text = form.format(value)
     zero = isfinite(value) and not re.search("[1-9]", text)
-    return (form.format(0) if zero else text).replace("-", "−")
+    return re.sub("[+-]", "", text) if zero else text.replace("-", "−")
 
 
 def between(low: float, high: float, form: str = "{:.1f}") -> str:

@@ -52,10 +52,8 @@ def _row(strategy: str, rows: pd.DataFrame) -> dict[str, object]:
         row[f"{name}_sum_{label}"] = per_run(f"{name}_sum").mean()
         row[f"{name}_std_{label}"] = float(np.sqrt(max(spread, 0.0)))
     row |= bootstrap.mean(per_run("reward")).columns("reward")
-    for one in PLATOON:
-        column = one.columns[0]
-        if one.key not in row:
-            row[one.key] = getattr(rows[column], one.aggregate)() if column in rows else np.nan
+    rows = rows.assign(episodes=1.0)
+    row |= {one.key: one.value(rows) for one in PLATOON if one.key not in row}
     hybrid = "learned_share" in rows and rows["learned_share"].notna().any()
     return row | {name: per_run(name).mean() if hybrid else np.nan for name in PER_RUN}
 

@@ -35,7 +35,13 @@ FEW_WINDOWS, SHORT = 5, 150.0  # least number of windows; length of short ones [
 
 def remarks(windows: pd.DataFrame) -> list[str]:
     """Return sentences on limitations of the numbers of an evaluation."""
-    means, found = measures.means(windows, (*REACH, BROKEN)), []
+    added = [one for one in measures.MEASURES if one.key not in measures.SHIPPED]
+    means = measures.means(windows, (*REACH, BROKEN, *(one.key for one in added)))
+    found = [
+        f"No episode has a number of {one.key}: its function gives NaN, or lacks an entry."
+        for one in added
+        if means[one.key].isna().all()
+    ]
 
     def named(shares: pd.Series, least: float) -> str:
         large = shares[shares > least].items()

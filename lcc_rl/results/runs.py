@@ -16,7 +16,7 @@ from lcc_rl.config.schemas import SECTIONS, BaseConfig, as_text
 from lcc_rl.errors import LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import parse_yaml, read_text
-from lcc_rl.results.trust import trusted
+from lcc_rl.results.trust import own_modules, trusted
 from lcc_rl.runs.origin import ORIGIN, origin
 from lcc_rl.runs.states import CONFIG, no_run
 
@@ -56,7 +56,9 @@ def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:
     kept = [name for name in RUN_FILES if (folder / name).exists()]
     if not kept:
         return
-    keys = differing(dict(flatten(stored)), dict(flatten(as_plain(cfg))))
+    with suppress(ResultsError):  # complete a file of an older version by defaults
+        stored = as_plain(trusted(stored, str(folder / CONFIG), own_modules(cfg))[0], places=False)
+    keys = differing(dict(flatten(stored)), dict(flatten(as_plain(cfg, places=False))))
     keys = [key for key in keys if not any(f"{key}.".startswith(f"{x}.") for x in (*but, "trust"))]
     if keys:
         names = ", ".join(keys[:3]) + (", …" if len(keys) > 3 else "")

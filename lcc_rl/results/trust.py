@@ -9,10 +9,10 @@ from typing import Any
 
 from lcc_rl.config.nodes import as_nodes, as_plain, nodes_in, settings_at, with_defaults
 from lcc_rl.config.schemas import parse_config
-from lcc_rl.config.words import DOTTED, FILTERED, YAML
+from lcc_rl.config.words import DOTTED, FILTERED, YAML, module_named
 from lcc_rl.errors import ConfigError, ResultsError, raised_as
 from lcc_rl.io.settings import parse_yaml, read_text
-from lcc_rl.settings import TARGET, find_target
+from lcc_rl.settings import find_target
 
 # Packages of classes that a stored configuration may name, and the module of functions.
 ROOMS = "agents data drivers energy evaluation functional pieces runs.loggers synthetic"
@@ -70,12 +70,11 @@ def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] =
     Raises:
         ResultsError: naming the target.
     """
-    for key, value in _named(content):
-        module = value.rpartition(".")[0]
+    for key, value, module in _named(content):
         if module in trust:
             continue
         try:
-            found = find_target(str(value), where) if _within_registry(module) else None
+            found = find_target(value, where) if _within_registry(module) else None
         except ConfigError as error:
             raise ResultsError(f"{error}; of another release, or damaged") from error
         # A module also contains its imports, such as import_module.
@@ -87,25 +86,23 @@ def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] =
             )
 
 
-def _named(content: Any) -> Iterator[tuple[str, str]]:
-    """Yield the keys and dotted paths of all classes and functions in settings."""
+def _named(content: Any) -> Iterator[tuple[str, str, str]]:
+    """Yield key, value and module of all modules, classes and functions that settings name."""
     for key, _, value in settings_at(content):
-        last, dotted = key.rpartition(".")[2], "." in str(value)
-        if key.startswith("measures."):
-            yield key, f"{value}.register"
-        if last == TARGET or (last == "law" and value) or (last == "model" and dotted):
-            yield key, str(value)
+        single = not isinstance(value, (list, Mapping))
+        if single and (module := module_named(key, str(value))):
+            yield key, str(value), module
         elif key.partition(".")[0] == "compare" and isinstance(value, str):
             path = Path(value.removesuffix(FILTERED))
             if path.suffix in YAML and path.is_file():
                 yield from _named(parse_yaml(read_text(path), str(path)))
             elif DOTTED.fullmatch(str(path)) and not path.exists():
-                yield key, str(path)
+                yield key, str(path), str(path).rpartition(".")[0]
 
 
 def own_modules(cfg: Any) -> list[str]:
     """Return the modules outside :data:`REGISTRY` in a configuration, sorted."""
-    modules = {value.rpartition(".")[0] for _, value in _named(as_plain(cfg))}
+    modules = {module for *_, module in _named(as_plain(cfg))}
     return sorted(module for module in modules if not _within_registry(module))
 
 

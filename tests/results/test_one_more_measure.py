@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import json
 import re
 import sys
@@ -10,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from helpers import check_refused, slow_but
@@ -22,6 +24,7 @@ from lcc_rl.evaluation.metrics import METRICS, ROAD_METRICS, register, safety_me
 from lcc_rl.results.measures import MEASURES, Measure
 from lcc_rl.results.names import in_words
 from lcc_rl.results.platoons import PLATOON
+from lcc_rl.results.remarks import remarks
 
 SMALL = [
     "scenario.horizon=60",
@@ -91,7 +94,7 @@ def test_it_stands_in_every_table(words, mine, tmp_path, capsys) -> None:
     if words == "task":
         assert "limit: jerk ≤ 0.001 [m/s³]" in found["text"]
         assert "False" in [row["kept"] for row in cells]
-        with pytest.raises(ResultsError, match=r"measures.0 names 'my_measures.register'"):
+        with pytest.raises(ResultsError, match=r"measures.0 names 'my_measures', "):
             table.main([str(folder)])
 
 
@@ -105,6 +108,7 @@ def test_rows_of_platoons_have_it(mine, tmp_path, capsys) -> None:
 
 
 REFUSED = [
+    ("a x!", {}, lambda over, gap: gap, "measure 'a x!': expected letters, digits and _"),
     ("min_gap_m", {}, lambda over, gap: gap, "the package has one of this key"),
     ("mine", {}, lambda over, gapp: gapp, "entry of the measure mine 'gapp'.*'gap'"),
     ("mine", {"bound": "≥"}, None, "bound of mine '≥'; valid: .*at least"),
@@ -127,3 +131,18 @@ def test_a_score_has_it(mine, tmp_path) -> None:
     assert score.main([*words, *SMALL, mine]) == 0
     (row,) = json.loads((tmp_path / "out" / "score.json").read_text("utf-8"))["results"]
     assert row["measures"][MINE.key] > 0.0
+
+
+def test_a_key_is_registered_once_but_a_module_may_be_loaded_again(mine) -> None:
+    load("evaluate", [mine])
+    importlib.reload(sys.modules["my_measures"])
+    assert [one.key for one in MEASURES].count(MINE.key) == 1
+    words = "peak_jerk: my_measures has registered one of this key; expected another"
+    check_refused(lambda metric: register(MINE, metric), [(lambda over: over.steps, words)])
+
+
+def test_a_measure_without_a_number_is_named(mine) -> None:
+    load("evaluate", [mine])
+    rows = {"strategy": ["alcc"], "episodes": [3], MINE.key: [np.nan]}
+    assert any(f"No episode has a number of {MINE.key}" in x for x in remarks(pd.DataFrame(rows)))
+    assert not remarks(pd.DataFrame(rows | {MINE.key: [1.0]}))

@@ -283,5 +283,5 @@ def test_no_table_has_a_negative_zero() -> None:
         saved_text(-0.04, -0.04, 0),
     ):
         assert not re.search(r"[-−]\$?0\.?0*\b", text), text
-    assert saved_text(-0.04, -0.06, 0.0) == "+0.0 (−0.1 … 0.0)"
+    assert saved_text(-0.04, -0.06, 0.0) == "0.0 (−0.1 … 0.0)"
     assert as_csv(pd.DataFrame({"x": [-0.0, 1.5]}), "comma").split() == ["x", "0,0", "1,5"]

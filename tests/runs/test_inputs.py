@@ -8,15 +8,19 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import yaml
 from commands import NO_AGENT, run_command
 from helpers import slow_but
 
 from lcc_rl.commands.evaluation import made_by
 from lcc_rl.config import identity, load
 from lcc_rl.config.inputs import inputs_of
+from lcc_rl.config.nodes import as_plain
 from lcc_rl.drivers.tables import load_drivers
 from lcc_rl.envs.inputs import shared_inputs
+from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import write_parquet
+from lcc_rl.results.runs import check_folder
 
 OWN = """import own_helper
 from lcc_rl.pieces import RewardTerm
@@ -97,6 +101,17 @@ def test_modules_of_another_environment_are_not_followed(place, monkeypatch) -> 
     monkeypatch.syspath_prepend(shared)
     found = inputs_of({"compare": ["own_term.Term"]})
     assert [*found["compare"]] == ["own_term.py"]
+
+
+def test_imports_within_functions_and_packages_are_followed(place) -> None:
+    package = place / "own_parts"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "late.py").write_text("import own_helper, torch, lcc_rl, missing\n")
+    (package / "beside.py").write_text("")
+    (package / "term.py").write_text("def Term():\n    from .late import X\n")
+    found = inputs_of({"compare": ["own_parts.term.Term"]})
+    assert [*found["compare"]] == ["term.py", "late.py", "own_helper.py"]
 
 
 def test_own_files_of_settings_are_read_anew(place, monkeypatch) -> None:
@@ -187,3 +202,14 @@ def test_a_class_that_is_defined_anew_is_used(monkeypatch) -> None:
             exec(OWN_LEADERS.replace("FASTEST", fastest), vars(module))
         counts.append(len(shared_inputs(load("train", words)).evaluation))
     assert counts == [90, 90, 44]
+
+
+def test_a_setting_that_an_older_version_did_not_have_is_no_other_setting(place) -> None:
+    cfg = load("evaluate", ["variant=idm"])
+    stored = as_plain(cfg)
+    del stored["evaluation"]["front"], stored["measures"]
+    (place / "config.yaml").write_text(yaml.safe_dump(stored))
+    (place / "episodes.parquet").write_text("")
+    check_folder(cfg, place)
+    with pytest.raises(ResultsError, match=r"episodes.parquet of other settings \(seed\)"):
+        check_folder(load("evaluate", ["variant=idm", "seed=1"]), place)

@@ -24,7 +24,7 @@ def test_one_command_writes_the_table(tmp_path) -> None:
     assert main(["ring", "--out", str(tmp_path / "ring"), *SMALL]) == 0
     table = read_parquet(tmp_path / "ring" / "tables" / "ring.parquet").set_index("driven by")
     assert {"FollowerStopper", "PI with saturation", "field experiment"} < set(table.index)
-    assert table.loc["simulated drivers", "speeds against humans"] == "+0.0 %"
+    assert table.loc["simulated drivers", "speeds against humans"] == "0.0 %"
     text = (tmp_path / "ring" / "results.md").read_text()
     assert "2 s in which humans drive all cars" in text
 

@@ -15,7 +15,7 @@ from lcc_rl.agents.gradient import GradientLoop
 from lcc_rl.config import load
 from lcc_rl.envs import load_inputs
 
-QUICK = ("scenario.horizon=20", "training.segment=20", "training.environments=8")
+QUICK = ("scenario.horizon=20", "training.segment=20", "training.environments=8", "agent.warm_up=0")
 OWN = "Analytic"
 
 

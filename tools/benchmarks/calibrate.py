@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numba
 import numpy as np
 from scipy.optimize import differential_evolution
 
-from benchmarks.harness import Row, Run, agree, alternate, rows_of, stream
-from benchmarks.plain_numba import KNOWN
-from lcc_rl.data.sources import EpisodesSource
+from benchmarks.harness import Row, agree, alternate, rows_of, stream
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.observed import Observed, observe
 from lcc_rl.drivers.parameters import DEFAULT_BOUNDS
 from lcc_rl.functional.idm import IDMConstants
 
 NAMES = ("desired_speed", "time_gap")
-OURS, PYTHON, NUMBA = "fit", "scipy, scaled from few", "scipy and numba"
-Objective = Callable[[Any], float]
+OURS, SCIPY = "fit", "scipy and numba"
+# The order in which squared_error reads the parameters of IDMConstants.
+KNOWN = (
+    *("acceleration", "deceleration", "min_gap", "exponent", "gap_floor"),
+    *("braking_limit", "acceleration_limit"),
+)
+Objective = Callable[..., float]
 
 
 def squared_error(
@@ -34,7 +37,7 @@ def squared_error(
         follower: those of the follower [m/s].
         gap: the first gap [m].
         dt: sampling interval [s].
-        known: the values of :data:`benchmarks.plain_numba.KNOWN`.
+        known: the values of :data:`KNOWN`.
     """
     maximum, comfort, min_gap, _, floor, braking, limit = known
     desired_speed, headway, speed, total = candidate[0], candidate[1], follower[0], 0.0
@@ -51,83 +54,51 @@ def squared_error(
     return total
 
 
-def objective(observed: Observed, index: int, compiled: Any = None) -> Objective:
+def objective(observed: Observed, index: int, error: Objective) -> Objective:
     """Return the RMSPE (0.07 is 7 %) of one driver as a function of (v0, T).
 
     Args:
         observed: the episodes.
         index: which of them.
-        compiled: :func:`squared_error` as numba compiled it; None: in plain Python.
+        error: :func:`squared_error` as numba compiled it.
     """
     part = slice(int(observed.samples[index]))
     speeds = [x[part, index].numpy() for x in (observed.leader_speed, observed.follower_speed)]
     norm = float((speeds[1] ** 2).sum())
-    if compiled is None:
-        speeds = [speed.tolist() for speed in speeds]
-    settings: tuple[Any, ...] = (
-        *speeds,
-        float(observed.gaps[0, index]),
-        observed.time_step,
-        tuple(getattr(IDMConstants(), name) for name in KNOWN),
-    )
-    function = compiled or squared_error
-    return lambda candidate: float((function(candidate, *settings) / norm) ** 0.5)
+    known = tuple(getattr(IDMConstants(), name) for name in KNOWN)
+    settings = (*speeds, float(observed.gaps[0, index]), observed.time_step, known)
+    return lambda candidate: float((error(candidate, *settings) / norm) ** 0.5)
 
 
 def calibrate(options: Namespace) -> list[Row]:
     """Return the seconds to fit (v0, T) of every driver, beside scipy driver by driver.
 
-    scipy's differential evolution runs with its own defaults: with an objective that numba
-    compiled (before the clock starts) for every driver, and with one in plain Python for a few,
-    scaled to all by the number of samples. Ours is the default search, compiled in the untimed run
-    before. The mean RMSPE of each way is a row, too.
+    scipy's differential evolution runs with its own defaults and an objective that numba compiles
+    before the clock starts. Ours is the default search, compiled in the untimed run before. The
+    mean RMSPE of each is a row, too.
     """
-    source = EpisodesSource(path=options.episodes) if options.episodes else stream(options.quick)
-    observed = observe(source.load().episodes)
-    few = np.linspace(0, observed.count - 1, 2 if options.quick else 6).round().astype(int)
-    compiled = numba.njit(fastmath=True, error_model="numpy")(squared_error)
-    objectives = [objective(observed, index, compiled) for index in range(observed.count)]
+    observed = observe(stream(options.quick).load().episodes)
+    error = numba.njit(fastmath=True, error_model="numpy")(squared_error)
+    objectives = [objective(observed, index, error) for index in range(observed.count)]
     objectives[0](np.array([20.0, 1.0]))  # compiles
     found: dict[str, Any] = {}
-    plain = [objective(observed, int(index)) for index in few]
-    runs = {
-        OURS: ours(found, observed),
-        PYTHON: scipy(found, PYTHON, plain, options.quick),
-        NUMBA: scipy(found, NUMBA, objectives, options.quick),
-    }
-    spent = alternate(runs, options.repeats)
-    spent[PYTHON] = spent[PYTHON] * (observed.samples.sum() / observed.samples[few].sum())
-    fitted = found[OURS][["desired_speed_mps", "time_gap_s", "rmspe"]].to_numpy()
-    for own, (*parameters, error) in zip(plain, fitted[few], strict=True):
-        agree("our objective", error, own(parameters))
-    rows = rows_of(spent, "s", {OURS: [PYTHON, NUMBA], NUMBA: [PYTHON]}, observed.count)
-    errors = fitted[:, 2]
-    for other, own, count in (
-        (PYTHON, errors[few], len(few)),
-        (NUMBA, errors, observed.count),
-    ):
-        means = {OURS: np.array([100 * own.mean()]), other: np.array([100 * found[other].mean()])}
-        rows += rows_of(means, "% RMSPE", {OURS: [other]}, count)
-    return rows
+    bounds = [DEFAULT_BOUNDS[parameter] for parameter in NAMES]
+    limit = {"maxiter": 2} if options.quick else {}
 
-
-def ours(found: dict[str, Any], observed: Observed) -> Run:
-    """Return the fit of every driver at once."""
-
-    def run() -> None:
+    def ours() -> None:
         drivers = Calibrator()(observed).drivers.set_index("episode")
         found[OURS] = drivers.loc[observed.identity["episode"]]
 
-    return run
-
-
-def scipy(found: dict[str, Any], name: str, objectives: Sequence[Objective], quick: bool) -> Run:
-    """Return the fit of drivers one by one."""
-    bounds = [DEFAULT_BOUNDS[parameter] for parameter in NAMES]
-    limit = {"maxiter": 2} if quick else {}
-
-    def run() -> None:
+    def scipy() -> None:
         results = [differential_evolution(x, bounds, seed=0, **limit) for x in objectives]
-        found[name] = np.array([result.fun for result in results])
+        found[SCIPY] = np.array([100 * result.fun for result in results])
 
-    return run
+    spent = alternate({OURS: ours, SCIPY: scipy}, options.repeats)
+    fitted = found[OURS][["desired_speed_mps", "time_gap_s", "rmspe"]].to_numpy()
+    for function, (*parameters, own) in zip(objectives, fitted, strict=True):
+        agree("our objective", own, function(np.array(parameters)))
+    errors = {OURS: 100 * fitted[:, 2], SCIPY: found[SCIPY]}
+    means = {name: np.array([each.mean()]) for name, each in errors.items()}
+    against = {OURS: [SCIPY]}
+    rows = rows_of(spent, "s", against, observed.count)
+    return rows + rows_of(means, "% RMSPE", against, observed.count)

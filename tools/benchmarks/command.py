@@ -16,8 +16,6 @@ from shutil import which
 
 import pandas as pd
 import torch
-from rich.console import Console
-from rich.markup import escape
 
 from benchmarks import harness
 from benchmarks.analytic import analytic
@@ -26,7 +24,7 @@ from benchmarks.collect import collect
 from benchmarks.env import env
 from benchmarks.evaluate import evaluate
 from benchmarks.gym import gym
-from benchmarks.harness import EXTRA, Row, drawn, installed, page
+from benchmarks.harness import EXTRA, Row, installed, page, table
 from benchmarks.loading import loading, start
 from benchmarks.read import read
 from benchmarks.string import string
@@ -53,8 +51,6 @@ def parse(arguments: Sequence[str] | None) -> Namespace:
     parser = Arguments(description=__doc__.partition("\n")[0] if __doc__ else None)
     listed = f"{', '.join(BENCHMARKS)}; all by default, which takes minutes"
     parser.add_argument("names", nargs="*", metavar="name", help=listed)
-    parser.add_argument("--ngsim", help="18-column CSV to read (default: a synthetic stream)")
-    parser.add_argument("--episodes", help="episode table to calibrate (default: the stream's)")
     parser.add_argument(
         "--compile", action=BooleanOptionalAction, help="compiled cases (default: yes)"
     )
@@ -88,10 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     torch.set_num_threads(options.threads)
     harness.timer = options.clock
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    console, rows = Console(), []
-    console.width = max(console.width, 110)
     if not installed():
-        console.print(escape(f"left out: {', '.join(EXTRA)} ({how_to_install('bench')})"))
+        print(f"left out: {', '.join(EXTRA)} ({how_to_install('bench')})")
     here = {
         "threads": options.threads,
         "clock": options.clock,
@@ -100,14 +94,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "date": f"{date.today()}",
         "repeats": options.repeats,
     }
+    rows = pd.DataFrame()
     for name in options.names or BENCHMARKS:
-        measured = BENCHMARKS[name](options)
-        console.print(drawn(name, measured))
-        load = os.getloadavg()[0]
-        rows += [{"benchmark": name, **row, "load": load} for row in measured]
-        # After each, so that what is measured stays whatever happens to the next.
-        if rows:
-            table = pd.DataFrame(rows).astype({"batch": "Int64"}).assign(**here)
-            write_parquet(table, out)
-    console.print(f"{len(rows)} rows: {out}")
+        measured = pd.DataFrame(BENCHMARKS[name](options)).assign(benchmark=name, **here)
+        if len(measured):
+            measured = measured.assign(load=os.getloadavg()[0]).astype({"batch": "Int64"})
+            print(f"\n{table(measured)}", flush=True)
+            rows = pd.concat([rows, measured])
+            write_parquet(rows, out)  # after each, so that an interruption loses the next ones only
+    print(f"{len(rows)} rows: {out}")
     return 0

@@ -19,8 +19,8 @@ def env(options: Namespace) -> list[Row]:
 
     "step" is what TorchRL's collector calls (``step_and_maybe_reset``) and keeps nothing, like the
     plain loop; "StringCollector" is the training's own, which keeps the rewards; "rollout" stacks
-    every entry of every moment. Every run begins at one first moment, far behind the leader, so
-    that nobody resets. Both are first checked to be the same physics.
+    every entry of every time. Every run starts from the same state, far behind the leader, so that
+    no episode resets. Both implementations are first checked to agree.
     """
     check_physics(options, 20 if options.quick else 250)
     rows: list[Row] = []
@@ -30,13 +30,15 @@ def env(options: Namespace) -> list[Row]:
             runs = ways(options, batch, steps, ending)
             plain, counts = f"plain loop{ending}", dict.fromkeys(runs, batch * steps)
             against = {name: [plain] for name in runs if name != plain}
-            rows += rates(options, runs, "steps/s", counts, against, batch, first=bool(ending))
+            rows += rates(options, runs, "steps/s", counts, against, batch)
     return rows
 
 
-def ways(options: Namespace, batch: int, steps: int, ending: str) -> dict[str, Run]:
+def ways(
+    options: Namespace, batch: int, steps: int, ending: str, followers: int = 1
+) -> dict[str, Run]:
     """Return every way to take so many steps, all eager or, with an ending, all compiled."""
-    env = alcc(options, batch, far=True)
+    env, again = (alcc(options, batch, True, followers) for _ in range(2))
     zero = torch.zeros(batch, 1, 1)
     plain, start = PlainLoop(env), env.reset()
     advance = plain.step
@@ -61,7 +63,7 @@ def ways(options: Namespace, batch: int, steps: int, ending: str) -> dict[str, R
         for _ in range(steps):
             state, _ = advance(state, action)
 
-    collect = collecting(alcc(options, batch, far=True), zero, steps, bool(ending))
+    collect = collecting(again, zero, steps, bool(ending))
     runs = {"rollout": rollout, "StringCollector": collect, "step": step, "plain loop": loop}
     return {f"{name}{ending}": run for name, run in runs.items()}
 

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from benchmarks.harness import Row, Run, installed, rates
-from benchmarks.plain import PlainLoop, training
-from benchmarks.plain_numba import NUMBA, NumbaLoop
 
 DATA = ("platoons=3", "recordings=2", "vehicles=3", "duration_s=[35,45]")
 SMALL = ["experiment=paper_windows", *(f"data.{setting}" for setting in DATA)]
@@ -20,8 +17,7 @@ MANY, SYNC = 16, "SyncVectorEnv"
 def gym(options: Namespace) -> list[Row]:
     """Return steps per second of Gymnasium's environments with zero actions, resets included.
 
-    The vector environment stands beside Gymnasium's ``SyncVectorEnv`` of as many single ones, and
-    beside loops of numbers that numba compiles, the limit.
+    The vector environment is compared with Gymnasium's ``SyncVectorEnv`` of as many single ones.
     """
     if not installed():
         return []
@@ -37,16 +33,12 @@ def gym(options: Namespace) -> list[Row]:
     vector = gymnasium.make_vec(name, num_envs=many, **how)
     ones = [lambda: gymnasium.make(name, **how)] * many
     same = gymnasium.vector.AutoresetMode.SAME_STEP
-    env = training(options, many)
     runs = {
         "gymnasium.make_vec": stepping(vector, steps),
-        NUMBA: partial(NumbaLoop(PlainLoop(env), env.reset()).play, steps),
         SYNC: stepping(gymnasium.vector.SyncVectorEnv(ones, autoreset_mode=same), steps),
     }
     counts = dict.fromkeys(runs, steps * many)
-    return rows + rates(
-        options, runs, "steps/s", counts, {"gymnasium.make_vec": [SYNC, NUMBA]}, many
-    )
+    return rows + rates(options, runs, "steps/s", counts, {"gymnasium.make_vec": [SYNC]}, many)
 
 
 def stepping(env: Any, steps: int) -> Run:

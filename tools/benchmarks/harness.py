@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import time
-import warnings
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
@@ -13,7 +11,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from rich.table import Table
 
 from lcc_rl.results.render import markdown_row
 from lcc_rl.synthetic.stream import StreamSource
@@ -51,7 +48,6 @@ def rates(
     counts: Mapping[str, int],
     against: Against,
     batch: int | None = None,
-    first: bool = False,
     grad: bool = False,
 ) -> list[Row]:
     """Time runs in turn and return their rates.
@@ -63,20 +59,12 @@ def rates(
         counts: what one call of each run makes or does.
         against: the alternatives of each case; those that are no case are left out.
         batch: the batch size.
-        first: add the seconds of each first call, with nothing kept of an earlier compilation.
         grad: keep gradients.
     """
-    rows: list[Row] = []
     with torch.set_grad_enabled(grad):
-        if first:
-            config: Any = torch.compiler.config  # torch adds its method patch on import
-            with config.patch(force_disable_caches=True), warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that caches are disabled
-                calls = {name: np.array([seconds(run)]) for name, run in runs.items()}
-            rows = rows_of(calls, "s, first call", batch=batch)
         spent = alternate(runs, options.repeats)
     values = {name: counts[name] / each for name, each in spent.items()}
-    return rows_of(values, unit, against, batch) + rows
+    return rows_of(values, unit, against, batch)
 
 
 def rows_of(
@@ -127,16 +115,6 @@ def endings(options: Namespace) -> tuple[str, ...]:
     return ("", ", compiled") if options.compile else ("",)
 
 
-def drawn(name: str, rows: list[Row]) -> Table:
-    """Return the rows of one benchmark as a table for the terminal."""
-    table = Table(title=name, caption=f"load average {os.getloadavg()[0]:.1f}")
-    for heading in HEADINGS:
-        table.add_column(heading, justify="left" if heading in ("case", "unit", "to") else "right")
-    for row in rows:
-        table.add_row(*cells_of(row))
-    return table
-
-
 def cells_of(row: Any) -> list[str]:
     """Return the cells of a row below :data:`HEADINGS`."""
     numbers = (row["value"], row["spread_low"], row["spread_high"])
@@ -147,11 +125,16 @@ def cells_of(row: Any) -> list[str]:
     return [row["case"], batch, value, f"{low} … {high}", row["unit"], ratio, other]
 
 
+def table(rows: pd.DataFrame) -> str:
+    """Return rows as a table in Markdown."""
+    cases = rows.assign(case=rows["benchmark"] + ": " + rows["case"])
+    lines = [HEADINGS, ["---"] * len(HEADINGS), *map(cells_of, cases.to_dict("records"))]
+    return "\n".join(map(markdown_row, lines))
+
+
 def page(rows: pd.DataFrame) -> str:
-    """Return rows as a table in Markdown, below a line on where and when they were measured."""
+    """Return the table of rows below a line on where and when they were measured."""
     kinds = ("machine", "torch", "threads", "clock", "repeats", "date")
     where = (f"{kind} {', '.join(map(str, rows[kind].unique()))}" for kind in kinds)
     load = f"load average {rows['load'].min():.1f} to {rows['load'].max():.1f}."
-    cases = rows.assign(case=rows["benchmark"] + ": " + rows["case"])
-    table = [HEADINGS, ["---"] * len(HEADINGS), *map(cells_of, cases.to_dict("records"))]
-    return "\n".join([f"{'; '.join(where)}; {load}", "", *map(markdown_row, table)])
+    return f"{'; '.join(where)}; {load}\n\n{table(rows)}"

@@ -16,28 +16,13 @@ import pandas as pd
 import pyarrow.parquet as pq
 
 from benchmarks.harness import Row, rates, rows_of
-from benchmarks.read import peak_memory
 from lcc_rl import results
 from lcc_rl.config import load
 from lcc_rl.config.schemas import as_text
 from lcc_rl.io.files import write_parquet
 
 NUMBERS, BLOCK = 40, 50_000  # columns of a row besides its names; rows of a group
-OWN = """
-import sys
-from lcc_rl.results import load
-def read(): load(sys.argv[1])
-"""
-PLAIN = """
-import sys
-import pandas, pyarrow.pandas_compat
-from pathlib import Path
-from pyarrow import parquet
-def read():
-    return [parquet.read_table(x).to_pandas() for x in Path(sys.argv[1]).glob("*/*.parquet")]
-"""
 ARROW = "pyarrow, to pandas"
-PEAK_OF = {"results.load": OWN, ARROW: PLAIN}
 STARTS = {
     "import torchrl": ("-c", "import torchrl.envs, torchrl.collectors, torchrl.objectives"),
     "evaluate smoke": (
@@ -49,10 +34,7 @@ STARTS = {
 
 
 def loading(options: Namespace) -> list[Row]:
-    """Return rows/s of ``results.load`` and by how much it raises the peak of memory.
-
-    One run of many rows, and many runs of few, with the settings of an evaluation each.
-    """
+    """Return rows/s of ``results.load``: of one run of many rows, and of many runs of few."""
     rows: list[Row] = []
     shapes = ((1, 1000), (3, 100)) if options.quick else ((1, 1_000_000), (200, 1000))
     for runs, size in shapes:
@@ -63,11 +45,8 @@ def loading(options: Namespace) -> list[Row]:
                 "results.load": partial(results.load, folder),
                 ARROW: partial(_plain, folder),
             }
-            against = {"results.load": [ARROW]}
-            counts = dict.fromkeys(read, runs * size)
-            rows += rates(options, read, f"rows/s, {runs} runs", counts, against)
-            peaks = {case: peak_memory(text, name) for case, text in PEAK_OF.items()}
-            rows += rows_of(peaks, f"MiB, {runs} runs", against)
+            counts, unit = dict.fromkeys(read, runs * size), f"rows/s, {runs} runs"
+            rows += rates(options, read, unit, counts, {"results.load": [ARROW]})
     return rows
 
 

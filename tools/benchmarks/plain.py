@@ -167,11 +167,6 @@ class PlainLoop:
             "desired_time_gap": headway,
         }
 
-    def play_on(self, now: State, action: Tensor, _: Any) -> Played:
-        """Take a step; an episode that ends goes on."""
-        after, written = self.step(now, action)
-        return after, written, written["observation"]
-
     def play(self, now: State, action: Tensor, seeds: Any) -> Played:
         """Take a step, replace episodes that end; return state, what was written, observation.
 
@@ -213,7 +208,7 @@ def chosen(over: Tensor, new: Tensor, old: Tensor) -> Tensor:
 
 
 def check_physics(options: Namespace, steps: int) -> None:
-    """Hold the plain loop against the environment, whose episodes go on after a collision."""
+    """Check the plain loop against the environment, in which episodes go on after a collision."""
     _check_steps(alcc(options, 64), steps)
     _check_steps(alcc(options, 64, far=True, followers=3), steps)
     check_resets(options)

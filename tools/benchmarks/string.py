@@ -7,15 +7,11 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
-import torch
 from tensordict import TensorDict
 
-from benchmarks.env import collecting
+from benchmarks.env import ways
 from benchmarks.harness import Row, Run, agree, endings, rates
-from benchmarks.plain import PlainLoop, alcc
-from benchmarks.plain_numba import NUMBA, NumbaLoop
 from benchmarks.sumo import start
 from lcc_rl.config import load
 from lcc_rl.envs import build_env, load_inputs
@@ -30,9 +26,8 @@ def string(options: Namespace) -> list[Row]:
 
     First a batch behind automated vehicles that keep their speed, with the estimate of every
     driver and the reward, by the training's collector, beside the same physics as one function of
-    tensors, and as loops of numbers that numba compiles. Then a single ring of
-    human drivers by the evaluation's player, which keeps speeds and gaps, beside SUMO, which
-    drives its own IDM and keeps nothing.
+    tensors. Then a single ring of human drivers by the evaluation's player, which keeps speeds and
+    gaps, beside SUMO, which drives its own IDM and keeps nothing.
     """
     return [*batch(options), *ring(options)]
 
@@ -40,30 +35,14 @@ def string(options: Namespace) -> list[Row]:
 def batch(options: Namespace) -> list[Row]:
     """Return the rows of many strings side by side."""
     count, steps = (4, 10) if options.quick else (1024, 30)
-    env = alcc(options, count, True, SIZE - 1)
-    start, zero = env.reset(), torch.zeros(count, 1, 1)
-    plain, loops = PlainLoop(env), NumbaLoop(PlainLoop(env), start.copy())
-    runs: dict[str, Run] = {}
-    against: dict[str, list[str]] = {}
+    rows: list[Row] = []
     for ending in endings(options):
-        advance = torch.compile(plain.step, dynamic=False) if ending else plain.step
-
-        def loop(steps: int = steps, advance: Any = advance) -> Any:
-            state = plain.start(start)
-            for _ in range(steps):
-                state, _ = advance(state, zero.squeeze(-2))
-            return state
-
         own, other = f"StringCollector{ending}", f"plain loop{ending}"
-        again = alcc(options, count, True, SIZE - 1)
-        runs |= {own: collecting(again, zero, steps, bool(ending)), other: loop}
-        against[own] = [other, NUMBA]
-    played, state = loops.play(steps), loop()
-    for column, key in enumerate(("speed", "gap")):
-        agree(f"{key} of {NUMBA}", played[:, 2:, column], state[key].squeeze(-1))
-    runs[NUMBA] = lambda: NumbaLoop(plain, start.copy()).play(steps)
-    counts = dict.fromkeys(runs, count * steps * SIZE)
-    return rates(options, runs, "vehicle-steps/s", counts, against, count)
+        every = ways(options, count, steps, ending, SIZE - 1)
+        runs = {name: every[name] for name in (own, other)}
+        counts = dict.fromkeys(runs, count * steps * SIZE)
+        rows += rates(options, runs, "vehicle-steps/s", counts, {own: [other]}, count)
+    return rows
 
 
 def ring(options: Namespace) -> list[Row]:

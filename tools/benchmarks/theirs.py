@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
 from typing import Any
 
 import gymnasium
@@ -45,7 +44,7 @@ class PlainVector(VecEnv):  # type: ignore[misc,unused-ignore]
 
     @torch.no_grad()
     def step_wait(self) -> Any:
-        """Step; return what is seen, rewards, ends and what stable-baselines3 asks of the ends."""
+        """Step; return observations, rewards, dones and infos."""
         self.now, written, seen = self.play(self.now, self.actions, self.plain.seeds())
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for row in written["done"].flatten().nonzero().flatten().tolist():
@@ -56,23 +55,23 @@ class PlainVector(VecEnv):  # type: ignore[misc,unused-ignore]
         ends = (written[name].flatten().numpy() for name in ("reward", "done"))
         return seen.numpy(), *ends, infos
 
-    def _nothing(self, *_: Any, **__: Any) -> list[Any]:
-        """Return that no environment has attributes, methods or wrappers of its own."""
+    def _none_each(self, *_: Any, **__: Any) -> list[Any]:
+        """Return None for each environment; there are no attributes to report."""
         return [None] * self.num_envs
 
-    close = get_attr = set_attr = env_method = env_is_wrapped = _nothing
+    close = get_attr = set_attr = env_method = env_is_wrapped = _none_each
 
 
-def their_agent(options: Namespace, vector: VecEnv, kind: str, **how: Any) -> Any:
+def their_agent(vector: VecEnv, kind: str, **how: Any) -> Any:
     """Return stable-baselines3's agent of that name with the paper's layers."""
     layers = {"net_arch": [200, 100, 50]}
     settings = {"policy_kwargs": layers, "gamma": 0.9, "device": "cpu", **how}
     return getattr(stable_baselines3, kind)("MlpPolicy", vector, **settings)
 
 
-def predicting(options: Namespace, vector: VecEnv, steps: int) -> Run:
+def predicting(vector: VecEnv, steps: int) -> Run:
     """Return so many steps of ``predict`` and the environment; nothing is kept."""
-    model, state = their_agent(options, vector, "DDPG"), {"seen": vector.reset()}
+    model, state = their_agent(vector, "DDPG"), {"seen": vector.reset()}
 
     def run() -> None:
         for _ in range(steps):

@@ -8,7 +8,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import torch
 
 from benchmarks.collect import OTHER
 from benchmarks.harness import Row, Run, alternate, installed, rows_of
@@ -26,16 +25,14 @@ def train(options: Namespace) -> list[Row]:
 
     "Trainer" is the package's own with 20 environments side by side, its bookkeeping included,
     checkpoints (one per 10 iterations) not; stable-baselines3's is ``DDPG.learn`` with the plain
-    loop as one environment. Both learn in batches of 1,024 from a buffer of 20,000; "medium"
-    is torch's reduced precision of matrix products, see docs/benchmarks.md. "At equal width" both
-    have 20 environments, and learn a batch of 256 per 8 transitions.
+    loop as one environment. Both learn in batches of 1,024 from a buffer of 20,000. "At equal
+    width" both have 20 environments, and learn a batch of 256 per 8 transitions.
     """
     batch, steps = (32, 40) if options.quick else (1024, 300)
     with TemporaryDirectory(prefix="lcc_rl_benchmark_") as folder:
         runs: dict[str, Run] = {"Trainer": trainer(options, batch, steps, Path(folder))}
         if installed():
             runs[OTHER] = their_training(options, batch, steps)
-        runs |= {f"{name}, medium": medium(run) for name, run in runs.items()}
         spent = alternate(runs, options.repeats)
         rows = costs(spent, steps, batch)
         batch, steps = (batch // 4, 10 * steps - 10 * steps % (8 * WIDTH))
@@ -54,20 +51,6 @@ def costs(spent: Mapping[str, np.ndarray], steps: int, batch: int) -> list[Row]:
     against = {name: [other] for name in spent if name != other}
     each = {name: seconds * 1000 / steps for name, seconds in spent.items()}
     return rows_of(each, "s", against, batch)
-
-
-def medium(run: Run) -> Run:
-    """Return a run with reduced precision of matrix products."""
-
-    def reduced() -> None:
-        before = torch.get_float32_matmul_precision()
-        torch.set_float32_matmul_precision("medium")
-        try:
-            run()
-        finally:
-            torch.set_float32_matmul_precision(before)
-
-    return reduced
 
 
 def trainer(options: Namespace, batch: int, steps: int, folder: Path, updates: float = 1.0) -> Run:
@@ -94,6 +77,6 @@ def their_training(
     how = {"train_freq": every, "gradient_steps": updates, "batch_size": batch}
     how["buffer_size"] = 20000
     vector = PlainVector(training(options, width), options.compile)
-    model = their_agent(options, vector, "DDPG", learning_starts=batch, verbose=0, **how)
+    model = their_agent(vector, "DDPG", learning_starts=batch, verbose=0, **how)
     model.learn(batch + every * width)
     return lambda: model.learn(steps, reset_num_timesteps=False)

@@ -69,7 +69,7 @@ def their_update(options: Namespace, agent: OffPolicy, played: TensorDictBase) -
 
     vector = PlainVector(training(options, 1), compiled=False)
     how = {"batch_size": agent.batch_size, "buffer_size": agent.buffer_size}
-    model = their_agent(options, vector, type(agent).__name__, **how)
+    model = their_agent(vector, type(agent).__name__, **how)
     model.set_logger(configure(None, []))
     columns = [played[key].cpu().numpy() for key in list(LEARNED_FROM.values())[:5]]
     for seen, action, after, reward, done in zip(*columns, strict=True):
