@@ -10,8 +10,9 @@ folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv" &&
     "$folder/venv/bin/python" -m pip install -qq \
-        eclipse-sumo==1.28.0 libsumo==1.28.0 numpy==2.4.6 scipy==1.17.1 gymnasium==1.4.0 \
-        torch==2.13.0 pandas==3.1.1 matplotlib==3.11.2 pygame==2.6.1 pyyaml==6.0.3 || exit 2
+        eclipse-sumo==1.28.0 libsumo==1.28.0 numpy==2.4.6 scipy==1.17.1 torch==2.13.0 || exit 2
+"$folder/venv/bin/python" -m pip install -qq gymnasium==1.4.0 pandas==3.1.1 \
+    matplotlib==3.11.2 pygame==2.6.1 pyyaml==6.0.3 || exit 2
 "$folder/venv/bin/python" -m pip install -qq --no-deps \
     highway-env==1.12.1 cavsandbox==0.11.2 diffidm==0.0.3 || exit 2
 cd "$folder"
