@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -20,6 +21,8 @@ from lcc_rl.errors import Diverged, needing, require
 from lcc_rl.interfaces.driver import MEASURED, Driver
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.controllers import Population
+
+log = logging.getLogger("lcc_rl")
 
 UNCHECKED, RELEASED = 0, -1.0  # SUMO's speed mode without checks; speed that releases a vehicle
 
@@ -48,7 +51,8 @@ class Bridge:
     Args:
         driver: a policy or a rule, see :class:`lcc_rl.interfaces.driver.Driver`.
         vehicles: ids of the driven vehicles, which may enter later, or a predicate on ids.
-        sight: largest gap to a vehicle ahead that is measured, bumper to bumper [m].
+        sight: largest gap ahead and behind that is measured, bumper to bumper [m]. SUMO itself
+            looks by edges: on the car's own edge it finds a leader at any distance.
         trust, safety, seed, drivers: see :class:`lcc_rl.interfaces.driver.Driver`.
 
     Raises:
@@ -72,6 +76,11 @@ class Bridge:
         names = {vehicles} if isinstance(vehicles, str) else vehicles
         self.chosen = names if callable(names) else set(names).__contains__
         self.sight = sight
+        kinds = self.sumo.vehicletype
+        slow = [kind for kind in kinds.getIDList() if kinds.getActionStepLength(kind) > delta]
+        if slow and self.sumo.simulation.getOption("step-method.ballistic") != "true":
+            words = "actionStepLength of %s exceeds the step of %g s: SUMO then moves all vehicles "
+            log.warning(words + "by ballistic steps, not by Euler's", ", ".join(slow), delta)
         self.modes: dict[str, int] = {}  # original speed modes of commanded vehicles
 
     def command(self, execute: bool = True) -> dict[str, float]:
@@ -131,7 +140,7 @@ class Bridge:
         own = (cars.getSpeed(car), gap, cars.getAcceleration(car))
         lead = (cars.getSpeed(ahead), cars.getAcceleration(ahead))
         behind, free = cars.getFollower(car, self.sight) or ("", 0.0)
-        if not behind:
+        room = free + cars.getMinGap(behind) if behind else 0.0
+        if not behind or room > self.sight:
             return (*own, *lead, 0.0, 0.0, 0.0, 0.0)
-        room = free + cars.getMinGap(behind)
         return (*own, *lead, cars.getSpeed(behind), room, cars.getAcceleration(behind), 1.0)

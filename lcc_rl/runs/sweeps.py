@@ -47,6 +47,7 @@ log = logging.getLogger("lcc_rl")
 
 LONGEST_NAME = 100  # characters of a folder's name before the hash
 SILENT = logging.CRITICAL + 1
+ROUNDED = re.compile(r"\d*\.\d{15,}(?:e-?\d+)?")  # 0.8999999999999999 of Hydra's range(0,0.9,0.3)
 
 
 def register_resolvers() -> None:
@@ -158,6 +159,7 @@ class SweepCallback(Callback):
         plan = make_plan(config)
         if plan.runs > MOST_RUNS:
             refuse(f"a sweep has at most {MOST_RUNS} runs")
+        warn_of_rounding(plan)
         if str(config.hydra.sweeper.get("_target_")).endswith(BasicSweeper.__name__):
             check_cells(config, plan.varied)
         type(self).folder = type(self).target = folder
@@ -228,6 +230,15 @@ def make_plan(config: DictConfig) -> SweepPlan:
     varied = [key_of(key) for key in swept]
     values = [list(islice(item.sweep_string_iterator(), MOST_RUNS + 1)) for item in swept.values()]
     return SweepPlan(math.prod(map(len, values)), varied, values)
+
+
+def warn_of_rounding(plan: SweepPlan) -> None:
+    """Log settings whose values have the rounding errors of Hydra's range() with decimals."""
+    for key, values in zip(plan.varied, plan.values, strict=True):
+        if rounded := [value for value in values if ROUNDED.search(value)]:
+            listed = ",".join(ROUNDED.sub(lambda x: f"{float(x[0]):.9g}", x) for x in values)
+            words = "%s=%s: range() rounds decimals in this way; list the values: %s=%s"
+            log.warning(words, key, rounded[-1], key, listed)
 
 
 def check_cells(config: DictConfig, varied: Collection[str]) -> None:

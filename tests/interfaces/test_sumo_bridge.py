@@ -66,7 +66,9 @@ def own_motion(driver: str) -> tuple[Tensor, Tensor]:
     return speed, torch.cat([first.unsqueeze(0), gap])
 
 
-def start(folder: Path, cars: dict[str, tuple[float, float]], step: float = STEP) -> None:
+def start(
+    folder: Path, cars: dict[str, tuple[float, float]], step: float = STEP, of_type: str = ""
+) -> None:
     """Start SUMO on a ring of 10 km with vehicles at given places and speeds."""
     sumo.write_network(folder / "net.xml", 10_000.0)
     rows = [
@@ -74,10 +76,11 @@ def start(folder: Path, cars: dict[str, tuple[float, float]], step: float = STEP
         '<route edges="east west"/></vehicle>'
         for car, (place, speed) in cars.items()
     ]
-    kind = f'<vType id="t" length="{LENGTH}" minGap="1.5" maxSpeed="40" speedDev="0"/>'
+    kind = f'<vType id="t" length="{LENGTH}" minGap="1.5" maxSpeed="40" speedDev="0"{of_type}/>'
     (folder / "cars.xml").write_text(f"<routes>{kind}{''.join(rows)}</routes>")
     words = ["sumo", "-n", f"{folder}/net.xml", "-r", f"{folder}/cars.xml", "--no-step-log"]
-    words += ["--step-length", str(step), "--step-method.ballistic", "true", "--no-warnings"]
+    words += ["--step-length", str(step), "--no-warnings"]
+    words += [] if of_type else ["--step-method.ballistic", "true"]
     libsumo.start(words)
     libsumo.simulationStep()
 
@@ -148,6 +151,23 @@ def test_a_command_is_executed_beyond_what_sumo_thinks_safe(tmp_path) -> None:
     bridge.release()
     libsumo.simulationStep()
     assert libsumo.vehicle.getAcceleration("own") < 0.0
+
+
+def test_sight_is_in_metres_ahead_and_behind(tmp_path) -> None:
+    """SUMO finds neighbours on the same edge at any distance."""
+    start(tmp_path, {"lead": (500.0, 10.0), "own": (440.0, 10.0), "behind": (380.0, 10.0)})
+    for sight, present in ((100.0, 1.0), (56.0, 1.0), (54.0, None)):
+        measured = Bridge("acc", "own", sight=sight)._measured("own")
+        assert (measured and measured[-1]) == present
+    libsumo.vehicle.moveTo("behind", "east_0", 370.0)
+    assert Bridge("acc", "own", sight=56.0)._measured("own")[5:] == (0.0,) * 4
+
+
+def test_an_action_step_that_changes_the_whole_simulation_is_named(tmp_path, caplog) -> None:
+    cars = {"lead": (500.0, 10.0), "own": (480.0, 10.0)}
+    start(tmp_path, cars, of_type=' actionStepLength="1"')
+    Bridge("acc", "own")
+    assert "actionStepLength of t exceeds the step of 0.1 s" in caplog.text
 
 
 class Counting(Controller):

@@ -123,6 +123,16 @@ def test_what_was_typed_may_refer_to_settings() -> None:
     assert sweeps.make_plan(config) == sweeps.SweepPlan(2, ["seed"], values)
 
 
+def test_a_range_of_decimals_is_told_to_be_listed(caplog) -> None:
+    typed = {"task": ["agent.tau=range(0,0.9,0.3)", "seed=range(3)", "agent.gamma=0.25,1e-3"]}
+    plan = sweeps.make_plan(OmegaConf.create({"hydra": {"overrides": typed, "sweeper": {}}}))
+    sweeps.warn_of_rounding(plan)
+    assert len(plan.values[0]) == 4  # three wanted
+    (told,) = caplog.messages
+    assert "agent.tau=0.8999999999999999" in told
+    assert told.endswith("list the values: agent.tau=0.0,0.3,0.6,0.9")
+
+
 CELLS = {
     ("reward.without=null,safty", "seed=0,1"): [
         f"will fail: reward.without=safty seed={seed}: unknown term of the reward"
