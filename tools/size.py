@@ -27,8 +27,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 41_880, "code": 27_450},
-    "tests": {"lines": 23_960},
+    "lcc_rl + tools": {"lines": 42_900, "code": 28_200},
+    "tests": {"lines": 24_700},
     "conf": {"yaml": 152},
 }
 CASES = 1_170  # ceiling of all quick tests, see tests/tools/test_size.py

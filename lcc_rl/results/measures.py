@@ -156,7 +156,7 @@ class Measure:
 
     def with_unit(self, value: float) -> str:
         """Return a value in four digits with its unit, as limits and pages name it."""
-        return f"{float(f'{self.scale * value:.4g}'):.10g} {self.unit}".rstrip()
+        return f"{float(f'{self.scale * value:.4g}'):,.10g} {self.unit}".rstrip()
 
 
 _kj = partial(Measure, unit="kJ", form="{:.1f}")
