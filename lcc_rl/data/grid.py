@@ -15,6 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.arrays import Floats, Integers, Mask
+from lcc_rl.data.interpolation import monotone
 from lcc_rl.data.trajectories import FRAME, ReadReport, starts_of
 from lcc_rl.errors import Concern, DataError
 
@@ -224,7 +225,11 @@ def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 def cut_by_files(samples: pd.DataFrame, key: str, files: Sequence[str]) -> list[Concern]:
     """Return a warning on records, named in the column ``key``, that continue in another file."""
-    times = samples.groupby([key, "file"])["time_s"].agg(["min", "max", "size"]).reset_index()
+    times = (
+        samples.groupby([key, "file"], observed=True)["time_s"]
+        .agg(["min", "max", "size"])
+        .reset_index()
+    )
     times = times.sort_values([key, "min"], ignore_index=True)
     usual = (times["max"] - times["min"]) / (times["size"] - 1)
     step = (times["min"] - times["max"].shift()).where(times[key] == times[key].shift())
@@ -290,32 +295,31 @@ def _interpolated(
     samples: pd.DataFrame, at: Floats, smooth: list[str], report: ReadReport
 ) -> tuple[pd.DataFrame, Integers]:
     """Return samples at the whole frames of each record; ``at``: frames of the given samples."""
-    from scipy.interpolate import PchipInterpolator  # here: it loads for a second
-
-    table, episode = samples[smooth].to_numpy(np.float64), samples["episode"].to_numpy()
-    frames, before, values = [], [], []
-    for start, length in zip(*stretches(episode), strict=True):
-        own = at[start : start + length]
-        grid = np.arange(np.ceil(own[0] - 1e-6), np.floor(own[-1] + 1e-6) + 1)
-        if len(grid) < 2:
-            report.drop("stretch without two samples on the time grid", int(length))
-            continue
-        motion = PchipInterpolator(own, table[start : start + length])
-        values.append(motion(grid.clip(own[0], own[-1])))
-        before.append(start + np.searchsorted(own, grid + 1e-6, side="right") - 1)
-        frames.append(grid.astype(np.int64))
-    if not frames:
+    starts, lengths = stretches(samples["episode"].to_numpy())
+    low, high = np.ceil(at[starts] - 1e-6), np.floor(at[starts + lengths - 1] + 1e-6)
+    counts = (high - low + 1).astype(np.int64)
+    if (few := counts < 2).any():
+        report.drop("stretch without two samples on the time grid", int(lengths[few].sum()))
+        keep = np.repeat(~few, lengths)
+        samples, at = samples[keep].reset_index(drop=True), at[keep]
+        lengths, low, counts = lengths[~few], low[~few], counts[~few]
+    if not len(counts):
         raise DataError(
             f"{report.source}: no record lasts {FRAME:g} s; is the time in another unit?"
         )
-    frame, first = np.concatenate(frames), np.maximum(np.concatenate(before), 0)
+    table, episode = samples[smooth].to_numpy(np.float64), samples["episode"].to_numpy()
+    values, number = monotone(at, table, lengths, low, counts, 1.0)
+    first = np.repeat(np.arange(len(at)), number)
+    frame = np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts - low, counts)
+    frame = frame.astype(np.int64)
+    first += at[np.minimum(first + 1, len(at) - 1)] <= frame + 1e-6  # each has one after it
     after = np.minimum(first + 1, len(samples) - 1)
     inside = (episode[after] == episode[first]) & (after > first)
     span = np.where(inside, at[after] - at[first], 1.0)
     weight = np.where(inside, ((frame - at[first]) / span).clip(0.0, 1.0), 0.0)
     weight[weight < 1e-5] = 0.0
     found, following = (samples.iloc[index].reset_index(drop=True) for index in (first, after))
-    found[smooth] = np.concatenate(values)
+    found[smooth] = values
     if "leader" in samples:
         found["leader"] = found.leader.where((weight == 0) | (following.leader == found.leader), 0)
     if "gap" in samples:

@@ -12,6 +12,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from lcc_rl.data.interpolation import grid_size, monotone
 from lcc_rl.data.trajectories import listed
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Settings
@@ -276,12 +277,12 @@ def resample(
     Returns:
         Speeds, ``[steps]``, float32 [m/s].
     """
-    from scipy.interpolate import PchipInterpolator  # here: it loads for a second
-
-    begin, end = time[0] if begin is None else begin, time[-1] if end is None else end
-    steps = int(np.floor((end - begin) / time_step + 1e-6)) + 1
-    grid = np.minimum(begin + time_step * np.arange(steps), time[-1])
-    return torch.tensor(PchipInterpolator(time, speed)(grid).clip(min=0.0), dtype=torch.float32)
+    first, last = (np.array([time[k] if x is None else x]) for k, x in ((0, begin), (-1, end)))
+    sizes = np.array([len(time)]), first, grid_size(first, last, time_step)
+    values = np.asarray(speed, float).reshape(len(time), -1)
+    found, _ = monotone(np.asarray(time, float), values, *sizes, time_step)
+    series = found.clip(min=0.0).reshape(-1, *np.shape(speed)[1:])
+    return torch.tensor(series, dtype=torch.float32)
 
 
 def at_step(profiles: Profiles, time_step: float) -> Profiles:

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from os.path import expanduser
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import torch
 
-from lcc_rl.data.grid import continuous, interpolated, places
+from lcc_rl.arrays import Floats, Integers
+from lcc_rl.data.grid import continuous, interpolated, places, stretches
+from lcc_rl.data.interpolation import grid_size, monotone
 from lcc_rl.data.plausible import Plausible
-from lcc_rl.data.profiles import Profiles, from_records, resample
+from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.data.sources import SHIPPED_FILES, find_files, units_of
-from lcc_rl.data.tables import Column, Names, TableFile, Units
-from lcc_rl.data.text import labels
-from lcc_rl.data.trajectories import ReadReport
+from lcc_rl.data.tables import SLOPES, Column, Names, TableFile, Units, same_text, tables_of
+from lcc_rl.data.text import alike
+from lcc_rl.data.trajectories import FRAME, ReadReport, starts_of
 from lcc_rl.errors import DataError
 
 TIME_COLUMN, SPEED_COLUMN = "time_s", "speed_mps"
@@ -25,7 +30,9 @@ DRIVE_FIELDS = (
     Column("drive", "text", required=False),
     Column("time", "time", blank=True),
     Column("speed", "speed", blank=True),
+    Column("grade", "grade", least=-0.3, most=0.3, required=False),  # of lcc-rl energy
 )
+BLOCK = 1 << 20  # samples that are interpolated together
 DRIVE_COLUMNS: dict[str, str | None] = {
     "drive": "drive",
     "time": TIME_COLUMN,
@@ -57,7 +64,45 @@ def read_speed_record(
     samples, _ = _read(
         TableFile(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {}, divide=False
     )
-    return samples[TIME_COLUMN].to_numpy(), samples[SPEED_COLUMN].to_numpy()
+    return samples.samples[TIME_COLUMN].to_numpy(), samples.samples[SPEED_COLUMN].to_numpy()
+
+
+@dataclass(frozen=True)
+class Drives:
+    """Samples of speed records, record after record.
+
+    Args:
+        samples: ``time_s`` [s], ``speed_mps`` [m/s] and, if it was read, ``grade`` [rad]; each
+            record has two samples or more.
+        lengths: number of samples of each record.
+        names: the records' names.
+        drives: the records' drives, which have several records if blank cells, holes or
+            implausible samples divide them.
+    """
+
+    samples: pd.DataFrame
+    lengths: Integers
+    names: list[str]
+    drives: list[str]
+
+    def at_steps(self, time_step: float) -> Iterator[tuple[slice, Floats, Integers]]:
+        """Yield blocks of records with their samples every ``time_step`` seconds.
+
+        Yields:
+            The records of the block, their speeds and, if read, grades ``[samples, columns]``, and
+            the number of samples of each record.
+        """
+        ends = np.cumsum(self.lengths)
+        time, starts = self.samples[TIME_COLUMN].to_numpy(), ends - self.lengths
+        counts = grid_size(time[starts], time[ends - 1], time_step)
+        values = self.samples.drop(columns=TIME_COLUMN).to_numpy(np.float64)
+        block = np.cumsum(counts) // BLOCK
+        for first in starts_of(block):
+            some = slice(int(first), int(first + (block == block[first]).sum()))
+            rows = slice(int(starts[some.start]), int(ends[some.stop - 1]))
+            own, begin = time[rows], time[starts[some]]
+            sizes = self.lengths[some], begin, counts[some]
+            yield some, monotone(own, values[rows], *sizes, time_step)[0], counts[some]
 
 
 def read_drives(
@@ -67,18 +112,38 @@ def read_drives(
     plausible: Plausible | None = None,
     units: Units | None = None,
 ) -> tuple[Profiles, list[str]]:
+    """Read the speed records of tables as profiles.
+
+    Args:
+        path, columns, plausible, units: see :func:`read_samples`.
+        time_step: step of the profiles [s]; the records are interpolated to it.
+    """
+    found, lines = read_samples(path, columns, plausible, units)
+    speeds = [
+        record
+        for _, values, counts in found.at_steps(time_step)
+        for record in torch.from_numpy(values[:, 0].clip(min=0.0)).float().split(counts.tolist())
+    ]
+    return from_records(speeds, found.names, found.drives, time_step), lines
+
+
+def read_samples(
+    path: str | Sequence[str],
+    columns: Names,
+    plausible: Plausible | None = None,
+    units: Units | None = None,
+    time_step: float = FRAME,
+) -> tuple[Drives, list[str]]:
     """Read the speed records of tables.
 
     A table without the column ``drive`` is one drive, unless another name is configured.
 
     Args:
         path, columns, plausible, units: see :class:`lcc_rl.data.leaders.DriveLeaders`.
-        time_step: step of the profiles [s]; the records are interpolated to it.
+        time_step: step to which they will be interpolated, for the report [s].
 
     Returns:
-        A profile for each record, sorted by name, those of a single one by time, and lines on the
-        data. Its recording is the drive, which has several profiles if blank cells, holes or
-        implausible samples divide it.
+        The records, sorted by name, those of a single one by time, and lines on the data.
 
     Raises:
         DataError: naming file, row and column, if a value is missing or no number, a time is
@@ -87,29 +152,42 @@ def read_drives(
     files = find_files(path)
     if len(files) > 1 and columns["drive"] is None:
         raise DataError(f"{path}: {len(files)} files; leader=record drives one, see leader=drives")
-    tables = [
-        TableFile(name, label=label) for name, label in zip(files, labels(files), strict=True)
-    ]
-    read = [_read(table, columns, plausible, units or {}) for table in tables]
-    table = pd.concat([samples for samples, _ in read], keys=files, names=["file"]).reset_index(0)
-    own = table.groupby("name")["file"].nunique()
-    if (own > 1).any():
-        raise DataError(f"{path}: drive {own.idxmax()!r} is in several files; expected one")
-    records = table.groupby("name", sort=columns["drive"] is not None)
-    speeds = [
-        resample(x[TIME_COLUMN].to_numpy(), x[SPEED_COLUMN].to_numpy(), time_step)
-        for _, x in records
-    ]
-    names, drives = map(str, records.groups), map(str, records["drive"].first())
-    profiles = from_records(speeds, [*names], [*drives], time_step)
-    lines = [line for x, own in read for line in (*own, *interpolated(x, time_step))]
-    return profiles, list(dict.fromkeys(lines))
+    parts, lines = [], []
+    seen: dict[str, int] = {}
+    for number, table in enumerate(tables_of(files)):
+        part, report = _read(table, columns, plausible, units or {}, time_step)
+        for name in part.names:
+            if seen.setdefault(name, number) != number:
+                raise DataError(f"{path}: drive {name!r} is in several files; expected one")
+        parts.append(part)
+        lines += report
+    names = [name for part in parts for name in part.names]
+    drives = [name for part in parts for name in part.drives]
+    lengths = np.concatenate([part.lengths for part in parts])
+    samples = pd.concat([part.samples for part in parts], ignore_index=True)
+    order = np.argsort(np.array(names), kind="stable")
+    if columns["drive"] is not None and (np.diff(order) != 1).any():
+        starts = np.cumsum(lengths) - lengths
+        rows = np.repeat(starts[order], lengths[order]) + _within(lengths[order])
+        samples, lengths = samples.take(rows), lengths[order]
+        names, drives = [names[i] for i in order], [drives[i] for i in order]
+    return Drives(samples, lengths, names, drives), alike(lines, files)
+
+
+def _within(lengths: Integers) -> Integers:
+    """Return the number of each sample in its record, from 0."""
+    return np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
 
 
 def _read(
-    table: TableFile, columns: Names, plausible: Plausible | None, units: Units, divide: bool = True
-) -> tuple[pd.DataFrame, list[str]]:
-    """Return name, drive, time and speed of the plausible samples of a file, and the report."""
+    table: TableFile,
+    columns: Names,
+    plausible: Plausible | None,
+    units: Units,
+    time_step: float = FRAME,
+    divide: bool = True,
+) -> tuple[Drives, list[str]]:
+    """Return the plausible samples of a file, and the report."""
     samples, report = _samples(table, columns, units), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
     samples = continuous(samples, "drive", place, report, divide)
@@ -117,14 +195,19 @@ def _read(
     kept, lines = (plausible or Plausible()).select(
         samples, str(table.path), place, "leader.plausible", units=known
     )
-    kept["drive"] = kept.pop("recording")
-    parts = kept.groupby("drive")["episode"].transform("nunique") > 1
-    start = kept.groupby("episode")[TIME_COLUMN].transform("min").map("+{:g}s".format)
-    kept["name"] = kept["drive"].where(~parts, kept["drive"] + start)
-    line = f"read {kept['name'].nunique():,} speed record(s), {len(kept):,} rows, {table.path}"
+    lines += interpolated(kept, time_step)
+    starts, lengths = stretches(kept.pop("episode").to_numpy())
+    drives = kept.pop("recording").iloc[starts].astype(str).tolist()
+    count, since = Counter(drives), kept[TIME_COLUMN].to_numpy()[starts]
+    names = [
+        name if count[name] == 1 else f"{name}+{start:g}s"
+        for name, start in zip(drives, since, strict=True)
+    ]
+    line = f"read {len(names):,} speed record(s), {len(kept):,} rows, {table.path}"
     if table.preamble:
         line += ": native OpenACC, its first car"
-    return kept, [line, *table.notes, *report.left_out(), *report.notes, *lines]
+    found = Drives(kept, lengths, names, drives)
+    return found, [line, *table.notes, *report.left_out(), *report.notes, *lines]
 
 
 def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:
@@ -142,9 +225,9 @@ def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:
     # A record may end before the table; in native files, blank cells divide it.
     if rows[-1] >= len(rows) and (single or not table.preamble):
         raise table.fault(int(np.argmax(rows != np.arange(len(rows)))), "speed", "is blank")
-    samples = pd.DataFrame(
-        {TIME_COLUMN: read["time"], SPEED_COLUMN: read["speed"], "file": 0, "row": rows}
-    )
-    samples["recording"] = read.get("drive", table.label)
-    samples["episode"] = np.unique(samples["recording"], return_inverse=True)[1]
-    return samples
+    samples = pd.DataFrame({TIME_COLUMN: read["time"], SPEED_COLUMN: read["speed"]})
+    if "grade" in read:
+        slope = units.get("grade", "rad") in SLOPES
+        samples["grade"] = np.arctan(read["grade"]) if slope else read["grade"]
+    samples["recording"] = read.get("drive", same_text(table.label, len(rows)))
+    return samples.assign(episode=samples["recording"].cat.codes.astype(int), file=0, row=rows)
