@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from os.path import expanduser
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import torch
+from torch import Tensor
 
-from lcc_rl.arrays import Floats, Integers
 from lcc_rl.data.grid import continuous, interpolated, places, stretches
 from lcc_rl.data.interpolation import grid_size, monotone
 from lcc_rl.data.plausible import Plausible
@@ -21,7 +22,7 @@ from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.data.sources import SHIPPED_FILES, find_files, units_of
 from lcc_rl.data.tables import SLOPES, Column, Names, TableFile, Units, same_text, tables_of
 from lcc_rl.data.text import alike
-from lcc_rl.data.trajectories import FRAME, ReadReport, starts_of
+from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
 
 TIME_COLUMN, SPEED_COLUMN = "time_s", "speed_mps"
@@ -32,7 +33,7 @@ DRIVE_FIELDS = (
     Column("speed", "speed", blank=True),
     Column("grade", "grade", least=-0.3, most=0.3, required=False),  # of lcc-rl energy
 )
-BLOCK = 1 << 20  # samples that are interpolated together
+BLOCK = 50  # records that are interpolated together
 DRIVE_COLUMNS: dict[str, str | None] = {
     "drive": "drive",
     "time": TIME_COLUMN,
@@ -64,45 +65,21 @@ def read_speed_record(
     samples, _ = _read(
         TableFile(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {}, divide=False
     )
-    return samples.samples[TIME_COLUMN].to_numpy(), samples.samples[SPEED_COLUMN].to_numpy()
+    return samples[TIME_COLUMN].to_numpy(), samples[SPEED_COLUMN].to_numpy()
 
 
-@dataclass(frozen=True)
-class Drives:
-    """Samples of speed records, record after record.
+class Drive(NamedTuple):
+    """A speed record without holes, at equal steps.
 
     Args:
-        samples: ``time_s`` [s], ``speed_mps`` [m/s] and, if it was read, ``grade`` [rad]; each
-            record has two samples or more.
-        lengths: number of samples of each record.
-        names: the records' names.
-        drives: the records' drives, which have several records if blank cells, holes or
-            implausible samples divide them.
+        name: its name, with its start if the drive has several records.
+        drive: its drive.
+        values: speed [m/s] and, if it was read, grade [rad], ``[steps + 1, columns]``, float32.
     """
 
-    samples: pd.DataFrame
-    lengths: Integers
-    names: list[str]
-    drives: list[str]
-
-    def at_steps(self, time_step: float) -> Iterator[tuple[slice, Floats, Integers]]:
-        """Yield blocks of records with their samples every ``time_step`` seconds.
-
-        Yields:
-            The records of the block, their speeds and, if read, grades ``[samples, columns]``, and
-            the number of samples of each record.
-        """
-        ends = np.cumsum(self.lengths)
-        time, starts = self.samples[TIME_COLUMN].to_numpy(), ends - self.lengths
-        counts = grid_size(time[starts], time[ends - 1], time_step)
-        values = self.samples.drop(columns=TIME_COLUMN).to_numpy(np.float64)
-        block = np.cumsum(counts) // BLOCK
-        for first in starts_of(block):
-            some = slice(int(first), int(first + (block == block[first]).sum()))
-            rows = slice(int(starts[some.start]), int(ends[some.stop - 1]))
-            own, begin = time[rows], time[starts[some]]
-            sizes = self.lengths[some], begin, counts[some]
-            yield some, monotone(own, values[rows], *sizes, time_step)[0], counts[some]
+    name: str
+    drive: str
+    values: Tensor
 
 
 def read_drives(
@@ -111,39 +88,18 @@ def read_drives(
     time_step: float,
     plausible: Plausible | None = None,
     units: Units | None = None,
-) -> tuple[Profiles, list[str]]:
-    """Read the speed records of tables as profiles.
-
-    Args:
-        path, columns, plausible, units: see :func:`read_samples`.
-        time_step: step of the profiles [s]; the records are interpolated to it.
-    """
-    found, lines = read_samples(path, columns, plausible, units)
-    speeds = [
-        record
-        for _, values, counts in found.at_steps(time_step)
-        for record in torch.from_numpy(values[:, 0].clip(min=0.0)).float().split(counts.tolist())
-    ]
-    return from_records(speeds, found.names, found.drives, time_step), lines
-
-
-def read_samples(
-    path: str | Sequence[str],
-    columns: Names,
-    plausible: Plausible | None = None,
-    units: Units | None = None,
-    time_step: float = FRAME,
-) -> tuple[Drives, list[str]]:
+) -> tuple[list[Drive], list[str]]:
     """Read the speed records of tables.
 
     A table without the column ``drive`` is one drive, unless another name is configured.
 
     Args:
         path, columns, plausible, units: see :class:`lcc_rl.data.leaders.DriveLeaders`.
-        time_step: step to which they will be interpolated, for the report [s].
+        time_step: step to which the records are interpolated [s].
 
     Returns:
-        The records, sorted by name, those of a single one by time, and lines on the data.
+        The records, sorted by name, those of a single drive by time, and lines on the data. A drive
+        has several records if blank cells, holes or implausible samples divide it.
 
     Raises:
         DataError: naming file, row and column, if a value is missing or no number, a time is
@@ -152,42 +108,53 @@ def read_samples(
     files = find_files(path)
     if len(files) > 1 and columns["drive"] is None:
         raise DataError(f"{path}: {len(files)} files; leader=record drives one, see leader=drives")
-    parts, lines = [], []
-    seen: dict[str, int] = {}
-    for number, table in enumerate(tables_of(files)):
-        part, report = _read(table, columns, plausible, units or {}, time_step)
-        for name in part.names:
-            if seen.setdefault(name, number) != number:
-                raise DataError(f"{path}: drive {name!r} is in several files; expected one")
-        parts.append(part)
-        lines += report
-    names = [name for part in parts for name in part.names]
-    drives = [name for part in parts for name in part.drives]
-    lengths = np.concatenate([part.lengths for part in parts])
-    samples = pd.concat([part.samples for part in parts], ignore_index=True)
-    order = np.argsort(np.array(names), kind="stable")
-    if columns["drive"] is not None and (np.diff(order) != 1).any():
-        starts = np.cumsum(lengths) - lengths
-        rows = np.repeat(starts[order], lengths[order]) + _within(lengths[order])
-        samples, lengths = samples.take(rows), lengths[order]
-        names, drives = [names[i] for i in order], [drives[i] for i in order]
-    return Drives(samples, lengths, names, drives), alike(lines, files)
+    found: list[Drive] = []
+    lines: list[str] = []
+    seen: set[str] = set()
+    for table in tables_of(files):
+        samples, report = _read(table, columns, plausible, units or {})
+        own = [*_drives(samples, time_step)]
+        if twice := seen.intersection(one.name for one in own):
+            raise DataError(f"{path}: drive {min(twice)!r} is in several files; expected one")
+        seen.update(one.name for one in own)
+        line = f"read {len(own):,} speed record(s), {len(samples):,} rows, {table.path}"
+        line += ": native OpenACC, its first car" * bool(table.preamble)
+        lines += [line, *report, *interpolated(samples, time_step)]
+        found += own
+    if columns["drive"] is not None:
+        found.sort(key=attrgetter("name"))
+    return found, alike(lines, files)
 
 
-def _within(lengths: Integers) -> Integers:
-    """Return the number of each sample in its record, from 0."""
-    return np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+def as_profiles(drives: Sequence[Drive], time_step: float) -> Profiles:
+    """Return drives as profiles; arguments as for :func:`read_drives`."""
+    names, whole, values = zip(*drives, strict=True)
+    return from_records([one[:, 0] for one in values], names, whole, time_step)
+
+
+def _drives(samples: pd.DataFrame, time_step: float) -> Iterator[Drive]:
+    """Yield the records of a file, interpolated many at a time."""
+    starts, lengths = stretches(samples["episode"].to_numpy())
+    time, ends = samples[TIME_COLUMN].to_numpy(), starts + lengths
+    names = samples["recording"].iloc[starts].astype(str).tolist()
+    count, begin = Counter(names), time[starts]
+    sizes = grid_size(begin, time[ends - 1], time_step)
+    values = samples[[x for x in (SPEED_COLUMN, "grade") if x in samples]].to_numpy(np.float64)
+    for first in range(0, len(starts), BLOCK):
+        some, rows = slice(first, first + BLOCK), slice(starts[first], ends[first:][:BLOCK][-1])
+        how = lengths[some], begin[some], sizes[some], time_step
+        new = torch.from_numpy(monotone(time[rows], values[rows], *how)[0]).float()
+        new[:, 0].clamp_(min=0.0)
+        for name, start, own in zip(
+            names[some], begin[some], new.split(sizes[some].tolist()), strict=True
+        ):
+            yield Drive(name if count[name] == 1 else f"{name}+{start:g}s", name, own)
 
 
 def _read(
-    table: TableFile,
-    columns: Names,
-    plausible: Plausible | None,
-    units: Units,
-    time_step: float = FRAME,
-    divide: bool = True,
-) -> tuple[Drives, list[str]]:
-    """Return the plausible samples of a file, and the report."""
+    table: TableFile, columns: Names, plausible: Plausible | None, units: Units, divide: bool = True
+) -> tuple[pd.DataFrame, list[str]]:
+    """Return recording, episode and values of the plausible samples of a file, and the report."""
     samples, report = _samples(table, columns, units), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
     samples = continuous(samples, "drive", place, report, divide)
@@ -195,19 +162,7 @@ def _read(
     kept, lines = (plausible or Plausible()).select(
         samples, str(table.path), place, "leader.plausible", units=known
     )
-    lines += interpolated(kept, time_step)
-    starts, lengths = stretches(kept.pop("episode").to_numpy())
-    drives = kept.pop("recording").iloc[starts].astype(str).tolist()
-    count, since = Counter(drives), kept[TIME_COLUMN].to_numpy()[starts]
-    names = [
-        name if count[name] == 1 else f"{name}+{start:g}s"
-        for name, start in zip(drives, since, strict=True)
-    ]
-    line = f"read {len(names):,} speed record(s), {len(kept):,} rows, {table.path}"
-    if table.preamble:
-        line += ": native OpenACC, its first car"
-    found = Drives(kept, lengths, names, drives)
-    return found, [line, *table.notes, *report.left_out(), *report.notes, *lines]
+    return kept, [*table.notes, *report.left_out(), *report.notes, *lines]
 
 
 def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:

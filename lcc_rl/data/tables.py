@@ -309,7 +309,7 @@ class TableFile:
         """Yield rows of the file, and the number of rows before them."""
         if self.parquet:
             with raised_as(DataError, f"{self.path}: not a readable table", Exception):
-                whole = pq.read_table(self.path, columns=[*names])
+                whole = pq.read_table(self.path, columns=[*names], read_dictionary=[*names])
                 whole.validate(full=True)  # else damaged text would fail only when used
             yield whole, 0
             return

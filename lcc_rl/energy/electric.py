@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Self
 
 from pydantic import Field
 from torch import Tensor
@@ -45,6 +45,12 @@ class ElectricCar(EnergyModel):
         self.resistance = 0.5 * AIR * self.drag * self.area  # of the air [N/(m/s)²]
         slope = self.rolling * math.cos(self.grade) + math.sin(self.grade)
         self.rolling_force = self.mass * GRAVITY * slope  # [N]
+
+    def with_grade(self, grade: Tensor) -> Self:
+        """Return the car on a road with a grade [rad] for each speed, of the same shape."""
+        found = super().with_grade(grade)
+        found.rolling_force = self.mass * GRAVITY * (self.rolling * grade.cos() + grade.sin())
+        return found
 
     def strongest(self, speed: Tensor) -> Tensor | None:
         """Return the acceleration at the power limit, less the resistances [m/s²]."""
