@@ -21,7 +21,7 @@ LAZY = {
     "compare": "lcc_rl.api",
     "export": "lcc_rl.interfaces.export",
     "simulate": "lcc_rl.evaluation.simulation",
-    "trip_energies": "lcc_rl.evaluation.trips",
+    "trip_energies": "lcc_rl.commands.energy",
 }
 __all__ = ["__version__", "results", *LAZY]
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from copy import copy
-from typing import Annotated, Self
+from typing import Annotated
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.errors import require
 from lcc_rl.settings import Settings
 
 # Widths of moving averages of speeds before their energy is computed [s]. Shorter ones keep the
@@ -51,18 +49,6 @@ class EnergyModel(Settings, ABC):
     def inertia(self) -> float:
         """The mass that is accelerated, rotating parts included [kg]."""
         return self.mass * self.rotating_mass
-
-    def with_grade(self, grade: Tensor) -> Self:
-        """Return the model on a road with a grade [rad] for each speed, of the same shape.
-
-        Raises:
-            ConfigError: if the model has no setting ``grade``.
-        """
-        name = type(self).__name__
-        require(hasattr(self, "grade"), f"{name} has no grade; choose another energy=…")
-        found = copy(self)
-        found.grade = grade
-        return found
 
     def burnt(self, energy: Tensor) -> tuple[Tensor, Tensor]:
         """Return the fuel [L] and its carbon dioxide [g] of an energy drawn [J]; 0 without fuel."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Self
+from typing import Annotated
 
+import torch
 from pydantic import Field
 from torch import Tensor
 
@@ -43,14 +44,9 @@ class ElectricCar(EnergyModel):
 
     def validate(self) -> None:
         self.resistance = 0.5 * AIR * self.drag * self.area  # of the air [N/(m/s)²]
-        slope = self.rolling * math.cos(self.grade) + math.sin(self.grade)
+        lib = torch if isinstance(self.grade, Tensor) else math  # a grade of each sample, or one
+        slope = self.rolling * lib.cos(self.grade) + lib.sin(self.grade)
         self.rolling_force = self.mass * GRAVITY * slope  # [N]
-
-    def with_grade(self, grade: Tensor) -> Self:
-        """Return the car on a road with a grade [rad] for each speed, of the same shape."""
-        found = super().with_grade(grade)
-        found.rolling_force = self.mass * GRAVITY * (self.rolling * grade.cos() + grade.sin())
-        return found
 
     def strongest(self, speed: Tensor) -> Tensor | None:
         """Return the acceleration at the power limit, less the resistances [m/s²]."""
