@@ -24,7 +24,8 @@ from pydantic import Field
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.config import load, quoted, top_key
 from lcc_rl.data.leaders import DriveLeaders
-from lcc_rl.data.speed_records import Drive, read_drives
+from lcc_rl.data.profiles import Profiles
+from lcc_rl.data.speed_records import read_drives
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import Concern, require
 from lcc_rl.evaluation.metrics import KILO
@@ -55,11 +56,8 @@ def trip_energies(
     Returns:
         A row per trip, sorted by name: ``trip``, ``parts`` (records that holes divide it into),
         ``duration_s``, ``distance_km``, ``energy_kj`` as drawn, ``net_energy_kj``, less the gain of
-        kinetic energy; of the energy drawn ``energy_kwh`` and ``kwh_per_100km``, and for a model
-        with fuel ``fuel_l``, ``co2_g``, ``l_per_100km`` and ``co2_g_per_km``.
-
-    Raises:
-        LccError: for any error in settings or files, in one line.
+        kinetic energy; and of the energy drawn ``energy_kwh``, ``kwh_per_100km``, fuel and carbon
+        dioxide.
     """
     for word in overrides:
         known = top_key(word) in ("energy", "leader", "scenario", "trust")
@@ -71,11 +69,11 @@ def trip_energies(
     (model, *others), step = build_energy(cfg).models, cfg.scenario.time_step
     require(not others, "energy: a mixture has several models; choose one, such as fuel")
     source = cfg.leader.made(DriveLeaders)
-    drives, lines = read_drives(source.path, source.columns, step, source.plausible, source.units)
+    records, lines = read_drives(source.path, source.columns, step, source.plausible, source.units)
     for line in lines:
         log.log(logging.WARNING if isinstance(line, Concern) else logging.INFO, line)
-    blocks = (drives[first : first + BLOCK] for first in range(0, len(drives), BLOCK))
-    rows = pd.concat([_energies(block, model, step) for block in blocks])
+    blocks = (slice(first, first + BLOCK) for first in range(0, len(records), BLOCK))
+    rows = pd.concat([_energies(records, block, model) for block in blocks])
     trips = rows.groupby("trip").sum().reset_index()
     way = trips["distance_km"].where(trips["distance_km"] > 0.0)
     trips["energy_kwh"] = trips["energy_kj"] / KWH
@@ -88,28 +86,29 @@ def trip_energies(
     return trips
 
 
-def _energies(drives: Sequence[Drive], model: Any, time_step: float) -> pd.DataFrame:
-    """Return duration, distance and energies of records, as ``energy_measures`` does."""
-    whole = torch.cat([drive.values for drive in drives])
-    ends = np.cumsum([len(drive.values) for drive in drives])
-    first, last, speed = np.append(0, ends[:-1]), ends - 1, whole[:, 0]
-    if whole.shape[1] > 1:  # with grades
+def _energies(records: Profiles, block: slice, model: Any) -> pd.DataFrame:
+    """Return duration, distance and energies of some records, as ``energy_measures`` does."""
+    first, step = records.offsets[block].numpy(), records.time_step
+    last = first + records.lengths[block].numpy() - 1
+    rows, first, last = slice(first[0], last[-1] + 1), first - first[0], last - first[0]
+    speed = records.speeds[rows]
+    if records.grades is not None:
         name = type(model).__name__
         require(hasattr(model, "grade"), f"{name} has no grade; choose another energy=…")
         model = copy(model)
-        model.grade = whole[:-1, 1]
+        model.grade = records.grades[rows][:-1]
         model.validate()
-    power = model.power(speed[:-1], speed.diff() / time_step).numpy()
+    power = model.power(speed[:-1], speed.diff() / step).numpy()
     power[last[:-1]] = 0.0  # from one record to the next
-    drawn = KILO * time_step * np.add.reduceat(power, first, dtype=np.float64)
+    drawn = KILO * step * np.add.reduceat(power, first, dtype=np.float64)
     edges = speed[np.stack([first, last])].double()
     total = np.add.reduceat(speed.numpy(), first, dtype=np.float64) - 0.5 * edges.sum(0).numpy()
     return pd.DataFrame(
         {
-            "trip": [drive.drive for drive in drives],
+            "trip": records.recordings[block],
             "parts": 1,
-            "duration_s": time_step * (last - first),
-            "distance_km": KILO * time_step * total,
+            "duration_s": step * (last - first),
+            "distance_km": KILO * step * total,
             "energy_kj": drawn,
             "net_energy_kj": drawn - KILO * model.stored_energy(edges).diff(dim=0)[0].numpy(),
         }

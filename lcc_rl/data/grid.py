@@ -15,7 +15,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.arrays import Floats, Integers, Mask
-from lcc_rl.data.interpolation import monotone
 from lcc_rl.data.trajectories import FRAME, ReadReport, starts_of
 from lcc_rl.errors import Concern, DataError
 
@@ -296,31 +295,32 @@ def _interpolated(
     samples: pd.DataFrame, at: Floats, smooth: list[str], report: ReadReport
 ) -> tuple[pd.DataFrame, Integers]:
     """Return samples at the whole frames of each record; ``at``: frames of the given samples."""
-    starts, lengths = stretches(samples["episode"].to_numpy())
-    low, high = np.ceil(at[starts] - 1e-6), np.floor(at[starts + lengths - 1] + 1e-6)
-    counts = (high - low + 1).astype(np.int64)
-    if (few := counts < 2).any():
-        report.drop("stretch without two samples on the time grid", int(lengths[few].sum()))
-        keep = np.repeat(~few, lengths)
-        samples, at = samples[keep].reset_index(drop=True), at[keep]
-        lengths, low, counts = lengths[~few], low[~few], counts[~few]
-    if not len(counts):
+    from scipy.interpolate import PchipInterpolator  # here: it loads for a second
+
+    table, episode = samples[smooth].to_numpy(np.float64), samples["episode"].to_numpy()
+    frames, before, values = [], [], []
+    for start, length in zip(*stretches(episode), strict=True):
+        own = at[start : start + length]
+        grid = np.arange(np.ceil(own[0] - 1e-6), np.floor(own[-1] + 1e-6) + 1)
+        if len(grid) < 2:
+            report.drop("stretch without two samples on the time grid", int(length))
+            continue
+        motion = PchipInterpolator(own, table[start : start + length])
+        values.append(motion(grid.clip(own[0], own[-1])))
+        before.append(start + np.searchsorted(own, grid + 1e-6, side="right") - 1)
+        frames.append(grid.astype(np.int64))
+    if not frames:
         raise DataError(
             f"{report.source}: no record lasts {FRAME:g} s; is the time in another unit?"
         )
-    table, episode = samples[smooth].to_numpy(np.float64), samples["episode"].to_numpy()
-    values, number = monotone(at, table, lengths, low, counts, 1.0)
-    first = np.repeat(np.arange(len(at)), number)
-    frame = np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts - low, counts)
-    frame = frame.astype(np.int64)
-    first += at[np.minimum(first + 1, len(at) - 1)] <= frame + 1e-6  # each has one after it
+    frame, first = np.concatenate(frames), np.maximum(np.concatenate(before), 0)
     after = np.minimum(first + 1, len(samples) - 1)
     inside = (episode[after] == episode[first]) & (after > first)
     span = np.where(inside, at[after] - at[first], 1.0)
     weight = np.where(inside, ((frame - at[first]) / span).clip(0.0, 1.0), 0.0)
     weight[weight < 1e-5] = 0.0
     found, following = (samples.iloc[index].reset_index(drop=True) for index in (first, after))
-    found[smooth] = values
+    found[smooth] = np.concatenate(values)
     if "leader" in samples:
         found["leader"] = found.leader.where((weight == 0) | (following.leader == found.leader), 0)
     if "gap" in samples:

@@ -27,23 +27,10 @@ from lcc_rl.data.profiles import (
     resample,
 )
 from lcc_rl.data.sources import find_files
-from lcc_rl.data.speed_records import (
-    DRIVE_COLUMNS,
-    DRIVE_FIELDS,
-    as_profiles,
-    read_drives,
-    read_speed_record,
-)
+from lcc_rl.data.speed_records import DRIVE_COLUMNS, DRIVE_FIELDS, read_drives, read_speed_record
 from lcc_rl.data.tables import check_map
 from lcc_rl.data.trajectories import FRAME
-from lcc_rl.errors import (
-    ConfigError,
-    DataError,
-    raised_as,
-    require,
-    require_known,
-    require_positive,
-)
+from lcc_rl.errors import ConfigError, DataError, raised_as, require_known, require_positive
 from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, parse
 
 LISTED = 8  # most names in a line
@@ -296,10 +283,11 @@ class DriveLeaders(Settings):
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
         """Read all records; see :meth:`RecordLeaders.load`."""
         single = self.columns["drive"] is None
-        graded = self.columns.get("grade") is not None
-        require(not graded, "leader.columns.grade: only lcc-rl energy uses the grade of drives")
-        found, report = read_drives(self.path, self.columns, time_step, self.plausible, self.units)
-        profiles = as_profiles(found, time_step)
+        profiles, report = read_drives(
+            self.path, self.columns, time_step, self.plausible, self.units
+        )
+        if profiles.grades is not None:
+            raise ConfigError("leader.columns.grade: only lcc-rl energy uses grades")
         drives = {*profiles.recordings}
         each = 1 < len(drives) == len(find_files(self.path))  # a file is a drive
         if each and self.together and len({*map(self._family, drives)}) == 1:

@@ -12,7 +12,6 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.data.interpolation import grid_size, monotone
 from lcc_rl.data.trajectories import listed
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Settings
@@ -40,6 +39,7 @@ class Profiles:
         sources: the source of each record, if there are several; else empty.
         followers: speed [m/s] and gap [m] of the recorded driver behind each leader,
             ``[samples, 2]``, float32; None if there is none.
+        grades: grade of the road at each sample, for energies of trips [rad]; None: not read.
     """
 
     speeds: Tensor
@@ -52,6 +52,7 @@ class Profiles:
     weights: Tensor | None = None
     sources: tuple[str, ...] = ()
     followers: Tensor | None = None
+    grades: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -277,12 +278,12 @@ def resample(
     Returns:
         Speeds, ``[steps]``, float32 [m/s].
     """
-    first, last = (np.array([time[k] if x is None else x]) for k, x in ((0, begin), (-1, end)))
-    sizes = np.array([len(time)]), first, grid_size(first, last, time_step)
-    values = np.asarray(speed, float).reshape(len(time), -1)
-    found, _ = monotone(np.asarray(time, float), values, *sizes, time_step)
-    series = found.clip(min=0.0).reshape(-1, *np.shape(speed)[1:])
-    return torch.tensor(series, dtype=torch.float32)
+    from scipy.interpolate import PchipInterpolator  # here: it loads for a second
+
+    begin, end = time[0] if begin is None else begin, time[-1] if end is None else end
+    steps = int(np.floor((end - begin) / time_step + 1e-6)) + 1
+    grid = np.minimum(begin + time_step * np.arange(steps), time[-1])
+    return torch.tensor(PchipInterpolator(time, speed)(grid).clip(min=0.0), dtype=torch.float32)
 
 
 def at_step(profiles: Profiles, time_step: float) -> Profiles:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
-from operator import attrgetter
 from os.path import expanduser
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -16,9 +15,8 @@ import torch
 from torch import Tensor
 
 from lcc_rl.data.grid import continuous, interpolated, places, stretches
-from lcc_rl.data.interpolation import grid_size, monotone
 from lcc_rl.data.plausible import Plausible
-from lcc_rl.data.profiles import Profiles, from_records
+from lcc_rl.data.profiles import Profiles, from_records, resample
 from lcc_rl.data.sources import SHIPPED_FILES, find_files, units_of
 from lcc_rl.data.tables import SLOPES, Column, Names, TableFile, Units, same_text, tables_of
 from lcc_rl.data.text import alike
@@ -33,7 +31,6 @@ DRIVE_FIELDS = (
     Column("speed", "speed", blank=True),
     Column("grade", "grade", least=-0.3, most=0.3, required=False),  # of lcc-rl energy
 )
-BLOCK = 50  # records that are interpolated together
 DRIVE_COLUMNS: dict[str, str | None] = {
     "drive": "drive",
     "time": TIME_COLUMN,
@@ -68,38 +65,25 @@ def read_speed_record(
     return samples[TIME_COLUMN].to_numpy(), samples[SPEED_COLUMN].to_numpy()
 
 
-class Drive(NamedTuple):
-    """A speed record without holes, at equal steps.
-
-    Args:
-        name: its name, with its start if the drive has several records.
-        drive: its drive.
-        values: speed [m/s] and, if it was read, grade [rad], ``[steps + 1, columns]``, float32.
-    """
-
-    name: str
-    drive: str
-    values: Tensor
-
-
 def read_drives(
     path: str | Sequence[str],
     columns: Names,
     time_step: float,
     plausible: Plausible | None = None,
     units: Units | None = None,
-) -> tuple[list[Drive], list[str]]:
+) -> tuple[Profiles, list[str]]:
     """Read the speed records of tables.
 
     A table without the column ``drive`` is one drive, unless another name is configured.
 
     Args:
         path, columns, plausible, units: see :class:`lcc_rl.data.leaders.DriveLeaders`.
-        time_step: step to which the records are interpolated [s].
+        time_step: step of the profiles [s]; the records are interpolated to it.
 
     Returns:
-        The records, sorted by name, those of a single drive by time, and lines on the data. A drive
-        has several records if blank cells, holes or implausible samples divide it.
+        A profile for each record, sorted by name, those of a single one by time, and lines on the
+        data. Its recording is the drive, which has several profiles if blank cells, holes or
+        implausible samples divide it.
 
     Raises:
         DataError: naming file, row and column, if a value is missing or no number, a time is
@@ -108,53 +92,47 @@ def read_drives(
     files = find_files(path)
     if len(files) > 1 and columns["drive"] is None:
         raise DataError(f"{path}: {len(files)} files; leader=record drives one, see leader=drives")
-    found: list[Drive] = []
+    found: dict[str, tuple[str, Tensor, Tensor | None]] = {}
     lines: list[str] = []
-    seen: set[str] = set()
     for table in tables_of(files):
         samples, report = _read(table, columns, plausible, units or {})
-        own = [*_drives(samples, time_step)]
-        if twice := seen.intersection(one.name for one in own):
+        own = dict(_records(samples, time_step))
+        if twice := own.keys() & found.keys():
             raise DataError(f"{path}: drive {min(twice)!r} is in several files; expected one")
-        seen.update(one.name for one in own)
-        line = f"read {len(own):,} speed record(s), {len(samples):,} rows, {table.path}"
-        line += ": native OpenACC, its first car" * bool(table.preamble)
-        lines += [line, *report, *interpolated(samples, time_step)]
-        found += own
-    if columns["drive"] is not None:
-        found.sort(key=attrgetter("name"))
-    return found, alike(lines, files)
+        found |= own
+        lines += [*report, *interpolated(samples, time_step)]
+    names = [*found] if columns["drive"] is None else sorted(found)
+    drives, speeds, grades = zip(*(found[name] for name in names), strict=True)
+    profiles = from_records(speeds, names, drives, time_step)
+    whole = torch.cat(grades) if columns.get("grade") else None
+    return replace(profiles, grades=whole), alike(lines, files)
 
 
-def as_profiles(drives: Sequence[Drive], time_step: float) -> Profiles:
-    """Return drives as profiles; arguments as for :func:`read_drives`."""
-    names, whole, values = zip(*drives, strict=True)
-    return from_records([one[:, 0] for one in values], names, whole, time_step)
-
-
-def _drives(samples: pd.DataFrame, time_step: float) -> Iterator[Drive]:
-    """Yield the records of a file, interpolated many at a time."""
+def _records(
+    samples: pd.DataFrame, time_step: float
+) -> Iterator[tuple[str, tuple[str, Tensor, Tensor | None]]]:
+    """Yield name, drive, speed and, if it was read, grade of each record of a file."""
     starts, lengths = stretches(samples["episode"].to_numpy())
-    time, ends = samples[TIME_COLUMN].to_numpy(), starts + lengths
-    names = samples["recording"].iloc[starts].astype(str).tolist()
-    count, begin = Counter(names), time[starts]
-    sizes = grid_size(begin, time[ends - 1], time_step)
-    values = samples[[x for x in (SPEED_COLUMN, "grade") if x in samples]].to_numpy(np.float64)
-    for first in range(0, len(starts), BLOCK):
-        some, rows = slice(first, first + BLOCK), slice(starts[first], ends[first:][:BLOCK][-1])
-        how = lengths[some], begin[some], sizes[some], time_step
-        new = torch.from_numpy(monotone(time[rows], values[rows], *how)[0]).float()
-        new[:, 0].clamp_(min=0.0)
-        for name, start, own in zip(
-            names[some], begin[some], new.split(sizes[some].tolist()), strict=True
-        ):
-            yield Drive(name if count[name] == 1 else f"{name}+{start:g}s", name, own)
+    drives, seen = samples["recording"].iloc[starts].astype(str).tolist(), set[str]()
+    count, time = Counter(drives), samples[TIME_COLUMN].to_numpy()
+    speed, grade = samples[SPEED_COLUMN].to_numpy(), samples.get("grade")
+    for drive, start, length in zip(drives, starts, lengths, strict=True):
+        rows, name = slice(start, start + length), drive
+        if count[drive] > 1:
+            name = f"{drive}+{time[start]:g}s"
+            name = f"{drive}+{time[start]!s}s" if name in seen else name
+            seen.add(name)
+        own, slope = resample(time[rows], speed[rows], time_step), None
+        if grade is not None:
+            at = time[start] + time_step * np.arange(len(own))
+            slope = torch.tensor(np.interp(at, time[rows], grade[rows]), dtype=torch.float32)
+        yield name, (drive, own, slope)
 
 
 def _read(
     table: TableFile, columns: Names, plausible: Plausible | None, units: Units, divide: bool = True
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Return recording, episode and values of the plausible samples of a file, and the report."""
+    """Return recording, episode and motion of the plausible samples of a file, and the report."""
     samples, report = _samples(table, columns, units), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
     samples = continuous(samples, "drive", place, report, divide)
@@ -162,7 +140,10 @@ def _read(
     kept, lines = (plausible or Plausible()).select(
         samples, str(table.path), place, "leader.plausible", units=known
     )
-    return kept, [*table.notes, *report.left_out(), *report.notes, *lines]
+    line = f"read {kept['episode'].nunique():,} speed record(s), {len(kept):,} rows, {table.path}"
+    if table.preamble:
+        line += ": native OpenACC, its first car"
+    return kept, [line, *table.notes, *report.left_out(), *report.notes, *lines]
 
 
 def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:
