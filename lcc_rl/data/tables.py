@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 from math import pi
-from os.path import expanduser  # pathlib's raises for an unknown user
+from os.path import expanduser, getsize, isfile  # pathlib's raises for an unknown user
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -42,8 +42,9 @@ from lcc_rl.data.text import (
     stem,
     unended,
 )
-from lcc_rl.data.trajectories import FOOT
+from lcc_rl.data.trajectories import FOOT, listed
 from lcc_rl.errors import Concern, ConfigError, DataError, raised_as, require_known, unknown_name
+from lcc_rl.io.memory import require_memory
 
 log = logging.getLogger("lcc_rl")
 
@@ -367,13 +368,27 @@ class TableFile:
 
 
 def tables_of(files: Sequence[str]) -> Iterator[TableFile]:
-    """Yield the tables of files, and log the progress every few seconds."""
+    """Yield the tables of files, and log the progress every few seconds.
+
+    Raises:
+        ConfigError: if reading them needs more memory than is free.
+    """
+    require_memory({f"reading {listed(files)}": sum(map(_memory, filter(isfile, files)))})
     due = monotonic() + EVERY
     for number, (name, label) in enumerate(zip(files, labels(files), strict=True)):
         if monotonic() > due:
             log.info("read %d of %d files", number, len(files))
             due = monotonic() + EVERY
         yield TableFile(name, label=label)
+
+
+def _memory(file: str) -> float:
+    """Return the memory for reading a file, as measured with millions of rows [bytes]."""
+    if Path(file).suffix in PARQUET:
+        with suppress(pa.ArrowException):  # the reader refuses a damaged file
+            known = pq.read_metadata(file)
+            return 60.0 * known.num_rows * known.num_columns
+    return 10.0 * getsize(file)
 
 
 class Block:
