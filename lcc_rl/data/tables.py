@@ -484,7 +484,7 @@ def same_text(text: str, rows: int) -> pd.Categorical:
 def joined(parts: Sequence[Any]) -> Any:
     """Return consecutive parts of a column; the categories of all are sorted."""
     if isinstance(parts[0], pd.Categorical):
-        return parts[0] if len(parts) == 1 else union_categoricals(parts, sort_categories=True)
+        return parts[0] if len(parts) == 1 else union_categoricals([*parts], sort_categories=True)
     return np.concatenate(parts)
 
 
