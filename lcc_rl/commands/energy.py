@@ -45,11 +45,8 @@ def trip_energies(
 ) -> pd.DataFrame:
     """Return the energy of recorded trips, and log lines on the data.
 
-    Speeds are interpolated to 0.1 s (``scenario.time_step``), as those of leaders in an evaluation.
-
     Args:
-        path: a .csv or .parquet table of many trips, files with one trip each, a folder, a pattern,
-            or several of these.
+        path: a table of many trips, files with one trip each, a folder, a pattern, or a list.
         overrides: the energy model, columns and units: ``["energy=fuel", "leader.columns.drive=id",
             "leader.units.speed=km/h", "leader.columns.grade=slope", "leader.units.grade=%"]``.
 
@@ -123,13 +120,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=ending, help="also write a row per trip: .csv, .parquet")
     options = parser.parse_args(arguments)
     files = [word for word in options.words if "=" not in word or Path(word).exists()]
-    if not files:
-        parser.error("expected a file of trips")
     out = options.out and new_file(options.out, "--out")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     trips = trip_energies(files, [word for word in options.words if word not in files])
     print(trips.head(MOST_ROWS).to_string(index=False, float_format="{:,.4g}".format))
-    print(f"… and {len(trips) - MOST_ROWS:,} more\n" * (len(trips) > MOST_ROWS), end="")
     sums = trips[["distance_km", "energy_kj", "energy_kwh"]].sum()
     words = "{distance_km:,.1f} km, {energy_kj:,.0f} kJ, {energy_kwh:,.1f} kWh".format(**sums)
     print(f"{len(trips):,} trips: {words}")

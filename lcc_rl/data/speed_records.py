@@ -113,15 +113,12 @@ def _records(
 ) -> Iterator[tuple[str, tuple[str, Tensor, Tensor | None]]]:
     """Yield name, drive, speed and, if it was read, grade of each record of a file."""
     starts, lengths = stretches(samples["episode"].to_numpy())
-    drives, seen = samples["recording"].iloc[starts].astype(str).tolist(), set[str]()
+    drives = samples["recording"].iloc[starts].astype(str).tolist()
     count, time = Counter(drives), samples[TIME_COLUMN].to_numpy()
     speed, grade = samples[SPEED_COLUMN].to_numpy(), samples.get("grade")
     for drive, start, length in zip(drives, starts, lengths, strict=True):
-        rows, name = slice(start, start + length), drive
-        if count[drive] > 1:
-            name = f"{drive}+{time[start]:g}s"
-            name = f"{drive}+{time[start]!s}s" if name in seen else name
-            seen.add(name)
+        rows = slice(start, start + length)
+        name = drive if count[drive] == 1 else f"{drive}+{time[start]:.12g}s"
         own, slope = resample(time[rows], speed[rows], time_step), None
         if grade is not None:
             at = time[start] + time_step * np.arange(len(own))
