@@ -2,7 +2,8 @@
 
 ``lcc_rl.simulate`` drives a string of vehicles behind a leader, ``lcc_rl.make_env`` builds a
 TorchRL environment of one, ``lcc_rl.learn`` trains a policy, ``lcc_rl.compare`` evaluates several,
-``lcc_rl.export`` writes one for other software and ``lcc_rl.results`` reads the results of runs.
+``lcc_rl.export`` writes one for other software, ``lcc_rl.trip_energies`` returns the energy of
+recorded trips and ``lcc_rl.results`` reads the results of runs.
 The command is ``lcc-rl``.
 """
 
@@ -13,7 +14,6 @@ from typing import Any
 
 from lcc_rl.version import __version__
 
-__all__ = ["__version__", "compare", "export", "learn", "make_env", "results", "simulate"]
 # Modules of names that load torch.
 LAZY = {
     "make_env": "lcc_rl.envs.factory",
@@ -21,7 +21,9 @@ LAZY = {
     "compare": "lcc_rl.api",
     "export": "lcc_rl.interfaces.export",
     "simulate": "lcc_rl.evaluation.simulation",
+    "trip_energies": "lcc_rl.commands.energy",
 }
+__all__ = ["__version__", "results", *LAZY]
 
 
 def __getattr__(name: str) -> Any:

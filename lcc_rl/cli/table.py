@@ -33,7 +33,7 @@ from lcc_rl.results.sweeps import load_sweep
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.states import CONFIG, run_folders
 
-TABLE_FORMATS: dict[str, Callable[[pd.DataFrame], str]] = {
+TABLE_FORMATS: dict[str, Callable[..., str]] = {
     "text": as_markdown,
     "markdown": as_markdown,
     "latex": as_latex,
@@ -59,7 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     marks = "decimal mark of --format csv; with comma, columns are separated by ;"
     parser.add_argument("--decimal", choices=("point", "comma"), default="point", help=marks)
     options = parser.parse_args(arguments)
-    if options.decimal == "comma" and options.format != "csv":
+    csv = options.format == "csv"
+    if options.decimal == "comma" and not csv:
         parser.error("--decimal comma needs --format csv")
     names = options.columns.split(",") if options.columns else []
     note = ""
@@ -79,14 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if options.all:
             table = chosen(worded(report.table), names)
         else:
-            note = report.note
-            files = options.format == "csv"
-            table = chosen(report.short, names) if files else for_print(report, names)
-    if options.format == "csv":
-        print(as_csv(table, options.decimal))
-    else:
-        print(TABLE_FORMATS[options.format](table))
-    if note and options.format != "csv":
+            note = "" if csv else report.note
+            table = chosen(report.short, names) if csv else for_print(report, names)
+    print(TABLE_FORMATS[options.format](table, *[options.decimal] * csv))
+    if note:
         lines = fill(note, 98, initial_indent="% ", subsequent_indent="% ")
         print(lines if options.format == "latex" else f"\n{note}")
 

@@ -65,7 +65,7 @@ def check_overrides(words: Sequence[str], given: Collection[str], reason: str) -
 
     Args:
         words: the remaining words.
-        given: keys that the command sets.
+        given: keys that the command sets, such as ``data`` or ``scenario.string``.
         reason: why they cannot be given, for the message.
 
     Raises:
@@ -74,5 +74,6 @@ def check_overrides(words: Sequence[str], given: Collection[str], reason: str) -
     if any(word.startswith("-") or ("=" not in word and word[:1] != "~") for word in words):
         raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")
     for word in words:
-        require(top_key(word) not in given, f"{word}: {reason}")
+        for key in typed_keys(word):
+            require(not {key, top_key(key)} & {*given}, f"{word}: {reason}")
         require(top_key(word) != "hydra", f"{word} has no effect: this command chooses the folders")

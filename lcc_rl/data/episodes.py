@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from functools import partial
 
 import numpy as np
@@ -10,8 +10,18 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.data.grid import Places, continuous, cut_by_files, on_grid, places, stretches
-from lcc_rl.data.tables import LARGEST_ID, Column, Names, TableFile, Units, whole_numbers
-from lcc_rl.data.text import labels, lacking
+from lcc_rl.data.tables import (
+    LARGEST_ID,
+    Column,
+    Names,
+    TableFile,
+    Units,
+    joined,
+    same_text,
+    tables_of,
+    whole_numbers,
+)
+from lcc_rl.data.text import alike, lacking
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
 
@@ -47,6 +57,7 @@ PAIR_MEASURED = [column.key for column in PAIR_FIELDS if column.blank]  # not bl
 EPISODE_NAMES = dict(zip((column.key for column in PAIR_FIELDS), SCHEMA, strict=True))
 EPISODE_ALIASES = {"event": "episode", "period": "recording"}
 DERIVED_POSITIONS = "no positions given: those of leaders are the integral of their speeds"
+TEXTS = ("recording", "label")  # categorical columns
 MOTION_COLUMNS = [name for name in SCHEMA if name.endswith(("_position_m", "_speed_mps", "gap_m"))]
 
 
@@ -71,27 +82,32 @@ def read_episodes(
         DataError: naming file, row and column, if a cell is missing or no number, or rows
             contradict each other.
     """
-    tables: list[pd.DataFrame] = []
+    parts: list[pd.DataFrame] = []
     notes: list[str] = []
-    place = partial(places, columns=columns)
-    for path, label in zip(paths, labels(paths), strict=True):
-        file = TableFile(path, label=label)
-        table, lines = _table(file, columns or {}, units or {}, place, tables)
-        if tables:
-            table["episode"] += tables[-1]["episode"].max() + 1 - table["episode"].min()
-        tables.append(table)
+    place, seen, count = partial(places, columns=columns), set[str](), 0
+    for number, file in enumerate(tables_of(paths)):
+        table, lines = _table(file, columns or {}, units or {}, place, seen, count)
+        episode = table["episode"]
+        if parts:
+            table["episode"] = episode + parts[-1]["episode"].max() + 1 - episode.min()
+        seen, count = seen | {*table["recording"].cat.categories}, count + episode.nunique()
+        parts.append(table.assign(file=number))
         notes += lines
-    whole = pd.concat(tables, ignore_index=True)
+    texts = {name: joined([part.pop(name).array for part in parts]) for name in TEXTS}
+    whole = parts[0] if len(parts) == 1 else pd.concat(parts, ignore_index=True)
+    parts.clear()
+    whole = whole.assign(label=texts["label"])
+    whole.insert(1, "recording", texts["recording"].astype(str))
     notes += cut_by_files(whole, "label", paths)
-    return whole, list(dict.fromkeys(notes))
+    return whole, alike(notes, paths)
 
 
 def _table(
-    file: TableFile, columns: Names, units: Units, place: Places, tables: Sequence[pd.DataFrame]
+    file: TableFile, columns: Names, units: Units, place: Places, seen: Set[str], count: int
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Read a file after others, ``tables``, and resample it to the grid."""
+    """Read a file after ``count`` episodes of the recordings ``seen``, and resample it."""
     names = _names(file, columns)
-    table, numbers = _rows(file, names, units, tables)
+    table, numbers = _rows(file, names, units, seen, count)
     notes = list(file.notes)
     for name, words in (
         ("recording", "no column recording: each file is one recording"),
@@ -105,7 +121,8 @@ def _table(
     table, _ = on_grid(table, start, MOTION_COLUMNS, place, report)
     table["time_s"] = table["time_s"].round(6)
     table["episode"] = _numbered(table["episode"].to_numpy(), numbers)
-    table = table[[*SCHEMA, "file", "row", "label"]].astype({**SCHEMA, "recording": str})
+    kinds = {name: kind for name, kind in SCHEMA.items() if name not in TEXTS}
+    table = table[[*SCHEMA, "row", "label"]].astype(kinds)
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
         notes.append(DERIVED_POSITIONS)
@@ -116,7 +133,7 @@ def _table(
 
 
 def _rows(
-    file: TableFile, names: Names, units: Units, tables: Sequence[pd.DataFrame]
+    file: TableFile, names: Names, units: Units, seen: Set[str], count: int
 ) -> tuple[pd.DataFrame, NDArray[np.int64]]:
     """Return rows of a file with episodes numbered from 0, and the file's own numbers."""
     read = file.read(PAIR_FIELDS, names, units, "data.columns", PAIR_MEASURED)
@@ -124,14 +141,13 @@ def _rows(
         raise DataError(f"{file.path}: has no episodes; expected at least one row")
     kept = read.pop("row")
     rows = len(kept)
-    labels = read.get("episode", np.zeros(rows, dtype=str))
+    labels = read.pop("episode", same_text("", rows))
     codes, found = pd.factorize(labels)
     numbers = whole_numbers(np.asarray(found))
     if numbers is None or (np.abs(numbers) >= 2**31).any():
         numbers = np.arange(len(found))
-    recording = read.get("recording", np.full(rows, file.label))
-    shared = any({*table["recording"].unique()} & {*np.unique(recording)} for table in tables)
-    before = shared * sum(table["episode"].nunique() for table in tables)
+    recording = read.get("recording", same_text(file.label, rows))
+    before = count * bool(seen & {*recording.categories})
     follower = 2 * (codes + before) + 2  # unknown vehicles of several files are different ones
     values = {
         **dict.fromkeys(SCHEMA, np.zeros(rows)),
@@ -140,8 +156,8 @@ def _rows(
         "follower_id": read.get("follower_id", follower),
         "leader_id": read.get("leader_id", follower - 1),
     }
-    table = pd.DataFrame({**values, "time_s": read["time"].round(6)})  # resolution 1 µs
-    table = table.assign(file=len(tables), row=kept, label=labels, episode=codes)
+    values |= {"time_s": read["time"].round(6), "row": kept, "label": labels, "episode": codes}
+    table = pd.DataFrame(values, copy=False)  # times have a resolution of 1 µs
     _check_pairs(table, file)
     return table, numbers
 
@@ -173,7 +189,7 @@ def _check_pairs(table: pd.DataFrame, file: TableFile) -> None:
     first = np.zeros(int(episode.max()) + 1, dtype=np.int64)
     first[episode[::-1]] = rows[::-1]
     for name in ("recording", "follower_id", "leader_id"):
-        values = table[name].to_numpy()
+        values = (table[name].cat.codes if name in TEXTS else table[name]).to_numpy()
         wrong = values != values[first[episode]]
         if wrong.any():
             row = int(table["row"].to_numpy()[wrong].min())

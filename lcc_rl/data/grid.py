@@ -134,7 +134,8 @@ def _first_of_moments(
     samples: pd.DataFrame, what: str, place: Places, report: ReadReport
 ) -> pd.DataFrame:
     """Return the first row of each time of sorted records."""
-    again = samples.duplicated(["episode", "time_s"]).to_numpy()
+    again = np.append(False, np.diff(samples["time_s"]) == 0)
+    again[1:] &= np.diff(samples["episode"]) == 0
     if not again.any():
         return samples
     given = samples.columns.drop(["file", "row"], errors="ignore")
@@ -224,7 +225,11 @@ def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 def cut_by_files(samples: pd.DataFrame, key: str, files: Sequence[str]) -> list[Concern]:
     """Return a warning on records, named in the column ``key``, that continue in another file."""
-    times = samples.groupby([key, "file"])["time_s"].agg(["min", "max", "size"]).reset_index()
+    times = (
+        samples.groupby([key, "file"], observed=True)["time_s"]
+        .agg(["min", "max", "size"])
+        .reset_index()
+    )
     times = times.sort_values([key, "min"], ignore_index=True)
     usual = (times["max"] - times["min"]) / (times["size"] - 1)
     step = (times["min"] - times["max"].shift()).where(times[key] == times[key].shift())

@@ -286,6 +286,8 @@ class DriveLeaders(Settings):
         profiles, report = read_drives(
             self.path, self.columns, time_step, self.plausible, self.units
         )
+        if profiles.grades is not None:
+            raise ConfigError("leader.columns.grade: only lcc-rl energy uses grades")
         drives = {*profiles.recordings}
         each = 1 < len(drives) == len(find_files(self.path))  # a file is a drive
         if each and self.together and len({*map(self._family, drives)}) == 1:

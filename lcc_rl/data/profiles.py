@@ -39,6 +39,7 @@ class Profiles:
         sources: the source of each record, if there are several; else empty.
         followers: speed [m/s] and gap [m] of the recorded driver behind each leader,
             ``[samples, 2]``, float32; None if there is none.
+        grades: grade of the road at each sample, for energies of trips [rad]; None: not read.
     """
 
     speeds: Tensor
@@ -51,6 +52,7 @@ class Profiles:
     weights: Tensor | None = None
     sources: tuple[str, ...] = ()
     followers: Tensor | None = None
+    grades: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.names)

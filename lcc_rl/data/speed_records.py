@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from os.path import expanduser
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import torch
+from torch import Tensor
 
-from lcc_rl.data.grid import continuous, interpolated, places
+from lcc_rl.data.grid import continuous, interpolated, places, stretches
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
 from lcc_rl.data.sources import SHIPPED_FILES, find_files, units_of
-from lcc_rl.data.tables import Column, Names, TableFile, Units
-from lcc_rl.data.text import labels
+from lcc_rl.data.tables import SLOPES, Column, Names, TableFile, Units, same_text, tables_of
+from lcc_rl.data.text import alike
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError
 
@@ -25,6 +29,7 @@ DRIVE_FIELDS = (
     Column("drive", "text", required=False),
     Column("time", "time", blank=True),
     Column("speed", "speed", blank=True),
+    Column("grade", "grade", least=-0.3, most=0.3, required=False),  # of lcc-rl energy
 )
 DRIVE_COLUMNS: dict[str, str | None] = {
     "drive": "drive",
@@ -87,29 +92,44 @@ def read_drives(
     files = find_files(path)
     if len(files) > 1 and columns["drive"] is None:
         raise DataError(f"{path}: {len(files)} files; leader=record drives one, see leader=drives")
-    tables = [
-        TableFile(name, label=label) for name, label in zip(files, labels(files), strict=True)
-    ]
-    read = [_read(table, columns, plausible, units or {}) for table in tables]
-    table = pd.concat([samples for samples, _ in read], keys=files, names=["file"]).reset_index(0)
-    own = table.groupby("name")["file"].nunique()
-    if (own > 1).any():
-        raise DataError(f"{path}: drive {own.idxmax()!r} is in several files; expected one")
-    records = table.groupby("name", sort=columns["drive"] is not None)
-    speeds = [
-        resample(x[TIME_COLUMN].to_numpy(), x[SPEED_COLUMN].to_numpy(), time_step)
-        for _, x in records
-    ]
-    names, drives = map(str, records.groups), map(str, records["drive"].first())
-    profiles = from_records(speeds, [*names], [*drives], time_step)
-    lines = [line for x, own in read for line in (*own, *interpolated(x, time_step))]
-    return profiles, list(dict.fromkeys(lines))
+    found: dict[str, tuple[str, Tensor, Tensor | None]] = {}
+    lines: list[str] = []
+    for table in tables_of(files):
+        samples, report = _read(table, columns, plausible, units or {})
+        own = dict(_records(samples, time_step))
+        if twice := own.keys() & found.keys():
+            raise DataError(f"{path}: drive {min(twice)!r} is in several files; expected one")
+        found |= own
+        lines += [*report, *interpolated(samples, time_step)]
+    names = [*found] if columns["drive"] is None else sorted(found)
+    drives, speeds, grades = zip(*(found[name] for name in names), strict=True)
+    profiles = from_records(speeds, names, drives, time_step)
+    whole = torch.cat(grades) if columns.get("grade") else None
+    return replace(profiles, grades=whole), alike(lines, files)
+
+
+def _records(
+    samples: pd.DataFrame, time_step: float
+) -> Iterator[tuple[str, tuple[str, Tensor, Tensor | None]]]:
+    """Yield name, drive, speed and, if it was read, grade of each record of a file."""
+    starts, lengths = stretches(samples["episode"].to_numpy())
+    drives = samples["recording"].iloc[starts].astype(str).tolist()
+    count, time = Counter(drives), samples[TIME_COLUMN].to_numpy()
+    speed, grade = samples[SPEED_COLUMN].to_numpy(), samples.get("grade")
+    for drive, start, length in zip(drives, starts, lengths, strict=True):
+        rows = slice(start, start + length)
+        name = drive if count[drive] == 1 else f"{drive}+{time[start]:.12g}s"
+        own, slope = resample(time[rows], speed[rows], time_step), None
+        if grade is not None:
+            at = time[start] + time_step * np.arange(len(own))
+            slope = torch.tensor(np.interp(at, time[rows], grade[rows]), dtype=torch.float32)
+        yield name, (drive, own, slope)
 
 
 def _read(
     table: TableFile, columns: Names, plausible: Plausible | None, units: Units, divide: bool = True
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Return name, drive, time and speed of the plausible samples of a file, and the report."""
+    """Return recording, episode and motion of the plausible samples of a file, and the report."""
     samples, report = _samples(table, columns, units), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
     samples = continuous(samples, "drive", place, report, divide)
@@ -117,11 +137,7 @@ def _read(
     kept, lines = (plausible or Plausible()).select(
         samples, str(table.path), place, "leader.plausible", units=known
     )
-    kept["drive"] = kept.pop("recording")
-    parts = kept.groupby("drive")["episode"].transform("nunique") > 1
-    start = kept.groupby("episode")[TIME_COLUMN].transform("min").map("+{:g}s".format)
-    kept["name"] = kept["drive"].where(~parts, kept["drive"] + start)
-    line = f"read {kept['name'].nunique():,} speed record(s), {len(kept):,} rows, {table.path}"
+    line = f"read {kept['episode'].nunique():,} speed record(s), {len(kept):,} rows, {table.path}"
     if table.preamble:
         line += ": native OpenACC, its first car"
     return kept, [line, *table.notes, *report.left_out(), *report.notes, *lines]
@@ -142,9 +158,9 @@ def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:
     # A record may end before the table; in native files, blank cells divide it.
     if rows[-1] >= len(rows) and (single or not table.preamble):
         raise table.fault(int(np.argmax(rows != np.arange(len(rows)))), "speed", "is blank")
-    samples = pd.DataFrame(
-        {TIME_COLUMN: read["time"], SPEED_COLUMN: read["speed"], "file": 0, "row": rows}
-    )
-    samples["recording"] = read.get("drive", table.label)
-    samples["episode"] = np.unique(samples["recording"], return_inverse=True)[1]
-    return samples
+    samples = pd.DataFrame({TIME_COLUMN: read["time"], SPEED_COLUMN: read["speed"]})
+    if "grade" in read:
+        slope = units.get("grade", "rad") in SLOPES
+        samples["grade"] = np.arctan(read["grade"]) if slope else read["grade"]
+    samples["recording"] = read.get("drive", same_text(table.label, len(rows)))
+    return samples.assign(episode=samples["recording"].cat.codes.astype(int), file=0, row=rows)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,8 +16,15 @@ from lcc_rl.data.agreement import LEAST_WAY
 from lcc_rl.data.grid import Places, continuous, cut_by_files, on_grid, places
 from lcc_rl.data.plausible import SMOOTHING
 from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource, find_files, read_as, units_of
-from lcc_rl.data.tables import Column, TableFile, check_map, whole_numbers
-from lcc_rl.data.text import labels
+from lcc_rl.data.tables import (
+    Column,
+    TableFile,
+    check_map,
+    joined,
+    same_text,
+    tables_of,
+    whole_numbers,
+)
 from lcc_rl.data.trajectories import (
     CAR_LENGTH,
     FRAME,
@@ -117,9 +125,7 @@ class TableSource(TrajectorySource):
     def _rows(self, report: ReadReport) -> pd.DataFrame:
         """Return the rows of all files in SI."""
         parts = []
-        for number, label in enumerate(labels(report.files)):
-            name = report.files[number]
-            table = TableFile(name)
+        for number, table in enumerate(tables_of(report.files)):
             part = table.read(
                 TABLE_FIELDS, self.columns, self.units, "data.columns", TABLE_MEASURED
             )
@@ -133,10 +139,10 @@ class TableSource(TrajectorySource):
                 raise table.fault(int(part["row"][np.argmax(blank)]), "length", remedy)
             _report_blank_gaps(table, part)
             rows = len(part["row"])
-            file, recording = np.full(rows, number), np.full(rows, label)
-            parts.append({"recording": recording, **part, "file": file})
+            recording = same_text(table.label, rows)
+            parts.append({"recording": recording, **part, "file": np.full(rows, number)})
             report.notes += table.notes
-        columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+        columns = {key: joined([part.pop(key) for part in parts]) for key in [*parts[0]]}
         count = len(columns["time"])
         report.drop("blank time, speed or position", report.rows_read - count)
         if not report.rows_read:
@@ -146,15 +152,15 @@ class TableSource(TrajectorySource):
             length = columns.get("length", np.zeros(count))
             columns["length"] = np.where(length > 0, length, self.vehicle_length)
         if "lane" in columns:
-            columns["lane"] = np.unique(columns["lane"], return_inverse=True)[1]
+            columns["lane"] = columns["lane"].codes
         return pd.DataFrame(columns).rename(columns={"time": "time_s"})
 
 
-def _report_blank_gaps(table: TableFile, read: Mapping[str, NDArray]) -> None:
+def _report_blank_gaps(table: TableFile, read: Mapping[str, Any]) -> None:
     """Count samples that name a leader but have a blank gap, in the notes of the file."""
     if "gap" not in read or "leader" not in read:
         return
-    blank = np.isnan(read["gap"]) & ~np.isin(read["leader"], NO_LEADER)
+    blank = np.isnan(read["gap"]) & ~read["leader"].isin(NO_LEADER)
     if blank.any():
         first = table.fault(int(read["row"][np.argmax(blank)]), "gap", "is blank")
         table.notes.append(
@@ -164,26 +170,28 @@ def _report_blank_gaps(table: TableFile, read: Mapping[str, NDArray]) -> None:
 
 
 def _vehicles(
-    vehicle: NDArray, leader: NDArray | None, report: ReadReport
+    vehicle: pd.Categorical, leader: pd.Categorical | None, report: ReadReport
 ) -> dict[str, NDArray[np.int64]]:
     """Return vehicles and leaders as positive whole numbers; 0 for no leader."""
-    ahead = np.full(len(vehicle), "") if leader is None else leader
-    numbers, leaders = whole_numbers(vehicle), whole_numbers(np.where(ahead == "", "0", ahead))
+    ahead = same_text("", len(vehicle)) if leader is None else leader
+    own, others = (np.asarray(x.categories, dtype=object) for x in (vehicle, ahead))
+    numbers, leaders = whole_numbers(own), whole_numbers(np.where(others == "", "0", others))
     if numbers is None or numbers.min() <= 0 or leaders is None:
         if numbers is not None and leaders is not None:  # columns with blanks have "0.0" for "0"
-            vehicle, ahead = numbers.astype(str), np.where(ahead == "", "", leaders.astype(str))
-        names, codes = np.unique(vehicle, return_inverse=True)
+            own, others = numbers.astype(str), np.where(others == "", "", leaders.astype(str))
+        names, codes = np.unique(own, return_inverse=True)
         report.names = dict(enumerate(names.tolist(), 1))
         shown = listed(names.tolist())
         report.notes.append(f"{len(names):,} vehicles are numbered from 1 by name: {shown}")
-        numbers, known = codes.astype(np.int64) + 1, pd.Index(names).get_indexer(ahead) + 1
-        none = np.isin(ahead, NO_LEADER) & (known == 0)
+        numbers, known = codes.astype(np.int64) + 1, pd.Index(names).get_indexer(others) + 1
+        none = np.isin(others.astype(str), NO_LEADER) & (known == 0)
         # A leader without a row gets a number that no vehicle has.
         leaders = np.where(none, 0, np.where(known == 0, len(names) + 1, known))
+    found = numbers[vehicle.codes]
     if leader is None:
-        return {"vehicle": numbers}
-    leaders = np.where((leaders < 0) | (leaders == numbers), 0, leaders).astype(np.int64)
-    return {"vehicle": numbers, "leader": leaders}
+        return {"vehicle": found}
+    front = leaders[ahead.codes].astype(np.int64)
+    return {"vehicle": found, "leader": np.where((front < 0) | (front == found), 0, front)}
 
 
 def to_trajectories(rows: pd.DataFrame, place: Places, report: ReadReport) -> Trajectories:

@@ -6,20 +6,25 @@ are finite, in SI and within the range of their quantity.
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
-from os.path import expanduser  # pathlib's raises for an unknown user
+from math import pi
+from os.path import expanduser, getsize, isfile  # pathlib's raises for an unknown user
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from pandas.api.types import union_categoricals
 
 from lcc_rl.data.text import (
     NO_TABLE,
@@ -27,6 +32,7 @@ from lcc_rl.data.text import (
     SEPARATORS,
     cells_of,
     is_relative,
+    labels,
     lacking,
     line_chunks,
     parse_text,
@@ -36,10 +42,14 @@ from lcc_rl.data.text import (
     stem,
     unended,
 )
-from lcc_rl.data.trajectories import FOOT
+from lcc_rl.data.trajectories import FOOT, listed
 from lcc_rl.errors import Concern, ConfigError, DataError, raised_as, require_known, unknown_name
+from lcc_rl.io.memory import require_memory
+
+log = logging.getLogger("lcc_rl")
 
 PARQUET = (".parquet", ".pq")
+EVERY = 10.0  # time between lines on the progress [s]
 LARGEST_CELL = 1e12  # in SI: beyond any time or position, and within every type
 LONGEST_TEXT = 1000  # most characters of a name
 LARGEST_ID = 2**53  # larger whole numbers do not fit a float
@@ -53,7 +63,9 @@ UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, ISO: 1.0, CLOCK: 1.0},
     "speed": {**SPEEDS, "kph": SPEEDS["km/h"]},
     "length": {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT},
+    "grade": {"rad": 1.0, "deg": pi / 180, "%": 0.01, "m/m": 1.0},
 }
+SLOPES = ("%", "m/m")  # units of grades that are slopes, the tangent of the angle
 SI = {quantity: next(iter(units)) for quantity, units in UNITS.items()}
 # Spellings of units other than SI in names of columns; "min" may also mean the minimum.
 UNIT_WORDS = {
@@ -200,7 +212,7 @@ class TableFile:
         units: Units | None = None,
         option: str = "",
         measured: Iterable[str] = (),
-    ) -> dict[str, NDArray]:
+    ) -> dict[str, Any]:
         """Read columns and check every cell.
 
         Args:
@@ -211,7 +223,8 @@ class TableFile:
             measured: keys of columns; rows with a blank cell in one of them are left out.
 
         Returns:
-            The columns by key, in SI, and ``row``, the number of each row in the file, from 0.
+            The columns by key, in SI, text as a categorical with sorted categories, and ``row``,
+            the number of each row in the file, from 0.
 
         Raises:
             DataError: if a column is missing, or naming the row and column of a cell at fault, or
@@ -233,12 +246,12 @@ class TableFile:
             ]
             for block in self.blocks([*self.names.values()])
         ]
-        whole = map(np.concatenate, zip(*parts, strict=True))
+        whole = map(joined, zip(*parts, strict=True))
         read = {column.key: values for column, values in zip(wanted, whole, strict=True)}
         self.count = len(next(iter(read.values())))
         return self._measured({**read, "row": np.arange(self.count)}, measured)
 
-    def _measured(self, read: dict[str, NDArray], keys: Iterable[str]) -> dict[str, NDArray]:
+    def _measured(self, read: dict[str, Any], keys: Iterable[str]) -> dict[str, Any]:
         """Return columns without rows in which one of ``keys`` is blank; the notes count them."""
         blank = {key: np.isnan(read[key]) for key in keys if key in read}
         wrong = np.logical_or.reduce([np.zeros(self.count, dtype=bool), *blank.values()])
@@ -252,7 +265,11 @@ class TableFile:
             raise first
         line = f"left out {int(wrong.sum()):,} rows with a blank cell, the first: {first}"
         self.notes.append(line)
-        return {key: values[~wrong] for key, values in read.items()}
+        kept = {key: values[~wrong] for key, values in read.items()}
+        return {
+            key: x.remove_unused_categories() if isinstance(x, pd.Categorical) else x
+            for key, x in kept.items()
+        }
 
     def _scale(self, column: Column, units: Units, option: str) -> float:
         """Return the size of a column's unit in SI; refuse another unit in its name."""
@@ -293,7 +310,7 @@ class TableFile:
         """Yield rows of the file, and the number of rows before them."""
         if self.parquet:
             with raised_as(DataError, f"{self.path}: not a readable table", Exception):
-                whole = pq.read_table(self.path, columns=[*names])
+                whole = pq.read_table(self.path, columns=[*names], read_dictionary=[*names])
                 whole.validate(full=True)  # else damaged text would fail only when used
             yield whole, 0
             return
@@ -350,6 +367,30 @@ class TableFile:
             self.notes.append(f"{self.path}: numbers have a decimal comma")
 
 
+def tables_of(files: Sequence[str]) -> Iterator[TableFile]:
+    """Yield the tables of files, and log the progress every few seconds.
+
+    Raises:
+        ConfigError: if reading them needs more memory than is free.
+    """
+    require_memory({f"reading {listed(files)}": sum(map(_memory, filter(isfile, files)))})
+    due = monotonic() + EVERY
+    for number, (name, label) in enumerate(zip(files, labels(files), strict=True)):
+        if monotonic() > due:
+            log.info("read %d of %d files", number, len(files))
+            due = monotonic() + EVERY
+        yield TableFile(name, label=label)
+
+
+def _memory(file: str) -> float:
+    """Return the memory for reading a file, as measured with millions of rows [bytes]."""
+    if Path(file).suffix in PARQUET:
+        with suppress(pa.ArrowException):  # the reader refuses a damaged file
+            known = pq.read_metadata(file)
+            return 60.0 * known.num_rows * known.num_columns
+    return 10.0 * getsize(file)
+
+
 class Block:
     """Consecutive rows of a table; cells are converted and checked on demand.
 
@@ -370,7 +411,7 @@ class Block:
         """Keep only the rows where ``mask`` is true; messages still name rows of the file."""
         self.row, self.cells = self.row[mask], self.cells.filter(pa.array(mask))
 
-    def values(self, column: Column, name: str, scale: float = 1.0) -> NDArray:
+    def values(self, column: Column, name: str, scale: float = 1.0) -> Any:
         """Return the values of a column in SI, see :func:`checked_cells`."""
 
         def fault(row: int, words: str) -> DataError:
@@ -384,8 +425,8 @@ class Block:
 
 def checked_cells(
     cells: Cells, column: Column, fault: Fault, scale: float = 1.0, comma: bool = False
-) -> NDArray:
-    """Return the checked values of a column.
+) -> Any:
+    """Return the checked values of a column, numbers or a categorical.
 
     Args:
         cells: unconverted cells.
@@ -398,15 +439,13 @@ def checked_cells(
         DataError: for the first wrong cell.
     """
     if column.quantity == "text":
-        texts = pc.utf8_trim_whitespace(pc.cast(cells, pa.string()))
-        lengths = np.asarray(pc.fill_null(pc.utf8_length(texts), 0))
-        if (lengths > LONGEST_TEXT).any():  # every cell would need as much memory
-            row = int(np.argmax(lengths > LONGEST_TEXT))
-            raise fault(row, f"holds a text of {lengths[row]:,} characters; expected a name")
-        found = np.asarray(pc.fill_null(texts, "")).astype(str)
-        if not column.blank and (found == "").any():
-            raise fault(int(np.argmax(found == "")), "is blank")
-        return found
+        texts = categorical(cells)
+        for text in texts.categories[texts.categories.str.len() > LONGEST_TEXT]:
+            row = int(np.argmax(texts == text))
+            raise fault(row, f"holds a text of {len(text):,} characters; expected a name")
+        if not column.blank and (blank := texts == "").any():
+            raise fault(int(np.argmax(blank)), "is blank")
+        return texts
     values = numbers_of(_seconds(cells) if column.quantity == "time" else cells, fault, comma)
     if scale != 1.0:
         values = values * scale
@@ -423,6 +462,30 @@ def checked_cells(
         row = int(np.argmax(wrong))
         raise fault(row, f"holds {_shown(cells[row])}; expected {column.expected}")
     return values
+
+
+def categorical(cells: Cells) -> pd.Categorical:
+    """Return trimmed texts, ``""`` for blank cells; each text is stored once."""
+    if isinstance(cells, pa.ChunkedArray):
+        return joined([categorical(chunk) for chunk in cells.chunks or [pa.array([], pa.string())]])
+    encoded = cells.dictionary_encode()
+    names = pc.utf8_trim_whitespace(pc.cast(encoded.dictionary, pa.string())).fill_null("")
+    found = [*names.to_pylist(), *[""] * (encoded.null_count > 0)]
+    texts, place = np.unique(np.array(found, dtype=object), return_inverse=True)
+    codes = place[np.asarray(encoded.indices.fill_null(len(names)))]
+    return pd.Categorical.from_codes(codes, pd.Index(texts, dtype=object))
+
+
+def same_text(text: str, rows: int) -> pd.Categorical:
+    """Return a column with one text in all rows."""
+    return pd.Categorical.from_codes(np.zeros(rows, np.int8), pd.Index([text], dtype=object))
+
+
+def joined(parts: Sequence[Any]) -> Any:
+    """Return consecutive parts of a column; the categories of all are sorted."""
+    if isinstance(parts[0], pd.Categorical):
+        return parts[0] if len(parts) == 1 else union_categoricals([*parts], sort_categories=True)
+    return np.concatenate(parts)
 
 
 def _shown(cell: pa.Scalar) -> str:

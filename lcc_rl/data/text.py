@@ -8,7 +8,7 @@ import re
 import zlib
 from codecs import EncodedFile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from io import BufferedReader
@@ -169,6 +169,25 @@ def labels(files: Sequence[str]) -> list[str]:
         x if counts[x] == 1 else "/".join(Path(name).parts[same:])
         for x, name in zip(stems, files, strict=True)
     ]
+
+
+def alike(lines: Iterable[str], files: Iterable[str], most: int = 3) -> list[str]:
+    """Return distinct lines, one for more than ``most`` that differ by file and numbers only."""
+    lines, known = list(dict.fromkeys(lines)), {*files}
+
+    def kind(line: str) -> str:
+        words = ("…" if word.rstrip(":,") in known else word for word in line.split(" "))
+        return re.sub(r"[0-9][0-9,.]*", "…", " ".join(words))
+
+    kinds = list(map(kind, lines))
+    counts, first = Counter(kinds), dict(zip(kinds[::-1], lines[::-1], strict=True))
+    found = []
+    for line, own in zip(lines, kinds, strict=True):
+        if counts[own] <= most:
+            found.append(line)
+        elif first[own] is line:
+            found.append(type(line)(f"{line} (and {counts[own] - 1:,} lines alike)"))
+    return found
 
 
 def parse_text(

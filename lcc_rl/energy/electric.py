@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
+import torch
 from pydantic import Field
 from torch import Tensor
 
@@ -43,7 +44,8 @@ class ElectricCar(EnergyModel):
 
     def validate(self) -> None:
         self.resistance = 0.5 * AIR * self.drag * self.area  # of the air [N/(m/s)²]
-        slope = self.rolling * math.cos(self.grade) + math.sin(self.grade)
+        lib = torch if isinstance(self.grade, Tensor) else math  # a grade of each sample, or one
+        slope = self.rolling * lib.cos(self.grade) + lib.sin(self.grade)
         self.rolling_force = self.mass * GRAVITY * slope  # [N]
 
     def strongest(self, speed: Tensor) -> Tensor | None:

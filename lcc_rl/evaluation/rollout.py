@@ -87,6 +87,7 @@ class Player:
         self.checked = list(dict.fromkeys([*driven, *wishes, *self.kept]))
         self.compiled = compiled
         self.record: Record = {}
+        self.start: State = {}  # before the first step
         self.advance = Compiled(self._advance, "the evaluation", compiled, env.device)
 
     @torch.no_grad()
@@ -109,6 +110,7 @@ class Player:
                 to keep is not finite.
         """
         state, record = self._begin(given), self.record
+        self.start = state
         if self.rowwise:
             return self._checked(*self._by_rows(state), named)
         running, alive = torch.ones_like(state[TERMINATED]), []

@@ -13,9 +13,8 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from lcc_rl.config import load
+from lcc_rl.config import check_overrides, load
 from lcc_rl.config.schemas import StudyConfig, TimeStep
-from lcc_rl.config.words import top_key, typed_keys
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
@@ -106,8 +105,8 @@ def simulate(
         >>> found.steps.shape[0], found.vehicles["vehicle"].tolist()
         (1204, [0, 1, 2, 3])
     """
-    for key in set().union(*map(typed_keys, overrides)):
-        require(not {key, top_key(key)} & OF_ARGUMENTS, f"{key} has no effect: see the arguments")
+    given = OF_ARGUMENTS | ({"drivers"} if drivers is not None else set())
+    check_overrides(overrides, given, "has no effect in simulate: see the arguments")
     profiles = _profiles(leader, time_step, seconds)
     spec = None if controller is None else setting_of(controller, "controller")
     words = (
@@ -141,18 +140,22 @@ def _words(string: str | Mapping[str, Any]) -> str:
 
 def _profiles(leader: Any, time_step: float, seconds: float | None) -> Profiles:
     """Return the leaders' records, of one length; for a ring one of zeros."""
+    steps = (seconds or 0.0) / time_step
+    whole = abs(steps - round(steps)) < 1e-6
+    require(whole, f"simulate: seconds={seconds or 0.0:g} is no multiple of time_step={time_step}")
     if leader is None:
         require(seconds is not None, "simulate: a ring has no leader's record; give seconds=…")
-        return constant_profiles(0.0, round((seconds or 0.0) / time_step), time_step, ["ring"])
+        return constant_profiles(0.0, round(steps), time_step, ["ring"])
     listed = isinstance(leader, (list, tuple)) and len(leader) > 0
     several = listed and not all(isinstance(x, (int, float, np.number)) for x in leader)
     records = [_record(one, time_step) for one in (leader if several else [leader])]
-    steps = min((len(record) for record in records), default=0) - 1
-    require(steps > 0, "simulate: leader needs at least two speeds [m/s]")
-    if seconds is not None:
-        words = f"simulate: seconds={seconds:g}, and the leader drives for {steps * time_step:g} s"
-        require(0 < round(seconds / time_step) <= steps, words)
-        steps = round(seconds / time_step)
+    most = min((len(record) for record in records), default=0) - 1
+    require(most > 0, "simulate: leader needs at least two speeds [m/s]")
+    words = (
+        f"simulate: seconds={seconds or 0.0:g}, and the leader drives for {most * time_step:g} s"
+    )
+    require(round(steps) <= most, words)
+    steps = round(steps) or most
     names = [f"leader {number}" for number in range(len(records))]
     return from_records([x[: steps + 1] for x in records], names, names, time_step)
 
@@ -187,8 +190,8 @@ def _simulated(strategy: Strategy, inputs: Inputs, repeats: int, seed: int) -> S
     keys = [LEADER, CLASS, INDEX, *(("vehicles", name) for name in MOTION)]
     player = Player(env, strategy.policy, keys, strategy.title, rowwise=fast)
     given = reset_options(env, profile, repeat % people, seed, people, repeat // people)
-    start = env.reset(options=given)["vehicles", "gap"].unsqueeze(0)
     record, alive = player.play(given)
+    start = player.start["vehicles", "gap"].unsqueeze(0)
     return _Motion(cfg, record, start, alive).tables()
 
 

@@ -11,11 +11,13 @@ from helpers import check_refused
 from table_text import BY_GAP, long_table, pairs, written
 
 from lcc_rl.config.inputs import inputs_of
+from lcc_rl.data import tables
 from lcc_rl.data.leaders import DriveLeaders
 from lcc_rl.data.sources import EpisodesSource, find_files
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.data.text import labels
 from lcc_rl.errors import Concern, DataError
+from lcc_rl.io import memory
 
 UNKNOWN = ["recording", "follower_id", "leader_id"]
 PAIRS = pairs(2, 300).drop(columns=UNKNOWN)
@@ -101,3 +103,32 @@ def test_short_trips_and_those_of_another_rate_are_named(tmp_path) -> None:
     report = DriveLeaders(path=str(tmp_path), evaluation_share=1.0).load(0.1, 1500).report
     assert report.count("samples 1 s apart were interpolated to 0.1 s") == 1
     assert "left out 1 of 3 record(s), shorter than an episode of 150 s: trip2 (59 s)" in report
+
+
+def test_many_files_have_one_line_progress_and_a_check_of_memory(
+    tmp_path, monkeypatch, caplog, subtests
+) -> None:
+    for number in range(5):
+        written(tmp_path, long_table(cars=1).rename(columns=TRIP), f"trip{number}.csv")
+    read = DriveLeaders(path=str(tmp_path), evaluation_share=1.0).load
+    with subtests.test("one line for many"):
+        lines = [line for line in read(0.1, 399).report if "speed record(s)" in line]
+        assert len(lines) == 1
+        assert "(and 4 lines alike)" in lines[0]
+    with subtests.test("progress"):
+        monkeypatch.setattr(tables, "EVERY", -1.0)
+        with caplog.at_level("INFO", "lcc_rl"):
+            read(0.1, 399)
+        assert "read 4 of 5 files" in caplog.messages
+    with subtests.test("memory"):
+        monkeypatch.setattr(memory, "available", lambda device: 1000)
+        check_refused(read, [(0.1, 399, r"reading .*trip0\.csv.* needs about .* of memory")])
+
+
+def test_a_long_name_is_stored_once(tmp_path) -> None:
+    names = ["a", "x" * 900, "b "] * 10_000
+    written(tmp_path, pd.DataFrame({"name": names, "v": 1.0}), "names.parquet")
+    file = tables.TableFile(tmp_path / "names.parquet")
+    found = file.read([tables.Column("name", "text")], {"name": "name"})["name"]
+    assert found.nbytes < 1e5
+    assert list(found[:3]) == ["a", "x" * 900, "b"]

@@ -90,11 +90,13 @@ def test_wrong_arguments_are_named() -> None:
         ({"leader": np.ma.masked_greater(WAVE, 9.0)}, "speeds must be finite"),
         ({"leader": WAVE, "drivers": {"a": 1}}, "drivers: not a population: "),
         *(
-            ({"leader": WAVE, "overrides": [f"{key}=2"]}, f"{key} has no effect: see the arguments")
+            ({"leader": WAVE, "overrides": [f"{key}=2"]}, f"{key}=2: has no effect in simulate")
             for key in ("scenario.horizon", "scenario.string", "seed", "compare", "leader.path")
         ),
         ({"leader": "nowhere.csv"}, "nowhere.csv: no such file"),
         ({"leader": WAVE, "seconds": 99.0}, "seconds=99, and the leader drives for 20 s"),
+        ({"leader": WAVE, "seconds": 1.25}, "seconds=1.25 is no multiple of time_step=0.1"),
+        ({"leader": WAVE, "drivers": POPULATION, "overrides": ["drivers=highway"]}, "drivers=high"),
         ({"leader": WAVE, "seconds": "long"}, r"simulate\.seconds must be a valid number"),
         ({"leader": WAVE, "time_step": 0.0}, r"simulate\.time_step must be greater"),
         ({"leader": WAVE, "repeats": 0}, r"simulate\.repeats must be greater"),

@@ -1,0 +1,138 @@
+"""Energy of recorded trips: in kJ, kWh, litres and grams, per trip and per kilometre.
+
+lcc-rl energy trips.parquet energy=fuel                  # columns drive, time_s and speed_mps
+lcc-rl energy folder energy=bolt --out energies.parquet  # a file per trip
+lcc-rl energy a.csv 'leader.columns={drive: id, grade: slope}' leader.units.grade=% energy=fuel
+
+Further words are settings: energy=…, and leader.columns and leader.units of the files.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from copy import copy
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+import torch
+from pydantic import Field
+
+from lcc_rl.cli.guard import main_guard
+from lcc_rl.config import load, quoted, top_key
+from lcc_rl.data.leaders import DriveLeaders
+from lcc_rl.data.profiles import Profiles
+from lcc_rl.data.speed_records import read_drives
+from lcc_rl.envs.inputs import build_energy
+from lcc_rl.errors import Concern, require
+from lcc_rl.evaluation.metrics import KILO
+from lcc_rl.io.atomic import atomic_path, new_file
+from lcc_rl.io.files import write_parquet
+from lcc_rl.runs.arguments import Arguments, typed
+
+log = logging.getLogger("lcc_rl")
+
+BLOCK = 10  # records whose energies are computed together; more exceed the processor's cache
+KWH = 3600.0  # [kJ]
+MOST_ROWS = 20  # most trips that are printed
+
+
+def trip_energies(
+    path: str | PathLike | Sequence[str | PathLike], overrides: Sequence[str] = ()
+) -> pd.DataFrame:
+    """Return the energy of recorded trips, and log lines on the data.
+
+    Args:
+        path: a table of many trips, files with one trip each, a folder, a pattern, or a list.
+        overrides: the energy model, columns and units: ``["energy=fuel", "leader.columns.drive=id",
+            "leader.units.speed=km/h", "leader.columns.grade=slope", "leader.units.grade=%"]``.
+
+    Returns:
+        A row per trip, sorted by name: ``trip``, ``parts`` (records that holes divide it into),
+        ``duration_s``, ``distance_km``, ``energy_kj`` as drawn, ``net_energy_kj``, less the gain of
+        kinetic energy; and of the energy drawn ``energy_kwh``, ``kwh_per_100km``, fuel and carbon
+        dioxide.
+    """
+    for word in overrides:
+        known = top_key(word) in ("energy", "leader", "scenario", "trust")
+        require(known, f"{word} has no effect on the energy of given trips")
+    names = [path] if isinstance(path, (str, PathLike)) else path
+    listed = ",".join(quoted(fspath(name)) for name in names)
+    words = ["variant=direct", "leader=drives", f"leader.path=[{listed}]", *overrides]
+    cfg = load("evaluate", words)
+    (model, *others), step = build_energy(cfg).models, cfg.scenario.time_step
+    require(not others, "energy: a mixture has several models; choose one, such as fuel")
+    source = cfg.leader.made(DriveLeaders)
+    records, lines = read_drives(source.path, source.columns, step, source.plausible, source.units)
+    for line in lines:
+        log.log(logging.WARNING if isinstance(line, Concern) else logging.INFO, line)
+    blocks = (slice(first, first + BLOCK) for first in range(0, len(records), BLOCK))
+    rows = pd.concat([_energies(records, block, model) for block in blocks])
+    trips = rows.groupby("trip").sum().reset_index()
+    way = trips["distance_km"].where(trips["distance_km"] > 0.0)
+    trips["energy_kwh"] = trips["energy_kj"] / KWH
+    trips["kwh_per_100km"] = 100.0 * trips["energy_kwh"] / way
+    if model.heating_value:
+        drawn = torch.from_numpy(trips["energy_kj"].to_numpy() / KILO)
+        trips["fuel_l"], trips["co2_g"] = (x.numpy() for x in model.burnt(drawn))
+        trips["l_per_100km"] = 100.0 * trips["fuel_l"] / way
+        trips["co2_g_per_km"] = trips["co2_g"] / way
+    return trips
+
+
+def _energies(records: Profiles, block: slice, model: Any) -> pd.DataFrame:
+    """Return duration, distance and energies of some records, as ``energy_measures`` does."""
+    first, step = records.offsets[block].numpy(), records.time_step
+    last = first + records.lengths[block].numpy() - 1
+    rows, first, last = slice(first[0], last[-1] + 1), first - first[0], last - first[0]
+    speed = records.speeds[rows]
+    if records.grades is not None:
+        name = type(model).__name__
+        require(hasattr(model, "grade"), f"{name} has no grade; choose another energy=…")
+        model = copy(model)
+        model.grade = records.grades[rows][:-1]
+        model.validate()
+    power = model.power(speed[:-1], speed.diff() / step).numpy()
+    power[last[:-1]] = 0.0  # from one record to the next
+    drawn = KILO * step * np.add.reduceat(power, first, dtype=np.float64)
+    edges = speed[np.stack([first, last])].double()
+    total = np.add.reduceat(speed.numpy(), first, dtype=np.float64) - 0.5 * edges.sum(0).numpy()
+    return pd.DataFrame(
+        {
+            "trip": records.recordings[block],
+            "parts": 1,
+            "duration_s": step * (last - first),
+            "distance_km": KILO * step * total,
+            "energy_kj": drawn,
+            "net_energy_kj": drawn - KILO * model.stored_energy(edges).diff(dim=0)[0].numpy(),
+        }
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the energy of trips, and write it to a file."""
+    parser = Arguments(prog="lcc-rl energy", description=__doc__)
+    parser.add_argument("words", nargs="+", help="tables, folders, patterns; settings key=value")
+    ending = typed(Annotated[str, Field(pattern=r"\.(csv|parquet)$")])
+    parser.add_argument("--out", type=ending, help="also write a row per trip: .csv, .parquet")
+    options = parser.parse_args(arguments)
+    files = [word for word in options.words if "=" not in word or Path(word).exists()]
+    out = options.out and new_file(options.out, "--out")
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    trips = trip_energies(files, [word for word in options.words if word not in files])
+    print(trips.head(MOST_ROWS).to_string(index=False, float_format="{:,.4g}".format))
+    sums = trips[["distance_km", "energy_kj", "energy_kwh"]].sum()
+    words = "{distance_km:,.1f} km, {energy_kj:,.0f} kJ, {energy_kwh:,.1f} kWh".format(**sums)
+    print(f"{len(trips):,} trips: {words}")
+    if out and out.suffix == ".parquet":
+        write_parquet(trips, out)
+    elif out:
+        with atomic_path(out) as temporary:
+            trips.to_csv(temporary, index=False)
+
+
+if __name__ == "__main__":
+    main_guard(main)()

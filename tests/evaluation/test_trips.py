@@ -1,0 +1,125 @@
+"""The energy of recorded trips is that of a leader in an evaluation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from helpers import check_refused
+
+import lcc_rl
+from lcc_rl.commands.energy import main
+from lcc_rl.config import load
+from lcc_rl.envs import load_inputs
+from lcc_rl.envs.inputs import build_energy
+from lcc_rl.evaluation.metrics import energy_measures
+
+COLUMNS = "leader.columns={drive: trip, time: t, speed: v}"
+GRADED = ["leader.columns={drive: trip, time: t, speed: v, grade: slope}", "leader.units.grade=%"]
+SECONDS = 60
+
+
+def made(step: float = 1.0) -> pd.DataFrame:
+    """Two trips of a minute, the second one on a slope of 3 %."""
+    time = np.arange(0.0, SECONDS + step / 2, step)
+    speed = 12.0 + 8.0 * np.sin(0.1 * time), 18.0 - 6.0 * np.cos(0.2 * time)
+    parts = [
+        pd.DataFrame({"trip": name, "t": time, "v": own, "slope": slope})
+        for name, own, slope in zip("ab", speed, (0.0, 3.0), strict=True)
+    ]
+    return pd.concat(parts, ignore_index=True)
+
+
+@pytest.fixture
+def path(tmp_path) -> str:
+    made().to_csv(tmp_path / "trips.csv", index=False)
+    return str(tmp_path / "trips.csv")
+
+
+def test_the_energy_is_that_of_the_leaders_of_an_evaluation(path, subtests) -> None:
+    for energy in ("bolt", "electric", "fuel", "compact", "alcc"):
+        with subtests.test(energy):
+            found = lcc_rl.trip_energies(path, [f"energy={energy}", COLUMNS])
+            words = [f"leader.path={path}", COLUMNS, "leader.evaluation_share=1"]
+            words = ["variant=direct", "leader=drives", *words, f"energy={energy}"]
+            cfg = load("evaluate", [*words, f"scenario.horizon={10 * SECONDS}"])
+            leaders, fleet = load_inputs(cfg).evaluation, build_energy(cfg)
+            assert [*leaders.recordings] == found["trip"].tolist() == ["a", "b"]
+            speed = torch.stack([leaders.record(i) for i in range(2)], 1)[..., None, None]
+            power = fleet.power(speed[:-1], speed.diff(dim=0) / 0.1)
+            expected = energy_measures(power, speed, torch.ones_like(power) > 0, 0.1, fleet)
+            for key, unit in (("energy_kj", 1.0), ("net_energy_kj", 1.0), ("distance_m", 1e-3)):
+                own = found[key.replace("_m", "_km")] if unit < 1 else found[key]
+                np.testing.assert_allclose(own, unit * expected[key].flatten(), rtol=1e-5)
+            ratio = found["energy_kj"] / 36.0 / found["distance_km"]
+            np.testing.assert_allclose(found["kwh_per_100km"], ratio, rtol=1e-9)
+            assert ("fuel_l" in found) == (energy in ("fuel", "compact"))
+
+
+def test_a_grade_by_sample_is_that_of_the_model(path, subtests) -> None:
+    for energy in ("electric", "fuel"):
+        with subtests.test(energy):
+            flat, steep = (
+                lcc_rl.trip_energies(path, [f"energy={energy}", f"energy.grade={x}", COLUMNS])
+                for x in (0.0, np.arctan(0.03))
+            )
+            found = lcc_rl.trip_energies(path, [f"energy={energy}", *GRADED])["energy_kj"]
+            expected = [flat["energy_kj"][0], steep["energy_kj"][1]]
+            np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_trips_of_files_rates_and_with_holes(tmp_path, path, subtests) -> None:
+    whole = lcc_rl.trip_energies(path, ["energy=bolt", COLUMNS])
+    for step in (0.1, 0.25, 1.0):
+        with subtests.test(step=step):
+            folder = tmp_path / f"{step}"
+            folder.mkdir()
+            for name, trip in made(step).groupby("trip"):
+                trip.drop(columns="trip").to_parquet(folder / f"{name}.parquet")
+            words = ["energy=bolt", "leader.columns={time: t, speed: v}"]
+            found = lcc_rl.trip_energies(folder, words)
+            assert found["trip"].tolist() == ["a", "b"]
+            np.testing.assert_allclose(found["energy_kj"], whole["energy_kj"], rtol=5e-3)
+    with subtests.test("a hole"):
+        trips = made()
+        trips[~trips["t"].between(25.0, 33.0)].to_csv(path, index=False)
+        found = lcc_rl.trip_energies(path, ["energy=bolt", COLUMNS])
+        assert found["parts"].tolist() == [2, 2]
+        assert (found["duration_s"] < SECONDS - 8).all()
+        assert (found["distance_km"] < whole["distance_km"]).all()
+
+
+def test_the_command_prints_and_writes_the_trips(tmp_path, path, capsys, subtests) -> None:
+    expected = lcc_rl.trip_energies(path, ["energy=fuel", COLUMNS])
+    for name, read in (("x.csv", pd.read_csv), ("x.parquet", pd.read_parquet)):
+        with subtests.test(name):
+            main([path, COLUMNS, "energy=fuel", "--out", str(tmp_path / name)])
+            assert "2 trips: 1.8 km" in capsys.readouterr().out
+            pd.testing.assert_frame_equal(read(tmp_path / name), expected)
+
+
+def test_refused_trips(path) -> None:
+    trips = made()
+    faults = {
+        "word": (trips.assign(v=trips["v"].astype(str).where(trips.index != 70, "x")), []),
+        "fast": (trips.assign(v=3.6 * trips["v"]), []),
+    }
+
+    def call(*words: str) -> None:
+        table, more = faults.get(words[0], (trips, list(words)))
+        table.to_csv(path, index=False)
+        lcc_rl.trip_energies(path, [COLUMNS, "energy=bolt", *more])
+
+    check_refused(
+        call,
+        [
+            ("word", r"trips\.csv: data row 71, column 'v' holds 'x'"),
+            ("fast", r"trips\.csv: .*data row 1\d, column 'v' .*leader\.units\.speed"),
+            ("seed=3", "seed=3 has no effect on the energy of given trips"),
+            ("energy=mixture", "a mixture has several models"),
+            ("leader.columns.drive=id", "lacks the column id; it has trip, t, v, slope"),
+            (GRADED[0], r"data row 62, column 'slope' holds '3\.0'.*0\.3 rad"),
+            (*GRADED, "energy=alcc", "PaperMotor has no grade"),
+        ],
+    )
