@@ -181,6 +181,7 @@ class EvaluationConfig(Section):
     batch_size: Count
     seed: Seed
     sample_episodes: Annotated[int, Field(ge=0)]
+    sample_mb: Positive | None
     repeats: Million
     shards: Million
     shard: Annotated[int, Field(ge=0)]
