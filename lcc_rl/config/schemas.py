@@ -181,10 +181,10 @@ class EvaluationConfig(Section):
     batch_size: Count
     seed: Seed
     sample_episodes: Annotated[int, Field(ge=0)]
-    sample_mb: Positive | None
     repeats: Million
     shards: Million
     shard: Annotated[int, Field(ge=0)]
+    sample_mb: Positive | None = None  # largest size of steps.parquet, else every n-th step
     compiled: bool | None = None
     full_length: bool = False
     humans_first: NonNegative = 0.0  # time with human drivers only, on a ring, not measured [s]
