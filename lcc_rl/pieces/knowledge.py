@@ -91,6 +91,11 @@ class ObservationMemory(StepTransform):
     shares: ClassVar[Tensor]
     places: ClassVar[Tensor]
 
+    @property
+    def view(self) -> str:
+        """The view of its entries."""
+        return "spread" if self.kind == "spread" else "memory"
+
     def setup(self, world: World) -> None:
         """Find the sources and the length of the history."""
         time_step = world.time_step
@@ -104,15 +109,12 @@ class ObservationMemory(StepTransform):
             self.depth = max(ages) + 1
         self.counted, self.repeat = len(self.sources), len(self.seconds)
         wide = self.counted * self.repeat
-        writes, kept = [self.found.wide(wide)], ["memory.entries"]
-        if self.stacked:
-            writes, kept = (
-                [*writes, self.history.wide(self.counted * self.depth)],
-                ["memory.history"],
-            )
-        elif self.kind == "spread":
+        writes = [self.found.wide(wide)]
+        if self.kind == "spread":
             writes = [self.spread.wide(wide), self.averages.wide(wide)]
-            kept = ["spread.entries", "spread.averages"]
+        elif self.stacked:
+            writes.append(self.history.wide(self.counted * self.depth))
+        kept = [str(entry.key) for entry in writes[self.stacked :]]
         reached = [f"{NEXT}.{source}" for source in self.sources]
         self.declare(world, [*kept, *reached], writes)
         # The same entries at reset, which has no previous step.
