@@ -106,7 +106,7 @@ class GradientLoop(TrainingLoop[Any]):
         shares = mean_of(missed)
         limits = self._limits_row(shares)
         self.objective.limits.update(shares)
-        behind = {name: sum(row[name] for row in each) / len(each) for name in each[0]}
+        behind = {name: torch.stack([row[name] for row in each]).mean(0) for name in each[0]}
         limits |= self.objective.each.update(behind)
         count = sum(part.numel() for part in played)
         return self._record(played, losses, spent, count, {"learning_rate": rate}, limits)

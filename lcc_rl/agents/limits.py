@@ -136,9 +136,6 @@ class LimitsEach:
 
     Args:
         largest, rate, known: as for :class:`Limits`.
-
-    Raises:
-        ConfigError: as :class:`Limits`.
     """
 
     def __init__(
@@ -151,17 +148,12 @@ class LimitsEach:
 
     def take(self, records: int) -> None:
         """Begin with the number of the records of leaders."""
+        require(records or not self.largest, "agent.limits_each: no recorded leader on this road")
         self.records = [self.make() for _ in range(records)]
 
     def begin(self, profile: Tensor | None) -> None:
-        """Begin a batch of episodes behind the records ``[batch, 1]``; None: without leaders.
-
-        Raises:
-            ConfigError: if there is a limit and no leader.
-        """
-        if self.largest:
-            require(profile is not None, "agent.limits_each: no recorded leader on this road")
-            self.profile = profile.flatten().tolist()  # type: ignore[union-attr]
+        """Begin a batch of episodes behind the records ``[batch, 1]``; None: without leaders."""
+        self.profile = [] if profile is None else profile.flatten().tolist()
 
     def price(self, name: str, like: Tensor) -> Tensor | float:
         """Return the multiplier of each episode, ``[batch, 1, 1]``; 0 for other terms."""

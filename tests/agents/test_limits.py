@@ -109,7 +109,7 @@ def test_a_limit_of_each_record_raises_the_price_behind_that_record_only() -> No
     other.begin(torch.tensor([[1], [2]]))
     assert other.price("spacing", price).flatten().log().tolist() == pytest.approx([0.0, 1.26])
     with pytest.raises(ConfigError, match=r"agent\.limits_each: no recorded leader on this road"):
-        limits.begin(None)
+        limits.take(0)
     with pytest.raises(ConfigError, match=r"agent\.limits_each\.gap: there is no agent\.surrog"):
         LimitsEach({"gap": 0.5}, 0.1, known)
 
