@@ -55,7 +55,7 @@ def configurations() -> Iterator[StudyConfig]:
         yield cfg
         if cfg.deployed is not None:
             yield cfg.after_training()
-    knowledge = ["+knowledge=[memory,preview]", "scenario.pieces.memory.kind=stacked"]
+    knowledge = ["+knowledge=[spread,preview]", "scenario.pieces.memory.kind=stacked"]
     cfg = load("train", ["variant=alcc", SIZES, "+filter=cbf", "+faults=all", *knowledge])
     yield cfg
     for drawn_or_single in ({"size": 6, "penetration": 0.34}, "automated human*4"):

@@ -46,6 +46,8 @@ class Analytic(Agent):
     # Largest share of the time in which a surrogate's limit may be missed, by its name, or that of
     # the recorded drivers; its weight is the price at the start, see lcc_rl.agents.limits.
     limits: dict[str, Share | Literal["recorded"] | None] = field(default_factory=dict)
+    # Likewise, but behind each record of leaders by itself, each with a price of its own.
+    limits_each: dict[str, Share | None] = field(default_factory=dict)
     limit_rate: Positive = 0.1  # largest change of the logarithm of such a price at once
     # Terms of the objective only.
     regularizers: dict[str, InstanceOf[RewardTerm] | None] = field(default_factory=dict)
@@ -178,6 +180,8 @@ class Analytic(Agent):
 
     def _parts(self) -> dict[str, Any]:
         own = {"policy": self.policy, "optimizer": self.optimizer, "limits": self.objective.limits}
+        if self.objective.each.largest:
+            own["limits_each"] = self.objective.each
         if self.bootstrap:
             learned = (self.value, self.target, self.value_optimizer)
             own |= dict(zip(("value", "target", "value_optimizer"), learned, strict=True))

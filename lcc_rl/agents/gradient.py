@@ -18,6 +18,7 @@ from lcc_rl.agents.objective import Objective
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.pieces.base import REWARD, as_key, next_key
+from lcc_rl.pieces.leader import PROFILE, NGSIMLeader
 from lcc_rl.pieces.rewards import RewardTerm
 
 log = logging.getLogger("lcc_rl")
@@ -39,6 +40,8 @@ class GradientLoop(TrainingLoop[Any]):
         self.terms = [piece for piece in pieces_of(self.env) if isinstance(piece, RewardTerm)]
         self.objective: Objective = self.agent.objective
         self.objective.replace(self.terms)
+        leaders = [piece for piece in pieces_of(self.env) if isinstance(piece, NGSIMLeader)]
+        self.objective.each.take(sum(len(piece.names) for piece in leaders))
         self.horizon -= self.agent.burn_in + self.agent.uncounted
         if not self.agent.bootstrap and self.settings.segment < self.horizon:
             log.warning(
@@ -75,6 +78,7 @@ class GradientLoop(TrainingLoop[Any]):
         rate = self.agent.anneal(self.iteration / self.iterations)
         self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
         state = source.skip(source.start(), self.agent.burn_in)
+        self.objective.each.begin(state.get(PROFILE))
         running = torch.ones(self.env.batch_size[0], 1, 1, device=self.env.device)
         if self.agent.uncounted:
             with torch.no_grad():
@@ -83,6 +87,7 @@ class GradientLoop(TrainingLoop[Any]):
             running = (~crashed.any(1, keepdim=True)).to(running)
         played, losses, spent = [], [], [0.0, 0.0]
         missed: list[dict[str, float]] = []
+        each: list[dict[str, Tensor]] = []
         for _ in range(self.horizon // self.settings.segment):
             begun = time.perf_counter()
             state, record = source.play(state, self.settings.segment)
@@ -92,6 +97,7 @@ class GradientLoop(TrainingLoop[Any]):
             running, result = self._learn(data, running[:, -1:])
             losses.append(result)
             missed.append(self.objective.missed(data, running))
+            each.append(self.objective.missed_each(data, running))
             played.append(data.detach().select(*REPORTED))
             state = {key: value.detach() for key, value in state.items()}
             spent[0] += collected - begun
@@ -100,6 +106,8 @@ class GradientLoop(TrainingLoop[Any]):
         shares = mean_of(missed)
         limits = self._limits_row(shares)
         self.objective.limits.update(shares)
+        behind = {name: torch.stack([row[name] for row in each]).mean(0) for name in each[0]}
+        limits |= self.objective.each.update(behind)
         count = sum(part.numel() for part in played)
         return self._record(played, losses, spent, count, {"learning_rate": rate}, limits)
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -36,24 +37,29 @@ class Limits:
             recorded drivers, see :meth:`take`.
         rate: largest change of the logarithm of a multiplier per update.
         known: the surrogates by name.
+        where: the setting that gives the limits.
 
     Raises:
         ConfigError: if a name is unknown, or its surrogate has no limit or no weight.
     """
 
     def __init__(
-        self, largest: Mapping[str, float | str | None], rate: float, known: Mapping[str, Any]
+        self,
+        largest: Mapping[str, float | str | None],
+        rate: float,
+        known: Mapping[str, Any],
+        where: str = "agent.limits",
     ) -> None:
         given = {name: share for name, share in largest.items() if share is not None}
         for name in given:
-            require(name in known, f"agent.limits.{name}: there is no agent.surrogates.{name}")
+            require(name in known, f"{where}.{name}: there is no agent.surrogates.{name}")
             if not hasattr(known[name], "missed"):
                 kind = type(known[name]).__name__
-                raise ConfigError(f"agent.limits.{name}: {kind} has no limit to keep")
+                raise ConfigError(f"{where}.{name}: {kind} has no limit to keep")
             if not known[name].weight:
                 raise ConfigError(
-                    f"agent.limits.{name}: agent.surrogates.{name}.weight is 0, so its price has "
-                    f"no effect; raise it, or use agent.limits.{name}=null"
+                    f"{where}.{name}: agent.surrogates.{name}.weight is 0, so its price has "
+                    f"no effect; raise it, or use {where}.{name}=null"
                 )
         self.recorded = {name: known[name] for name, share in given.items() if share == RECORDED}
         self.largest = {name: 0.0 if x == RECORDED else float(x) for name, x in given.items()}
@@ -120,3 +126,69 @@ class Limits:
 
     def _kept(self) -> tuple[dict[str, float], dict[str, float]]:
         return self.logarithms, self.latest
+
+
+class LimitsEach:
+    """Limits that hold behind each record of leaders by itself, each with a multiplier.
+
+    The limit of all episodes together may be missed behind one leader and more than kept behind
+    another; here it may not. Such a price adds to that of all episodes.
+
+    Args:
+        largest, rate, known: as for :class:`Limits`.
+    """
+
+    def __init__(
+        self, largest: Mapping[str, float | None], rate: float, known: Mapping[str, Any]
+    ) -> None:
+        self.make = partial(Limits, largest, rate, known, "agent.limits_each")
+        self.largest = self.make().largest
+        self.records: list[Limits] = []
+        self.profile: list[int] = []  # record of each episode of the batch
+
+    def take(self, records: int) -> None:
+        """Begin with the number of the records of leaders."""
+        require(records or not self.largest, "agent.limits_each: no recorded leader on this road")
+        self.records = [self.make() for _ in range(records)]
+
+    def begin(self, profile: Tensor | None) -> None:
+        """Begin a batch of episodes behind the records ``[batch, 1]``; None: without leaders."""
+        self.profile = [] if profile is None else profile.flatten().tolist()
+
+    def price(self, name: str, like: Tensor) -> Tensor | float:
+        """Return the multiplier of each episode, ``[batch, 1, 1]``; 0 for other terms."""
+        if name not in self.largest:
+            return 0.0
+        return like.new_tensor([self.records[i].price(name) for i in self.profile])[:, None, None]
+
+    def update(self, shares: Mapping[str, Tensor]) -> dict[str, float]:
+        """Update the multipliers of the batch's records.
+
+        Args:
+            shares: share of the time in which each limit was missed, ``[batch]``.
+
+        Returns:
+            The largest share behind a record, and the mean price, of each limit.
+        """
+        row = {}
+        for name, share in shares.items():
+            behind: dict[int, list[float]] = {}
+            for record, value in zip(self.profile, share.tolist(), strict=True):
+                behind.setdefault(record, []).append(value)
+            means = {record: sum(values) / len(values) for record, values in behind.items()}
+            prices = [self.records[record].price(name) for record in means]
+            row[f"most_{name}"] = max(means.values())
+            row[f"price_each_{name}"] = sum(prices) / len(prices)
+            for record, mean in means.items():
+                self.records[record].update({name: mean})
+        return row
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the multipliers, a row per record."""
+        rows = [x.state_dict()["logarithms"] for x in self.records]
+        return {"logarithms": torch.stack(rows) if rows else torch.zeros(0, dtype=torch.float64)}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore the result of :meth:`state_dict`."""
+        for record, row in zip(self.records, state["logarithms"], strict=True):
+            record.load_state_dict({"logarithms": row})

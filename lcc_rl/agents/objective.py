@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lcc_rl.agents.limits import Limits
+from lcc_rl.agents.limits import Limits, LimitsEach
 from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.functional.finite import any_nonfinite
 from lcc_rl.pieces.base import Key, next_key
@@ -21,8 +21,8 @@ class Objective:
     """The terms of an objective and the prices of its limits.
 
     Args:
-        settings: its ``surrogates``, ``regularizers``, ``limits`` and ``limit_rate``, see
-            :class:`lcc_rl.agents.analytic.Analytic`.
+        settings: its ``surrogates``, ``regularizers``, ``limits``, ``limits_each`` and
+            ``limit_rate``, see :class:`lcc_rl.agents.analytic.Analytic`.
         device: device of the terms.
         world: see :class:`lcc_rl.pieces.world.World`.
 
@@ -40,6 +40,7 @@ class Objective:
 
         self.surrogates, self.regularizers = made("surrogates"), made("regularizers")
         self.limits = Limits(settings.limits, settings.limit_rate, self.surrogates)
+        self.each = LimitsEach(settings.limits_each, settings.limit_rate, self.surrogates)
         self.terms: list[tuple[RewardTerm, float]] = []
 
     def replace(self, terms: Sequence[RewardTerm]) -> None:
@@ -83,10 +84,10 @@ class Objective:
         Raises:
             Diverged: naming the first term that is not finite.
         """
-        parts = [
-            factor * self.limits.price(term.name) * term.computed(_entries(term, data)).squeeze(-1)
-            for term, factor in self.terms
-        ]
+        parts = []
+        for term, factor in self.terms:
+            value = term.computed(_entries(term, data)).squeeze(-1)
+            parts.append(factor * self._price(term.name, value) * value)
         if any_nonfinite(parts):
             for (term, _), part in zip(self.terms, parts, strict=True):
                 if any_nonfinite([part]):
@@ -94,9 +95,15 @@ class Objective:
                     raise Diverged(f"the objective's term {term.name} ({kind}) is nan")
         return torch.stack(parts).sum(0)
 
-    def limited(self) -> dict[str, Any]:
-        """Return the terms with a limit, by name."""
-        return {term.name: term for term, _ in self.terms if term.name in self.limits.largest}
+    def _price(self, name: str, like: Tensor) -> Tensor | float:
+        """Return the price of a term: that of all episodes, plus that behind its record."""
+        each = self.each.price(name, like)
+        only_each = name in self.each.largest and name not in self.limits.largest
+        return each if only_each else self.limits.price(name) + each
+
+    def limited(self, limits: Limits | LimitsEach) -> dict[str, Any]:
+        """Return the terms with such a limit, by name."""
+        return {term.name: term for term, _ in self.terms if term.name in limits.largest}
 
     def missed(self, data: TensorDictBase, running: Tensor) -> dict[str, float]:
         """Return the share of a rollout's time in which each limit was missed.
@@ -105,14 +112,25 @@ class Objective:
             data: the rollout, ``[batch, steps]``.
             running: which steps count, ``[batch, steps, 1]``.
         """
-        shares = {}
-        with torch.no_grad():
-            for name, term in self.limited().items():
-                missed = term.missed(*term.views(*_entries(term, data))).squeeze(-1)
-                counted = running.expand_as(missed)
-                total = (missed * counted).double().sum() / counted.sum().clamp(min=1)
-                shares[name] = float(total)
-        return shares
+        return {
+            name: float(self._missed(term, data, running, (0, 1, 2)))
+            for name, term in self.limited(self.limits).items()
+        }
+
+    def missed_each(self, data: TensorDictBase, running: Tensor) -> dict[str, Tensor]:
+        """Return the shares of the time in each episode, ``[batch]``; see :meth:`missed`."""
+        return {
+            name: self._missed(term, data, running, (1, 2))
+            for name, term in self.limited(self.each).items()
+        }
+
+    @torch.no_grad()
+    def _missed(
+        self, term: Any, data: TensorDictBase, running: Tensor, over: tuple[int, ...]
+    ) -> Tensor:
+        missed = term.missed(*term.views(*_entries(term, data))).squeeze(-1)
+        counted = running.expand_as(missed)
+        return (missed * counted).double().sum(over) / counted.sum(over).clamp(min=1)
 
 
 def _entries(term: RewardTerm, data: TensorDictBase) -> list[Tensor]:

@@ -184,6 +184,7 @@ class EvaluationConfig(Section):
     repeats: Million
     shards: Million
     shard: Annotated[int, Field(ge=0)]
+    sample_mb: Positive | None = None  # largest size of steps.parquet, else every n-th step
     compiled: bool | None = None
     full_length: bool = False
     humans_first: NonNegative = 0.0  # time with human drivers only, on a ring, not measured [s]

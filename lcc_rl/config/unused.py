@@ -101,14 +101,16 @@ def _of_objective(
     cfg: StudyConfig, written: Any, typed: AbstractSet[str]
 ) -> Iterator[tuple[str, str]]:
     """Yield settings of terms and surrogates that a training by the gradient ignores, and why."""
-    surrogates, limits = (cfg.agent.settings[key] for key in ("surrogates", "limits"))
+    kinds = ("surrogates", "limits", "limits_each")
+    surrogates, limits, each = (cfg.agent.settings[key] for key in kinds)
     if not cfg.agent.settings["bootstrap"]:
         for key in ("value_lr", "value_every", "td_lambda", "tau"):
             yield f"agent.{key}", "agent.bootstrap=false learns no value"
-    limited = {name for name, share in limits.items() if share is not None}
+    given = (*limits.items(), *each.items())
+    limited = {name for name, share in given if share is not None}
     terms = {name: term for name, term in cfg.reward.terms.items() if term.settings.get("weight")}
-    for name in {*surrogates, *limits} - {*terms}:
-        for key in ("surrogates", "limits"):
+    for name in {*surrogates, *limits, *each} - {*terms}:
+        for key in kinds:
             yield f"agent.{key}.{name}", f"the reward has no term {name}"
     for name, term in terms.items():
         if name not in surrogates and not getattr(term.kind, "graded", True):

@@ -18,7 +18,7 @@ from lcc_rl.envs.inputs import Inputs
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.evaluation.metrics import registered, safety_measures
 from lcc_rl.evaluation.rollout import Player, reset_options
-from lcc_rl.evaluation.rows import INDEX
+from lcc_rl.evaluation.rows import INDEX, VALUE_BYTES
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import REWARD
@@ -30,6 +30,9 @@ TRACKING_ERRORS = ("gap_error", "speed_error", "leader_speed_error")
 CASE_ENTRIES = ("speed", "gap", "acceleration", "jerk", "power", *TRACKING_ERRORS)
 CASE_KEYS = [("leader", "speed"), *(("vehicles", name) for name in CASE_ENTRIES), REWARD]
 CASE_KEYS += [INDEX, WINNER, *COUNTERS]
+# Columns of a time series besides the speed.
+TRACED = {"gap": "gap_m", "acceleration": "acceleration_mps2", "jerk": "jerk_mps3"}
+TRACED["winner"] = "winner"
 CaseSeries = dict[str, Tensor]  # ``[time, runs, vehicles]``
 
 
@@ -49,6 +52,9 @@ class Cases:
         cases = (*inputs.cases, windows, *whole)
         self.drives = [CaseRuns(strategy, case, inputs, cfg.device) for case in cases]
         self.largest = max((drive.size for drive in self.drives), key=math.prod)
+        # Size of the time series of the cases in a file, which hardly compress [bytes].
+        steps = sum(case.horizon * (case.followers + 1) for case in inputs.cases)
+        self.sampled = steps * len(TRACED) * VALUE_BYTES
 
     def count(self, block: int) -> int:
         """Return the number of runs of all cases."""
@@ -187,8 +193,7 @@ def trace(series: CaseSeries, time_step: float) -> pd.DataFrame:
     leader = series["leader"][1:, 0]
     steps, vehicles = series["jerk"].shape[0], series["jerk"].shape[2]
     columns = {"speed_mps": torch.cat([leader, series["speed"][1:, 0]], dim=-1)}
-    labels = {"gap": "gap_m", "acceleration": "acceleration_mps2", "jerk": "jerk_mps3"}
-    for name, label in {**labels, "winner": "winner"}.items():
+    for name, label in TRACED.items():
         if name in series:
             own = series[name][:, 0].to(leader.dtype)
             columns[label] = torch.cat([torch.full_like(leader, torch.nan), own], dim=-1)

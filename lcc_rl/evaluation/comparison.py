@@ -55,6 +55,15 @@ class Comparison:
         count, steps, moment = max((x.largest for x in self.players), key=math.prod)
         size = f"an evaluation of {count} episodes of {steps} steps side by side"
         require_memory({size: count * steps * moment}, cfg.device)
+        self.every, most = 1, settings.sample_mb
+        if most is not None:
+            self.every = max(1, math.ceil(sum(x.sampled for x in self.players) / (most * 1e6)))
+        if self.every > 1:
+            log.info(
+                "%s keeps every %dth step of the sample episodes, at most %g MB; "
+                "evaluation.sample_mb=null keeps all",
+                *(STEPS, self.every, most),
+            )
 
     def play(self, folder: Path) -> Rows:
         """Play the episodes and write their rows and sample time series; call it once.
@@ -91,7 +100,11 @@ class Comparison:
         title = f"evaluate {in_words(name)} ({place + 1} of {len(self.strategies)})"
         with ProgressReporter(title, sum(counts.values()), "episode", done, where) as progress:
             for block in missing:
-                store.put(place, block, player.play(block))
+                rows, steps = player.play(block)
+                if self.every > 1 and len(steps):
+                    number = (steps["time_s"] / self.cfg.scenario.time_step).round() - 1
+                    steps = steps[number % self.every == 0]
+                store.put(place, block, (rows, steps))
                 done += counts[block]
                 if where is not None:
                     progress.update(done)

@@ -19,12 +19,13 @@ from lcc_rl.envs.inputs import Inputs, build_energy, second_energy
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import require
 from lcc_rl.evaluation.foreign import GivenPolicy
-from lcc_rl.evaluation.metrics import damping_time
+from lcc_rl.evaluation.metrics import SERIES, damping_time
 from lcc_rl.evaluation.rollout import Player, reset_options
 from lcc_rl.evaluation.rows import (
     FILTER_ENTRIES,
     INDEX,
     ROW_KEYS,
+    VALUE_BYTES,
     as_frame,
     brakings,
     describe,
@@ -192,6 +193,9 @@ class Episodes:
         self.player = Player(env, strategy.policy, keys, strategy.title, compiled, rowwise)
         count = min(sample_episodes, len(plan))
         self.samples = set(np.linspace(0, len(plan) - 1, count).round().astype(int).tolist())
+        # Size of their time series in a file, which hardly compress [bytes].
+        values = len(self.cfg.scenario.vehicles) * len(SERIES) * VALUE_BYTES
+        self.sampled = len(self.samples) * (self.cfg.scenario.horizon - self.begun) * values
 
     def count(self, block: int) -> int:
         """Return the number of episodes of a block."""

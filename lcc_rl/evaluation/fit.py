@@ -111,9 +111,9 @@ def _observed(cfg: StudyConfig) -> dict[str, Any]:
     """Return the settings of an observation, the order of its entries and the memory."""
     node = as_plain(cfg.observation)
     order = [key for key, _ in flatten(node) if key.startswith("scales.")]
-    memory = cfg.scenario.pieces.get("memory")
-    found = {"observation": {**node, "order of scales": order}}
-    return found if memory is None else {**found, "scenario.pieces.memory": as_plain(memory)}
+    kept = {name: cfg.scenario.pieces.get(name) for name in ("memory", "spread")}
+    memory = {f"scenario.pieces.{name}": as_plain(x) for name, x in kept.items() if x is not None}
+    return {"observation": {**node, "order of scales": order}, **memory}
 
 
 def check_scenario(path: str, own: StudyConfig, cfg: StudyConfig) -> None:

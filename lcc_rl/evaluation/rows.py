@@ -55,6 +55,7 @@ SAMPLED = (
     "desired_speed_mps",
     "time_gap_s",
 )
+VALUE_BYTES = 4  # of a value in a time series
 ROW_KEYS = [("leader", name) for name in ("speed", "acceleration")]
 ROW_KEYS += [("vehicles", name) for name in SERIES]
 INDEX = (AUTOMATED, "index")

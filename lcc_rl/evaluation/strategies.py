@@ -34,7 +34,7 @@ from lcc_rl.settings import TARGET, path_of
 
 log = logging.getLogger("lcc_rl")
 
-KNOWLEDGE = ("memory", "preview")  # pieces that belong to a policy's observation
+KNOWLEDGE = ("memory", "spread", "preview")  # pieces that belong to a policy's observation
 TrainedPolicy = tuple[dict[str, Any], StudyConfig]  # weights and configuration
 
 

@@ -254,8 +254,8 @@ def program(
         network = learned.module
     (observation,), (action,) = found.values()
     world = measuring(scenario.time_step, BEHIND_PRESENT not in observation.names)
-    remembers = any(name.startswith("memory.") for name in observation.seen)
-    memory = [p for p in pieces if isinstance(p, ObservationMemory) and remembers]
+    seen = {name.partition(".")[0] for name in observation.seen}
+    memory = [p for p in pieces if isinstance(p, ObservationMemory) and p.view in seen]
     largest = action.max_acceleration
     network = NetworkController(network=network, max_acceleration=largest)
     return driving([*memory, observation, network], safety, world)

@@ -73,19 +73,28 @@ class ObservationMemory(StepTransform):
     Writes ``("memory", "entries")``, ``[*batch, A, sources × seconds]``, ordered by source: for
     each source and each number in ``seconds`` the exponential average with this time constant
     (``filtered``), or the value of this age (``stacked``, which also writes ``("memory",
-    "history")``). Values before the episode are those of its start.
+    "history")``). Values before the episode are those of its start. ``spread`` writes ``("spread",
+    "entries")`` instead: the exponential average of the distance from the exponential average
+    (``("spread", "averages")``), which tells waves from free flow; 0 at the start.
     """
 
     # Remembered entries: dotted names of views with one number, "self.gap".
     sources: Annotated[tuple[str, ...], Field(min_length=1)] = ("ahead.speed",)
     seconds: Times = (0.5, 1.0, 2.0, 5.0)  # time constants or ages, at least a step [s]
-    kind: Literal["filtered", "stacked"] = "filtered"
+    kind: Literal["filtered", "stacked", "spread"] = "filtered"
 
     measures = True
     found = Entry("memory.entries", "of source", "averages or past values of each source")
     history = Entry("memory.history", "of source", "values of each source in the last steps")
+    spread = Entry("spread.entries", "of source", "mean distances of each source from its average")
+    averages = Entry("spread.averages", "of source", "averages of each source")
     shares: ClassVar[Tensor]
     places: ClassVar[Tensor]
+
+    @property
+    def view(self) -> str:
+        """The view of its entries."""
+        return "spread" if self.kind == "spread" else "memory"
 
     def setup(self, world: World) -> None:
         """Find the sources and the length of the history."""
@@ -99,11 +108,15 @@ class ObservationMemory(StepTransform):
             ages = [world.steps(age, "memory.seconds") for age in self.seconds]
             self.depth = max(ages) + 1
         self.counted, self.repeat = len(self.sources), len(self.seconds)
-        kept = self.history if self.stacked else self.found
-        writes = [self.found.wide(self.counted * self.repeat)]
-        writes += [self.history.wide(self.counted * self.depth)] * self.stacked
+        wide = self.counted * self.repeat
+        writes = [self.found.wide(wide)]
+        if self.kind == "spread":
+            writes = [self.spread.wide(wide), self.averages.wide(wide)]
+        elif self.stacked:
+            writes.append(self.history.wide(self.counted * self.depth))
+        kept = [str(entry.key) for entry in writes[self.stacked :]]
         reached = [f"{NEXT}.{source}" for source in self.sources]
-        self.declare(world, [str(kept.key), *reached], writes)
+        self.declare(world, [*kept, *reached], writes)
         # The same entries at reset, which has no previous step.
         self.first = Views(world.string, AUTOMATED, world.sensed(AUTOMATED, self.sources))
         shares = 1.0 - torch.exp(-time_step / torch.tensor(list(self.seconds)))
@@ -111,7 +124,12 @@ class ObservationMemory(StepTransform):
         self.register_buffer("places", torch.tensor(ages))
 
     def compute(self, kept: Tensor, *measured: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        """Return the entries, and the history if it is kept."""
+        """Return the entries, and the history or the averages if they are kept."""
+        if self.kind == "spread":
+            average, now = measured[0], torch.cat(measured[1:], -1)
+            now = now.repeat_interleave(self.repeat, -1)
+            away = (now - average).abs()
+            return torch.lerp(kept, away, self.shares), torch.lerp(average, now, self.shares)
         now = torch.cat(measured, -1)
         if not self.stacked:
             return torch.lerp(kept, now.repeat_interleave(self.repeat, -1), self.shares)
@@ -124,3 +142,6 @@ class ObservationMemory(StepTransform):
         now = torch.cat(self.first.of(start), -1)
         for key, repeat in zip(self.targets, (self.repeat, self.depth), strict=False):
             start.set(key, now.repeat_interleave(repeat, -1))
+        if self.kind == "spread":
+            start.set(self.targets[1], start.get(self.targets[0]))
+            start.set(self.targets[0], torch.zeros_like(start.get(self.targets[0])))

@@ -7,7 +7,7 @@ import torch
 from helpers import followed_profiles, wavy_profiles
 from test_analytic import make
 
-from lcc_rl.agents.limits import Limits
+from lcc_rl.agents.limits import Limits, LimitsEach
 from lcc_rl.energy import as_fleet
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.power import acceleration_loss, steady_power
@@ -90,6 +90,40 @@ def test_the_record_says_shares_and_prices(tmp_path) -> None:
         torch.tensor(expected.to_numpy()),
         atol=1e-6,
     )
+
+
+def test_a_limit_of_each_record_raises_the_price_behind_that_record_only() -> None:
+    known = {"spacing": ExcessSpacing()}
+    limits = LimitsEach({"spacing": 0.5}, 0.1, known)
+    limits.take(3)
+    limits.begin(torch.tensor([[2], [0], [2]]))
+    # In the mean 0.4, which a limit of all episodes would keep.
+    row = limits.update({"spacing": torch.tensor([1.0, -0.4, 0.6])})
+    assert row == {"most_spacing": pytest.approx(0.8), "price_each_spacing": 1.0}
+    price = limits.price("spacing", torch.zeros(1)).flatten()
+    assert torch.allclose(price.log(), torch.tensor([2.1 * 0.6, -2.1, 2.1 * 0.6]))
+    assert limits.price("gap", price) == 0.0
+    other = LimitsEach({"spacing": 0.5}, 0.1, known)
+    other.take(3)
+    other.load_state_dict(limits.state_dict())
+    other.begin(torch.tensor([[1], [2]]))
+    assert other.price("spacing", price).flatten().log().tolist() == pytest.approx([0.0, 1.26])
+    with pytest.raises(ConfigError, match=r"agent\.limits_each: no recorded leader on this road"):
+        limits.take(0)
+    with pytest.raises(ConfigError, match=r"agent\.limits_each\.gap: there is no agent\.surrog"):
+        LimitsEach({"gap": 0.5}, 0.1, known)
+
+
+def test_a_training_keeps_a_price_behind_each_record(tmp_path) -> None:
+    words = ("surrogates@agent=limits", "training.episodes=32", "agent.limit_rate=0.5")
+    trainer = make(tmp_path / "one", *words, "+agent.limits_each.efficiency=0.0")
+    rows = trainer.run()
+    assert (rows["most_efficiency"] >= rows["share_efficiency"] - 1e-6).all()
+    prices = {x.price("efficiency") for x in trainer.objective.each.records}
+    assert rows["price_each_efficiency"].iloc[0] == 1.0 != rows["price_each_efficiency"].iloc[-1]
+    again = make(tmp_path / "one", *words, "+agent.limits_each.efficiency=0.0")
+    again.load()
+    assert {x.price("efficiency") for x in again.objective.each.records} == prices
 
 
 def test_path_energy_is_a2_without_what_the_motion_stores() -> None:

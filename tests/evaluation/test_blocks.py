@@ -14,6 +14,7 @@ from helpers import POPULATION, compose, network, slow_but, wavy_profiles
 
 from lcc_rl import results
 from lcc_rl.commands import evaluation
+from lcc_rl.config import load
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.envs import Inputs
 from lcc_rl.errors import ResultsError
@@ -154,8 +155,7 @@ def test_a_damaged_block_and_one_of_other_weights_are_played_again(
 
 @pytest.mark.slow
 def test_shards_are_one_table_and_a_missing_one_is_said(whole, tmp_path, caplog) -> None:
-    words = [*WORDS, BLOCK, "experiment=smoke", "data.platoons=2", "data.recordings=2"]
-    words += ["data.duration_s=[32,40]", "scenario.horizon=40", "sweep=parts"]
+    words = [*WORDS, BLOCK, *NO_AGENT, "sweep=parts"]
     words += ["evaluation.shards=4", "evaluation.shard=range(4)"]
     run_command("lcc_rl.cli.evaluate", "-m", *words, cwd=tmp_path, check=True)
     root, order = tmp_path / "outputs/evaluate/parts", ["profile_id", "driver_id", "strategy"]
@@ -171,7 +171,7 @@ def test_shards_are_one_table_and_a_missing_one_is_said(whole, tmp_path, caplog)
     shutil.rmtree(gone.parent)
     assert f"evaluation.shard={number}" in results.load(root).attrs["missing"][0]
     assert "1 of 4 shards of variant idm are missing" in caplog.text
-    with pytest.raises(ResultsError, match="1 of 4 shards"):
+    with pytest.raises(ResultsError, match=r"not finished: evaluation\.shard=2"):
         results.load(root, strict=True)
     # The same command plays what is missing and nothing else.
     run_command("lcc_rl.cli.evaluate", "-m", *words, cwd=tmp_path, check=True)
@@ -213,3 +213,24 @@ def test_a_compiled_evaluation_differs_by_rounding() -> None:
     tables = [evaluate(strategy, inputs, 3, 20, 1, 2, compiled=fast) for fast in (False, True)]
     for plain, fast in zip(*tables, strict=True):
         pd.testing.assert_frame_equal(fast, plain, rtol=1e-4, atol=1e-4)
+
+
+def test_time_series_are_thinned_to_the_largest_size_of_their_file(tmp_path, subtests) -> None:
+    cacc = load("evaluate", ["variant=cacc", "evaluation.full_length=false"])
+    for name, base, most in (("episodes", settings(BLOCK), 0.004), ("cases", cacc, 0.05)):
+        with subtests.test(name):
+            tables = {}
+            for limit in (None, most):
+                cfg = base.with_(evaluation={"sample_mb": limit})
+                folder = tmp_path / f"{name}{limit}"
+                evaluation.run(cfg, folder, quiet=True)
+                tables[limit] = read_parquet(folder / "steps.parquet")
+            assert (folder / "steps.parquet").stat().st_size < most * 1e6 + 20_000  # columns' heads
+            all_steps, kept = tables[None], tables[most]
+            times = sorted(set(kept["time_s"]))
+            step = cfg.scenario.time_step
+            every = round((times[1] - times[0]) / step)
+            assert every > 1
+            number = (all_steps["time_s"] / step).round() - 1
+            expected = all_steps[number % every == 0].reset_index(drop=True)
+            pd.testing.assert_frame_equal(kept, expected, check_exact=True)

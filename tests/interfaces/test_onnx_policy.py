@@ -150,17 +150,17 @@ def test_a_program_with_memory_brakes_after_a_nan_until_it_begins_anew(follow) -
     torch.testing.assert_close(again, first)
 
 
-@pytest.mark.parametrize("kind", ["filtered", "stacked"])
-def test_it_remembers_as_the_piece_does(kind) -> None:
-    words = ["+knowledge=memory", f"scenario.pieces.memory.kind={kind}", "scenario.horizon=9"]
+@pytest.mark.parametrize(("knowledge", "kind"), [("memory", "stacked"), ("spread", "filtered")])
+def test_it_remembers_as_the_piece_does(knowledge, kind) -> None:
+    words = [f"+knowledge={knowledge}", f"scenario.pieces.memory.kind={kind}", "scenario.horizon=9"]
     words.append("evaluation.warm_up=0")
     env = small_env("alcc", 3, words, nominal=True)
     pieces = pieces_of(env)
-    kinds = (Observation, Action, ObservationMemory)
-    seen, action, memory = (next(p for p in pieces if isinstance(p, k)) for k in kinds)
+    seen, action = (next(p for p in pieces if isinstance(p, k)) for k in (Observation, Action))
+    memory = [piece for piece in pieces if isinstance(piece, ObservationMemory)]
     network = torch.nn.Linear(len(seen.factors), 1)
     controller = NetworkController(network=network, max_acceleration=action.max_acceleration)
-    driver = driving([memory, seen, controller], None, measuring(0.1))
+    driver = driving([*memory, seen, controller], None, measuring(0.1))
     kept = torch.zeros(3, driver.width)
 
     whose = {"self": ("vehicles", 0), "ahead": ("leader", 0), "behind": ("vehicles", 1)}

@@ -257,6 +257,7 @@ def makers(road: str) -> dict[str, Callable[[], Piece]]:
         "MotorPower, estimated": believed,
         "Collision": Collision(),
         "ObservationMemory": memory,
+        "ObservationMemory, spread": ObservationMemory(seconds=[0.5, 1.0], kind="spread"),
         "Observation": Observation(scales=SCALES, visible=2, widths={"memory": 4}),
     }
     first = {"RolePlaces": RolePlaces(), **({} if string.ring else leading())}

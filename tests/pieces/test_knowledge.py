@@ -93,3 +93,15 @@ def test_every_vehicle_of_a_string_remembers_what_it_saw() -> None:
     past, speed = data["memory", "entries"][0, ..., 0], data["vehicles", "speed"][0, ..., 0]
     assert torch.equal(past[5:, 1], speed[:-5, 1])
     assert torch.equal(past[5:, 0], data["leader", "speed"][0, :-5, 0])
+
+
+def test_the_spread_is_the_average_distance_from_the_average() -> None:
+    data = played("+knowledge=spread", "scenario.pieces.spread.seconds=[2.0]")
+    spread, leader = data["spread", "entries"][0, :, 0, 0], data["leader", "speed"][0, :, 0]
+    share, average, expected = 1.0 - math.exp(-0.05), leader[0].item(), [0.0]
+    for speed in leader[1:].tolist():
+        expected.append(expected[-1] + share * (abs(speed - average) - expected[-1]))
+        average += share * (speed - average)
+    assert torch.allclose(spread, torch.tensor(expected), atol=1e-4)
+    assert expected[-1] > 0.01
+    assert torch.allclose(data[OBSERVATION][0, :, 0, -1], 0.5 * spread)
