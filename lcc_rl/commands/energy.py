@@ -1,10 +1,10 @@
 """Energy of recorded trips: in kJ, kWh, litres and grams, per trip and per kilometre.
 
-lcc-rl energy trips.parquet energy=fuel                  # columns drive, time_s and speed_mps
+lcc-rl energy trips.parquet energy=fuel   # columns drive, time_s, speed_mps
 lcc-rl energy folder energy=bolt --out energies.parquet  # a file per trip
-lcc-rl energy a.csv 'leader.columns={drive: id, grade: slope}' leader.units.grade=% energy=fuel
+lcc-rl energy a.csv leader.columns.grade=slope leader.units.grade=%
 
-Further words are settings: energy=…, and leader.columns and leader.units of the files.
+Further words are settings: energy=…, leader.columns and leader.units.
 """
 
 from __future__ import annotations

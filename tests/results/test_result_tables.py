@@ -224,7 +224,7 @@ def test_flow_may_be_limited_to_that_of_other_strategies(capsys) -> None:
     one = report(windows_for(rows), task, MOTOR)
     assert one.table["kept"].tolist() == [True, True, True, False]
     print_table(terminal(one))
-    assert " ≥ 1900 " in capsys.readouterr().out
+    assert " ≥ 1,900 " in capsys.readouterr().out
     # Of the simulated drivers, which the task compares with, that is 1,940.
     share = replace(task, limits={"flow_vph": "97 %"})
     kept = report(windows_for(rows), share, MOTOR).table["kept"]
