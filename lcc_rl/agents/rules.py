@@ -17,6 +17,7 @@ from lcc_rl.agents.actor import Activation, make_actor, seeded_mlp
 from lcc_rl.errors import ConfigError, require, require_known, unknown_name
 from lcc_rl.pieces.cruise import IDMACC, Cruise, LinearACC
 from lcc_rl.pieces.observation import Observation
+from lcc_rl.pieces.rules import Calm
 
 
 class Rule(nn.Module):
@@ -36,7 +37,7 @@ class Rule(nn.Module):
 
     def __init__(
         self,
-        kind: type[Cruise],
+        kind: type[Cruise | Calm],
         observation: Observation,
         constants: Mapping[str, float] | None,
         max_acceleration: float,
@@ -48,7 +49,7 @@ class Rule(nn.Module):
         self.law, self.names = kind.law, tuple(values)
         self.logarithms = nn.Parameter(torch.tensor([math.log(x) for x in values.values()]))
         self.max_acceleration = max_acceleration
-        self.columns = [observation.column(name) for name in kind.reads]
+        self.columns = [observation.column(*names) for names in kind.observed]
         self.register_buffer("scales", observation.factors[self.columns].clone(), False)
 
     def constants(self) -> dict[str, float]:
@@ -57,11 +58,11 @@ class Rule(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the action in [−1, 1], ``[*batch, 1]``, for the observation ``[*batch, n]``."""
-        speed, gap, relative_speed = (
+        seen = (
             observation[..., column : column + 1] / scale
             for column, scale in zip(self.columns, self.scales, strict=True)
         )
-        command = self.law(speed, gap, relative_speed, *self.logarithms.exp())
+        command = self.law(*seen, *self.logarithms.exp())
         return (command / self.max_acceleration).clamp(-1.0, 1.0)
 
 
@@ -87,7 +88,7 @@ class Residual(nn.Module):
         return (self.rule(observation) + correction).clamp(-1.0, 1.0)
 
 
-RULE_KINDS: dict[str, type[Cruise]] = {"idm": IDMACC, "acc": LinearACC}
+RULE_KINDS: dict[str, type[Cruise | Calm]] = {"idm": IDMACC, "acc": LinearACC, "calm": Calm}
 NETWORK_ALONE = "network"
 RESIDUAL = "residual_"
 
