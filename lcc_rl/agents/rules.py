@@ -21,11 +21,11 @@ from lcc_rl.pieces.rules import Calm
 
 
 class Rule(nn.Module):
-    """A cruise control with learned logarithms of its constants, which remain positive.
+    """A rule with learned logarithms of its constants, which remain positive.
 
     Args:
         kind: the controller with the law; its defaults are the initial constants.
-        observation: the observation, with the vehicle's own speed, gap and relative speed.
+        observation: the observation, with the entries that the rule reads.
         constants: other initial constants, by name.
         max_acceleration: acceleration of action 1 [m/s²].
 
@@ -105,8 +105,8 @@ def make_policy(
     """Build the policy of an agent.
 
     Args:
-        kind: ``"network"``; a rule with learned constants, ``"idm"`` or ``"acc"``; or a rule with a
-            network, ``"residual_idm"`` or ``"residual_acc"``.
+        kind: ``"network"``; a rule with learned constants, ``"idm"``, ``"acc"`` or ``"calm"``; or a
+            rule with a network, such as ``"residual_idm"``.
         observation: the observation of the policy.
         hidden: sizes of the hidden layers of a network.
         seed: seed of its initial weights.
