@@ -49,8 +49,9 @@ class Rule(nn.Module):
         self.law, self.names = kind.law, tuple(values)
         self.logarithms = nn.Parameter(torch.tensor([math.log(x) for x in values.values()]))
         self.max_acceleration = max_acceleration
-        self.columns = [observation.column(*names) for names in kind.observed]
-        self.register_buffer("scales", observation.factors[self.columns].clone(), False)
+        self.columns = [observation.columns_of(*names) for names in kind.observed]
+        firsts = [columns.start for columns in self.columns]
+        self.register_buffer("scales", observation.factors[firsts].clone(), False)
 
     def constants(self) -> dict[str, float]:
         """Return the constants by name."""
@@ -59,8 +60,8 @@ class Rule(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         """Return the action in [−1, 1], ``[*batch, 1]``, for the observation ``[*batch, n]``."""
         seen = (
-            observation[..., column : column + 1] / scale
-            for column, scale in zip(self.columns, self.scales, strict=True)
+            observation[..., columns].mean(-1, keepdim=True) / scale
+            for columns, scale in zip(self.columns, self.scales, strict=True)
         )
         command = self.law(*seen, *self.logarithms.exp())
         return (command / self.max_acceleration).clamp(-1.0, 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Annotated, ClassVar
 
@@ -87,16 +88,18 @@ class Observation(Feature):
         factors = [1.0] * len(values) if self.raw else values
         self.register_buffer("factors", torch.tensor(factors))
 
-    def column(self, *names: str) -> int:
-        """Return the column of an entry, ``"self.gap"``, or of its difference from a second one.
+    def columns_of(self, name: str, *base: str) -> slice:
+        """Return the columns of an entry, ``"self.gap"``, or of its differences from a second one.
 
         Raises:
             ConfigError: if it is not observed.
         """
-        known, what = self.columns(), " relative to ".join(names)
-        message = f"a rule needs {what}, which observation.scales does not name"
-        require(list(names) in known, message)
-        return known.index(list(names))
+        named = re.compile(re.escape(name) + r"(\.\d+)?")
+        columns = enumerate(self.columns())
+        found = [i for i, (own, *of) in columns if named.fullmatch(own) and tuple(of) == base]
+        what = " relative to ".join((name, *base))
+        require(bool(found), f"a rule needs {what}, which observation.scales does not name")
+        return slice(found[0], found[-1] + 1)
 
     def columns(self) -> list[list[str]]:
         """Return for each column the name of its entry, and that of the subtracted entry if any.

@@ -181,8 +181,8 @@ class Calm(Averaging):
     response: Positive = 1.0  # τ [s]
 
     reads = ("self.speed", "self.gap", "self.relative_speed")
-    # A learned policy reads the mean as the difference of a memory of the own speed from it.
-    observed = (*((name,) for name in reads), ("memory.entries.0", "self.speed"))
+    # A learned policy reads the mean from a memory of the own speed.
+    observed = (*((name,) for name in reads), ("memory.entries", "self.speed"))
 
     @classmethod
     def constants_of_rule(cls) -> dict[str, float]:

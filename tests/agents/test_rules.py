@@ -46,11 +46,11 @@ def test_calm_reads_the_mean_of_its_speed_from_a_memory() -> None:
     scales = {**SCALES, "memory": {"entries": 0.5}}
     words = {"widths": {"memory": 4}}
     kept = Observation(scales=scales, relative_to={"memory": sources}, **words).bind()
-    state, lags = seen(4.0, 14.0, -0.3), torch.tensor([0.5 * 0.6, 9.0, 9.0, 9.0])
-    # The mean is 0.6 m/s above the speed, 2 m above 12 m add 0.04 m/s, in 1 s.
+    state, lags = seen(4.0, 14.0, -0.3), torch.tensor([0.5 * 0.4, 0.5 * 0.8, 9.0, 9.0])
+    # The mean of both is 0.6 m/s above the speed, 2 m above 12 m add 0.04 m/s, in 1 s.
     action = policy("calm", kept)(torch.cat([state, lags.expand(1, 1, 4)], -1))
     assert action.item() == pytest.approx(0.64 / 3.0)
-    with pytest.raises(ConfigError, match=r"needs memory\.entries\.0 relative to self\.speed"):
+    with pytest.raises(ConfigError, match=r"needs memory\.entries relative to self\.speed"):
         policy("residual_calm")
 
 
