@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from lcc_rl.agents.actor import Activation, make_actor, seeded_mlp
 from lcc_rl.errors import ConfigError, require, require_known, unknown_name
+from lcc_rl.functional.layout import total
 from lcc_rl.pieces.cruise import IDMACC, Cruise, LinearACC
 from lcc_rl.pieces.observation import Observation
 from lcc_rl.pieces.rules import Calm
@@ -50,8 +51,8 @@ class Rule(nn.Module):
         self.logarithms = nn.Parameter(torch.tensor([math.log(x) for x in values.values()]))
         self.max_acceleration = max_acceleration
         self.columns = [observation.columns_of(*names) for names in kind.observed]
-        firsts = [columns.start for columns in self.columns]
-        self.register_buffer("scales", observation.factors[firsts].clone(), False)
+        scales = [observation.factors[columns].sum() for columns in self.columns]
+        self.register_buffer("scales", torch.stack(scales), False)
 
     def constants(self) -> dict[str, float]:
         """Return the constants by name."""
@@ -60,7 +61,7 @@ class Rule(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         """Return the action in [−1, 1], ``[*batch, 1]``, for the observation ``[*batch, n]``."""
         seen = (
-            observation[..., columns].mean(-1, keepdim=True) / scale
+            total(observation[..., columns], -1) / scale  # the mean, if there are several
             for columns, scale in zip(self.columns, self.scales, strict=True)
         )
         command = self.law(*seen, *self.logarithms.exp())
