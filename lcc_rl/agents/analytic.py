@@ -34,8 +34,8 @@ class Analytic(Agent):
     Once started, ``policy`` is the module.
     """
 
-    # A network; a rule with learned constants (idm, acc); or a network on top of a rule
-    # (residual_idm, residual_acc).
+    # A network; a rule with learned constants (idm, acc, calm); or a network on top of a rule
+    # (residual_idm, residual_acc, residual_calm).
     policy: Any = "network"
     constants: dict[str, Positive] | None = None  # of a rule at the start; the others keep theirs
     hidden: Sequence[Count] = (200, 100, 50)  # layers of a network

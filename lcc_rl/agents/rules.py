@@ -15,16 +15,18 @@ from torch import Tensor, nn
 
 from lcc_rl.agents.actor import Activation, make_actor, seeded_mlp
 from lcc_rl.errors import ConfigError, require, require_known, unknown_name
+from lcc_rl.functional.layout import total
 from lcc_rl.pieces.cruise import IDMACC, Cruise, LinearACC
 from lcc_rl.pieces.observation import Observation
+from lcc_rl.pieces.rules import Calm
 
 
 class Rule(nn.Module):
-    """A cruise control with learned logarithms of its constants, which remain positive.
+    """A rule with learned logarithms of its constants, which remain positive.
 
     Args:
         kind: the controller with the law; its defaults are the initial constants.
-        observation: the observation, with the vehicle's own speed, gap and relative speed.
+        observation: the observation, with the entries that the rule reads.
         constants: other initial constants, by name.
         max_acceleration: acceleration of action 1 [m/s²].
 
@@ -36,7 +38,7 @@ class Rule(nn.Module):
 
     def __init__(
         self,
-        kind: type[Cruise],
+        kind: type[Cruise | Calm],
         observation: Observation,
         constants: Mapping[str, float] | None,
         max_acceleration: float,
@@ -48,8 +50,9 @@ class Rule(nn.Module):
         self.law, self.names = kind.law, tuple(values)
         self.logarithms = nn.Parameter(torch.tensor([math.log(x) for x in values.values()]))
         self.max_acceleration = max_acceleration
-        self.columns = [observation.column(name) for name in kind.reads]
-        self.register_buffer("scales", observation.factors[self.columns].clone(), False)
+        self.columns = [observation.columns_of(*names) for names in kind.observed]
+        scales = [observation.factors[columns].sum() for columns in self.columns]
+        self.register_buffer("scales", torch.stack(scales), False)
 
     def constants(self) -> dict[str, float]:
         """Return the constants by name."""
@@ -57,11 +60,11 @@ class Rule(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the action in [−1, 1], ``[*batch, 1]``, for the observation ``[*batch, n]``."""
-        speed, gap, relative_speed = (
-            observation[..., column : column + 1] / scale
-            for column, scale in zip(self.columns, self.scales, strict=True)
+        seen = (
+            total(observation[..., columns], -1) / scale  # the mean, if there are several
+            for columns, scale in zip(self.columns, self.scales, strict=True)
         )
-        command = self.law(speed, gap, relative_speed, *self.logarithms.exp())
+        command = self.law(*seen, *self.logarithms.exp())
         return (command / self.max_acceleration).clamp(-1.0, 1.0)
 
 
@@ -87,7 +90,7 @@ class Residual(nn.Module):
         return (self.rule(observation) + correction).clamp(-1.0, 1.0)
 
 
-RULE_KINDS: dict[str, type[Cruise]] = {"idm": IDMACC, "acc": LinearACC}
+RULE_KINDS: dict[str, type[Cruise | Calm]] = {"idm": IDMACC, "acc": LinearACC, "calm": Calm}
 NETWORK_ALONE = "network"
 RESIDUAL = "residual_"
 
@@ -104,8 +107,8 @@ def make_policy(
     """Build the policy of an agent.
 
     Args:
-        kind: ``"network"``; a rule with learned constants, ``"idm"`` or ``"acc"``; or a rule with a
-            network, ``"residual_idm"`` or ``"residual_acc"``.
+        kind: ``"network"``; a rule with learned constants, ``"idm"``, ``"acc"`` or ``"calm"``; or a
+            rule with a network, such as ``"residual_idm"``.
         observation: the observation of the policy.
         hidden: sizes of the hidden layers of a network.
         seed: seed of its initial weights.

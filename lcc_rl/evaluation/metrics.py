@@ -14,7 +14,7 @@ from torch import Tensor
 from lcc_rl.energy import AVERAGED, AVERAGES, Fleet, as_fleet
 from lcc_rl.errors import require, require_known
 from lcc_rl.functional.safety import NEVER
-from lcc_rl.results.measures import MEASURES, SHIPPED, Measure
+from lcc_rl.results.measures import CALM, MEASURES, SHIPPED, Measure
 from lcc_rl.results.platoons import PLATOON
 
 KILO = 1e-3
@@ -22,7 +22,6 @@ UNSAFE_TTC = 4.0  # [s] (A10)
 LONG_TIME_GAP = 2.5  # [s] (A13)
 SHORT_TIME_GAP = 1.0  # [s]
 APART = 1.0  # brakings of a vehicle within this time count as one [s]
-CALM = 0.5  # spread of speeds below which a wave counts as damped [m/s]
 PACE = 1.0  # lower speeds do not count for moving time gaps [m/s]
 ACTS = 0.01  # change of a command above which a filter counts as active [m/s²]
 SERIES = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")  # of every vehicle

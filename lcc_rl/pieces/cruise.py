@@ -23,6 +23,7 @@ class Cruise(Controller):
     max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
 
     reads = ("self.speed", "self.gap", "self.relative_speed")
+    observed = tuple((name,) for name in reads)  # as columns of an observation
 
     @classmethod
     def constants_of_rule(cls) -> dict[str, float]:

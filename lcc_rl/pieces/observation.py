@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Annotated, ClassVar
 
@@ -81,24 +82,24 @@ class Observation(Feature):
         known = world.sensed(AUTOMATED, [".".join(name) for name in names])
         views = Views(string, AUTOMATED, known, visible)
         self.declare(world, views, [self.gathered.wide(len(values))])
-        firsts = [sum(counts[:place]) for place in range(len(counts))]
-        # The (first) column of each entry without a difference.
-        each = zip(seen, firsts, bases, strict=True)
-        self.layout = {".".join(key): first for key, first, base in each if not base}
         self.seen, self.names = [".".join(key) for key in seen], [".".join(key) for key in names]
         self.bases = [[names.index(key) for key in keys] for keys in bases]
         self.repeats = [n // max(len(keys), 1) for n, keys in zip(counts, bases, strict=True)]
         factors = [1.0] * len(values) if self.raw else values
         self.register_buffer("factors", torch.tensor(factors))
 
-    def column(self, name: str) -> int:
-        """Return the column of an entry, e.g. ``"self.gap"``.
+    def columns_of(self, name: str, *base: str) -> slice:
+        """Return the columns of an entry, ``"self.gap"``, or of its differences from a second one.
 
         Raises:
-            ConfigError: if it is not observed, or only as a difference.
+            ConfigError: if it is not observed.
         """
-        require(name in self.layout, f"a rule needs {name}, which observation.scales does not name")
-        return self.layout[name]
+        named = re.compile(re.escape(name) + r"(\.\d+)?")
+        columns = enumerate(self.columns())
+        found = [i for i, (own, *of) in columns if named.fullmatch(own) and tuple(of) == base]
+        what = " relative to ".join((name, *base))
+        require(bool(found), f"a rule needs {what}, which observation.scales does not name")
+        return slice(found[0], found[-1] + 1)
 
     def columns(self) -> list[list[str]]:
         """Return for each column the name of its entry, and that of the subtracted entry if any.

@@ -9,11 +9,12 @@ from pydantic import Field, InstanceOf
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from lcc_rl.functional.driver_models import Each
 from lcc_rl.functional.layout import join, total
 from lcc_rl.pieces.base import Entry
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.world import World
-from lcc_rl.settings import NonNegative, Positive
+from lcc_rl.settings import NonNegative, Positive, defaults
 
 Window = Annotated[float, Field(gt=0.0, le=3600.0)]
 Pair = tuple[NonNegative, NonNegative]
@@ -165,28 +166,45 @@ class Calm(Averaging):
     """Rule that ends waves of drivers with a reaction time, on rings of 22 cars up to 0.5 s.
 
     The vehicle drives at the mean v_d of its own speed, faster where the gap Δx is long:
-    v_cmd = min(v_d + k·max(Δx − g, 0), (Δx − s)/T + c·(v_ahead − v)), at least 0. The mean lets the
-    gap take up the wave; the first gain closes what is left of it slowly, and the bound keeps the
-    time gap T. The command is that of :class:`FollowerStopper`.
+    v_cmd = min(v_d + k·max(Δx − g, 0), (Δx − s − Δv₋²/(2d))/T) with Δv₋ = min(v_ahead − v, 0), at
+    least 0. The mean lets the gap take up the wave; the first gain closes what is left of it
+    slowly, and the bound keeps the time gap T after the closing speed is braked by d. The command
+    is (v_cmd − v)/τ within the limits, because the bound may fall at −Δv₋/T, that is by 10 m/s².
     """
 
     window: Window = 15.0  # length of the mean [s]
     gain: NonNegative = 0.02  # k, of gaps above ``gap`` [1/s]
-    gap: NonNegative = 15.0  # g [m]
+    gap: NonNegative = 12.0  # g [m]
     standstill_gap: NonNegative = 2.0  # s [m]
     time_gap: Positive = 1.2  # T, which the speed does not fall below [s]
-    closing: NonNegative = 0.5  # c, factor of the closing speed
+    braking: Positive = 1.5  # d, deceleration behind a slower vehicle [m/s²]
+    response: Positive = 1.0  # τ [s]
 
-    reads = ("self.speed", "self.gap", "ahead.speed")
+    reads = ("self.speed", "self.gap", "self.relative_speed")
+    # A learned policy reads the mean from a memory of the own speed.
+    observed = (*((name,) for name in reads), ("memory.entries", "self.speed"))
+
+    @classmethod
+    def constants_of_rule(cls) -> dict[str, float]:
+        """Return the constants of the law with their defaults."""
+        own = ("gain", "gap", "standstill_gap", "time_gap", "braking", "response")
+        return {name: defaults(cls)[name] for name in own}
+
+    @staticmethod
+    def law(speed: Tensor, gap: Tensor, relative: Tensor, lag: Tensor, *constants: Each) -> Tensor:
+        """Return the command [m/s²] for a mean of the own speed that is ``lag`` above it [m/s]."""
+        gain, longest, standstill_gap, time_gap, braking, response = constants
+        wanted = lag + gain * (gap - longest).clamp(min=0.0)
+        free = gap - standstill_gap - relative.clamp(max=0.0).square() / (2.0 * braking)
+        return torch.maximum(torch.minimum(wanted, free / time_gap - speed), -speed) / response
 
     def command(
-        self, speed: Tensor, gap: Tensor, ahead: Tensor, step: Tensor, history: Tensor
+        self, speed: Tensor, gap: Tensor, relative: Tensor, step: Tensor, history: Tensor
     ) -> Any:
         """Return the commands and the history."""
         mean, past = self.mean(speed, step, history)
-        wanted = mean + self.gain * (gap - self.gap).clamp(min=0.0)
-        bound = (gap - self.standstill_gap) / self.time_gap + self.closing * (ahead - speed)
-        return self.towards(torch.minimum(wanted, bound).clamp(min=0.0), speed), past
+        constants = (getattr(self, name) for name in self.constants_of_rule())
+        return self.law(speed, gap, relative, mean - speed, *constants), past
 
 
 class Handover(Controller):

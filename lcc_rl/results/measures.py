@@ -27,6 +27,7 @@ FLOW = "flow_vph"
 TTC, LONG_GAPS = "share_ttc_unsafe", "share_time_gap_long_moving"
 BARE, TURNED = "share_ttc_unpromised", "share_turned_unsafe"
 SPEED_STD, FINAL_SPREAD = "speed_std_mps", "final_speed_spread_mps"
+CALM = 0.5  # spread of speeds below which a wave counts as damped [m/s]
 AGGREGATES = ("mean", "sum", "min", "max")
 SIGNS = {"at least": "≥", "at most": "≤"}
 SHARE, COUNT = "%", "{:.0f}"
@@ -75,6 +76,7 @@ class Measure:
         per: a column; the measure is then the ratio of both totals.
         factor: factor on a ratio.
         score: its name as a task's score.
+        least: mean of a baseline below which no share of it is given: it is noise.
 
     Raises:
         ConfigError: if aggregate or bound is unknown.
@@ -94,6 +96,7 @@ class Measure:
     per: str = ""
     factor: float = 1.0
     score: str = ""
+    least: float = 0.0
 
     def __post_init__(self) -> None:
         require_known(f"aggregate of {self.key}", self.aggregate, AGGREGATES)
@@ -199,7 +202,9 @@ MEASURES = [
     _per("delay_s_per_km", "  delay against v0", unit="s/km", of="delay_s"),
     _least("mean_speed_mps", "mean speed", unit="m/s", aggregate="mean", limit="mean\nspeed"),
     Measure(SPEED_STD, "deviation of a speed in time", unit="m/s", score=SPEED_STD),
-    Measure(FINAL_SPREAD, "spread of speeds at the end", unit="m/s", score=FINAL_SPREAD),
+    Measure(
+        FINAL_SPREAD, "spread of speeds at the end", unit="m/s", score=FINAL_SPREAD, least=CALM
+    ),
     _least(FLOW, "flow", unit="1/h", form=COUNT, aggregate="mean"),
     Measure("string_ratio", "string ratio", score="string_ratio"),
     Measure("damped", "episodes that end calm", form="{:.0%}"),

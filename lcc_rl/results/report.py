@@ -402,7 +402,11 @@ def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
         KEEPS,
     ]
     columns = {one.key: one.scale * table[one.key] for one in task.bounds}
-    saved = f"{saved_against(table, task.against, always=True)}; " * (len(table) > 1)
+    words, least = saved_against(table, task.against, always=True), task.measure.least
+    if (table.loc[table["strategy"] == task.against, SCORE] < least).any():
+        words = f"no saving: the baseline, {in_words(task.against)}, is below {least:g} "
+        words += task.measure.unit
+    saved = f"{words}; " * (len(table) > 1)
     caption = f"{saved}kept: all limits, without a collision; {ALL}"
     short = shortened(table.assign(**columns), shown)
     return {"short": short, "caption": caption, "against": task.against, "label": task.label}

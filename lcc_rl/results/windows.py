@@ -202,12 +202,14 @@ def savings(
     Returns:
         The share with its interval over windows or drives, and seeds
         (:func:`lcc_rl.results.bootstrap.estimate`), for the windows of both; NaN if one of them is
-        missing.
+        missing, or the baseline is below the measure's ``least``.
     """
     energy, way, drives = _by_window(with_equal_seeds(rows, strategy, baseline), column, per)
     if energy.empty or not {strategy, baseline} <= set(energy.columns.get_level_values(0)):
         return NOTHING
     ours, theirs = ((energy[x].to_numpy(), way[x].to_numpy()) for x in (strategy, baseline))
+    if theirs[0].mean() < next((x.least for x in MEASURES if x.key == column), -np.inf):
+        return NOTHING
     paired = equal_seeds(energy[strategy].columns, energy[baseline].columns)
     return saving(ours[0], theirs[0], paired, drives, ways=(ours[1], theirs[1]))
 

@@ -23,9 +23,10 @@ def seen(speed: float, gap: float, relative: float) -> torch.Tensor:
     return torch.tensor([[[0.1 * (speed + relative), 0.1 * speed, 0.5 * relative, 0.1 * gap]]])
 
 
-def policy(kind: str, **settings):
+def policy(kind: str, observation: Observation | None = None, **settings):
     given = {"constants": None, "max_acceleration": 3.0} | settings
-    return make_policy(kind, Observation(scales=SCALES).bind(), (8, 8), 0, **given).module
+    observation = observation or Observation(scales=SCALES).bind()
+    return make_policy(kind, observation, (8, 8), 0, **given).module
 
 
 @pytest.mark.parametrize("state", [(8.0, 15.0, 0.5), (0.0, 2.5, 1.0), (12.0, 18.0, -2.0)])
@@ -38,6 +39,19 @@ def test_the_rules_are_those_of_the_equations(state) -> None:
     assert action.item() == pytest.approx(float(idm) / 4.0, rel=1e-4)
     acc = LinearACC.law(speed, gap, relative, 25.0, 1.5, 2.0, 0.1, 0.5)
     assert policy("acc")(seen(*state)).item() == pytest.approx(float(acc) / 3.0, rel=1e-4)
+
+
+def test_calm_reads_the_mean_of_its_speed_from_a_memory() -> None:
+    sources = ["self.speed", "ahead.speed"]
+    scales = {**SCALES, "memory": {"entries": 0.5}}
+    words = {"widths": {"memory": 4}}
+    kept = Observation(scales=scales, relative_to={"memory": sources}, **words).bind()
+    state, lags = seen(4.0, 14.0, -0.3), torch.tensor([0.5 * 0.4, 0.5 * 0.8, 9.0, 9.0])
+    # The mean of both is 0.6 m/s above the speed, 2 m above 12 m add 0.04 m/s, in 1 s.
+    action = policy("calm", kept)(torch.cat([state, lags.expand(1, 1, 4)], -1))
+    assert action.item() == pytest.approx(0.64 / 3.0)
+    with pytest.raises(ConfigError, match=r"needs memory\.entries relative to self\.speed"):
+        policy("residual_calm")
 
 
 class Scaled(Controller):

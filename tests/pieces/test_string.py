@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from helpers import ACTION, POPULATION, REWARD, compose, small_env, string, wavy_profiles
@@ -284,16 +286,36 @@ def test_a_handover_switches_at_its_moment() -> None:
 
 
 def test_calm_follows_its_formula() -> None:
-    piece = Calm(window=2.0, max_acceleration=50.0, max_deceleration=50.0)
+    piece = Calm(window=2.0, response=2.0, max_acceleration=50.0, max_deceleration=50.0)
     piece = piece.bind(World(time_step=1.0))
     history, speed = torch.zeros(1, 4, 2), torch.full((1, 4, 1), 4.0)
-    gap = torch.tensor([10.0, 65.0, 5.0, 2.0]).view(1, 4, 1)
-    ahead = torch.tensor([4.0, 4.0, 4.0, 0.0]).view(1, 4, 1)
-    command, past = piece.command(speed, gap, ahead, torch.zeros(1, 1, 1), history)
-    # The mean is 4 m/s; 50 m above 15 m add 1 m/s; 3 m above 2 m allow 2.5 m/s; last, it stops.
-    assert command.flatten().tolist() == pytest.approx([0.0, 1.0, -1.5, -4.0])
-    slower, _ = piece.command(0.5 * speed, gap, ahead, torch.ones(1, 1, 1), past)
-    assert slower.flatten().tolist()[:2] == pytest.approx([1.0, 2.0])  # the mean is now 3 m/s
+    gap = torch.tensor([10.0, 62.0, 5.0, 5.0]).view(1, 4, 1)
+    relative = torch.tensor([0.0, 0.0, 0.0, -3.0]).view(1, 4, 1)
+    command, past = piece.command(speed, gap, relative, torch.zeros(1, 1, 1), history)
+    # The mean is 4 m/s; 50 m above 12 m add 1 m/s; 3 m above 2 m allow 2.5 m/s, but none where
+    # 3 m are needed to brake. Half of the difference is the command.
+    assert command.flatten().tolist() == pytest.approx([0.0, 0.5, -0.75, -2.0])
+    slower, _ = piece.command(0.5 * speed, gap, relative, torch.ones(1, 1, 1), past)
+    assert slower.flatten().tolist()[:2] == pytest.approx([0.5, 1.0])  # the mean is now 3 m/s
+
+
+def test_calm_follows_a_leader_without_jerk_or_contact() -> None:
+    """A leader that slows from 19 to 3 m/s and speeds up again, as in waves of a motorway."""
+    piece = Calm().bind(World())
+    speed, gap, before = torch.full((1, 1, 1), 11.0), torch.full((1, 1, 1), 20.0), 0.0
+    history, jerks, gaps = torch.zeros(1, 1, 150), [], []
+    for step in range(1200):
+        ahead = 11.0 + 8.0 * math.sin(2.0 * math.pi * step / 600.0)
+        at = torch.full((1, 1, 1), step)
+        command, history = piece.command(speed, gap, ahead - speed, at, history)
+        command = command.clamp(*piece.limits)
+        gap = gap + 0.1 * (ahead - speed - 0.05 * command)
+        speed = (speed + 0.1 * command).clamp(min=0.0)
+        jerks.append(abs(command.item() - before) / 0.1)
+        gaps.append(gap.item())
+        before = command.item()
+    assert max(jerks) < 20.0  # 43 m/s³ with a command that reaches v_cmd in one step
+    assert min(gaps) > 2.0
 
 
 def test_pi_saturation_follows_its_formula() -> None:

@@ -266,6 +266,18 @@ def test_a_share_is_limited_in_the_mean_and_a_column_may_be_the_score() -> None:
         assert found["score"].tolist() == pytest.approx([0.5, 0.1])
 
 
+def test_no_share_is_given_of_a_spread_without_a_wave() -> None:
+    """The first seconds of a ring: 0.02 m/s of human drivers would be a saving of −900 %."""
+    task = Task(name="mine", score="final_speed_spread_mps")
+    words = "no saving: the baseline, simulated drivers, is below 0.5 m/s; "
+    for spread, saved in ((0.02, np.nan), (0.49, np.nan), (0.5, 0.6), (2.0, 0.9)):
+        human = driven("human", 1.0, 1.0, final_speed_spread_mps=spread)
+        own = driven("own", 1.0, 1.0, final_speed_spread_mps=0.2)
+        one = report(windows_for(pd.concat([human, own])), task, MOTOR)
+        assert one.table["saving"].tolist()[1] == pytest.approx(saved, nan_ok=True), spread
+        assert one.caption.startswith(words) == np.isnan(saved), spread
+
+
 def test_signs_of_a_name_stay_in_its_cell() -> None:
     table = pd.DataFrame({"driven by": ["a|b_c & 5 %\n#"], "energy_kj": [1.0]})
     head, rule, row = as_markdown(table).splitlines()
