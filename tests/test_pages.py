@@ -216,6 +216,8 @@ class Runner(Reader):
         where = kind or ("calibrate" if file else "train")
         made = self.folder.glob(f"outputs/{where}/**/{holds[1:]}")
         runs = sorted(made, key=lambda path: path.stat().st_mtime)
+        if file and not runs:  # a file of an earlier run, see page_files.FILES
+            return file[1:]
         folder = runs[-1].parent if runs and not name.startswith("other") else self.run
         if name == "sweep" and (folder.parent / "sweep.json").exists():
             folder = folder.parent
