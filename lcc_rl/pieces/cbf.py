@@ -61,9 +61,9 @@ class CBFFilter(RoleTransform):
     vehicle ahead keeps its acceleration and braking suffices.
 
     With ``longest_gap``, ``longest_gap − gap − h·(v_ahead − v)`` is kept positive, too, with
-    ``h = √(2·longest_gap / max_acceleration)``; the last two terms are the gap after h at the
-    present speeds. Half of the acceleration suffices to keep this limit; the other half is left for
-    a vehicle ahead that accelerates. Limits of short gaps have priority.
+    ``h = √(2·longest_gap / a)`` and the largest acceleration a; the last two terms are the gap
+    after h at the present speeds. Half of the acceleration suffices to keep this limit; the other
+    half is left for a vehicle ahead that accelerates. Limits of short gaps have priority.
 
     Behind a leader at standstill both limits are about gap / speed, so a vehicle that approaches
     from far away must violate one of them. With ``full_speed``, ``longest(v)`` is ``time_gap·v``
@@ -83,7 +83,8 @@ class CBFFilter(RoleTransform):
     controller of a filtered role writes. It is differentiable.
     """
 
-    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
+    # Lowers the limits of the vehicles, in both directions; 3: it does not [m/s²].
+    max_acceleration: Positive = MAX_ACCELERATION
     # Use the actuators and sensors of the scenario; false: assume that both are exact.
     robust: bool = True
     time_to_collision: Positive = 4.0  # shortest allowed [s]
@@ -122,7 +123,10 @@ class CBFFilter(RoleTransform):
         self.guaranteed = self.robust or self.role not in {*world.actuators, *world.sensors}
         if not self.robust:
             actuation, sensors = Actuation(), Sensors()
-        self.response = actuation.response_in(world, self.role, self.max_acceleration)
+        limits = world.limits(self.role, self.max_acceleration)
+        assert limits is not None
+        self.least, self.largest = limits
+        self.response = actuation.response_in(world, self.role, -self.least)
         self.sensing = sensors.sensing_in(world, self.role)
         # The memories of pending commands and of measurements, where there are any.
         self.late = self.response.late > 0 or self.response.share < 1.0
@@ -193,8 +197,8 @@ class CBFFilter(RoleTransform):
         command = self._comfortable(wanted, now, ahead_acceleration, differs.abs(), safe)
         stays = (gap < self.margin) & (relative + differs <= 0.0)
         command = torch.where(stays, command.clamp(max=0.0), command)
-        command = command.clamp(-self.max_acceleration, self.max_acceleration)
-        return torch.where(known, command, -self.max_acceleration), agreed
+        command = command.clamp(self.least, self.largest)
+        return torch.where(known, command, self.least), agreed
 
     def _safe(self, worst: PairState) -> Tensor:
         """Return the largest command after which full braking suffices."""
@@ -225,7 +229,7 @@ class CBFFilter(RoleTransform):
             least = (opening - self.time_gap_rate * (allowed - gap)) / slope
             command = torch.maximum(command, least)
         if self.longest_gap is not None:
-            foresight = math.sqrt(2.0 * self.longest_gap / self.max_acceleration)
+            foresight = math.sqrt(2.0 * self.longest_gap / self.largest)
             room = self.longest_gap - gap - foresight * opening
             faster = (opening - self.time_gap_rate * room) / (foresight + half)
             command = torch.maximum(command, ahead_acceleration + faster)
