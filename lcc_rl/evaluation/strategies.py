@@ -17,6 +17,7 @@ from lcc_rl.config import load
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import FILTERED, RECORDED
+from lcc_rl.envs.factory import replaces_leader
 from lcc_rl.errors import ConfigError, ResultsError, raised_as, require
 from lcc_rl.evaluation.fit import check_action, check_scenario, check_width
 from lcc_rl.evaluation.named import (
@@ -76,7 +77,8 @@ def applies(cfg: StudyConfig, name: str) -> bool:
     if name == DIRECT:
         return bool(roles - {AUTOMATED})
     if name == RECORDED:
-        return cfg.scenario.vehicles.places(AUTOMATED) == (0,) and cfg.scenario.road != RING
+        first = cfg.scenario.vehicles.places(AUTOMATED) == (0,)
+        return first and cfg.scenario.road != RING and not replaces_leader(cfg.scenario)
     return AUTOMATED in roles and (not name.endswith("oracle") or roles == {AUTOMATED})
 
 

@@ -136,20 +136,27 @@ class CBFFilter(RoleTransform):
         self.agreement = Agreement(self.sensing, world.time_step)
         kept = [f"{self.role}.agreement", *self.memories]
         seen = [f"next.{self.role}.{WANTED}", *FILTER_READS, *kept]
+        self.replaced = world.replaced
+        seen += ["self.followed"] * self.replaced
         self.declare(world, [*seen, *["episode.step"] * (self.from_step > 0)])
         self.limits = Braking(self.response.braking, self.braking_ahead, self.time_to_collision)
 
     def watch(self) -> CBFGuarantee:
         """Return the piece that records the steps which the filter's guarantee covers."""
-        return CBFGuarantee(safety=self).bind(World(self.string), self.role)
+        world = World(self.string, replaced=self.replaced)
+        return CBFGuarantee(safety=self).bind(world, self.role)
 
     def compute(self, wanted: Tensor, *state: Tensor) -> tuple[Tensor, Tensor]:
         """Return the filtered commands and the memory of gaps."""
-        if not self.from_step:
-            return self.filtered(wanted, *state)
-        *state, step = state  # type: ignore[assignment]
-        command, agreed = self.filtered(wanted, *state)
-        return torch.where(step < self.from_step, wanted, command), agreed
+        given = list(state)
+        step = given.pop() if self.from_step else None
+        if self.replaced:  # gaps to another vehicle are not compared
+            same = given.pop() > self.sensing.oldest
+            given[len(FILTER_READS)] = torch.where(same, given[len(FILTER_READS)], 0.0)
+        command, agreed = self.filtered(wanted, *given)
+        return command if step is None else torch.where(
+            step < self.from_step, wanted, command
+        ), agreed
 
     def kept(self, memories: Sequence[Tensor], nothing: Tensor) -> list[Tensor]:
         """Return the memories of actuation and sensors; ``nothing``, one column, for none."""
@@ -273,7 +280,8 @@ class CBFGuarantee(RoleTransform):
     It is 1 where the vehicle was safe when the step began and the vehicle ahead braked no harder
     than ``braking_ahead``, in the step and since the oldest measurement in use. Time-to-collision
     at the end of the step is then above the filter's limit. Elsewhere, and before the filter acts
-    (``from_s``), it is 0.
+    (``from_s``), it is 0. It is 0, too, while a measurement in use is of a vehicle ahead that has
+    been replaced.
 
     ``(role, "safe")`` of the same shape is 1 where the vehicle was safe when the step began, by its
     true state and the declared actuators. A covered step that ends unsafe shows that actuators or
@@ -289,13 +297,17 @@ class CBFGuarantee(RoleTransform):
 
     def setup(self, world: World) -> None:
         seen = ["self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration"]
-        self.declare(world, [*seen, *self.safety.memories, "episode.step"])
+        self.replaced = world.replaced
+        seen += [*self.safety.memories, "episode.step", *["next.self.followed"] * self.replaced]
+        self.declare(world, seen)
 
     def compute(
         self, speed: Tensor, gap: Tensor, ahead: Tensor, acceleration: Tensor, *more: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return 1 for covered steps, and 1 for steps that begin safe."""
-        safety, (*memories, step) = self.safety, more
+        safety, later = self.safety, list(more)
+        followed = later.pop() if self.replaced else None
+        *memories, step = later
         actuation, sensors = safety.kept(memories, speed)
         now = PairState(speed, gap - safety.margin, ahead, actuation[..., :1])
         if safety.late:
@@ -307,4 +319,6 @@ class CBFGuarantee(RoleTransform):
         kept_up = hardest >= -safety.braking_ahead - ROUNDING
         safe = room >= -ROUNDING
         promised = safe & kept_up & (step >= safety.from_step)
+        if followed is not None:
+            promised = promised & (followed > safety.sensing.oldest)
         return promised.to(speed.dtype), safe.to(speed.dtype)

@@ -41,6 +41,7 @@ class World:
         filtered: roles with a safety filter.
         max_braking: hardest braking of automated vehicles [m/s²].
         max_acceleration: largest acceleration of automated vehicles [m/s²].
+        replaced: whether the leader is replaced during episodes.
     """
 
     string: VehicleString = field(default_factory=VehicleString)
@@ -55,6 +56,7 @@ class World:
     filtered: Collection[str] = ()
     max_braking: float = MAX_ACCELERATION
     max_acceleration: float = MAX_ACCELERATION
+    replaced: bool = False
 
     def given(self, what: str, where: str) -> Any:
         """Return profiles, population or energy.
