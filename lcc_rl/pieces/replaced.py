@@ -38,9 +38,7 @@ class ReplacedLeader(NGSIMLeader):
     settling: Positive = 5.0  # time constant with which the excess decays [s]
 
     replaces = True
-    more = (
-        Entry(PLACEMENT, "–, m, m", "1 if the leader is replaced; largest gap; distance added"),
-    )
+    more = (Entry(PLACEMENT, "–, m, m", "1 if the leader is replaced; largest gap; added gap", 3),)
 
     def validate(self) -> None:
         if (self.gap is None) == (self.farther is None):
