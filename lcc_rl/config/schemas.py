@@ -143,6 +143,12 @@ class ScenarioConfig(Section):
         """
         return parse_string(self.string, self.road)
 
+    @property
+    def replaced(self) -> bool:
+        """Whether the leader is replaced during episodes."""
+        leader = self.pieces.get("leader")
+        return leader is not None and getattr(leader.kind, "replaces", False)
+
 
 class RewardConfig(Section):
     """The reward: named terms."""

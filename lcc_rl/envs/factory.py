@@ -109,14 +109,8 @@ def world_of(
         [role for role, _ in _by_role(scenario, "filters")],
         scenario.max_braking,
         scenario.max_acceleration,
-        replaces_leader(scenario),
+        scenario.replaced,
     )
-
-
-def replaces_leader(scenario: ScenarioConfig) -> bool:
-    """Return whether the leader is replaced during episodes."""
-    leader = scenario.pieces.get("leader")
-    return leader is not None and getattr(leader.kind, "replaces", False)
 
 
 def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:

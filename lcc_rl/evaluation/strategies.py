@@ -17,7 +17,6 @@ from lcc_rl.config import load
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import FILTERED, RECORDED
-from lcc_rl.envs.factory import replaces_leader
 from lcc_rl.errors import ConfigError, ResultsError, raised_as, require
 from lcc_rl.evaluation.fit import check_action, check_scenario, check_width
 from lcc_rl.evaluation.named import (
@@ -78,7 +77,7 @@ def applies(cfg: StudyConfig, name: str) -> bool:
         return bool(roles - {AUTOMATED})
     if name == RECORDED:
         first = cfg.scenario.vehicles.places(AUTOMATED) == (0,)
-        return first and cfg.scenario.road != RING and not replaces_leader(cfg.scenario)
+        return first and cfg.scenario.road != RING and not cfg.scenario.replaced
     return AUTOMATED in roles and (not name.endswith("oracle") or roles == {AUTOMATED})
 
 
