@@ -99,9 +99,9 @@ class Controller(RoleTransform):
             remembers: entries of the memory.
         """
         self.time_step = world.time_step
-        own = (getattr(self, name, None) for name in ("max_acceleration", "max_deceleration"))
+        most = (getattr(self, name, None) for name in ("max_acceleration", "max_deceleration"))
         # Limits of the commands [m/s²]; None: not clamped.
-        self.limits: tuple[float, float] | None = world.limits(self.role, *own)
+        self.limits: tuple[float, float] | None = world.limits(self.role, *most)
         memory = self.remembers if remembers is None else remembers
         own = [Entry((ROLE, x)) if isinstance(x, str) else x for x in memory]
         kept = [".".join(as_key(entry.of(self.role).key)) for entry in own]
