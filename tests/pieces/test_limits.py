@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import pytest
 import torch
 from helpers import POPULATION, check_refused, composed, play
@@ -20,6 +22,7 @@ from lcc_rl.results.policies import SHIPPED_POLICIES, load_policy
 STRONG = ("scenario.max_braking=6", "scenario.horizon=250")
 FILTERED = (*STRONG, "+filter=cbf", "scenario.filters.automated.braking_ahead=6")
 RULES = ("acc", "idm_acc", "follower_stopper", "pi_saturation", "calm", "constant", "idm", "gipps")
+MORE = ("ovm", "fvdm", *["mpc"] * bool(find_spec("osqp")))
 SEEN = [("vehicles", name) for name in ("gap", "acceleration", "ttc")]
 AUTO = "scenario.controllers.automated"
 
@@ -54,9 +57,11 @@ def check_safe(strategy: Strategy) -> None:
 
 def test_no_rule_collides_behind_a_leader_that_brakes_as_hard_as_declared() -> None:
     cfg = composed("variant=alcc", *FILTERED)
-    for name in RULES:
+    for name in (*RULES, *MORE):
         check_safe(baseline(cfg, f"{name}_filtered"))
-    check_safe(baseline(composed("variant=cacc", *FILTERED, "scenario.horizon=100"), "cacc"))
+    for name in ("cacc", "deadbeat"):
+        cfg = composed(f"variant={name}", *FILTERED, "scenario.horizon=100")
+        check_safe(baseline(cfg, name))
 
 
 @pytest.mark.slow
