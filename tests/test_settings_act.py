@@ -47,6 +47,8 @@ SHORT = ("max_acceleration", "time_to_collision", "rate", "margin", "braking_ahe
 REASONS: Mapping[str, str] = {
     "split.evaluation_share": "whole recordings are held out, and there are two",
     "scenario.controllers.human.wiener_range": "a factor of wiener, which is 0",
+    "scenario.max_braking": "no command is as unsafe",
+    "scenario.max_acceleration": "no command is as large",
     "scenario.vehicle_length": "enters flow and the excess of spacing only",
     "scenario.start.automated.standstill_gap": "episodes begin with the recorded gap",
     "scenario.start.human.cap_time_gap": "no gap at the start is as long",
@@ -101,6 +103,8 @@ ACTS: Sequence[tuple[str, Sequence[str], str]] = (
     ("limits", ["training.gap_range=[2.0,4.0]"], f"{FILTER}.least_gap=40"),
     ("limits", CLOSE, f"{FILTER}.max_acceleration=2.55"),
     ("limits", CLOSE, f"{FILTER}.time_to_collision=3.4"),
+    ("limits", CLOSE, "scenario.max_braking=2.55"),
+    ("ddpg", [], "scenario.max_acceleration=0.1"),
     ("limits", CLOSE, f"{FILTER}.rate=0.1"),
     ("limits", CLOSE, f"{FILTER}.margin=0.17"),
     ("limits", CLOSE, f"{FILTER}.braking_ahead=2.21"),

@@ -29,7 +29,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 CEILINGS = {
     "lcc_rl + tools": {"lines": 42_900, "code": 28_200},
     "tests": {"lines": 24_700},
-    "conf": {"yaml": 152},
+    "conf": {"yaml": 157},
 }
 CASES = 1_170  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {

@@ -19,6 +19,7 @@ from pydantic import AfterValidator, Field
 from lcc_rl.config.nodes import Node, as_nodes, as_plain, check_nodes, check_numbers
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString, parse_string
+from lcc_rl.pieces.world import MAX_ACCELERATION
 from lcc_rl.settings import (
     TARGET,
     Count,
@@ -122,6 +123,9 @@ class ScenarioConfig(Section):
     circumference_range: list[Positive] = Field(default_factory=lambda: [1.0, 1.0])
     vehicle_length: Positive  # [m]
     initial_speed: Speed  # on a ring [m/s]
+    # Limits of automated vehicles, for every controller, filter and policy [m/s²].
+    max_braking: Positive = MAX_ACCELERATION
+    max_acceleration: Positive = MAX_ACCELERATION
     controllers: Nodes
     start: Nodes
     filters: Nodes
@@ -138,6 +142,12 @@ class ScenarioConfig(Section):
             ConfigError: naming the position in the pattern that cannot be parsed.
         """
         return parse_string(self.string, self.road)
+
+    @property
+    def replaced(self) -> bool:
+        """Whether the leader is replaced during episodes."""
+        leader = self.pieces.get("leader")
+        return leader is not None and getattr(leader.kind, "replaces", False)
 
 
 class RewardConfig(Section):

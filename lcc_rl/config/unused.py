@@ -77,6 +77,9 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
         for role in {*getattr(cfg.scenario, group)} & {*cfg.scenario.controllers}:
             if role not in cfg.scenario.vehicles.names:
                 yield f"scenario.{group}.{role}", f"no vehicle of the string is {role}"
+    if AUTOMATED not in cfg.scenario.vehicles.names:
+        for name in ("max_braking", "max_acceleration"):
+            yield f"scenario.{name}", "no vehicle of the string is automated"
     for name, node in cfg.scenario.fleet.items():
         roles = node.settings.get("roles") if node is not None else None  # none of another class
         if roles and not {*roles} & {*cfg.scenario.vehicles.names}:

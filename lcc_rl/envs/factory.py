@@ -107,6 +107,9 @@ def world_of(
         {role: node.made(Actuation) for role, node in _by_role(scenario, "actuators")},
         {role: node.made(Sensors) for role, node in _by_role(scenario, "sensors")},
         [role for role, _ in _by_role(scenario, "filters")],
+        scenario.max_braking,
+        scenario.max_acceleration,
+        scenario.replaced,
     )
 
 

@@ -23,6 +23,8 @@ LONG_TIME_GAP = 2.5  # [s] (A13)
 SHORT_TIME_GAP = 1.0  # [s]
 APART = 1.0  # brakings of a vehicle within this time count as one [s]
 PACE = 1.0  # lower speeds do not count for moving time gaps [m/s]
+SPAN = 1.0  # over which accelerations and jerks are averaged [s]
+STANDSTILL = 0.1  # lower speeds count as standing [m/s]
 ACTS = 0.01  # change of a command above which a filter counts as active [m/s²]
 SERIES = ("speed", "gap", "acceleration", "power", "ttc", "time_gap", "jerk")  # of every vehicle
 OF_FILTER = ("promised", "safe", "wanted", "command")  # of vehicles behind a safety filter
@@ -169,8 +171,21 @@ class Reductions:
         return torch.where(self.alive, entry, torch.inf).amin(0).amin(-2)
 
     def highest(self, entry: Tensor) -> Tensor:
-        """Maximum over time and vehicles."""
-        return torch.where(self.alive, entry, -torch.inf).amax(0).amax(-2)
+        """Maximum over time and vehicles; an entry may lack the first times."""
+        alive = self.alive[len(self.alive) - len(entry) :]
+        found = torch.where(alive, entry, -torch.inf)
+        return found.amax(0).amax(-2) if len(entry) else found.sum(0).sum(-2) * torch.nan
+
+    def slope(self, entry: Tensor) -> Tensor:
+        """Change of an entry per second over each :data:`SPAN`; the first times are missing."""
+        steps = max(1, round(SPAN / self.time_step))
+        return (entry[steps:] - entry[:-steps]) / (steps * self.time_step)
+
+    def first(self, state: Tensor) -> Tensor:
+        """Time at which a state of a vehicle begins, the last of the vehicles; NaN if not all."""
+        state = state & self.alive
+        time = (state.int().argmax(0) + 1.0) * self.time_step
+        return torch.where(state.any(0), time, torch.nan).amax(-2)
 
 
 def _turned(over: Reductions, safe: Tensor) -> Tensor:
@@ -178,6 +193,11 @@ def _turned(over: Reductions, safe: Tensor) -> Tensor:
     turned = torch.zeros_like(safe, dtype=torch.bool)
     turned[:-1] = (safe[:-1] > 0.0) & (safe[1:] <= 0.0) & over.alive[1:]
     return turned
+
+
+def _extreme(value: Tensor) -> Tensor:
+    """Return a largest value; NaN for an episode without one."""
+    return torch.where(value.isfinite(), value, torch.nan)
 
 
 # Measures of the automated vehicles of a string by column of episodes.parquet. Each is a function
@@ -196,6 +216,16 @@ METRICS: dict[str, Metric] = {
         (time_gap > LONG_TIME_GAP) & (speed[1:] > PACE)
     ),
     "rms_jerk_mps3": lambda over, jerk: over.mean(jerk**2).sqrt(),
+    "max_jerk_mps3": lambda over, jerk: over.highest(jerk.abs()),
+    "max_jerk_1s_mps3": lambda over, acceleration: _extreme(
+        over.highest(over.slope(acceleration).abs())
+    ),
+    "max_deceleration_mps2": lambda over, acceleration: over.highest(-acceleration),
+    "max_deceleration_1s_mps2": lambda over, speed: _extreme(over.highest(-over.slope(speed))),
+    "standstill_s": lambda over, speed: over.first(speed[1:] < STANDSTILL),
+    "speed_overshoot_mps": lambda over, speed, leader_speed: _extreme(
+        over.highest((speed - leader_speed.cummax(0).values)[1:]).clamp(min=0.0)
+    ),
     "duration_s": lambda over: over.steps * over.time_step,
     "share_filter_acts": lambda over, command, wanted: over.mean((command - wanted).abs() > ACTS),
     "share_promised": lambda over, promised: over.mean(promised),

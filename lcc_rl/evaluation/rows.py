@@ -140,7 +140,8 @@ def measures(
             columns[f"{group}_{name}"] = added
     own = groups["cav"]
     if "gap" in own:
-        columns |= safety_measures(own, alive.unsqueeze(-2), time_step)
+        ahead = {f"leader_{name}": x for name, x in groups["leader"].items()}
+        columns |= safety_measures({**own, **ahead}, alive.unsqueeze(-2), time_step)
         for name in SUMMED:
             keys = [f"{group}_{name}" for group in ("cav", "hdv")]
             parts = [columns[key] for key in keys if key in columns]

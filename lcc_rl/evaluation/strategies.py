@@ -76,7 +76,8 @@ def applies(cfg: StudyConfig, name: str) -> bool:
     if name == DIRECT:
         return bool(roles - {AUTOMATED})
     if name == RECORDED:
-        return cfg.scenario.vehicles.places(AUTOMATED) == (0,) and cfg.scenario.road != RING
+        first = cfg.scenario.vehicles.places(AUTOMATED) == (0,)
+        return first and cfg.scenario.road != RING and not cfg.scenario.replaced
     return AUTOMATED in roles and (not name.endswith("oracle") or roles == {AUTOMATED})
 
 

@@ -74,6 +74,8 @@ class NetworkController(Controller):
 
     def setup(self, world: World) -> None:
         self.declare(world)
+        least, largest = self.limits or (-self.max_acceleration, self.max_acceleration)
+        self.limits = max(least, -self.max_acceleration), min(largest, self.max_acceleration)
         self.layers = self.network  # as a part of this module
 
     def command(self, observation: Tensor) -> Tensor:
@@ -253,7 +255,11 @@ def program(
         assert isinstance(learned, TensorDictModule)
         network = learned.module
     (observation,), (action,) = found.values()
-    world = measuring(scenario.time_step, BEHIND_PRESENT not in observation.names)
+    world = replace(
+        measuring(scenario.time_step, BEHIND_PRESENT not in observation.names),
+        max_braking=scenario.max_braking,
+        max_acceleration=scenario.max_acceleration,
+    )
     seen = {name.partition(".")[0] for name in observation.seen}
     memory = [p for p in pieces if isinstance(p, ObservationMemory) and p.view in seen]
     largest = action.max_acceleration

@@ -33,6 +33,7 @@ from lcc_rl.pieces.cbf import SLOWEST
 from lcc_rl.pieces.controllers import stream_name
 from lcc_rl.pieces.drivers import IDM, Drivers
 from lcc_rl.pieces.knowledge import ObservationMemory
+from lcc_rl.pieces.world import MAX_ACCELERATION
 from lcc_rl.results.policies import load_policy
 from lcc_rl.settings import values
 
@@ -72,6 +73,8 @@ def page_data(policy: Any, trust: Sequence[str], overrides: Sequence[str]) -> di
     car = energy[0] if len(energy) == 1 and isinstance(energy[0], CirclesFuel) else None
     strange = [f"role {name}" for name in vehicles.names if name not in (HUMAN, AUTOMATED)]
     strange += [f"scenario.{x}" for x in NOT_ON_PAGE if getattr(scenario, x)]
+    limits = {"max_braking": scenario.max_braking, "max_acceleration": scenario.max_acceleration}
+    strange += [f"scenario.{name}={x:g}" for name, x in limits.items() if x != MAX_ACCELERATION]
     if car is None or car.truck or car.grade:
         strange.append("energy (only one car on a level road: energy=compact)")
     human = None if strange else _human(cfg)

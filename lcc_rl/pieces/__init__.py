@@ -20,6 +20,7 @@ from lcc_rl.pieces.mpc import MPC
 from lcc_rl.pieces.observation import Observation
 from lcc_rl.pieces.ranges import RangeReward, SmoothRange
 from lcc_rl.pieces.recorded import RecordedDriver
+from lcc_rl.pieces.replaced import ReplacedLeader
 from lcc_rl.pieces.rewards import (
     CollisionPenalty,
     EfficiencyReward,

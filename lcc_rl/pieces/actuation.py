@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from lcc_rl.errors import require
 from lcc_rl.functional.actuation import Response
 from lcc_rl.functional.layout import join
 from lcc_rl.pieces.base import Entry, RoleTransform
@@ -37,9 +38,16 @@ class Actuation(RoleTransform):
         """Return the response of the role's vehicles; ``hardest``: of the commands [m/s²].
 
         Raises:
-            ConfigError: if the delay is no multiple of the time step, or too long.
+            ConfigError: if the delay is no multiple of the time step or too long, or the braking
+                exceeds that of the vehicle.
         """
         late = world.late(self.delay, f"scenario.actuators.{role}.delay")
+        limits = world.limits(role)
+        require(
+            limits is None or (self.braking or 0.0) <= -limits[0],
+            f"scenario.actuators.{role}.braking={self.braking} has no effect above "
+            f"scenario.max_braking={world.max_braking:g}",
+        )
         braking = min(self.braking or hardest, hardest)
         return Response.of(late, self.lag, braking, world.time_step)
 

@@ -61,9 +61,9 @@ class CBFFilter(RoleTransform):
     vehicle ahead keeps its acceleration and braking suffices.
 
     With ``longest_gap``, ``longest_gap − gap − h·(v_ahead − v)`` is kept positive, too, with
-    ``h = √(2·longest_gap / max_acceleration)``; the last two terms are the gap after h at the
-    present speeds. Half of the acceleration suffices to keep this limit; the other half is left for
-    a vehicle ahead that accelerates. Limits of short gaps have priority.
+    ``h = √(2·longest_gap / a)`` and the largest acceleration a; the last two terms are the gap
+    after h at the present speeds. Half of the acceleration suffices to keep this limit; the other
+    half is left for a vehicle ahead that accelerates. Limits of short gaps have priority.
 
     Behind a leader at standstill both limits are about gap / speed, so a vehicle that approaches
     from far away must violate one of them. With ``full_speed``, ``longest(v)`` is ``time_gap·v``
@@ -83,7 +83,8 @@ class CBFFilter(RoleTransform):
     controller of a filtered role writes. It is differentiable.
     """
 
-    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
+    # Lowers the limits of the vehicles, in both directions; 3: it does not [m/s²].
+    max_acceleration: Positive = MAX_ACCELERATION
     # Use the actuators and sensors of the scenario; false: assume that both are exact.
     robust: bool = True
     time_to_collision: Positive = 4.0  # shortest allowed [s]
@@ -122,7 +123,10 @@ class CBFFilter(RoleTransform):
         self.guaranteed = self.robust or self.role not in {*world.actuators, *world.sensors}
         if not self.robust:
             actuation, sensors = Actuation(), Sensors()
-        self.response = actuation.response_in(world, self.role, self.max_acceleration)
+        limits = world.limits(self.role, self.max_acceleration)
+        assert limits is not None
+        self.least, self.largest = limits
+        self.response = actuation.response_in(world, self.role, -self.least)
         self.sensing = sensors.sensing_in(world, self.role)
         # The memories of pending commands and of measurements, where there are any.
         self.late = self.response.late > 0 or self.response.share < 1.0
@@ -132,20 +136,27 @@ class CBFFilter(RoleTransform):
         self.agreement = Agreement(self.sensing, world.time_step)
         kept = [f"{self.role}.agreement", *self.memories]
         seen = [f"next.{self.role}.{WANTED}", *FILTER_READS, *kept]
+        self.replaced = world.replaced
+        seen += ["self.followed"] * self.replaced
         self.declare(world, [*seen, *["episode.step"] * (self.from_step > 0)])
         self.limits = Braking(self.response.braking, self.braking_ahead, self.time_to_collision)
 
     def watch(self) -> CBFGuarantee:
         """Return the piece that records the steps which the filter's guarantee covers."""
-        return CBFGuarantee(safety=self).bind(World(self.string), self.role)
+        world = World(self.string, replaced=self.replaced)
+        return CBFGuarantee(safety=self).bind(world, self.role)
 
     def compute(self, wanted: Tensor, *state: Tensor) -> tuple[Tensor, Tensor]:
         """Return the filtered commands and the memory of gaps."""
-        if not self.from_step:
-            return self.filtered(wanted, *state)
-        *state, step = state  # type: ignore[assignment]
-        command, agreed = self.filtered(wanted, *state)
-        return torch.where(step < self.from_step, wanted, command), agreed
+        given = list(state)
+        step = given.pop() if self.from_step else None
+        if self.replaced:  # gaps to another vehicle are not compared
+            same = given.pop() > self.sensing.oldest
+            given[len(FILTER_READS)] = torch.where(same, given[len(FILTER_READS)], 0.0)
+        command, agreed = self.filtered(wanted, *given)
+        return command if step is None else torch.where(
+            step < self.from_step, wanted, command
+        ), agreed
 
     def kept(self, memories: Sequence[Tensor], nothing: Tensor) -> list[Tensor]:
         """Return the memories of actuation and sensors; ``nothing``, one column, for none."""
@@ -193,8 +204,8 @@ class CBFFilter(RoleTransform):
         command = self._comfortable(wanted, now, ahead_acceleration, differs.abs(), safe)
         stays = (gap < self.margin) & (relative + differs <= 0.0)
         command = torch.where(stays, command.clamp(max=0.0), command)
-        command = command.clamp(-self.max_acceleration, self.max_acceleration)
-        return torch.where(known, command, -self.max_acceleration), agreed
+        command = command.clamp(self.least, self.largest)
+        return torch.where(known, command, self.least), agreed
 
     def _safe(self, worst: PairState) -> Tensor:
         """Return the largest command after which full braking suffices."""
@@ -225,7 +236,7 @@ class CBFFilter(RoleTransform):
             least = (opening - self.time_gap_rate * (allowed - gap)) / slope
             command = torch.maximum(command, least)
         if self.longest_gap is not None:
-            foresight = math.sqrt(2.0 * self.longest_gap / self.max_acceleration)
+            foresight = math.sqrt(2.0 * self.longest_gap / self.largest)
             room = self.longest_gap - gap - foresight * opening
             faster = (opening - self.time_gap_rate * room) / (foresight + half)
             command = torch.maximum(command, ahead_acceleration + faster)
@@ -269,7 +280,8 @@ class CBFGuarantee(RoleTransform):
     It is 1 where the vehicle was safe when the step began and the vehicle ahead braked no harder
     than ``braking_ahead``, in the step and since the oldest measurement in use. Time-to-collision
     at the end of the step is then above the filter's limit. Elsewhere, and before the filter acts
-    (``from_s``), it is 0.
+    (``from_s``), it is 0. It is 0, too, while a measurement in use is of a vehicle ahead that has
+    been replaced.
 
     ``(role, "safe")`` of the same shape is 1 where the vehicle was safe when the step began, by its
     true state and the declared actuators. A covered step that ends unsafe shows that actuators or
@@ -285,13 +297,17 @@ class CBFGuarantee(RoleTransform):
 
     def setup(self, world: World) -> None:
         seen = ["self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration"]
-        self.declare(world, [*seen, *self.safety.memories, "episode.step"])
+        self.replaced = world.replaced
+        seen += [*self.safety.memories, "episode.step", *["next.self.followed"] * self.replaced]
+        self.declare(world, seen)
 
     def compute(
         self, speed: Tensor, gap: Tensor, ahead: Tensor, acceleration: Tensor, *more: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return 1 for covered steps, and 1 for steps that begin safe."""
-        safety, (*memories, step) = self.safety, more
+        safety, later = self.safety, list(more)
+        followed = later.pop() if self.replaced else None
+        *memories, step = later
         actuation, sensors = safety.kept(memories, speed)
         now = PairState(speed, gap - safety.margin, ahead, actuation[..., :1])
         if safety.late:
@@ -303,4 +319,6 @@ class CBFGuarantee(RoleTransform):
         kept_up = hardest >= -safety.braking_ahead - ROUNDING
         safe = room >= -ROUNDING
         promised = safe & kept_up & (step >= safety.from_step)
+        if followed is not None:
+            promised = promised & (followed > safety.sensing.oldest)
         return promised.to(speed.dtype), safe.to(speed.dtype)

@@ -61,8 +61,10 @@ class Controller(RoleTransform):
 
     Where the role has a safety filter, it writes ``(role, "wanted")``, which the filter reads.
 
-    Its name in an environment is the role. Commands are clamped to ± the controller's setting
-    ``max_acceleration``; without this setting, those of automated vehicles to ±3 m/s².
+    Its name in an environment is the role. Commands to automated vehicles are clamped to the limits
+    of their brakes and drive (``scenario.max_braking``, ``scenario.max_acceleration``). A setting
+    ``max_acceleration`` or ``max_deceleration`` of the controller lowers them, see
+    :meth:`lcc_rl.pieces.world.World.limits`.
     """
 
     # Entries of its memory, 0 at first, or names of entries (role, name) with one number.
@@ -97,10 +99,9 @@ class Controller(RoleTransform):
             remembers: entries of the memory.
         """
         self.time_step = world.time_step
-        otherwise = MAX_ACCELERATION if self.role == AUTOMATED else None
-        largest = getattr(self, "max_acceleration", otherwise)
+        most = (getattr(self, name, None) for name in ("max_acceleration", "max_deceleration"))
         # Limits of the commands [m/s²]; None: not clamped.
-        self.limits: tuple[float, float] | None = None if largest is None else (-largest, largest)
+        self.limits: tuple[float, float] | None = world.limits(self.role, *most)
         memory = self.remembers if remembers is None else remembers
         own = [Entry((ROLE, x)) if isinstance(x, str) else x for x in memory]
         kept = [".".join(as_key(entry.of(self.role).key)) for entry in own]
@@ -133,7 +134,9 @@ class Action(Controller):
 
     def setup(self, world: World) -> None:
         self.declare(world, [f"{self.name}.action"])
-        self.limits = None  # the action is clamped when it is read
+        assert self.limits is not None
+        if max(self.limits[0], -self.limits[1]) <= -self.max_acceleration:
+            self.limits = None  # the action is clamped when it is read
 
     def command(self, action: Tensor) -> Tensor:
         return action * self.max_acceleration

@@ -9,7 +9,7 @@ from pydantic import Field
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
@@ -46,6 +46,7 @@ class LeaderPreview(Feature):
 
     def setup(self, world: World) -> None:
         profiles = world.profiles
+        require(not world.replaced, "a preview reads the record of a leader that is replaced")
         self.declare(world, writes=[self.known.wide((1, len(self.horizons)))])
         self.stream = stream_id("preview.noise")
         where = f"scenario.pieces.{self.name}"
@@ -73,9 +74,10 @@ class ObservationMemory(StepTransform):
     Writes ``("memory", "entries")``, ``[*batch, A, sources × seconds]``, ordered by source: for
     each source and each number in ``seconds`` the exponential average with this time constant
     (``filtered``), or the value of this age (``stacked``, which also writes ``("memory",
-    "history")``). Values before the episode are those of its start. ``spread`` writes ``("spread",
-    "entries")`` instead: the exponential average of the distance from the exponential average
-    (``("spread", "averages")``), which tells waves from free flow; 0 at the start.
+    "history")``). Values before the episode are those of its start; it starts anew behind another
+    vehicle that replaces the one ahead. ``spread`` writes ``("spread", "entries")`` instead: the
+    exponential average of the distance from the exponential average (``("spread", "averages")``),
+    which tells waves from free flow; 0 at the start.
     """
 
     # Remembered entries: dotted names of views with one number, "self.gap".
@@ -116,6 +118,8 @@ class ObservationMemory(StepTransform):
             writes.append(self.history.wide(self.counted * self.depth))
         kept = [str(entry.key) for entry in writes[self.stacked :]]
         reached = [f"{NEXT}.{source}" for source in self.sources]
+        self.replaced = world.replaced
+        reached += [f"{NEXT}.self.followed"] * self.replaced
         self.declare(world, [*kept, *reached], writes)
         # The same entries at reset, which has no previous step.
         self.first = Views(world.string, AUTOMATED, world.sensed(AUTOMATED, self.sources))
@@ -125,12 +129,18 @@ class ObservationMemory(StepTransform):
 
     def compute(self, kept: Tensor, *measured: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         """Return the entries, and the history or the averages if they are kept."""
-        if self.kind == "spread":
-            average, now = measured[0], torch.cat(measured[1:], -1)
+        given, spread = list(measured), self.kind == "spread"
+        same = given.pop() > 0.0 if self.replaced else None  # behind the same vehicle
+        average = given.pop(0) if spread else None
+        now = torch.cat(given, -1)
+        if same is not None:
+            fresh = now.repeat_interleave(kept.shape[-1] // self.counted, -1)
+            kept = torch.where(same, kept, 0.0 * fresh if spread else fresh)
+            average = None if average is None else torch.where(same, average, fresh)
+        if average is not None:
             now = now.repeat_interleave(self.repeat, -1)
             away = (now - average).abs()
             return torch.lerp(kept, away, self.shares), torch.lerp(average, now, self.shares)
-        now = torch.cat(measured, -1)
         if not self.stacked:
             return torch.lerp(kept, now.repeat_interleave(self.repeat, -1), self.shares)
         past = kept.unflatten(-1, (self.counted, self.depth))

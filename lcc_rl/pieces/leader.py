@@ -47,6 +47,7 @@ class NGSIMLeader(StepTransform):
         Entry(LEADER_ACCELERATION, "m/s²", "backward difference of the leader's speed"),
         Entry(NEXT_SPEED, "m/s", "speed of the leader one step ahead, for oracles"),
     )
+    more: ClassVar[tuple[Entry, ...]] = ()  # entries that a subclass writes
     speeds: ClassVar[Tensor]
     offsets: ClassVar[Tensor]
     lengths: ClassVar[Tensor]
@@ -60,7 +61,7 @@ class NGSIMLeader(StepTransform):
             DataError: if no record is as long as the horizon.
         """
         reads = [PROFILE, PROFILE_START, LEADER_SPEED, next_key(STEP), SEED]
-        self.declare(world, reads, self.writes[: 2 + self.foresight])
+        self.declare(world, reads, [*self.writes[: 2 + self.foresight], *self.more])
         self.perturbed = 0.0 if world.nominal else self.perturbation
         profiles = world.given("profiles", self.title).at_least(world.horizon)
         last = len(profiles) - 1

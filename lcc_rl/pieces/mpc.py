@@ -78,7 +78,7 @@ class MPC(MPCSettings, Controller):
         self.check_installed()
         self.declare(world)
         own = {field.name: getattr(self, field.name) for field in fields(MPCSettings)}
-        self.solver = Solver(MPCSettings(**own))
+        self.solver = Solver(MPCSettings(**own), self.limits)
 
     @staticmethod
     def check_installed() -> None:
@@ -105,15 +105,16 @@ class Solver:
 
     Args:
         settings: settings of the controller.
+        limits: least and largest command [m/s²]; None: ± the settings' ``max_acceleration``.
     """
 
-    def __init__(self, settings: MPCSettings) -> None:
-        self.settings = settings
-        self.program = FollowingProgram(settings)
+    def __init__(self, settings: MPCSettings, limits: tuple[float, float] | None = None) -> None:
+        self.settings, self.limits = settings, limits
+        self.program = FollowingProgram(settings, limits)
         self.osqp = _set_up(self.program)
 
     def __reduce__(self) -> Any:
-        return Solver, (self.settings,)  # OSQP's own object cannot be copied
+        return Solver, (self.settings, self.limits)  # OSQP's own object cannot be copied
 
     def __call__(self, rows: Array) -> tuple[Array, Array]:
         """Return the first accelerations, and 1 where there was no solution, ``[rows]``.
@@ -128,7 +129,7 @@ class Solver:
     def _each(self, rows: Array) -> tuple[Array, Array]:
         first, unsolved = np.full(len(rows), np.nan), np.zeros(len(rows))
         known = np.flatnonzero(np.isfinite(rows).all(1))
-        limit = self.settings.max_acceleration
+        least, largest = self.program.limits
         speed, gap, *others = rows[known].T
         vectors = self.program.vectors(speed, gap.clip(-LONGEST_GAP, LONGEST_GAP), *others)
         each = zip(known, vectors.linear, vectors.lower, vectors.upper, strict=True)
@@ -136,7 +137,7 @@ class Solver:
             self.osqp.update(q=linear, l=lower, u=upper)
             found = self.osqp.solve(raise_error=False)
             solved = found.info.status_val == 1
-            first[row] = np.clip(found.x[0], -limit, limit) if solved else -limit
+            first[row] = np.clip(found.x[0], least, largest) if solved else least
             unsolved[row] = not solved
         return first, unsolved
 
@@ -189,13 +190,15 @@ class FollowingProgram:
 
     Args:
         settings: settings of the controller.
+        limits: see :class:`Solver`.
 
     Attributes:
         quadratic: P, ``[4 N, 4 N]``.
         constraints: A, ``[5 N, 4 N]``.
     """
 
-    def __init__(self, settings: MPCSettings) -> None:
+    def __init__(self, settings: MPCSettings, limits: tuple[float, float] | None = None) -> None:
+        self.limits = limits or (-settings.max_acceleration, settings.max_acceleration)
         self.settings, self.steps = settings, round(settings.horizon / settings.step)
         h, n = settings.step, self.steps
         self.times = h * np.arange(1, n + 1)
@@ -245,10 +248,10 @@ class FollowingProgram:
             s.longest_time_gap * speed + np.maximum(narrowest, s.longest_gap) - free,
             free - s.least_ttc * (speed - lead),
             np.broadcast_to(speed, free.shape),
-            np.full_like(free, s.max_acceleration),
+            np.full_like(free, self.limits[1]),
         ]
         lower = np.full((len(free), 5 * n), -np.inf)
-        lower[:, 4 * n :] = -s.max_acceleration
+        lower[:, 4 * n :] = self.limits[0]
         linear = np.zeros((len(free), 4 * n))
         linear[:, :n] = s.steady_price * _steady_slope(speed) * self.speeds.sum(0)
         linear[:, 0] -= 2.0 * s.jerk_price * acceleration / s.step**2

@@ -46,7 +46,6 @@ class Averaging(Controller):
         memory = [self.history.wide(self.samples), *self.remembers] if self.averages else []
         reads = [*self.reads, *["episode.step"] * self.averages]
         self.declare(world, reads, remembers=memory)
-        self.limits = (-self.max_deceleration, self.max_acceleration)
 
     def mean(self, speed: Tensor, step: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean [m/s], ``[*batch, n, 1]``, and the history with the present speed."""

@@ -44,8 +44,10 @@ class Sensors(RoleTransform):
     delay: NonNegative = 0.0  # age of an arriving measurement, multiple of a step [s]
     dropouts: Share = 0.0  # probability that a measurement is missing; the last one is kept
     longest_dropout: NonNegative = 0.0  # longest drop-out, multiple of a step [s]
+    # Time from which the target is lost for longest_dropout; None: it is not [s].
+    lost_from: NonNegative | None = None
 
-    LATER = ("scale_error",)
+    LATER = ("scale_error", "lost_from")
     measured = (
         Entry("role.sensed_gap", "m", "gap as measured"),
         Entry("role.sensed_speed", "m/s", "own speed as measured"),
@@ -57,12 +59,16 @@ class Sensors(RoleTransform):
     index: ClassVar[Tensor]
 
     def validate(self) -> None:
-        if (self.dropouts > 0.0) != (self.longest_dropout > 0.0):
-            raise ValueError("dropouts and longest_dropout belong together: give both or none")
+        missing = self.dropouts > 0.0 or self.lost_from is not None
+        if missing != (self.longest_dropout > 0.0):
+            raise ValueError(
+                "dropouts or lost_from and longest_dropout belong together: give both or none"
+            )
 
     def setup(self, world: World) -> None:
         role, self.time_step = self.name, world.time_step
         self.sensing = self.sensing_in(world, role)
+        self.first_lost = world.steps(self.lost_from or 0.0, f"scenario.sensors.{role}.lost_from")
         self.apart = max(1, world.steps(self.error_time, f"scenario.sensors.{role}.error_time"))
         drawn = ["episode.seed", "next.episode.step"]
         seen = [f"{role}.{SENSORS}", *(f"next.{name}" for name in TRUE_STATE), *drawn]
@@ -93,6 +99,10 @@ class Sensors(RoleTransform):
         frames = join([*now, memory[..., 1 : -len(TRUE_STATE)]], -1)
         dropped = memory[..., :1] - self.sensing.late
         missing = uniform(seed, step, self.missing + self.index) < self.dropouts
+        if self.lost_from is not None:
+            missing = missing | (
+                (step > self.first_lost) & (step <= self.first_lost + self.sensing.longest)
+            )
         dropped = torch.where(missing & (dropped < self.sensing.longest), dropped + 1.0, 0.0)
         return self._measured(frames, self.sensing.late + dropped, seed, step)
 

@@ -24,6 +24,8 @@ from lcc_rl.settings import Factors, Positive, Speed
 
 RING_GAP = stream_id("string.ring_gap")
 WANTED, COMMAND, OBEYED = "wanted", "command", "obeyed"
+PLACEMENT = ("leader", "placement")
+LONG_AGO = 1e4  # steps since a vehicle ahead changed that has not changed
 COMMANDED = Entry("role.command", "m/s²", "acceleration that the role's controller commands")
 WISHED = Entry("role.wanted", "m/s²", "acceleration commanded before the safety filter")
 
@@ -100,6 +102,7 @@ class StringMotion(StepTransform):
         Entry("vehicles.jerk", "m/s³", "change of the executed acceleration per second"),
         Entry("vehicles.command", "m/s²", "acceleration commanded for the last step"),
     )
+    followed = Entry("vehicles.followed", "–", "steps since the vehicle ahead was replaced")
 
     def setup(self, world: World) -> None:
         """Read the commands of all roles, and bind their starts.
@@ -117,7 +120,10 @@ class StringMotion(StepTransform):
         indices = [(role, "index") for role in string.names] if string.drawn else []
         self.fleet = world.energy
         self.limited = self.fleet is not None and self.fleet.limited
-        self.declare(world, [*own, *leader, *commands, *indices, *[CLASS] * self.limited])
+        self.replaced = world.replaced
+        changes = [next_key(PLACEMENT), (VEHICLES, "followed")] * self.replaced
+        read = [*own, *leader, *commands, *indices, *changes, *[CLASS] * self.limited]
+        self.declare(world, read, [*self.writes, *[self.followed] * self.replaced])
         self.starts: dict[str, Any] = {
             role: start.bind(world, role) if isinstance(start, Part) else start
             for role, start in self.start.items()
@@ -159,7 +165,17 @@ class StringMotion(StepTransform):
         if self.limited:
             command = self.fleet.within(command, speed, self.time_step, parts[-1])
         motion = advance_string(speed, gap, acceleration, command, leader, reached, self.time_step)
-        return (*motion, command)
+        if not self.replaced:
+            return (*motion, command)
+        placement, followed = (x for x in parts[-2 - self.limited :][:2])
+        changed, near, added = placement.unsqueeze(-2).split(1, -1)
+        gap = torch.minimum(motion.gap[..., :1, :], near) + added
+        count = torch.where(changed > 0.0, 0.0, followed[..., :1, :] + 1.0)
+        gap, count = (
+            join([first, rest[..., 1:, :]], -2) if rest.shape[-2] > 1 else first
+            for first, rest in ((gap, motion.gap), (count, followed))
+        )
+        return (*motion._replace(gap=gap), command, count)
 
     def _assemble(self, parts: tuple[Tensor, ...], indices: tuple[Tensor, ...]) -> Tensor:
         """Return an entry of all vehicles, front to back, from those of the roles."""
@@ -196,6 +212,7 @@ class StringMotion(StepTransform):
             speed = speed if limits is None else torch.minimum(speed, limits)
             relative = entries_ahead(leader, speed) - speed
         still = torch.zeros_like(speed)
-        values = (speed, gap, relative, still, still.clone(), still.clone())
+        values = [speed, gap, relative, still, still.clone(), still.clone()]
+        values += [torch.full_like(still, LONG_AGO)] * self.replaced
         for key, value in zip(self.targets, values, strict=True):
             start.set(key, value)

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 from tensordict.utils import NestedKey
 
 from lcc_rl.errors import require
-from lcc_rl.functional.pattern import VehicleString
+from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.settings import Settings, values
 
 MAX_ACCELERATION = 3.0  # of vehicles by default, in both directions [m/s²]
@@ -39,6 +39,9 @@ class World:
         actuators: settings of :class:`lcc_rl.pieces.Actuation` by role.
         sensors: settings of :class:`lcc_rl.pieces.Sensors` by role.
         filtered: roles with a safety filter.
+        max_braking: hardest braking of automated vehicles [m/s²].
+        max_acceleration: largest acceleration of automated vehicles [m/s²].
+        replaced: whether the leader is replaced during episodes.
     """
 
     string: VehicleString = field(default_factory=VehicleString)
@@ -51,6 +54,9 @@ class World:
     actuators: Mapping[str, Any] = field(default_factory=dict)
     sensors: Mapping[str, Any] = field(default_factory=dict)
     filtered: Collection[str] = ()
+    max_braking: float = MAX_ACCELERATION
+    max_acceleration: float = MAX_ACCELERATION
+    replaced: bool = False
 
     def given(self, what: str, where: str) -> Any:
         """Return profiles, population or energy.
@@ -88,6 +94,36 @@ class World:
         most = MOST_LATE * self.time_step
         require(seconds < 1.001 * most, f"{what} must be at most {most:g} s, got {seconds:g} s")
         return self.steps(seconds, what)
+
+    def limits(
+        self, role: str, forward: float | None = None, backward: float | None = None
+    ) -> tuple[float, float] | None:
+        """Return the least and the largest command to the vehicles of a role [m/s²].
+
+        Args:
+            role: vehicles that are not automated have only the limits of their controller.
+            forward: the controller's ``max_acceleration``. None and :data:`MAX_ACCELERATION`, the
+                default, mean the limit of automated vehicles; other values lower it.
+            backward: its ``max_deceleration``, positive; None: ``forward``.
+
+        Raises:
+            ConfigError: if a setting exceeds the limits of automated vehicles.
+        """
+        own = {"max_deceleration": backward or forward, "max_acceleration": forward}
+        if role != AUTOMATED:
+            return None if forward is None else (-(backward or forward), forward)
+        found, most = [], (self.max_braking, self.max_acceleration)
+        for (name, value), vehicle in zip(own.items(), most, strict=True):
+            value = vehicle if value in (None, MAX_ACCELERATION) else value
+            require(
+                value <= (vehicle if backward else max(most)),
+                f"{name if backward else 'max_acceleration'}={value:g} exceeds the limits of "
+                f"automated vehicles, which brake by at most {most[0]:g} m/s² "
+                f"(scenario.max_braking) and accelerate by at most {most[1]:g} m/s² "
+                "(scenario.max_acceleration)",
+            )
+            found.append(min(value, vehicle))
+        return -found[0], found[1]
 
     def sensed(self, role: str, names: Sequence[NestedKey]) -> list[NestedKey]:
         """Return names of views of a role, with its measurements where it has sensors."""

@@ -79,15 +79,46 @@ def test_safety() -> None:
         "share_time_gap_long": [0.5, 0.0],
         "share_time_gap_long_moving": [0.0, 0.0],
         "rms_jerk_mps3": [12.5**0.5, 2.0],  # √((9 + 16)/2)
+        "max_jerk_mps3": [4.0, 2.0],
+        "max_deceleration_1s_mps2": [torch.nan, torch.nan],  # the episodes are shorter
+        "standstill_s": [torch.nan, torch.nan],
         "duration_s": [0.2, 0.1],
     }
     assert set(measures) == set(expected)
     named = {name for name in expected if name.startswith(("max_", "min_", "share_"))}
     filtered = {"share_ttc_unpromised", "share_turned_unsafe"}
     others = {"share_leader_faster", "share_time_gap_short", "flow_vph", "mean_speed_mps"}
-    assert named | others | filtered == set(limit_measures())
+    braking = {"max_deceleration_mps2", "max_jerk_1s_mps3"}  # of accelerations
+    assert named | others | filtered | braking == set(limit_measures())
     for name, values in expected.items():
-        torch.testing.assert_close(measures[name].flatten(), torch.tensor(values))
+        torch.testing.assert_close(measures[name].flatten(), torch.tensor(values), equal_nan=True)
+
+
+def test_braking_and_overshoot_as_standards_name_them() -> None:
+    # Two vehicles brake from 10 m/s by 5 and 2 m/s² after 1 s; the second episode ends before.
+    time = torch.arange(81) * 0.1
+    speed = torch.stack(
+        [(10.0 - a * (time - 1.0).clamp(min=0.0)).clamp(min=0.0) for a in (5.0, 2.0)]
+    )
+    speed = speed.T.reshape(81, 1, 2, 1).repeat(1, 2, 1, 1)
+    acceleration = speed.diff(dim=0) / 0.1
+    jerk = torch.cat([torch.zeros(1, 2, 2, 1), acceleration.diff(dim=0) / 0.1])
+    leader = (9.0 - 0.1 * time).view(81, 1, 1, 1).expand(81, 2, 1, 1)
+    alive = torch.ones(80, 2, 1, 1, dtype=torch.bool)
+    alive[9:, 1] = False
+    series = {"speed": speed, "acceleration": acceleration, "jerk": jerk, "leader_speed": leader}
+    found = safety_measures(series, alive, 0.1)
+    expected = {
+        "max_deceleration_mps2": [5.0, 0.0],
+        "max_deceleration_1s_mps2": [5.0, torch.nan],
+        "max_jerk_mps3": [50.0, 0.0],
+        "max_jerk_1s_mps3": [5.0, torch.nan],
+        "standstill_s": [6.0, torch.nan],  # of the last vehicle
+        "speed_overshoot_mps": [1.0, 1.0],
+    }
+    for name, values in expected.items():
+        close = {"atol": 1e-3, "rtol": 1e-3, "equal_nan": True}
+        torch.testing.assert_close(found[name].flatten(), torch.tensor(values), **close)
 
 
 def test_safety_of_many_vehicles_is_that_of_the_worst_and_shares_are_means() -> None:

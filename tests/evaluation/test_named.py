@@ -344,8 +344,16 @@ class Harder(Hard):
 def test_commands_to_automated_vehicles_alone_are_bounded() -> None:
     hard, harder = ({TARGET: f"{__name__}.{name}"} for name in ("Hard", "Harder"))
     handover = {TARGET: "lcc_rl.pieces.Handover", "before": harder, "after": hard, "from_s": 0.2}
-    for node, least in ((hard, -3.0), (harder, -4.0), (handover, (-4.0, -4.0, -3.0))):
-        cfg = compose("idm", "scenario.start.human=${scenario.start.automated}")
+    same_start = "scenario.start.human=${scenario.start.automated}"
+    strong = (same_start, "scenario.max_braking=4.5")
+    cases = (
+        ((same_start,), hard, -3.0),
+        (strong, hard, -4.5),
+        (strong, harder, -4.0),
+        (strong, handover, (-4.0, -4.0, -4.5)),
+    )
+    for words, node, least in cases:
+        cfg = compose("idm", *words)
         drivers = {AUTOMATED: node, "human": hard}
         nodes = {role: Node.of(own, role) for role, own in drivers.items()}
         cfg = cfg.with_(scenario={"controllers": nodes})

@@ -83,6 +83,7 @@ from lcc_rl.pieces import (
     PISaturation,
     RangeReward,
     RecordedDriver,
+    ReplacedLeader,
     RewardPiece,
     RewardTerm,
     RolePlaces,
@@ -136,6 +137,7 @@ STRINGS = {
     "open": VehicleString((*ROLES, "recorded")),
     "drawn": VehicleString((*ROLES, "recorded"), drawn=True),
     "ring": VehicleString(ROLES, ring=True),
+    "replaced": VehicleString(ROLES),
 }
 SCALES = {
     "self": {"speed": 0.1, "gap": 0.1},
@@ -149,8 +151,10 @@ BASES = (Piece, Feature, StepTransform, RewardPiece, RewardTerm, Controller, Dri
 STARTS = (HeadwayStart, TimeGapStart, EquilibriumStart)
 
 
-def leading() -> dict[str, Piece]:
+def leading(road: str) -> dict[str, Piece]:
     """The pieces that there are only behind a leader."""
+    if road == "replaced":
+        return {"ReplacedLeader": ReplacedLeader(at=(2 * T, 4 * T), gap=(5.0, 9.0))}
     return {
         "NGSIMLeader": NGSIMLeader(perturbation=0.5, foresight=True),
         "LeaderPreview": LeaderPreview(horizons=[0.5, 3.0], noise=0.2),
@@ -260,11 +264,13 @@ def makers(road: str) -> dict[str, Callable[[], Piece]]:
         "ObservationMemory, spread": ObservationMemory(seconds=[0.5, 1.0], kind="spread"),
         "Observation": Observation(scales=SCALES, visible=2, widths={"memory": 4}),
     }
-    first = {"RolePlaces": RolePlaces(), **({} if string.ring else leading())}
+    first = {"RolePlaces": RolePlaces(), **({} if string.ring else leading(road))}
     pieces: dict[str, tuple[str | None, Piece]] = {
         **{name: (None, piece) for name, piece in first.items()},
         **controllers(),
-        **({} if string.ring else {"RecordedDriver": ("recorded", RecordedDriver())}),
+        **(
+            {"RecordedDriver": ("recorded", RecordedDriver())} if "recorded" in string.names else {}
+        ),
         **{name: (None, piece) for name, piece in unnamed.items()},
         "Sensors": ("slow", BLURRED),
         **terms,
@@ -279,7 +285,7 @@ def makers(road: str) -> dict[str, Callable[[], Piece]]:
 def world_of(road: str, label: str) -> World:
     world = World(STRINGS[road], T, HORIZON, followed_profiles(), POPULATION, as_fleet(None))
     faults = {"actuators": {"slow": LATE}, "sensors": {"slow": BLURRED}}
-    world = replace(world, filtered=["automated"], **faults)
+    world = replace(world, filtered=["automated"], replaced=road == "replaced", **faults)
     if label == "CalibratedDrivers":
         return replace(world, population=MIXED)
     mixed = label.endswith("mixed") or label == "EnergyClasses"

@@ -287,7 +287,7 @@ def test_a_handover_switches_at_its_moment() -> None:
 
 def test_calm_follows_its_formula() -> None:
     piece = Calm(window=2.0, response=2.0, max_acceleration=50.0, max_deceleration=50.0)
-    piece = piece.bind(World(time_step=1.0))
+    piece = piece.bind(World(time_step=1.0, max_braking=50.0, max_acceleration=50.0))
     history, speed = torch.zeros(1, 4, 2), torch.full((1, 4, 1), 4.0)
     gap = torch.tensor([10.0, 62.0, 5.0, 5.0]).view(1, 4, 1)
     relative = torch.tensor([0.0, 0.0, 0.0, -3.0]).view(1, 4, 1)
@@ -320,7 +320,7 @@ def test_calm_follows_a_leader_without_jerk_or_contact() -> None:
 
 def test_pi_saturation_follows_its_formula() -> None:
     piece = PISaturation(window=2.0, max_acceleration=50.0, max_deceleration=50.0)
-    piece = piece.bind(World(time_step=1.0))
+    piece = piece.bind(World(time_step=1.0, max_braking=50.0, max_acceleration=50.0))
     history, before = torch.zeros(1, 4, 2), torch.full((1, 4, 1), 9.0)
     speed, ahead = torch.full((1, 4, 1), 10.0), torch.tensor([10.0, 12.0, 10.0, 4.0]).view(1, 4, 1)
     gap = torch.tensor([40.0, 18.5, 5.0, 3.0]).view(1, 4, 1)
