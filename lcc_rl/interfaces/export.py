@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from omegaconf import OmegaConf
 
-from lcc_rl.config import load, with_variant
-from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config import key_of, load, with_variant
 from lcc_rl.errors import ConfigError, needing, require, require_known
 from lcc_rl.evaluation.foreign import network_of
 from lcc_rl.evaluation.named import is_policy, rules
-from lcc_rl.interfaces.exported import described_input, program
+from lcc_rl.interfaces.exported import DrivingProgram, Safety, described_input, program
 from lcc_rl.interfaces.onnx_policy import MAKES, TAKES
 from lcc_rl.interfaces.ring_page import ring_page
 from lcc_rl.io.atomic import atomic_path, new_file
@@ -39,6 +39,7 @@ def export(
     variant: str = "alcc",
     overrides: Sequence[str] = (),
     normalize: Any = None,
+    safety: Safety = None,
 ) -> Path:
     """Write a trained policy, with its safety filter, for other software.
 
@@ -56,8 +57,11 @@ def export(
         path: the file to write.
         trust: modules outside this package that the policy may name.
         variant, overrides: environment in which a model or module was trained; for a page the
-            overrides are settings of its ring.
+            overrides are settings of its ring, for a trained policy's program settings of its
+            filter, such as ``safety.margin=2``.
         normalize: ``VecNormalize`` of a model; by default that of its environment.
+        safety: the safety filter of a program, or changed settings of its own, such as
+            ``{"margin": 2.0}``.
 
     Returns:
         The path of the file.
@@ -85,42 +89,52 @@ def export(
         f"file or {PRETRAINED}/<name>",
     )
     require(cfg is None or not page, f"a page ({PAGE}) needs a run or a policy file")
-    words = f"{' '.join(overrides)}: a program ({path.suffix}) has no road, a page ({PAGE}) has"
-    require(cfg is not None or page or not overrides, words)
-    make = EXPORTERS.get(path.suffix)
-    content = make(policy, trust, cfg) if make else ring_page(policy, trust, overrides).encode()
+    require(safety is None or not page, f"a page ({PAGE}) has the policy's own safety filter")
+    if cfg is None and not page and overrides:
+        words = f"{' '.join(overrides)}: a program ({path.suffix}) has no road, a page ({PAGE}) has"
+        require(all(key_of(item).startswith("safety.") for item in overrides), words)
+        safety = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)).safety)
+    if page:
+        content = ring_page(policy, trust, overrides).encode()
+    else:
+        content = EXPORTERS[path.suffix](program(policy, trust, cfg, safety), _name(policy))
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path
 
 
-def _program(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> tuple[Any, str]:
-    """Return the exported program and its description as JSON."""
-    module = program(policy, trust, cfg)
+def _name(policy: Any) -> str:
+    return str(policy if isinstance(policy, (str, PathLike)) else type(policy).__name__)
+
+
+def described(module: DrivingProgram, name: str) -> str:
+    """Return the description of a program as JSON: names, units and stand-ins of its inputs."""
     inputs = [described_input(name)._asdict() for name in module.names]
-    about: dict[str, Any] = {
-        "policy": str(policy if cfg is None else type(policy).__name__),
-        "lcc_rl": __version__,
-        "inputs": inputs,
-    }
+    for one in inputs:
+        if one["name"] in module.stand_ins:
+            one["stand_in"] = str(module.stand_ins[one["name"]])
+    about: dict[str, Any] = {"policy": name, "lcc_rl": __version__, "inputs": inputs}
     about["time_step_s"] = module.controller.time_step
     about |= {"output": "acceleration [m/s²]", "filter": module.safety is not None}
+    return json.dumps(about, ensure_ascii=False)
+
+
+def _program(module: DrivingProgram) -> Any:
+    """Return the exported program."""
     widths = [len(module.names), module.width][: 1 + (module.width > 0)]
     batch = dict(zip(TAKES, [{0: torch.export.Dim("batch", min=1)}] * len(widths), strict=False))
     examples = tuple(torch.ones(2, width) for width in widths)
-    made = torch.export.export(module, examples, dynamic_shapes=batch)
-    return made, json.dumps(about, ensure_ascii=False)
+    return torch.export.export(module, examples, dynamic_shapes=batch)
 
 
-def _as_pt2(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> bytes:
-    made, about = _program(policy, trust, cfg)
+def _as_pt2(module: DrivingProgram, name: str) -> bytes:
     buffer = BytesIO()
-    torch.export.save(made, buffer, extra_files={"lcc_rl": about})
+    torch.export.save(_program(module), buffer, extra_files={"lcc_rl": described(module, name)})
     return buffer.getvalue()
 
 
-def _as_onnx(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> bytes:
-    exported, about = _program(policy, trust, cfg)
+def _as_onnx(module: DrivingProgram, name: str) -> bytes:
+    exported = _program(module)
     count = len(exported.graph_signature.user_inputs)
     with needing("interfaces", "write a .pt2, or install what .onnx needs"):
         import onnx
@@ -139,7 +153,7 @@ def _as_onnx(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> byte
         )
     assert made is not None
     proto = made.model_proto
-    onnx.helper.set_model_props(proto, {"lcc_rl": about})
+    onnx.helper.set_model_props(proto, {"lcc_rl": described(module, name)})
     content: bytes = proto.SerializeToString()
     return content
 
@@ -148,14 +162,15 @@ PAGE = ".html"
 EXPORTERS = {".onnx": _as_onnx, ".pt2": _as_pt2}
 
 
-def main(words: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Export the policy of a command line."""
     parser = Arguments(description="Export a policy for other software.")
     parser.add_argument("policy", help="run folder, policy.pt or pretrained/<name>")
     parser.add_argument("path", help="file to write: a program (.onnx, .pt2) or a page (.html)")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
-    parser.add_argument("settings", nargs="*", default=[], help="of a page's ring: drivers=i80")
-    options = parser.parse_args(words)
+    words = "of a page's ring (drivers=i80) or of a program's filter (safety.margin=2)"
+    parser.add_argument("settings", nargs="*", default=[], help=words)
+    options = parser.parse_args(arguments)
     path = export(options.policy, options.path, options.trust, overrides=options.settings)
     if path.suffix == PAGE:
         print(f"{path}: the ring road in the browser, with {options.policy}")

@@ -29,10 +29,13 @@ def states(module: DrivingProgram, count: int = 256) -> torch.Tensor:
 
 
 def memories(module: DrivingProgram, count: int = 256) -> torch.Tensor:
-    """Of filters: gaps of as many metres as are predicted, and what they grow too fast [m/s]."""
+    """Of filters: gaps of as many metres as are predicted, what they grow too fast [m/s], and the
+    last measurements.
+    """
     chance = torch.Generator().manual_seed(1)
-    drawn, begun = torch.rand(count, 2, generator=chance), torch.ones(count, module.width - 2)
-    return torch.cat([begun, 20.0 * drawn[:, :1], drawn[:, 1:] - 0.5], -1)
+    drawn, begun = torch.rand(count, 2, generator=chance), torch.ones(count, 2)
+    last, missed = 20.0 * torch.rand(count, len(module.names)), torch.zeros(count, 1)
+    return torch.cat([begun, 20.0 * drawn[:, :1], drawn[:, 1:] - 0.5, last, missed], -1)
 
 
 def test_it_commands_what_the_vehicle_of_the_environment_obeys(module) -> None:
@@ -110,6 +113,14 @@ def test_a_measurement_that_is_no_number_brakes_or_shows(module, tmp_path) -> No
         makes = torch.export.load(files[1]).module()
         given = [one.name for one in session.get_inputs()]
         widths = [one.shape[1] for one in session.get_inputs()]
+        inputs = json.loads(session.get_modelmeta().custom_metadata_map["lcc_rl"])["inputs"]
+        usual = session.run(
+            None,
+            {
+                x: np.full((1, w), 12.0 * (x == "state"), np.float32)
+                for x, w in zip(given, widths, strict=True)
+            },
+        )[0][0]
         for rows in (1, 5):
             for column in range(widths[0]):
                 state = torch.full((rows, widths[0]), 12.0)
@@ -119,7 +130,9 @@ def test_a_measurement_that_is_no_number_brakes_or_shows(module, tmp_path) -> No
                 found = makes(*entries)
                 found = found[0] if isinstance(found, tuple) else found
                 for one in (session.run(None, feed)[0], found.detach().numpy()):
-                    np.testing.assert_allclose(one[0], wanted, rtol=1e-6)
+                    rear = "stand_in" in inputs[column]  # then a vehicle like the own one
+                    assert rear == inputs[column]["name"].startswith("behind.")
+                    np.testing.assert_allclose(one[0], usual if rear else wanted, rtol=1e-5)
                     assert np.isfinite(one[1:]).all()
 
 
@@ -127,6 +140,8 @@ def test_bad_input_is_one_clear_error() -> None:
     cases = [
         (["pretrained/alcc", "x.tflite"], "ending"),
         (["pretrained/nobody", "x.onnx"], "nobody"),
+        (["pretrained/alcc", "x.onnx", "safety.margin=2"], "alcc has no safety filter"),
+        (["pretrained/i80-follow", "x.onnx", "safety.margin=-2"], r"safety.margin must be greater"),
         (["idm_acc", "x.onnx"], "idm_acc is a rule; only a trained policy"),
     ]
     check_refused(main, cases, ConfigError)
