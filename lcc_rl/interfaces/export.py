@@ -1,4 +1,4 @@
-"""Export of trained policies as ONNX, PyTorch's ``.pt2`` or a page of the ring road.
+"""Export of policies and rules as ONNX, PyTorch's ``.pt2``, C or a page of the ring road.
 
 An exported program maps the measurements of a vehicle in SI units to its acceleration. It contains
 the scales of the observation, the network and the safety filter, if there is one. The program of a
@@ -22,12 +22,14 @@ from omegaconf import OmegaConf
 from lcc_rl.config import key_of, load, with_variant
 from lcc_rl.errors import ConfigError, needing, require, require_known
 from lcc_rl.evaluation.foreign import network_of
-from lcc_rl.evaluation.named import is_policy, rules
+from lcc_rl.evaluation.named import is_policy
+from lcc_rl.interfaces.c_code import c_code
+from lcc_rl.interfaces.driver import Driver
 from lcc_rl.interfaces.exported import DrivingProgram, Safety, described_input, program
 from lcc_rl.interfaces.onnx_policy import MAKES, TAKES
 from lcc_rl.interfaces.ring_page import ring_page
 from lcc_rl.io.atomic import atomic_path, new_file
-from lcc_rl.results.policies import PRETRAINED
+from lcc_rl.pieces.base import SEED
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.version import __version__
 
@@ -46,12 +48,14 @@ def export(
     The ending selects the format. ONNX (``.onnx``) and PyTorch's exported program (``.pt2``) read
     ``state``, ``[batch, inputs]`` in SI units, and return ``acceleration``, ``[batch, 1]`` [m/s²].
     A policy with a memory also has the input ``memory`` (zeros at first) and the output
-    ``next_memory``. Names, units and meanings of the inputs are in the file's metadata under
-    ``lcc_rl`` as JSON. A page (``.html``) shows the ring road with the policy in any browser, see
+    ``next_memory``. C code (``.c``) is one function ``step(state, memory)`` in C99. Names, units
+    and meanings of the inputs are in the file's metadata under ``lcc_rl`` as JSON. A page
+    (``.html``) shows the ring road with the policy in any browser, see
     :func:`lcc_rl.interfaces.ring_page.ring_page`.
 
     Args:
-        policy: a run folder, a policy file, or ``pretrained/<name>``; or a model of
+        policy: a run folder, a policy file, or ``pretrained/<name>``; a rule by name, with steps of
+            0.1 s (``"idm_acc_filtered"``); or a model of
             stable-baselines3 or a torch module from observations ``[batch, n]`` to actions
             ``[batch, 1]``.
         path: the file to write.
@@ -83,11 +87,6 @@ def export(
             kind = type(given).__name__
             raise ConfigError(f"expected a run, a file, a torch module or a model, got {kind}")
         cfg = load("train", with_variant(variant, overrides))
-    require(
-        cfg is not None or is_policy(str(policy)) or str(policy) not in rules(),
-        f"{policy} is a rule; only a trained policy can be exported: give a run folder, a policy "
-        f"file or {PRETRAINED}/<name>",
-    )
     require(cfg is None or not page, f"a page ({PAGE}) needs a run or a policy file")
     require(safety is None or not page, f"a page ({PAGE}) has the policy's own safety filter")
     if cfg is None and not page and overrides:
@@ -97,10 +96,20 @@ def export(
     if page:
         content = ring_page(policy, trust, overrides).encode()
     else:
-        content = EXPORTERS[path.suffix](program(policy, trust, cfg, safety), _name(policy))
+        rule = cfg is None and not is_policy(str(policy))
+        own = _rule(policy, trust, safety) if rule else program(policy, trust, cfg, safety)
+        content = EXPORTERS[path.suffix](own, _name(policy))
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path
+
+
+def _rule(name: Any, trust: Sequence[str], safety: Safety) -> DrivingProgram:
+    """Return the program of a rule with steps of 0.1 s."""
+    found = Driver(str(name), 0.1, trust, safety).program
+    words = f"{name} draws noise from seeds: it cannot be exported, only driven by a Driver"
+    require(SEED not in found.kept, words)
+    return found
 
 
 def _name(policy: Any) -> str:
@@ -158,15 +167,19 @@ def _as_onnx(module: DrivingProgram, name: str) -> bytes:
     return content
 
 
+def _as_c(module: DrivingProgram, name: str) -> bytes:
+    return c_code(module, described(module, name)).encode()
+
+
 PAGE = ".html"
-EXPORTERS = {".onnx": _as_onnx, ".pt2": _as_pt2}
+EXPORTERS = {".onnx": _as_onnx, ".pt2": _as_pt2, ".c": _as_c}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Export the policy of a command line."""
     parser = Arguments(description="Export a policy for other software.")
-    parser.add_argument("policy", help="run folder, policy.pt or pretrained/<name>")
-    parser.add_argument("path", help="file to write: a program (.onnx, .pt2) or a page (.html)")
+    parser.add_argument("policy", help="run folder, policy.pt, pretrained/<name> or a rule")
+    parser.add_argument("path", help="file: a program (.onnx, .pt2, .c) or a page (.html)")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
     words = "of a page's ring (drivers=i80) or of a program's filter (safety.margin=2)"
     parser.add_argument("settings", nargs="*", default=[], help=words)
@@ -175,7 +188,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if path.suffix == PAGE:
         print(f"{path}: the ring road in the browser, with {options.policy}")
         return 0
-    for item in map(described_input, program(options.policy, options.trust).names):
+    rule = not is_policy(options.policy)
+    shown = (_rule if rule else program)(options.policy, options.trust, None)
+    for item in map(described_input, shown.names):
         print(f"  {item.name} [{item.unit}]: {item.meaning}")
     print(f"{path}: maps these inputs, in this order, to the acceleration [m/s²]")
     return 0

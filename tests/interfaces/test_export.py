@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from torch import nn
 import lcc_rl
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.interfaces.driver import Driver
 from lcc_rl.interfaces.export import main
 from lcc_rl.interfaces.exported import DrivingProgram, program
 from lcc_rl.results.policies import load_policy
@@ -100,6 +104,37 @@ def test_onnxruntime_computes_the_same(module, tmp_path) -> None:
     assert [item["name"] for item in about["inputs"]] == module.names
 
 
+@pytest.mark.parametrize("name", ["pretrained/i24-follow5", "idm_acc_filtered", "idm_acc"])
+def test_c_code_computes_the_same(name, tmp_path) -> None:
+    """With the memory of its own, through NaN, a lost target and another one."""
+    if (compiler := shutil.which("cc")) is None:
+        pytest.skip("no C compiler")
+    path = lcc_rl.export(name, tmp_path / "follow.c")
+    strict = "-std=c99 -O2 -Wall -Wextra -Wno-unused-function -pedantic -Werror -shared -fPIC"
+    built = tmp_path / "follow.so"
+    subprocess.run([compiler, *strict.split(), path, "-o", built, "-lm"], check=True)
+    step = ctypes.CDLL(str(built)).step
+    step.restype = ctypes.c_float
+    module = Driver(name, 0.1).program
+    width, chance = len(module.names), np.random.default_rng(0)
+    state, kept = 20.0 * chance.random((1, width)), np.zeros((1, module.width), np.float32)
+    memory = [torch.zeros(1, module.width)] * bool(module.width)
+    for k in range(60):
+        state = np.abs(state + 0.3 * chance.normal(size=state.shape)).astype(np.float32)
+        seen = state.copy()
+        if memory and k in (20, 30, 31, 32):
+            seen[0, k % width] = np.nan
+        expected, *memory = (
+            module(torch.from_numpy(seen), *memory) if memory else [module(torch.from_numpy(seen))]
+        )
+        found = step(*(x.ctypes.data_as(ctypes.POINTER(ctypes.c_float)) for x in (seen, kept)))
+        assert found == pytest.approx(expected.item(), abs=2e-6), k
+        for one in memory:
+            np.testing.assert_allclose(kept, one.numpy(), rtol=1e-6, atol=1e-6)
+    head = path.read_text(encoding="utf-8")
+    assert all(f": {column} [" in head for column in module.names)
+
+
 def test_a_measurement_that_is_no_number_brakes_or_shows(module, tmp_path) -> None:
     """In every input of every format: clamp and minimum let NaN through, and hide nothing."""
     ort = pytest.importorskip("onnxruntime", reason="extra interfaces")
@@ -142,6 +177,8 @@ def test_bad_input_is_one_clear_error() -> None:
         (["pretrained/nobody", "x.onnx"], "nobody"),
         (["pretrained/alcc", "x.onnx", "safety.margin=2"], "alcc has no safety filter"),
         (["pretrained/i80-follow", "x.onnx", "safety.margin=-2"], r"safety.margin must be greater"),
-        (["idm_acc", "x.onnx"], "idm_acc is a rule; only a trained policy"),
+        (["idm_ac", "x.onnx"], "idm_acc"),
+        (["idm_acc", "x.html"], "idm_acc"),
+        (["human", "x.c"], "human draws noise from seeds: it cannot be exported"),
     ]
     check_refused(main, cases, ConfigError)
