@@ -82,8 +82,8 @@ class Agreement:
         share = (1.0 - math.exp(-self.time_step / self.settling)) * begun
         change = gap - half - predicted
         average = average + share * (change / self.time_step - average)
-        most = max(OTHER_TARGET, OTHER_TARGET_RATE * self.time_step) + 2.0 * self.sensing.gap
-        most = most + self.time_step * self.sensing.longest * relative.abs()
+        own = max(OTHER_TARGET, OTHER_TARGET_RATE * self.time_step) + 2.0 * self.sensing.gap
+        most = own + self.time_step * self.sensing.longest * relative.abs()
         average = torch.where(change.abs() > most, 0.0, average)
         return join([torch.ones_like(gap), gap + half, average], -1)
 

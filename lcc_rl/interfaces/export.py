@@ -92,7 +92,7 @@ def export(
     if cfg is None and not page and overrides:
         words = f"{' '.join(overrides)}: a program ({path.suffix}) has no road, a page ({PAGE}) has"
         require(all(key_of(item).startswith("safety.") for item in overrides), words)
-        safety = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)).safety)
+        safety = dict(OmegaConf.from_dotlist(list(overrides)).safety)
     if page:
         content = ring_page(policy, trust, overrides).encode()
     else:

@@ -173,7 +173,8 @@ class DrivingProgram(nn.Module):
 
         ``apply(piece, before, reached)`` applies each piece, by default ``piece.derive``.
         """
-        state, held = self._with_stand_ins(state), ()
+        state = self._with_stand_ins(state)
+        held: Sequence[Tensor] = ()
         values = () if memory is None else memory[:, 1:].split(self.sizes, -1)
         if self.safety is not None:
             state, *held = self._held(state, *values[-2:])
@@ -323,7 +324,8 @@ def filter_of(safety: Safety, own: CBFFilter | None, name: str) -> CBFFilter | N
     """Return the safety filter of a driver, whose own one is used if nothing else is given."""
     if not isinstance(safety, Mapping):
         return safety or own
-    require(own is not None, f"{name} has no safety filter whose settings safety could change")
+    if own is None:
+        raise ConfigError(f"{name} has no safety filter whose settings safety could change")
     return parse(type(own), values(own) | dict(safety), "safety")
 
 
