@@ -57,7 +57,7 @@ def c_code(module: DrivingProgram, about: str) -> str:
     """
     examples = [torch.ones(1, width) for width in (len(module.names), module.width) if width]
     try:
-        recorder, outputs = recorded(module, examples)
+        recorder, outputs = recorded(module if module.width else module.step, examples)
         body, types = [], dict[int, str]()
         for i in recorder.needed(variable for output in outputs for variable in output):
             body += _statement(i, *recorder.statements[i], types)

@@ -521,5 +521,5 @@ def test_noisy_speeds_of_a_fast_raster_are_smoothed_by_the_option_of_the_message
     found = read("leader.average_s=0.5").training.record(0)
     time = 0.24 + 0.1 * np.arange(len(found))
     np.testing.assert_allclose(found, 15.0 + np.sin(time / 5.0), atol=0.2)
-    with pytest.raises(DataError, match="no record is as long as leader.average_s=500"):
+    with pytest.raises(DataError, match=r"no record is as long as leader\.average_s=500"):
         read("leader.average_s=500")
