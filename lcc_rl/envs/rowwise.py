@@ -119,11 +119,7 @@ def recorded(
 
 
 def translated(function: TensorFunction, examples: Sequence[Tensor]) -> tuple[str, list[Array]]:
-    """Return the source of a function of numbers, and the tables that are its last arguments.
-
-    Raises:
-        Untranslatable: naming the operation that has no counterpart on single numbers.
-    """
+    """Return the source of a function of numbers, and the tables that are its last arguments."""
     recorder, outputs = recorded(function, examples)
     needed = recorder.needed(variable for output in outputs for variable in output)
     lines = []

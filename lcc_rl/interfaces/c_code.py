@@ -63,10 +63,8 @@ def c_code(module: DrivingProgram, about: str) -> str:
             body += _statement(i, *recorder.statements[i], types)
     except Untranslatable as error:
         raise ConfigError(f"C code of this policy or rule: {error} is not supported") from error
-    after = (
-        [f"memory[{place}] = v{i};" for place, i in enumerate(outputs[1])] if outputs[1:] else []
-    )
-    lines = "".join(f"    {line}\n" for line in [*body, *after, f"return v{outputs[0][0]};"])
+    body += [f"memory[{place}] = v{i};" for place, i in enumerate((*outputs, ())[1])]
+    lines = "".join(f"    {line}\n" for line in [*body, f"return v{outputs[0][0]};"])
     inputs = [described_input(name) for name in module.names]
     columns = "".join(f" * state[{k}]: {x.name} [{x.unit}]\n" for k, x in enumerate(inputs))
     tables = "".join(_table(f"t{k}", x.numpy()) for k, x in enumerate(recorder.tables))
@@ -79,16 +77,8 @@ def c_code(module: DrivingProgram, about: str) -> str:
 
 
 def _table(name: str, table: Array) -> str:
-    if table.dtype != np.float32:
-        raise ConfigError(f"C code: a table of {table.dtype} is not supported")
-    numbers = ", ".join(
-        f"{x!r}f" if "." in repr(x) else f"{x!r}.0f" for x in map(_short, table.flat)
-    )
+    numbers = ", ".join(f"{float(x).hex()}f" for x in table.astype(np.float32).flat)
     return f"\nstatic const float {name}[{table.size}] = {{{numbers}}};\n"
-
-
-def _short(value: np.float32) -> float:
-    return float(f"{value:.9g}")  # nine digits are exact in single precision
 
 
 def _statement(i: int, formula: str, reads: tuple[int, ...], types: dict[int, str]) -> list[str]:
@@ -96,12 +86,10 @@ def _statement(i: int, formula: str, reads: tuple[int, ...], types: dict[int, st
     given = [f"v{x}" for x in reads]
     if formula.startswith("layer("):
         weights, bias = re.findall(r"t\d+", formula)
-        shown = f"v{i}[sizeof {bias} / sizeof *{bias}], in{i}[] = {{{', '.join(given)}}};"
-        types[i] = "layer"
-        call = (
-            f"layer({weights}, {bias}, in{i}, {len(given)}, v{i}, sizeof {bias} / sizeof *{bias});"
-        )
-        return [f"float {shown}", call]
+        units, types[i] = f"sizeof {bias} / sizeof *{bias}", "layer"
+        inputs = f"in{i}[] = {{{', '.join(given)}}}"
+        call = f"layer({weights}, {bias}, in{i}, {len(given)}, v{i}, {units});"
+        return [f"float v{i}[{units}], {inputs};", call]
     if "**" in formula:
         formula = "powf({0}, {1})"
     elif re.search("ndtri|read|searchsorted", formula):
@@ -109,12 +97,7 @@ def _statement(i: int, formula: str, reads: tuple[int, ...], types: dict[int, st
     formula = re.sub(r"x0\[row, (\d+)\]", r"state[\1]", formula)
     formula = re.sub(r"x1\[row, (\d+)\]", r"memory[\1]", formula)
     text = WORD.sub(lambda found: FUNCTIONS[found[0]], formula)
-    start = next((kind for word, kind in TYPES.items() if formula.startswith(word)), "float")
-    whole = [types[x] for x in reads if types[x] != "layer"]
-    if formula in TRUTHS:
-        types[i] = "int"
-    elif whole and formula.split("(")[0] not in ("f32", "f64", "i64", "flag"):
-        types[i] = whole[-1]
-    else:
-        types[i] = start
+    kind = next((kind for word, kind in TYPES.items() if formula.startswith(word)), None)
+    operands = [types[x] for x in reads if types[x] != "layer"]
+    types[i] = "int" if formula in TRUTHS else kind or ["float", *operands][-1]
     return [f"const {types[i]} v{i} = {text.format(*given)};"]

@@ -87,8 +87,9 @@ def export(
             kind = type(given).__name__
             raise ConfigError(f"expected a run, a file, a torch module or a model, got {kind}")
         cfg = load("train", with_variant(variant, overrides))
-    require(cfg is None or not page, f"a page ({PAGE}) needs a run or a policy file")
-    require(safety is None or not page, f"a page ({PAGE}) has the policy's own safety filter")
+    rule = cfg is None and not is_policy(str(policy))
+    words = f"{policy}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
+    require(not page or (cfg is None and safety is None and not rule), words)
     if cfg is None and not page and overrides:
         words = f"{' '.join(overrides)}: a program ({path.suffix}) has no road, a page ({PAGE}) has"
         require(all(key_of(item).startswith("safety.") for item in overrides), words)
@@ -96,7 +97,6 @@ def export(
     if page:
         content = ring_page(policy, trust, overrides).encode()
     else:
-        rule = cfg is None and not is_policy(str(policy))
         own = _rule(policy, trust, safety) if rule else program(policy, trust, cfg, safety)
         content = EXPORTERS[path.suffix](own, _name(policy))
     with atomic_path(path) as temporary:
@@ -188,9 +188,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if path.suffix == PAGE:
         print(f"{path}: the ring road in the browser, with {options.policy}")
         return 0
-    rule = not is_policy(options.policy)
-    shown = (_rule if rule else program)(options.policy, options.trust, None)
-    for item in map(described_input, shown.names):
+    made = program if is_policy(options.policy) else _rule
+    for item in map(described_input, made(options.policy, options.trust, None).names):
         print(f"  {item.name} [{item.unit}]: {item.meaning}")
     print(f"{path}: maps these inputs, in this order, to the acceleration [m/s²]")
     return 0

@@ -136,12 +136,11 @@ class DrivingProgram(nn.Module):
     def _stand_ins(self) -> dict[str, str | float]:
         """Return zeros for a policy that observes presence, else a vehicle like the own one."""
         found: dict[str, str | float] = {}
-        for name in self.names:
-            view, _, entry = name.partition(".")
-            own = f"{SELF}.{entry}"
-            if view == BEHIND and (BEHIND_PRESENT in self.names or entry == "acceleration"):
+        for name in (name for name in self.names if name.startswith(f"{BEHIND}.")):
+            own = name.replace(BEHIND, SELF)
+            if BEHIND_PRESENT in self.names or name.endswith(".acceleration"):
                 found[name] = 0.0
-            elif view == BEHIND and own in self.names:
+            elif own in self.names:
                 found[name] = own
         return found
 

@@ -178,7 +178,7 @@ def test_bad_input_is_one_clear_error() -> None:
         (["pretrained/alcc", "x.onnx", "safety.margin=2"], "alcc has no safety filter"),
         (["pretrained/i80-follow", "x.onnx", "safety.margin=-2"], r"safety.margin must be greater"),
         (["idm_ac", "x.onnx"], "idm_acc"),
-        (["idm_acc", "x.html"], "idm_acc"),
+        (["idm_acc", "x.html"], r"idm_acc: a page \(.html\) needs a run or a policy file"),
         (["human", "x.c"], "human draws noise from seeds: it cannot be exported"),
     ]
     check_refused(main, cases, ConfigError)
