@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import runpy
+
 import numpy as np
 import pytest
 import torch
@@ -12,10 +14,10 @@ from lcc_rl.pieces.base import Piece
 from lcc_rl.results.units import in_unit
 
 
-def test_the_car_of_the_page_draws_what_its_map_says() -> None:
+def test_the_car_of_the_page_draws_what_its_map_says(tmp_path) -> None:
     (block,) = (b for b in blocks(ROOT / "docs" / "your_car.md") if "class MyCar" in b.text)
-    space: dict = {"__name__": "page"}
-    exec(block.text, space)
+    (tmp_path / "page_car.py").write_text(block.text)
+    space = runpy.run_path(str(tmp_path / "page_car.py"), run_name="page_car")
     assert issubclass(space["Follow"], Piece)
     car, chance = space["MyCar"](), np.random.default_rng(0)
     speed, acceleration = 40.0 * chance.random(200), 3.0 * chance.normal(size=200)
