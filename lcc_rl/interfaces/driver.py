@@ -235,10 +235,7 @@ class Driver:
         return state, not shape
 
     def _completed(self, measured: Mapping[str, Any]) -> dict[str, Any]:
-        """Return measurements with NaN for those of a vehicle behind that is not there.
-
-        The program replaces them by its stand-ins.
-        """
+        """Return measurements with NaN, which get stand-ins, where there is no vehicle behind."""
         found, absent = dict(measured), measured.keys().isdisjoint(self.behind)
         present = found.setdefault(BEHIND_PRESENT, float(not absent))
         for name in () if np.all(present) else self.behind:

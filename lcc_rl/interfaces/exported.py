@@ -208,10 +208,7 @@ class DrivingProgram(nn.Module):
         return torch.cat([columns[name] for name in self.names], -1)
 
     def _held(self, state: Tensor, last: Tensor, missed: Tensor) -> tuple[Tensor, ...]:
-        """Return the inputs of a step, with the last ones in the first step without measurement.
-
-        Further such steps are NaN. Also returns the inputs to keep and whether there were none.
-        """
+        """Return the inputs of a step, those to keep, and whether there was no measurement."""
         gap = state[:, self.names.index("self.gap")].unsqueeze(-1)
         known = state.isfinite().all(-1, keepdim=True) & (gap > 0.0)
         lost = torch.where(missed > 0.0, torch.nan, last.to(state.dtype))
