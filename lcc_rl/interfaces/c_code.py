@@ -46,11 +46,7 @@ TYPES = {"f32(": "float", "f64(": "double", "i64(": "int64_t", "flag(": "int", "
 
 
 def c_code(module: DrivingProgram, about: str) -> str:
-    """Return the source of a program as a function ``step`` of measurements and memory.
-
-    Args:
-        module: the program.
-        about: its description, a comment at the head of the file.
+    """Return the source of a program, with its description ``about``, as a function ``step``.
 
     Raises:
         ConfigError: naming the operation that has no counterpart in C here.

@@ -55,9 +55,8 @@ class Driver:
             Append ``_filtered`` to the name of a rule to put it behind the safety filter.
         time_step: duration of a step of the simulator [s]; a policy needs that of its training.
         trust: modules outside this package that a policy may name.
-        safety: the safety filter, or changed settings of the default, such as ``{"margin": 2.0}``;
-            None: that of the policy's training, or that of ``+filter=cbf`` for rules with
-            ``_filtered``.
+        safety: the safety filter, or changed settings, such as ``{"margin": 2.0}``, of the default:
+            that of the policy's training, or of ``+filter=cbf`` for rules with ``_filtered``.
         seed: seed of the drivers' noise; each new car has the next seed, also if it leaves and
             returns.
         drivers: population of rules with human drivers, such as ``"human"``: a table of ``lcc-rl
