@@ -107,8 +107,7 @@ def export(
 def _rule(name: Any, trust: Sequence[str], safety: Safety) -> DrivingProgram:
     """Return the program of a rule with steps of 0.1 s."""
     found = Driver(str(name), 0.1, trust, safety).program
-    words = f"{name} draws noise from seeds: it cannot be exported, only driven by a Driver"
-    require(SEED not in found.kept, words)
+    require(SEED not in found.kept, f"{name} draws noise from seeds: it cannot be exported")
     return found
 
 
