@@ -61,6 +61,15 @@ def wide(path: Path) -> None:
     pd.concat(parts).to_csv(path, index=False)
 
 
+def car_log(path: Path) -> None:
+    """The log of a car at 50 Hz behind two targets, one after the other."""
+    time = np.arange(0.0, 240.0, 0.02)
+    own, ahead = (12.0 + 3.0 * np.sin((time - late) / 5.0) for late in (1.0, 0.0))
+    gap = 30.0 + np.cumsum(ahead - own) * 0.02 - 9.0 * (time > 120.0)
+    columns = {"t": time, "v": own, "d": gap, "dv": ahead - own, "id": 1 + (time > 120.0)}
+    pd.DataFrame({**columns, "ok": 1}).to_csv(path, index=False)
+
+
 def table(path: Path) -> None:
     """A table with names and units of its own."""
     frame = long_table(cars=6, rows=600).rename(columns={"gap": "distance"})
@@ -137,6 +146,7 @@ FILES: dict[str, Callable[[Path], object]] = {
     "other.csv": official,
     "my.csv": table,
     "mine.csv": wide,
+    "log.csv": car_log,
     "pairs.parquet": pairs,
     "ring_pairs.parquet": pairs,
     "outputs/pipeline/<run>/trajectories.parquet": pairs,

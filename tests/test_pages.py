@@ -64,6 +64,7 @@ ENOUGH = {
     '["+filter=cbf"]': repr(["+filter=cbf", LENGTH, *WINDOWS, *DATA]),
     'learn("alcc", words,': f'learn("alcc", [*words, *{list(SMALL)}],',
     "n_trials=40": "n_trials=2",
+    "TRIALS = 30": "TRIALS = 1",
     "batch_size=1024": "batch_size=4",
     "num_envs=64": "num_envs=2",
     "batch_size=64": "batch_size=4",
@@ -79,6 +80,7 @@ ENTRIES = {"run": "pipeline"}  # entry points that are not called as their comma
 NEEDS = {
     "interfaces.md": ("gymnasium", "stable_baselines3", "onnx", "onnxscript", "onnxruntime"),
     "sweeps.md": ("optuna",),
+    "your_car.md": ("optuna",),
     "learners.md": ("stable_baselines3", "onnx", "onnxscript", "onnxruntime"),
 }
 PLACEHOLDER = re.compile(r"<[^<>=]*>…?|…")
@@ -286,7 +288,7 @@ def test_the_pages_stay_short() -> None:
         for number, line in enumerate(text, 1):
             free = number in inside or line.startswith(("|", "!["))
             assert free or len(line) <= 100, f"{page.name}:{number}"
-    assert sum(lines.values()) <= 4262
+    assert sum(lines.values()) <= 4390
     assert lines["README.md"] <= 90
 
 

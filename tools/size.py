@@ -27,8 +27,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 42_900, "code": 28_200},
-    "tests": {"lines": 24_700},
+    "lcc_rl + tools": {"lines": 43_120, "code": 28_380},
+    "tests": {"lines": 25_600},
     "conf": {"yaml": 157},
 }
 CASES = 1_170  # ceiling of all quick tests, see tests/tools/test_size.py
@@ -36,7 +36,7 @@ STRUCTURE = {
     "names in several modules": 60,
     "floors": 10,
     "circles": 0,
-    "functions with a configuration": 130,
+    "functions with a configuration": 127,
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence, Set
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,6 +17,7 @@ from lcc_rl.data.tables import (
     Names,
     TableFile,
     Units,
+    chosen,
     joined,
     same_text,
     tables_of,
@@ -48,13 +50,20 @@ PAIR_FIELDS = (
     Column("follower_position", "length", blank=True, required=False),
     Column("follower_speed", "speed", blank=True),
     Column("leader_position", "length", blank=True, required=False),
-    Column("leader_speed", "speed", blank=True),
+    Column("leader_speed", "speed", blank=True, required=False),
     Column("leader_length", "length", least=0.0, required=False),
     Column("gap", "length", blank=True),
+    # Of the log of a car, instead of the leader's speed: leader minus follower.
+    Column("relative_speed", "speed", blank=True, required=False),
+    Column("target", "text", blank=True, required=False),  # id of the leader; blank or 0: none
+    Column("valid", "text", blank=True, required=False),  # whether the leader is measured
 )
-PAIR_MEASURED = [column.key for column in PAIR_FIELDS if column.blank]  # not blank
+NO_LEADER = ("", "0", "-1", "0.0", "-1.0")  # in columns of leaders and targets
+VALID, NOT_VALID = ("1", "1.0", "true", "yes"), ("", "0", "0.0", "false", "no", "nan")
+# Rows with a blank cell in one of these are left out.
+PAIR_MEASURED = [x.key for x in PAIR_FIELDS if x.blank and x.quantity != "text"]
 # Default names.
-EPISODE_NAMES = dict(zip((column.key for column in PAIR_FIELDS), SCHEMA, strict=True))
+EPISODE_NAMES = dict(zip((column.key for column in PAIR_FIELDS), SCHEMA, strict=False))
 EPISODE_ALIASES = {"event": "episode", "period": "recording"}
 DERIVED_POSITIONS = "no positions given: those of leaders are the integral of their speeds"
 TEXTS = ("recording", "label")  # categorical columns
@@ -137,6 +146,7 @@ def _rows(
 ) -> tuple[pd.DataFrame, NDArray[np.int64]]:
     """Return rows of a file with episodes numbered from 0, and the file's own numbers."""
     read = file.read(PAIR_FIELDS, names, units, "data.columns", PAIR_MEASURED)
+    read, cars = _targets(read, file)
     if not len(read["time"]):
         raise DataError(f"{file.path}: has no episodes; expected at least one row")
     kept = read.pop("row")
@@ -148,18 +158,46 @@ def _rows(
         numbers = np.arange(len(found))
     recording = read.get("recording", same_text(file.label, rows))
     before = count * bool(seen & {*recording.categories})
-    follower = 2 * (codes + before) + 2  # unknown vehicles of several files are different ones
+    # Unknown vehicles of several files are different ones.
+    follower = 2 * (pd.factorize(cars)[0] + before) + 2
     values = {
         **dict.fromkeys(SCHEMA, np.zeros(rows)),
         **{EPISODE_NAMES[key]: cells for key, cells in read.items()},
         "recording": recording,
         "follower_id": read.get("follower_id", follower),
-        "leader_id": read.get("leader_id", follower - 1),
+        "leader_id": read.get("leader_id", 2 * (codes + before) + 1),
     }
     values |= {"time_s": read["time"].round(6), "row": kept, "label": labels, "episode": codes}
     table = pd.DataFrame(values, copy=False)  # times have a resolution of 1 µs
     _check_pairs(table, file)
     return table, numbers
+
+
+def _targets(read: dict[str, Any], file: TableFile) -> tuple[dict[str, Any], pd.Categorical]:
+    """Return the columns with an episode per target, and the file's episode of each row.
+
+    Rows without a valid target are left out. A relative speed becomes the leader's.
+    """
+    rows, valid = len(read["time"]), read.pop("valid", None)
+    target, relative = read.pop("target", None), read.pop("relative_speed", None)
+    kept, cars = np.ones(rows, dtype=bool), read.get("episode", same_text("", rows))
+    if relative is not None:
+        read["leader_speed"] = read["follower_speed"] + relative
+    if valid is not None:
+        folded = np.char.lower(np.asarray(valid).astype(str))
+        if (odd := ~np.isin(folded, (*VALID, *NOT_VALID))).any():
+            words = f"is {str(folded[odd][0])!r}; expected 1 or 0, true or false"
+            raise file.fault(int(read["row"][odd][0]), "valid", words)
+        kept &= np.isin(folded, VALID)
+    if target is not None:
+        kept &= ~target.isin(NO_LEADER)
+        names = np.char.add(np.asarray(cars).astype(str), " target ")
+        read["episode"] = pd.Categorical(np.char.add(names, np.asarray(target).astype(str)))
+    if kept.all():
+        return read, cars
+    place = f"data row {int(read['row'][np.argmin(kept)]) + 1}"
+    file.notes.append(f"left out {int((~kept).sum()):,} rows without a valid target, {place} …")
+    return chosen(read, kept), cars[kept]
 
 
 def _numbered(episode: NDArray, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -178,6 +216,10 @@ def _names(file: TableFile, columns: Names) -> dict[str, str | None]:
     }
     names |= columns
     missing = [EPISODE_NAMES[x.key] for x in PAIR_FIELDS if x.required and x.key not in names]
+    if names.get("relative_speed") is not None:
+        names.pop("leader_speed", None)
+    elif names.get("leader_speed") is None:
+        missing.append(EPISODE_NAMES["leader_speed"])
     if missing:
         raise lacking(str(file.path), missing, file.header, "data.columns")
     return names

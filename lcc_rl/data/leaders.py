@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -269,6 +269,8 @@ class DriveLeaders(Settings):
     least_variation: NonNegative = 2.0  # see RecordLeaders
     fastest: Positive | None = None  # largest mean speed of the leader in held-out windows [m/s]
     plausible: Plausible | None = None  # None: the defaults
+    # Width of a moving average of the speeds, before samples are checked; 0: none [s].
+    average_s: Annotated[float, Field(ge=0.0, lt=600.0)] = 0.0
 
     def validate(self) -> None:
         self.columns = {**DRIVE_COLUMNS, **self.columns}
@@ -284,7 +286,7 @@ class DriveLeaders(Settings):
         """Read all records; see :meth:`RecordLeaders.load`."""
         single = self.columns["drive"] is None
         profiles, report = read_drives(
-            self.path, self.columns, time_step, self.plausible, self.units
+            self.path, self.columns, time_step, self.plausible, self.units, self.average_s
         )
         if profiles.grades is not None:
             raise ConfigError("leader.columns.grade: only lcc-rl energy uses grades")

@@ -148,6 +148,7 @@ class EpisodesSource(Source):
     # Names in the table of ``episode``, ``recording``, ``follower_id``, ``leader_id``, ``time``,
     # ``follower_speed``, ``leader_speed``, ``gap`` (bumper to bumper), ``follower_position`` and
     # ``leader_position`` (front bumpers) and ``leader_length``; by default those of the package.
+    # Instead of ``leader_speed``: ``relative_speed``. ``valid`` and ``target`` divide episodes.
     columns: Mapping[str, str | None] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)  # such as {gap: ft}; else SI
 

@@ -71,13 +71,14 @@ def read_drives(
     time_step: float,
     plausible: Plausible | None = None,
     units: Units | None = None,
+    average_s: float = 0.0,
 ) -> tuple[Profiles, list[str]]:
     """Read the speed records of tables.
 
     A table without the column ``drive`` is one drive, unless another name is configured.
 
     Args:
-        path, columns, plausible, units: see :class:`lcc_rl.data.leaders.DriveLeaders`.
+        path, columns, plausible, units, average_s: see :class:`lcc_rl.data.leaders.DriveLeaders`.
         time_step: step of the profiles [s]; the records are interpolated to it.
 
     Returns:
@@ -95,7 +96,7 @@ def read_drives(
     found: dict[str, tuple[str, Tensor, Tensor | None]] = {}
     lines: list[str] = []
     for table in tables_of(files):
-        samples, report = _read(table, columns, plausible, units or {})
+        samples, report = _read(table, columns, plausible, units or {}, average_s=average_s)
         own = dict(_records(samples, time_step))
         if twice := own.keys() & found.keys():
             raise DataError(f"{path}: drive {min(twice)!r} is in several files; expected one")
@@ -127,20 +128,40 @@ def _records(
 
 
 def _read(
-    table: TableFile, columns: Names, plausible: Plausible | None, units: Units, divide: bool = True
+    table: TableFile,
+    columns: Names,
+    plausible: Plausible | None,
+    units: Units,
+    divide: bool = True,
+    average_s: float = 0.0,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Return recording, episode and motion of the plausible samples of a file, and the report."""
     samples, report = _samples(table, columns, units), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
     samples = continuous(samples, "drive", place, report, divide)
     known = units_of(DRIVE_FIELDS, DRIVE_COLUMNS, units) if divide else {}
+    if average_s:
+        samples = _averaged(samples, average_s, str(table.path))
+    remedy = ", smooth it (leader.average_s=0.5)" if divide and not average_s else ""
     kept, lines = (plausible or Plausible()).select(
-        samples, str(table.path), place, "leader.plausible", units=known
+        samples, str(table.path), place, "leader.plausible", remedy, known
     )
     line = f"read {kept['episode'].nunique():,} speed record(s), {len(kept):,} rows, {table.path}"
     if table.preamble:
         line += ": native OpenACC, its first car"
     return kept, [line, *table.notes, *report.left_out(), *report.notes, *lines]
+
+
+def _averaged(samples: pd.DataFrame, seconds: float, source: str) -> pd.DataFrame:
+    """Return centred moving averages of the speeds, of the samples that have a whole window."""
+    step = float(samples[TIME_COLUMN].diff()[samples["episode"].diff() == 0].median())
+    window = samples.groupby("episode")[SPEED_COLUMN].rolling(
+        round(seconds / step) | 1, center=True
+    )
+    kept = samples.assign(**{SPEED_COLUMN: window.mean().to_numpy()}).dropna(subset=SPEED_COLUMN)
+    if len(kept) < 2:
+        raise DataError(f"{source}: no record is as long as leader.average_s={seconds:g}")
+    return kept.reset_index(drop=True)
 
 
 def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:

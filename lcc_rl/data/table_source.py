@@ -13,6 +13,7 @@ from pydantic import Field
 
 from lcc_rl.arrays import Integers
 from lcc_rl.data.agreement import LEAST_WAY
+from lcc_rl.data.episodes import NO_LEADER
 from lcc_rl.data.grid import Places, continuous, cut_by_files, on_grid, places
 from lcc_rl.data.plausible import SMOOTHING
 from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource, find_files, read_as, units_of
@@ -54,7 +55,6 @@ TABLE_COLUMNS: dict[str, str | None] = {
     "time": "time_s",
     "speed": "speed_mps",
 }
-NO_LEADER = ("", "0", "-1", "0.0", "-1.0")  # in the column leader
 TABLE_MEASURED = ("time", "speed", "position")  # rows with a blank cell are left out
 IDENTIFYING = ("vehicle", "lane", "recording")  # must not be blank in the other rows
 AGREE = (0.8, 1.25)  # range of distance by positions divided by distance by speeds

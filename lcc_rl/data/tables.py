@@ -265,18 +265,16 @@ class TableFile:
             raise first
         line = f"left out {int(wrong.sum()):,} rows with a blank cell, the first: {first}"
         self.notes.append(line)
-        kept = {key: values[~wrong] for key, values in read.items()}
-        return {
-            key: x.remove_unused_categories() if isinstance(x, pd.Categorical) else x
-            for key, x in kept.items()
-        }
+        return chosen(read, ~wrong)
 
     def _scale(self, column: Column, units: Units, option: str) -> float:
         """Return the size of a column's unit in SI; refuse another unit in its name."""
         unit, name = units.get(column.key, SI.get(column.quantity, "")), self.names[column.key]
         scale = (unit and unit_size(column.quantity, unit)) or 1.0
-        if column.quantity == "speed" and is_relative(name):
+        if column.quantity == "speed" and is_relative(name) and column.key != "relative_speed":
             words = f"column {name!r} holds a relative speed; add the other car's, or rename it"
+            if column.key == "leader_speed":
+                words = f"column {name!r} is relative: name it data.columns.relative_speed"
             raise DataError(f"{self.path}: {words}")
         if column.key == "gap" and re.search("headway|hdwy|dhw", name.lower()):
             words = f"{self.path}: column {name!r}: does the gap include the leader's length?"
@@ -474,6 +472,15 @@ def categorical(cells: Cells) -> pd.Categorical:
     texts, place = np.unique(np.array(found, dtype=object), return_inverse=True)
     codes = place[np.asarray(encoded.indices.fill_null(len(names)))]
     return pd.Categorical.from_codes(codes, pd.Index(texts, dtype=object))
+
+
+def chosen(read: Mapping[str, Any], rows: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return some rows of columns, with the categories that they use."""
+    kept = {key: values[rows] for key, values in read.items()}
+    return {
+        key: x.remove_unused_categories() if isinstance(x, pd.Categorical) else x
+        for key, x in kept.items()
+    }
 
 
 def same_text(text: str, rows: int) -> pd.Categorical:

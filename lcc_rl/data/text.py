@@ -44,6 +44,7 @@ OTHER_FORMATS = {
 NO_TABLE = {
     b"version https://git-lfs": "a Git LFS pointer in place of the file: run git lfs pull",
     b"File created on ": "a VBOX file (vbo): save its [data] as CSV, with times as hh:mm:ss",
+    b"MDF  ": "an MDF measurement: save its channels as a table with asammdf (docs/data.md)",
     b"<": "XML or HTML; save the table as CSV (SUMO: --fcd-output fcd.csv)",
 }
 
@@ -280,6 +281,8 @@ def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: 
     how = f"; name the columns by {option}={{…}}" if option else ""
     if relative := next(filter(is_relative, header), None) if "speed" in missing[0] else None:
         hint = f" ({relative!r} is relative: add the follower's speed)"
+        if missing[0] == "leader_speed_mps":
+            hint = f" (set data.columns.relative_speed={relative})"
     if "gap_m" in missing and any("pos" in name.lower() for name in header):
         how = OF_POSITIONS
     if sum(map(bool, header)) == 1 or header[0].startswith(("#", "%")):

@@ -99,8 +99,10 @@ class Rowwise:
         return tuple(x.numpy() for x in tensors)
 
 
-def translated(function: TensorFunction, examples: Sequence[Tensor]) -> tuple[str, list[Array]]:
-    """Return the source of a function of numbers, and the tables that are its last arguments.
+def recorded(
+    function: TensorFunction, examples: Sequence[Tensor]
+) -> tuple[Recorder, list[list[int]]]:
+    """Return the recorded statements of a function, and the variables of each of its results.
 
     Raises:
         Untranslatable: naming the operation that has no counterpart on single numbers.
@@ -113,7 +115,12 @@ def translated(function: TensorFunction, examples: Sequence[Tensor]) -> tuple[st
         recorder.add(example, torch.tensor(variables).reshape(1, -1))
     with torch.no_grad(), recorder, TensorsOnly():
         results = function(*examples)
-    outputs = [recorder.numbers(x, x.dtype).flatten().tolist() for x in results]
+    return recorder, [recorder.numbers(x, x.dtype).flatten().tolist() for x in results]
+
+
+def translated(function: TensorFunction, examples: Sequence[Tensor]) -> tuple[str, list[Array]]:
+    """Return the source of a function of numbers, and the tables that are its last arguments."""
+    recorder, outputs = recorded(function, examples)
     needed = recorder.needed(variable for output in outputs for variable in output)
     lines = []
     for i in needed:

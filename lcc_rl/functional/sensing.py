@@ -12,6 +12,8 @@ from lcc_rl.functional.actuation import PairState
 from lcc_rl.functional.layout import join
 
 ROUNDING = 0.02  # exceeds the rounding of a gap's rate in single precision [m/s]
+# A gap that differs by more from its prediction is that of another vehicle ahead [m, m/s].
+OTHER_TARGET, OTHER_TARGET_RATE = 4.0, 40.0
 
 
 @dataclass(frozen=True)
@@ -72,12 +74,17 @@ class Agreement:
         """Return the memory after a measurement, ``[…, 3]``; zeros reset it.
 
         It holds 1; the measured gap plus half a step of relative motion, from which the trapezoidal
-        rule predicts the next gap [m]; and the average difference [m/s].
+        rule predicts the next gap [m]; and the average difference [m/s]. A vehicle that cuts in or
+        out changes the gap by more than its own length, which resets the memory.
         """
         begun, predicted, average = kept.split(1, -1)
         half = 0.5 * self.time_step * relative
         share = (1.0 - math.exp(-self.time_step / self.settling)) * begun
-        average = average + share * ((gap - half - predicted) / self.time_step - average)
+        change = gap - half - predicted
+        average = average + share * (change / self.time_step - average)
+        own = max(OTHER_TARGET, OTHER_TARGET_RATE * self.time_step) + 2.0 * self.sensing.gap
+        most = own + self.time_step * self.sensing.longest * relative.abs()
+        average = torch.where(change.abs() > most, 0.0, average)
         return join([torch.ones_like(gap), gap + half, average], -1)
 
     def difference(self, kept: Tensor, relative: Tensor) -> Tensor:

@@ -26,8 +26,10 @@ from lcc_rl.functional.recorder import Untranslatable
 from lcc_rl.interfaces.exported import (
     BEHIND_PRESENT,
     DrivingProgram,
+    Safety,
     described_input,
     driving,
+    filter_of,
     measuring,
     program,
 )
@@ -53,8 +55,8 @@ class Driver:
             Append ``_filtered`` to the name of a rule to put it behind the safety filter.
         time_step: duration of a step of the simulator [s]; a policy needs that of its training.
         trust: modules outside this package that a policy may name.
-        safety: the safety filter; None: that of the policy's training, or that of ``+filter=cbf``
-            for rules with ``_filtered``.
+        safety: the safety filter, or changed settings, such as ``{"margin": 2.0}``, of the default:
+            that of the policy's training, or of ``+filter=cbf`` for rules with ``_filtered``.
         seed: seed of the drivers' noise; each new car has the next seed, also if it leaves and
             returns.
         drivers: population of rules with human drivers, such as ``"human"``: a table of ``lcc-rl
@@ -81,7 +83,7 @@ class Driver:
         name: Any,
         time_step: float,
         trust: Sequence[str] = (),
-        safety: CBFFilter | None = None,
+        safety: Safety = None,
         seed: int = 0,
         drivers: Population | str | Path | None = None,
     ) -> None:
@@ -109,12 +111,14 @@ class Driver:
         self._check()
         self.reset()
 
-    def _rule(self, spec: Any, safety: CBFFilter | None, world: World) -> DrivingProgram:
-        if safety is None and isinstance(spec, str) and spec.endswith(FILTERED):
+    def _rule(self, spec: Any, safety: Safety, world: World) -> DrivingProgram:
+        own = None
+        if isinstance(spec, str) and spec.endswith(FILTERED):
             filters = load("evaluate", ["variant=idm", "+filter=cbf"]).scenario.filters
-            safety = filters[AUTOMATED].made(CBFFilter)
-        node = controller_of(spec, safety is not None and safety.time_gap is not None)
-        return driving([node.made(Controller)], safety, world)
+            own = filters[AUTOMATED].made(CBFFilter)
+        own = filter_of(safety, own, self.name)
+        node = controller_of(spec, own is not None and own.time_gap is not None)
+        return driving([node.made(Controller)], own, world)
 
     def _check(self) -> None:
         for name in self.names:
@@ -166,7 +170,8 @@ class Driver:
         """
         state, alone = self._state(measured)
         ids = range(len(state)) if cars is None else _ids(cars)
-        if self.program.safety is None and (lost := np.isnan(state)).any():
+        lost = np.isnan(state) & [name not in self.program.stand_ins for name in self.names]
+        if self.program.safety is None and lost.any():
             row, column = np.argwhere(lost)[0]
             raise Diverged(f"{self.name}: {self.names[column]} is nan in row {row} of the cars")
         self._admit(ids, state)
@@ -177,9 +182,9 @@ class Driver:
             raise Diverged(f"{self.name}: {what}")
         if memory:
             (self.memory,) = memory
-            if not np.isfinite(self.memory).all():
+            if not self.memory[:, 0].all():
                 held = zip(self.cars, self.memory, strict=True)
-                self.reset([car for car, row in held if not np.isfinite(row).all()])
+                self.reset([car for car, row in held if not row[0]])
         return float(command[0, 0]) if alone else command[:, 0]
 
     def _admit(self, cars: Sequence[Hashable], state: Array) -> None:
@@ -229,18 +234,11 @@ class Driver:
         return state, not shape
 
     def _completed(self, measured: Mapping[str, Any]) -> dict[str, Any]:
-        """Return measurements completed by those of a vehicle behind.
-
-        Without a vehicle behind they are zero for a policy that observes its presence. Else a
-        vehicle at the own speed and gap is assumed.
-        """
+        """Return measurements with NaN, which get stand-ins, where there is no vehicle behind."""
         found, absent = dict(measured), measured.keys().isdisjoint(self.behind)
         present = found.setdefault(BEHIND_PRESENT, float(not absent))
         for name in () if np.all(present) else self.behind:
-            entry = name.partition(".")[2]
-            zero = BEHIND_PRESENT in self.names or entry == "acceleration"
-            default = 0.0 if zero else measured[f"self.{entry}"]
-            found[name] = default if absent else np.where(present, found[name], default)
+            found[name] = np.nan if absent else np.where(present, found[name], np.nan)
         return found
 
     @cached_property

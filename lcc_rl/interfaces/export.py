@@ -1,4 +1,4 @@
-"""Export of trained policies as ONNX, PyTorch's ``.pt2`` or a page of the ring road.
+"""Export of policies and rules as ONNX, PyTorch's ``.pt2``, C or a page of the ring road.
 
 An exported program maps the measurements of a vehicle in SI units to its acceleration. It contains
 the scales of the observation, the network and the safety filter, if there is one. The program of a
@@ -17,17 +17,19 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from omegaconf import OmegaConf
 
-from lcc_rl.config import load, with_variant
-from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config import key_of, load, with_variant
 from lcc_rl.errors import ConfigError, needing, require, require_known
 from lcc_rl.evaluation.foreign import network_of
-from lcc_rl.evaluation.named import is_policy, rules
-from lcc_rl.interfaces.exported import described_input, program
+from lcc_rl.evaluation.named import is_policy
+from lcc_rl.interfaces.c_code import c_code
+from lcc_rl.interfaces.driver import Driver
+from lcc_rl.interfaces.exported import DrivingProgram, Safety, described_input, program
 from lcc_rl.interfaces.onnx_policy import MAKES, TAKES
 from lcc_rl.interfaces.ring_page import ring_page
 from lcc_rl.io.atomic import atomic_path, new_file
-from lcc_rl.results.policies import PRETRAINED
+from lcc_rl.pieces.base import SEED
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.version import __version__
 
@@ -39,25 +41,31 @@ def export(
     variant: str = "alcc",
     overrides: Sequence[str] = (),
     normalize: Any = None,
+    safety: Safety = None,
 ) -> Path:
     """Write a trained policy, with its safety filter, for other software.
 
     The ending selects the format. ONNX (``.onnx``) and PyTorch's exported program (``.pt2``) read
     ``state``, ``[batch, inputs]`` in SI units, and return ``acceleration``, ``[batch, 1]`` [m/s²].
     A policy with a memory also has the input ``memory`` (zeros at first) and the output
-    ``next_memory``. Names, units and meanings of the inputs are in the file's metadata under
-    ``lcc_rl`` as JSON. A page (``.html``) shows the ring road with the policy in any browser, see
+    ``next_memory``. C code (``.c``) is one function ``step(state, memory)`` in C99. Names, units
+    and meanings of the inputs are in the file's metadata under ``lcc_rl`` as JSON. A page
+    (``.html``) shows the ring road with the policy in any browser, see
     :func:`lcc_rl.interfaces.ring_page.ring_page`.
 
     Args:
-        policy: a run folder, a policy file, or ``pretrained/<name>``; or a model of
+        policy: a run folder, a policy file, or ``pretrained/<name>``; a rule by name, with steps of
+            0.1 s (``"idm_acc_filtered"``); or a model of
             stable-baselines3 or a torch module from observations ``[batch, n]`` to actions
             ``[batch, 1]``.
         path: the file to write.
         trust: modules outside this package that the policy may name.
         variant, overrides: environment in which a model or module was trained; for a page the
-            overrides are settings of its ring.
+            overrides are settings of its ring, for a trained policy's program settings of its
+            filter, such as ``safety.margin=2``.
         normalize: ``VecNormalize`` of a model; by default that of its environment.
+        safety: the safety filter of a program, or changed settings of its own, such as
+            ``{"margin": 2.0}``.
 
     Returns:
         The path of the file.
@@ -79,48 +87,62 @@ def export(
             kind = type(given).__name__
             raise ConfigError(f"expected a run, a file, a torch module or a model, got {kind}")
         cfg = load("train", with_variant(variant, overrides))
-    require(
-        cfg is not None or is_policy(str(policy)) or str(policy) not in rules(),
-        f"{policy} is a rule; only a trained policy can be exported: give a run folder, a policy "
-        f"file or {PRETRAINED}/<name>",
-    )
-    require(cfg is None or not page, f"a page ({PAGE}) needs a run or a policy file")
-    words = f"{' '.join(overrides)}: a program ({path.suffix}) has no road, a page ({PAGE}) has"
-    require(cfg is not None or page or not overrides, words)
-    make = EXPORTERS.get(path.suffix)
-    content = make(policy, trust, cfg) if make else ring_page(policy, trust, overrides).encode()
+    rule = cfg is None and not is_policy(str(policy))
+    words = f"{policy}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
+    require(not page or (cfg is None and safety is None and not rule), words)
+    if cfg is None and not page and overrides:
+        words = f"{' '.join(overrides)}: a program ({path.suffix}) has no road, a page ({PAGE}) has"
+        require(all(key_of(item).startswith("safety.") for item in overrides), words)
+        safety = dict(OmegaConf.from_dotlist(list(overrides)).safety)
+    if page:
+        content = ring_page(policy, trust, overrides).encode()
+    else:
+        own = _rule(policy, trust, safety) if rule else program(policy, trust, cfg, safety)
+        content = EXPORTERS[path.suffix](own, _name(policy))
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path
 
 
-def _program(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> tuple[Any, str]:
-    """Return the exported program and its description as JSON."""
-    module = program(policy, trust, cfg)
+def _rule(name: Any, trust: Sequence[str], safety: Safety) -> DrivingProgram:
+    """Return the program of a rule with steps of 0.1 s."""
+    found = Driver(str(name), 0.1, trust, safety).program
+    require(SEED not in found.kept, f"{name} draws noise from seeds: it cannot be exported")
+    return found
+
+
+def _name(policy: Any) -> str:
+    return str(policy if isinstance(policy, (str, PathLike)) else type(policy).__name__)
+
+
+def described(module: DrivingProgram, name: str) -> str:
+    """Return the description of a program as JSON: names, units and stand-ins of its inputs."""
     inputs = [described_input(name)._asdict() for name in module.names]
-    about: dict[str, Any] = {
-        "policy": str(policy if cfg is None else type(policy).__name__),
-        "lcc_rl": __version__,
-        "inputs": inputs,
-    }
+    for one in inputs:
+        if one["name"] in module.stand_ins:
+            one["stand_in"] = str(module.stand_ins[one["name"]])
+    about: dict[str, Any] = {"policy": name, "lcc_rl": __version__, "inputs": inputs}
     about["time_step_s"] = module.controller.time_step
     about |= {"output": "acceleration [m/s²]", "filter": module.safety is not None}
+    return json.dumps(about, ensure_ascii=False)
+
+
+def _program(module: DrivingProgram) -> Any:
+    """Return the exported program."""
     widths = [len(module.names), module.width][: 1 + (module.width > 0)]
     batch = dict(zip(TAKES, [{0: torch.export.Dim("batch", min=1)}] * len(widths), strict=False))
     examples = tuple(torch.ones(2, width) for width in widths)
-    made = torch.export.export(module, examples, dynamic_shapes=batch)
-    return made, json.dumps(about, ensure_ascii=False)
+    return torch.export.export(module, examples, dynamic_shapes=batch)
 
 
-def _as_pt2(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> bytes:
-    made, about = _program(policy, trust, cfg)
+def _as_pt2(module: DrivingProgram, name: str) -> bytes:
     buffer = BytesIO()
-    torch.export.save(made, buffer, extra_files={"lcc_rl": about})
+    torch.export.save(_program(module), buffer, extra_files={"lcc_rl": described(module, name)})
     return buffer.getvalue()
 
 
-def _as_onnx(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> bytes:
-    exported, about = _program(policy, trust, cfg)
+def _as_onnx(module: DrivingProgram, name: str) -> bytes:
+    exported = _program(module)
     count = len(exported.graph_signature.user_inputs)
     with needing("interfaces", "write a .pt2, or install what .onnx needs"):
         import onnx
@@ -139,28 +161,34 @@ def _as_onnx(policy: Any, trust: Sequence[str], cfg: StudyConfig | None) -> byte
         )
     assert made is not None
     proto = made.model_proto
-    onnx.helper.set_model_props(proto, {"lcc_rl": about})
+    onnx.helper.set_model_props(proto, {"lcc_rl": described(module, name)})
     content: bytes = proto.SerializeToString()
     return content
 
 
+def _as_c(module: DrivingProgram, name: str) -> bytes:
+    return c_code(module, described(module, name)).encode()
+
+
 PAGE = ".html"
-EXPORTERS = {".onnx": _as_onnx, ".pt2": _as_pt2}
+EXPORTERS = {".onnx": _as_onnx, ".pt2": _as_pt2, ".c": _as_c}
 
 
-def main(words: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Export the policy of a command line."""
     parser = Arguments(description="Export a policy for other software.")
-    parser.add_argument("policy", help="run folder, policy.pt or pretrained/<name>")
-    parser.add_argument("path", help="file to write: a program (.onnx, .pt2) or a page (.html)")
+    parser.add_argument("policy", help="run folder, policy.pt, pretrained/<name> or a rule")
+    parser.add_argument("path", help="file: a program (.onnx, .pt2, .c) or a page (.html)")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
-    parser.add_argument("settings", nargs="*", default=[], help="of a page's ring: drivers=i80")
-    options = parser.parse_args(words)
+    words = "of a page's ring (drivers=i80) or of a program's filter (safety.margin=2)"
+    parser.add_argument("settings", nargs="*", default=[], help=words)
+    options = parser.parse_args(arguments)
     path = export(options.policy, options.path, options.trust, overrides=options.settings)
     if path.suffix == PAGE:
         print(f"{path}: the ring road in the browser, with {options.policy}")
         return 0
-    for item in map(described_input, program(options.policy, options.trust).names):
+    made = program if is_policy(options.policy) else _rule
+    for item in map(described_input, made(options.policy, options.trust, None).names):
         print(f"  {item.name} [{item.unit}]: {item.meaning}")
     print(f"{path}: maps these inputs, in this order, to the acceleration [m/s²]")
     return 0

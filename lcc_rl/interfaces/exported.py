@@ -6,7 +6,7 @@ controller, safety filter. :mod:`.export` writes it to files, :mod:`.driver` run
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,10 +42,10 @@ from lcc_rl.pieces.base import (
 )
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.knowledge import ObservationMemory
-from lcc_rl.pieces.views import BEHIND, VEHICLES
+from lcc_rl.pieces.views import BEHIND, SELF, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.results.policies import load_policy
-from lcc_rl.settings import Positive, values
+from lcc_rl.settings import Positive, parse, values
 
 # Entries that are computed from other measurements: v_ahead − v.
 DERIVED_INPUTS = {
@@ -54,6 +54,9 @@ DERIVED_INPUTS = {
 }
 BEHIND_PRESENT = "behind.present"
 COMMAND_KEY = (AUTOMATED, "command")
+
+
+Safety = CBFFilter | Mapping[str, Any] | None  # a filter, or changed settings of a given one
 
 
 class Input(NamedTuple):
@@ -86,7 +89,10 @@ class DrivingProgram(nn.Module):
     """Maps measurements ``[batch, inputs]`` to accelerations ``[batch, 1]`` [m/s²].
 
     A program with a memory also reads and returns the memory, ``[batch, width]``. If its first
-    number is zero, the vehicle starts anew.
+    number is zero, the vehicle starts anew. Inputs of ``behind.`` that are NaN get their stand-ins.
+    With a safety filter, an input ahead that is not finite, or a gap that is not positive, is no
+    measurement. After one such step the last measurements are used again. In further ones the
+    filter brakes fully, and the vehicle starts anew.
 
     Args:
         pieces: a policy's memory and observation, the controller, the safety filter, in this order
@@ -95,6 +101,7 @@ class DrivingProgram(nn.Module):
     Attributes:
         names: the inputs, such as ``"self.gap"``.
         inputs: the inputs of each entry.
+        stand_ins: for each input of ``behind.`` the input that replaces a NaN, or a number.
         kept: shapes and types of the remembered entries.
         width: size of the memory, 0 if there is none.
     """
@@ -114,16 +121,30 @@ class DrivingProgram(nn.Module):
             own = [key for key in piece.entries if key in before]
             self.kept |= piece.layouts(torch.Size([]), own)
         self.sizes = [shape.numel() for shape, _ in self.kept.values()]
-        self.width = 1 + sum(self.sizes) if self.kept else 0
         written = {SEED, STEP}.union(*(piece.entries for piece in pieces))
         self.inputs = {key: self._inputs(".".join(key)) for key in needs if key not in written}
         self.names = list(dict.fromkeys(name for names in self.inputs.values() for name in names))
+        self.stand_ins = self._stand_ins()
+        # The last measurements, and whether the step before had none.
+        self.sizes += [len(self.names), 1] if self.safety is not None else []
+        self.width = 1 + sum(self.sizes) if self.sizes else 0
 
     def _inputs(self, name: str) -> tuple[str, ...]:
         """Return the inputs of an entry, one per number."""
         columns = [] if self.observation is None else self.observation.columns()
         several = tuple(column for column, *_ in columns if column.startswith(f"{name}."))
         return several or DERIVED_INPUTS.get(name, (name,))
+
+    def _stand_ins(self) -> dict[str, str | float]:
+        """Return zeros for a policy that observes presence, else a vehicle like the own one."""
+        found: dict[str, str | float] = {}
+        for name in (name for name in self.names if name.startswith(f"{BEHIND}.")):
+            own = name.replace(BEHIND, SELF)
+            if BEHIND_PRESENT in self.names or name.endswith(".acceleration"):
+                found[name] = 0.0
+            elif own in self.names:
+                found[name] = own
+        return found
 
     def forward(self, state: Tensor, memory: Tensor | None = None) -> Any:
         """Return the commanded accelerations and, if there is one, the memory after the step."""
@@ -135,6 +156,7 @@ class DrivingProgram(nn.Module):
 
     def begin(self, state: Tensor, seeds: Tensor) -> Tensor:
         """Return the initial memories of vehicles from seeds ``[batch, 1]``, int64."""
+        state = self._with_stand_ins(state)
         start = TensorDict()  # no batch dimensions: an export would fix their number
         clock: State = {SEED: seeds, STEP: torch.zeros_like(seeds)}
         for key, value in {**self.measured(state), **clock}.items():
@@ -142,7 +164,8 @@ class DrivingProgram(nn.Module):
         for piece in self.pieces:
             if isinstance(piece, StepTransform):
                 piece.begin(TensorDict(), start)
-        return self._packed({key: start.get(key) for key in self.kept}, state)
+        nothing = [] if self.safety is None else [state, torch.ones_like(state[:, :1])]
+        return self._packed({key: start.get(key) for key in self.kept}, state, nothing)
 
     def step(
         self, state: Tensor, memory: Tensor | None = None, apply: Any = None
@@ -151,23 +174,54 @@ class DrivingProgram(nn.Module):
 
         ``apply(piece, before, reached)`` applies each piece, by default ``piece.derive``.
         """
+        state = self._with_stand_ins(state)
+        held: Sequence[Tensor] = ()
+        values = () if memory is None else memory[:, 1:].split(self.sizes, -1)
+        if self.safety is not None:
+            state, *held = self._held(state, *values[-2:])
         reached = self.measured(state)
         before = dict(reached)
         if memory is not None:
-            values = memory[:, 1:].split(self.sizes, -1)
-            for (key, (shape, dtype)), value in zip(self.kept.items(), values, strict=True):
+            for (key, (shape, dtype)), value in zip(self.kept.items(), values, strict=False):
                 before[key] = value.reshape(-1, *shape).to(dtype)
         reached |= {key: before[key] + (key == STEP) for key in (SEED, STEP) if key in before}
         for piece in self.pieces:
             apply(piece, before, reached) if apply else piece.derive(before, reached)
         command = reached[COMMAND_KEY].flatten(1)
-        return (command,) if memory is None else (command, self._packed(reached, memory))
+        if memory is None:
+            return (command,)
+        after = self._packed(reached, memory, held)
+        if self.safety is not None:  # without measurements the vehicle starts anew
+            after = torch.where(after.isfinite().all(-1, keepdim=True), after, 0.0)
+        return command, after
 
-    def _packed(self, entries: State, like: Tensor) -> Tensor:
+    def _with_stand_ins(self, state: Tensor) -> Tensor:
+        """Return the inputs with the stand-ins of a vehicle behind that is not measured."""
+        if not self.stand_ins:
+            return state
+        columns = dict(zip(self.names, state.split(1, -1), strict=True))
+        rear = [columns[name] for name in self.stand_ins]
+        known = torch.cat(rear, -1).isfinite().all(-1, keepdim=True)
+        if BEHIND_PRESENT in columns:
+            known = known & (columns[BEHIND_PRESENT] > 0.0)
+        for name, other in self.stand_ins.items():
+            value = columns[other] if isinstance(other, str) else other
+            columns[name] = torch.where(known, columns[name], value)
+        return torch.cat([columns[name] for name in self.names], -1)
+
+    def _held(self, state: Tensor, last: Tensor, missed: Tensor) -> tuple[Tensor, ...]:
+        """Return the inputs of a step, those to keep, and whether there was no measurement."""
+        gap = state[:, self.names.index("self.gap")].unsqueeze(-1)
+        known = state.isfinite().all(-1, keepdim=True) & (gap > 0.0)
+        lost = torch.where(missed > 0.0, torch.nan, last.to(state.dtype))
+        found = torch.where(known, state, lost)
+        return found, found, (~known).to(state.dtype)
+
+    def _packed(self, entries: State, like: Tensor, held: Sequence[Tensor]) -> Tensor:
         rows = [torch.ones_like(like[:, :1])]
         for key, (shape, _) in self.kept.items():
             rows.append(entries[key].expand(like.shape[0], *shape).flatten(1).to(like.dtype))
-        return torch.cat(rows, 1)
+        return torch.cat([*rows, *(value.to(like.dtype) for value in held)], 1)
 
     def measured(self, state: Tensor) -> State:
         """Return the measured entries, ``[batch, 1, width]``."""
@@ -208,7 +262,7 @@ def program(
     policy: str | Path | nn.Module,
     trust: Sequence[str] = (),
     cfg: StudyConfig | None = None,
-    safety: CBFFilter | None = None,
+    safety: Safety = None,
 ) -> DrivingProgram:
     """Build the program of a trained policy.
 
@@ -217,7 +271,7 @@ def program(
             :func:`lcc_rl.evaluation.foreign.network_of`.
         trust: modules outside this package that the policy may name.
         cfg: the configuration in which a network was trained.
-        safety: the safety filter; None: its own.
+        safety: the safety filter, or changed settings of its own; None: its own.
 
     Raises:
         ConfigError: if no network drives, its filter depends on delays of a scenario, or its
@@ -242,7 +296,8 @@ def program(
                 f"{policy}: it drives vehicles of the class {name} (scenario.fleet) with limits "
                 "that only an environment has: it cannot drive in SUMO or be exported"
             )
-    safety = safety or next((p for p in pieces if isinstance(p, CBFFilter)), None)
+    own = next((p for p in pieces if isinstance(p, CBFFilter)), None)
+    safety = filter_of(safety, own, str(policy))
     if safety is not None and any(vars(safety).get("remembers", {}).values()):
         raise ConfigError(
             f"{policy}: its filter needs pending commands or earlier measurements, which exist "
@@ -265,6 +320,15 @@ def program(
     largest = action.max_acceleration
     network = NetworkController(network=network, max_acceleration=largest)
     return driving([*memory, observation, network], safety, world)
+
+
+def filter_of(safety: Safety, own: CBFFilter | None, name: str) -> CBFFilter | None:
+    """Return the safety filter of a driver, whose own one is used if nothing else is given."""
+    if not isinstance(safety, Mapping):
+        return safety or own
+    if own is None:
+        raise ConfigError(f"{name} has no safety filter whose settings safety could change")
+    return parse(type(own), values(own) | dict(safety), "safety")
 
 
 def driving(pieces: Sequence[Piece], safety: CBFFilter | None, world: World) -> DrivingProgram:

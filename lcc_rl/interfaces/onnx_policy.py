@@ -46,6 +46,7 @@ class ProgramInput(Settings):
     name: Short
     unit: Short
     meaning: str = ""
+    stand_in: Short = ""  # replaces a NaN: another input, or a number
 
     def validate(self) -> None:
         if self.name not in INPUT_UNITS:

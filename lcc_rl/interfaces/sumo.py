@@ -19,7 +19,7 @@ from unittest.mock import patch
 
 from lcc_rl.errors import Diverged, needing, require
 from lcc_rl.interfaces.driver import MEASURED, Driver
-from lcc_rl.pieces import CBFFilter
+from lcc_rl.interfaces.exported import Safety
 from lcc_rl.pieces.controllers import Population
 
 log = logging.getLogger("lcc_rl")
@@ -66,7 +66,7 @@ class Bridge:
         sight: float = 150.0,
         trust: Sequence[str] = (),
         seed: int = 0,
-        safety: CBFFilter | None = None,
+        safety: Safety = None,
         drivers: Population | None = None,
     ) -> None:
         self.sumo = load_sumo()

@@ -7,7 +7,7 @@ from lcc_rl.errors import ConfigError, require_known
 
 KJ_PER_WH = 3.6
 MPG = 235.215  # miles per US gallon times litres per 100 km
-ELECTRIC = {"kJ/km": 1.0, "Wh/km": 1.0 / KJ_PER_WH}
+ELECTRIC = {"kJ/km": 1.0, "Wh/km": 1.0 / KJ_PER_WH, "kWh/100km": 0.1 / KJ_PER_WH}
 OF_FUEL = ("g/km", "L/100km", "mpg")  # units for vehicles that all burn one fuel
 ENERGY_UNITS = (*ELECTRIC, *OF_FUEL)
 

@@ -114,7 +114,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
     (
         "episodes",
         csv(pairs().rename(columns={"leader_speed_mps": "relSpeed"})),
-        r"lacks the column leader_speed_mps.*'relSpeed' is relative: add the follower's speed",
+        r"lacks the column leader_speed_mps.*\(set data.columns.relative_speed=relSpeed\)",
     ),
     ("openacc", openacc_text().replace("IVS", "gap"), "lacks IVS1, IVS2"),
     ("openacc", csv(TABLE), "expected a native OpenACC file"),
@@ -157,6 +157,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ),
     ("record", "version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "run git lfs pull"),
     ("record", "File created on 03/05/2023\n\n[header]\n", r"is a VBOX file \(vbo\): save its"),
+    ("record", "MDF     4.10    asammdf8", "is an MDF measurement: save its channels .* asammdf"),
     ("table", "<?xml version='1.0'?>\n<fcd-export/>\n", "is XML or HTML; save the table as CSV"),
     ("table", "<fcd-export>\n</fcd-export>\n", r"is XML or HTML; .*\(SUMO: --fcd-output fcd.csv\)"),
     (
@@ -244,7 +245,7 @@ def test_a_relative_speed_is_named_by_its_column(tmp_path: Path) -> None:
         EpisodesSource(path=str(path), columns={"leader_speed": name}).load()
 
     names = ("rel_speed", "RelativeSpeed", "dV (m/s)", "Range rate", "delta_v")
-    words = "column '{}' holds a relative speed; add the other car's, or rename"
+    words = "column '{}' is relative: name it data.columns.relative_speed"
     check_refused(read, [(x, words.format(re.escape(x))) for x in names], DataError)
     read("reliable_speed")
 

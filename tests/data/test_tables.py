@@ -16,6 +16,7 @@ from lcc_rl.config import load
 from lcc_rl.data import text
 from lcc_rl.data.car_following import Criteria
 from lcc_rl.data.episodes import SCHEMA
+from lcc_rl.data.leaders import Leaders
 from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.smoothing import SavitzkyGolay
@@ -462,3 +463,63 @@ def test_lengths_in_feet_and_gaps_that_jump_are_named_in_tables(tmp_path) -> Non
     assert jumps.episodes["gap_m"].max() < 90.0
     assert any("where the gap jumps or is held" in line for line in jumps.report)
     assert not any("jumps or is held" in line for line in clean.report)
+
+
+# -- the log of one car ----------------------------------------------------------------------------
+
+LOG = {"time": "t", "follower_speed": "v", "gap": "range", "relative_speed": "range_rate"}
+LOG |= {"valid": "ok", "target": "id", "leader_speed": None}
+
+
+def car_log() -> pd.DataFrame:
+    """100 s at 50 Hz behind target 7, then 9, which is 12 m nearer; a second without a target."""
+    time = np.arange(5000) * 0.02
+    own, ahead = 15.0 + np.sin(time / 5.0), 15.0 + 2.0 * np.sin(time / 7.0)
+    gap = 40.0 + np.cumsum(ahead - own) * 0.02 - 12.0 * (time >= 60.0)
+    log = pd.DataFrame({"t": time, "v": own, "range": gap, "range_rate": ahead - own})
+    log["ok"], log["id"] = (time < 30.0) | (time >= 31.0), np.where(time < 60.0, 7, 9)
+    log.loc[~log["ok"], ["range", "range_rate", "id"]] = 0
+    return log
+
+
+def test_the_log_of_a_car_has_relative_speeds_targets_and_a_flag(tmp_path) -> None:
+    log = car_log()
+    other = log.assign(ok=log["ok"].map({True: "yes", False: "No"}), id=log["id"].map("t{}".format))
+    for path, table in (("log.csv", log), ("log.parquet", log), ("words.csv", other)):
+        name = tmp_path / path
+        table.to_parquet(name) if name.suffix == ".parquet" else table.to_csv(name, index=False)
+        loaded = EpisodesSource(path=str(name), columns=LOG).load()
+        found = loaded.episodes
+        assert len(found["episode"].unique()) == 3
+        assert any("left out 50 rows without a valid target" in line for line in loaded.report)
+        assert found["follower_id"].nunique() == 1
+        assert found["leader_id"].nunique() == 2
+        for _, part in found.groupby("episode"):
+            time = part["time_s"]
+            np.testing.assert_allclose(
+                part["leader_speed_mps"], 15.0 + 2.0 * np.sin(time / 7.0), atol=1e-3
+            )
+            assert part["gap_m"].diff().abs().max() < 0.5
+    bad = other.assign(ok="maybe")
+    bad.to_csv(tmp_path / "bad.csv", index=False)
+    with pytest.raises(DataError, match="data row 1, column 'ok' is 'maybe'; expected 1 or 0"):
+        EpisodesSource(path=str(tmp_path / "bad.csv"), columns=LOG).load()
+
+
+def test_noisy_speeds_of_a_fast_raster_are_smoothed_by_the_option_of_the_message(tmp_path) -> None:
+    log = car_log()
+    noise = 0.2 * np.random.default_rng(0).normal(size=len(log))
+    log.assign(v=log["v"] + noise).to_csv(tmp_path / "fast.csv", index=False)
+    words = ["leader=record", f"leader.path={tmp_path / 'fast.csv'}"]
+    words += ["leader.columns={time: t, speed: v}"]
+
+    def read(*more: str) -> Leaders:
+        return load("train", ["variant=alcc", *words, *more]).leader.made().load(0.1, 100)
+
+    with pytest.raises(DataError, match=r"smooth it \(leader.average_s=0.5\)"):
+        read()
+    found = read("leader.average_s=0.5").training.record(0)
+    time = 0.24 + 0.1 * np.arange(len(found))
+    np.testing.assert_allclose(found, 15.0 + np.sin(time / 5.0), atol=0.2)
+    with pytest.raises(DataError, match=r"no record is as long as leader\.average_s=500"):
+        read("leader.average_s=500")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from torch import nn
 import lcc_rl
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.interfaces.driver import Driver
 from lcc_rl.interfaces.export import main
 from lcc_rl.interfaces.exported import DrivingProgram, program
 from lcc_rl.results.policies import load_policy
@@ -29,10 +33,13 @@ def states(module: DrivingProgram, count: int = 256) -> torch.Tensor:
 
 
 def memories(module: DrivingProgram, count: int = 256) -> torch.Tensor:
-    """Of filters: gaps of as many metres as are predicted, and what they grow too fast [m/s]."""
+    """Of filters: gaps of as many metres as are predicted, what they grow too fast [m/s], and the
+    last measurements.
+    """
     chance = torch.Generator().manual_seed(1)
-    drawn, begun = torch.rand(count, 2, generator=chance), torch.ones(count, module.width - 2)
-    return torch.cat([begun, 20.0 * drawn[:, :1], drawn[:, 1:] - 0.5], -1)
+    drawn, begun = torch.rand(count, 2, generator=chance), torch.ones(count, 2)
+    last, missed = 20.0 * torch.rand(count, len(module.names)), torch.zeros(count, 1)
+    return torch.cat([begun, 20.0 * drawn[:, :1], drawn[:, 1:] - 0.5, last, missed], -1)
 
 
 def test_it_commands_what_the_vehicle_of_the_environment_obeys(module) -> None:
@@ -97,6 +104,37 @@ def test_onnxruntime_computes_the_same(module, tmp_path) -> None:
     assert [item["name"] for item in about["inputs"]] == module.names
 
 
+@pytest.mark.parametrize("name", ["pretrained/i24-follow5", "idm_acc_filtered", "idm_acc"])
+def test_c_code_computes_the_same(name, tmp_path) -> None:
+    """With the memory of its own, through NaN, a lost target and another one."""
+    if (compiler := shutil.which("cc")) is None:
+        pytest.skip("no C compiler")
+    path = lcc_rl.export(name, tmp_path / "follow.c")
+    strict = "-std=c99 -O2 -Wall -Wextra -Wno-unused-function -pedantic -Werror -shared -fPIC"
+    built = tmp_path / "follow.so"
+    subprocess.run([compiler, *strict.split(), path, "-o", built, "-lm"], check=True)
+    step = ctypes.CDLL(str(built)).step
+    step.restype = ctypes.c_float
+    module = Driver(name, 0.1).program
+    width, chance = len(module.names), np.random.default_rng(0)
+    state, kept = 20.0 * chance.random((1, width)), np.zeros((1, module.width), np.float32)
+    memory = [torch.zeros(1, module.width)] * bool(module.width)
+    for k in range(60):
+        state = np.abs(state + 0.3 * chance.normal(size=state.shape)).astype(np.float32)
+        seen = state.copy()
+        if memory and k in (20, 30, 31, 32):
+            seen[0, k % width] = np.nan
+        expected, *memory = (
+            module(torch.from_numpy(seen), *memory) if memory else [module(torch.from_numpy(seen))]
+        )
+        found = step(*(x.ctypes.data_as(ctypes.POINTER(ctypes.c_float)) for x in (seen, kept)))
+        assert found == pytest.approx(expected.item(), abs=2e-6), k
+        for one in memory:
+            np.testing.assert_allclose(kept, one.numpy(), rtol=1e-6, atol=1e-6)
+    head = path.read_text(encoding="utf-8")
+    assert all(f": {column} [" in head for column in module.names)
+
+
 def test_a_measurement_that_is_no_number_brakes_or_shows(module, tmp_path) -> None:
     """In every input of every format: clamp and minimum let NaN through, and hide nothing."""
     ort = pytest.importorskip("onnxruntime", reason="extra interfaces")
@@ -110,6 +148,14 @@ def test_a_measurement_that_is_no_number_brakes_or_shows(module, tmp_path) -> No
         makes = torch.export.load(files[1]).module()
         given = [one.name for one in session.get_inputs()]
         widths = [one.shape[1] for one in session.get_inputs()]
+        inputs = json.loads(session.get_modelmeta().custom_metadata_map["lcc_rl"])["inputs"]
+        usual = session.run(
+            None,
+            {
+                x: np.full((1, w), 12.0 * (x == "state"), np.float32)
+                for x, w in zip(given, widths, strict=True)
+            },
+        )[0][0]
         for rows in (1, 5):
             for column in range(widths[0]):
                 state = torch.full((rows, widths[0]), 12.0)
@@ -119,7 +165,9 @@ def test_a_measurement_that_is_no_number_brakes_or_shows(module, tmp_path) -> No
                 found = makes(*entries)
                 found = found[0] if isinstance(found, tuple) else found
                 for one in (session.run(None, feed)[0], found.detach().numpy()):
-                    np.testing.assert_allclose(one[0], wanted, rtol=1e-6)
+                    rear = "stand_in" in inputs[column]  # then a vehicle like the own one
+                    assert rear == inputs[column]["name"].startswith("behind.")
+                    np.testing.assert_allclose(one[0], usual if rear else wanted, rtol=1e-5)
                     assert np.isfinite(one[1:]).all()
 
 
@@ -127,6 +175,10 @@ def test_bad_input_is_one_clear_error() -> None:
     cases = [
         (["pretrained/alcc", "x.tflite"], "ending"),
         (["pretrained/nobody", "x.onnx"], "nobody"),
-        (["idm_acc", "x.onnx"], "idm_acc is a rule; only a trained policy"),
+        (["pretrained/alcc", "x.onnx", "safety.margin=2"], "alcc has no safety filter"),
+        (["pretrained/i80-follow", "x.onnx", "safety.margin=-2"], r"safety.margin must be greater"),
+        (["idm_ac", "x.onnx"], "idm_acc"),
+        (["idm_acc", "x.html"], r"idm_acc: a page \(.html\) needs a run or a policy file"),
+        (["human", "x.c"], "human draws noise from seeds: it cannot be exported"),
     ]
     check_refused(main, cases, ConfigError)

@@ -130,20 +130,24 @@ def test_an_exported_policy_that_remembers_drives_as_the_policy(follow) -> None:
     pd.testing.assert_frame_equal(*rows, rtol=1e-5)
 
 
-def test_a_program_with_memory_brakes_after_a_nan_until_it_begins_anew(follow) -> None:
+def test_a_program_with_memory_holds_a_nan_once_then_brakes_and_begins_anew(follow) -> None:
     program = Program(follow)
-    usual = {"self.gap": 25.0, "behind.gap": 20.0, "behind.present": 1.0}
-    speeds = dict.fromkeys(("self.speed", "ahead.speed", "behind.speed"), 12.0)
-    one = torch.tensor([(usual | speeds).get(name, 0.0) for name in program.names])
+    seen = {"self.gap": 25.0, "behind.gap": 20.0, "behind.present": 1.0}
+    seen |= dict.fromkeys(("self.speed", "ahead.speed", "behind.speed"), 12.0)
+    one = torch.tensor([seen.get(name, 0.0) for name in program.names])
     good = one.repeat(len(one), 1)
     bad = good.clone()
     bad.fill_diagonal_(torch.nan)  # one measurement of each row
-    kept = torch.tensor([[name == "ahead.speed"] for name in program.names])  # all it remembers
+    rear = torch.tensor([[name.startswith("behind.")] for name in program.names])
     zeros = torch.zeros(len(one), program.memory)
     first, memory = program(good, zeros)
     assert first.abs().max() < 1.0
     braking = torch.full_like(first, -3.0)
-    for state, expected in ((bad, braking), *2 * [(good, torch.where(kept, braking, first))]):
+    usual = {"behind.gap": 25.0}  # a vehicle behind like the own one
+    like_own = torch.tensor([(seen | usual).get(name, 0.0) for name in program.names])
+    stand_in = program(like_own[None], zeros[:1])[0]
+    held, lost = (torch.where(rear, stand_in, other) for other in (first, braking))
+    for state, expected in ((bad, held), (bad, lost), (bad, lost), (good, first)):
         found, memory = program(state, memory)
         torch.testing.assert_close(found, expected)
     again, _ = program(good, zeros)
