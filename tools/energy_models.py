@@ -125,6 +125,8 @@ def motions(steps: pd.DataFrame) -> tuple[dict[str, Speeds], list[str], float]:
     """
     cars = [name for name in map(str, steps) if re.fullmatch(r"(cav|hdv)\d*_speed", name)]
     keys = ["training_seed", "profile", "driver_id"]
+    given = {"strategy", "time_s", *keys} <= {*steps} and cars
+    require(given, f"{STEPS} is not of a string behind a leader or on a ring, but of a platoon")
     groups = {
         str(name): [frame for _, frame in rows.groupby(keys, dropna=False, sort=True)]
         for name, rows in steps.groupby("strategy")
@@ -135,6 +137,7 @@ def motions(steps: pd.DataFrame) -> tuple[dict[str, Speeds], list[str], float]:
         for name, frames in groups.items()
         if all(len(frame) == length and frame[cars].notna().all(axis=None) for frame in frames)
     }
+    require(found, f"{STEPS}: every strategy has an episode with a collision; expected one without")
     profiles = [frame["profile"].iloc[0] for frame in groups[next(iter(found))]]
     return found, profiles, float(steps["time_s"].diff().median())
 

@@ -32,6 +32,7 @@ from lcc_rl.evaluation.metrics import KILO
 from lcc_rl.io.atomic import atomic_path, new_file
 from lcc_rl.io.files import write_parquet
 from lcc_rl.runs.arguments import Arguments, typed
+from lcc_rl.settings import checked
 
 log = logging.getLogger("lcc_rl")
 
@@ -40,6 +41,7 @@ KWH = 3600.0  # [kJ]
 MOST_ROWS = 20  # most trips that are printed
 
 
+@checked
 def trip_energies(
     path: str | PathLike | Sequence[str | PathLike], overrides: Sequence[str] = ()
 ) -> pd.DataFrame:

@@ -123,3 +123,10 @@ def test_refused_trips(path) -> None:
             (*GRADED, "energy=alcc", "PaperMotor has no grade"),
         ],
     )
+    check_refused(
+        lcc_rl.trip_energies,
+        [
+            (path, "energy=bolt", "trip_energies.overrides .*got 'energy=bolt'"),
+            (3, [], r"trip_energies\.path"),
+        ],
+    )

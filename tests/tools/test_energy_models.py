@@ -67,3 +67,10 @@ def test_what_cannot_be_priced_is_one_line(folder, tmp_path) -> None:
         (folder, "nobody", "nobody is not in .*: it has acc, human, idm, idm_acc"),
     ]
     check_refused(energy_models.savings, cases)
+    steps = pd.read_parquet(folder / "steps.parquet")
+    collided = steps.assign(hdv_speed=np.nan)
+    cases = [
+        (steps.rename(columns={"driver_id": "case"}), "not of a string .* but of a platoon"),
+        (collided, "every strategy has an episode with a collision"),
+    ]
+    check_refused(energy_models.motions, cases)
