@@ -62,7 +62,7 @@ def by_sumo(name: str) -> Price:
         with tempfile.TemporaryDirectory() as folder:
             given, found = Path(folder) / "given", Path(folder) / "found"
             lines = (f"{time};{v:.6f};{a:.6f};0" for time, (v, a) in enumerate(rows.T))
-            given.write_text("\n".join(lines) + "\n")
+            given.write_text("\n".join(lines) + "\n", encoding="utf-8")
             binary = str(home / "bin" / "emissionsDrivingCycle")
             words = [binary, "-t", str(given), "-o", str(found), "-e", name]
             environment = {**os.environ, "SUMO_HOME": str(home)}

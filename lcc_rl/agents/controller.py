@@ -6,9 +6,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 
 from lcc_rl.errors import ConfigError, require_positive
+from lcc_rl.functional.pattern import MAX_ACCELERATION
 from lcc_rl.pieces.base import ACTION, NEXT, root_key
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.pieces.world import MAX_ACCELERATION
 
 
 class ControllerPolicy(TensorDictModuleBase):

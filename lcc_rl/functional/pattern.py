@@ -16,6 +16,7 @@ from lcc_rl.errors import ConfigError, require
 
 AUTOMATED, HUMAN = "automated", "human"
 OPEN, RING = "open", "ring"
+MAX_ACCELERATION = 3.0  # of automated vehicles by default, in both directions [m/s²]
 TOKEN = re.compile(r"\s*([A-Za-z_]\w*|\*\s*[0-9]+|[()])")
 MOST_VEHICLES = 10_000  # vehicles of one string
 

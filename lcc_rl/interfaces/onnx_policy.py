@@ -21,10 +21,11 @@ from pydantic import Field
 from torch import Tensor
 
 from lcc_rl.errors import ResultsError, needing, raised_as, require
+from lcc_rl.functional.pattern import MAX_ACCELERATION
 from lcc_rl.pieces.base import Entry, Piece, declared
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, VEHICLES
-from lcc_rl.pieces.world import MAX_ACCELERATION, World
+from lcc_rl.pieces.world import World
 from lcc_rl.settings import Positive, Settings, parse
 
 ABOUT = "lcc_rl"  # key of the metadata

@@ -24,7 +24,7 @@ from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import build_energy, load_inputs
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, MAX_ACCELERATION, RING
 from lcc_rl.functional.random import stream_id
 from lcc_rl.interfaces.driver import Driver
 from lcc_rl.interfaces.exported import NetworkController
@@ -33,7 +33,6 @@ from lcc_rl.pieces.cbf import SLOWEST
 from lcc_rl.pieces.controllers import stream_name
 from lcc_rl.pieces.drivers import IDM, Drivers
 from lcc_rl.pieces.knowledge import ObservationMemory
-from lcc_rl.pieces.world import MAX_ACCELERATION
 from lcc_rl.results.policies import load_policy
 from lcc_rl.settings import values
 

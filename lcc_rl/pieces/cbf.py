@@ -19,12 +19,13 @@ from lcc_rl.functional.braking import (
     safe_command,
 )
 from lcc_rl.functional.layout import batch_innermost, join
+from lcc_rl.functional.pattern import MAX_ACCELERATION
 from lcc_rl.functional.sensing import Agreement, brought_up
 from lcc_rl.pieces.actuation import ACTUATION, Actuation
 from lcc_rl.pieces.base import Entry, RoleTransform
 from lcc_rl.pieces.sensors import SENSORS, Sensors, frames_of
 from lcc_rl.pieces.string import COMMANDED, WANTED
-from lcc_rl.pieces.world import MAX_ACCELERATION, World
+from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
 
 ROUNDING = 5e-3  # of gaps [m] and accelerations [m/s²] in single precision

@@ -17,12 +17,12 @@ from lcc_rl.functional.cacc import (
     next_leader_speed,
     platoon_errors,
 )
-from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION
 from lcc_rl.functional.string import entries_ahead, gather
 from lcc_rl.pieces.base import Entry, Feature
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import LEADER, VEHICLES
-from lcc_rl.pieces.world import MAX_ACCELERATION, World
+from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Number, Positive
 
 # Prediction of the leader's next speed: v0 + a0 T, v0, or the true one, as an upper bound only.

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from lcc_rl.functional.driver_models import Each
 from lcc_rl.functional.idm import IDMConstants
+from lcc_rl.functional.pattern import MAX_ACCELERATION
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.pieces.world import MAX_ACCELERATION
 from lcc_rl.settings import Positive, defaults
 
 

@@ -23,7 +23,7 @@ from lcc_rl.functional.hcfs import (
     hybrid_decision,
     jerk_interval,
 )
-from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION
 from lcc_rl.pieces.base import Entry, Piece
 from lcc_rl.pieces.connected import (
     Communication,
@@ -33,7 +33,7 @@ from lcc_rl.pieces.connected import (
     leader_names,
 )
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.pieces.world import MAX_ACCELERATION, World
+from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
 
 WINNER = ("hybrid", "winner")

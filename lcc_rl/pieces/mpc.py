@@ -12,10 +12,11 @@ from pydantic import Field
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError, how_to_install
+from lcc_rl.functional.pattern import MAX_ACCELERATION
 from lcc_rl.functional.power import POWER_COEFFICIENTS
 from lcc_rl.pieces.base import Entry
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.pieces.world import MAX_ACCELERATION, World
+from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
 LONGEST_GAP = 200.0  # longer gaps count as this one [m]

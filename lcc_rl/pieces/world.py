@@ -9,10 +9,9 @@ from typing import Any, ClassVar, Self
 from tensordict.utils import NestedKey
 
 from lcc_rl.errors import require
-from lcc_rl.functional.pattern import AUTOMATED, VehicleString
+from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION, VehicleString
 from lcc_rl.settings import Settings, values
 
-MAX_ACCELERATION = 3.0  # of vehicles by default, in both directions [m/s²]
 MOST_LATE = 1000  # longest delay of sensors, actuators and drivers in steps, all of which are kept
 # Views that sensors measure, and the entries of the role with their measurements.
 SENSED = {

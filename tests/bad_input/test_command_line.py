@@ -50,7 +50,7 @@ REFUSED = {
     "status nowhere": "nowhere: no such folder",
     "animate nowhere --start nan": "--start: must be a finite number",
     "clairvoyant --iterations 0": "--iterations: must be greater than or equal to 1",
-    "export pretrained/alcc policy.banana": "'.banana'; valid: .html, .onnx",
+    "export pretrained/alcc policy.banana": "'.banana'; valid: .c, .html, .onnx",
     "reproduce alcc --recipe smoke --jobs 1000000000": "jobs must lie from 1 to",
 }
 # Commands that write what they are told to, and never over what is there.

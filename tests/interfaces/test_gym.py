@@ -419,7 +419,6 @@ def test_models_of_stable_baselines3_are_compared_and_exported(sb3, tmp_path) ->
             assert energy["model"] == pytest.approx(energy["file"], rel=1e-5)
     wide = nn.Linear(9, 1)
     cases = [
-        ("acc", "acc is a rule"),
         (wide, "Linear fails for observations of 7"),
         (object(), "expected a run, a file, a torch module or a"),
     ]
