@@ -27,14 +27,13 @@ from lcc_rl.data.leaders import DriveLeaders
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.data.speed_records import read_drives
 from lcc_rl.envs.inputs import build_energy
-from lcc_rl.errors import Concern, require
+from lcc_rl.errors import require
 from lcc_rl.evaluation.metrics import KILO
 from lcc_rl.io.atomic import atomic_path, new_file
 from lcc_rl.io.files import write_parquet
 from lcc_rl.runs.arguments import Arguments, typed
+from lcc_rl.runs.output import log_report
 from lcc_rl.settings import checked
-
-log = logging.getLogger("lcc_rl")
 
 BLOCK = 10  # records whose energies are computed together; more exceed the processor's cache
 KWH = 3600.0  # [kJ]
@@ -69,8 +68,7 @@ def trip_energies(
     require(not others, "energy: a mixture has several models; choose one, such as fuel")
     source = cfg.leader.made(DriveLeaders)
     records, lines = read_drives(source.path, source.columns, step, source.plausible, source.units)
-    for line in lines:
-        log.log(logging.WARNING if isinstance(line, Concern) else logging.INFO, line)
+    log_report(lines)
     blocks = (slice(first, first + BLOCK) for first in range(0, len(records), BLOCK))
     rows = pd.concat([_energies(records, block, model) for block in blocks])
     trips = rows.groupby("trip").sum().reset_index()

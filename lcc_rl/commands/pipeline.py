@@ -7,7 +7,6 @@ import multiprocessing
 import os
 import shlex
 import threading
-from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import fields, replace
@@ -35,7 +34,7 @@ from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.drivers.calibrator import count_records
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.inputs import LOADS, build_energy, load_inputs, second_energy
-from lcc_rl.errors import Concern, ConfigError, Interrupted, ResultsError
+from lcc_rl.errors import ConfigError, Interrupted, ResultsError
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
 from lcc_rl.figures.main_page import held_to, write_page
@@ -59,7 +58,7 @@ from lcc_rl.results.runs import (
 )
 from lcc_rl.results.trust import own_modules, trust_option
 from lcc_rl.runs.interrupts import INTERRUPTED
-from lcc_rl.runs.output import show_headline
+from lcc_rl.runs.output import log_report, show_headline
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch_jobs
 from lcc_rl.runs.states import claim
@@ -207,7 +206,7 @@ def read_once(cfg: PipelineConfig, folder: Path, learns: bool = True) -> None:
             raise ResultsError(f"{path} is of other data; choose another folder, or remove this")
         return
     loaded = cfg.data.made(LOADS).load()
-    _pass_on(loaded.report)
+    log_report(loaded.report)
     counts = [line for line in loaded.report if line.startswith(("kept ", "read "))]
     show_headline(f"data: {(counts or loaded.report)[-1]}")
     if learns:
@@ -223,18 +222,12 @@ def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
     own = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})
     check_folder(own, drivers.parent)
     if not drivers.exists():
-        found = calibration.run(own, drivers.parent, Console(quiet=True), emit=_pass_on)
+        found = calibration.run(own, drivers.parent, Console(quiet=True), emit=log_report)
         modes = {str(mode): rows for mode, rows in found.groupby("mode", sort=False)}
         errors = (f"{mode} {100.0 * x['rmspe'].mean():.2f} %" for mode, x in modes.items())
         records = count_records(next(iter(modes.values())))
         show_headline(f"calibrated {records}: mean RMSPE {', '.join(errors)}")
     return drivers
-
-
-def _pass_on(lines: Sequence[str]) -> None:
-    """Log lines of a report; lines on changes of the results also appear on the terminal."""
-    for line in lines:
-        log.log(logging.WARNING if isinstance(line, Concern) else logging.INFO, line)
 
 
 def train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:

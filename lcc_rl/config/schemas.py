@@ -18,12 +18,7 @@ from pydantic import AfterValidator, Field
 
 from lcc_rl.config.nodes import Node, as_nodes, as_plain, check_nodes, check_numbers
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.pattern import (
-    AUTOMATED,
-    MAX_ACCELERATION,
-    VehicleString,
-    parse_string,
-)
+from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION, VehicleString, parse_string
 from lcc_rl.settings import (
     TARGET,
     Count,

@@ -12,8 +12,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.arrays import Floats
+from lcc_rl.data.columns import FRAMES, SI, SPEEDS, UNITS, Units, unit_size
 from lcc_rl.data.grid import Place
-from lcc_rl.data.tables import FRAMES, SI, SPEEDS, UNITS, Units, unit_size
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.errors import Concern, DataError
 

@@ -10,13 +10,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from lcc_rl.data.columns import Column, Names, Units
 from lcc_rl.data.grid import Places, continuous, cut_by_files, on_grid, places, stretches
 from lcc_rl.data.tables import (
     LARGEST_ID,
-    Column,
-    Names,
     TableFile,
-    Units,
     chosen,
     joined,
     same_text,

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from lcc_rl.data.columns import check_map
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import (
     EvaluationShare,
@@ -28,7 +29,6 @@ from lcc_rl.data.profiles import (
 )
 from lcc_rl.data.sources import find_files
 from lcc_rl.data.speed_records import DRIVE_COLUMNS, DRIVE_FIELDS, read_drives, read_speed_record
-from lcc_rl.data.tables import check_map
 from lcc_rl.data.trajectories import FRAME
 from lcc_rl.errors import ConfigError, DataError, raised_as, require_known, require_positive
 from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, parse

@@ -19,8 +19,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from lcc_rl.data.columns import Column
 from lcc_rl.data.ngsim_recordings import Group, name_recordings
-from lcc_rl.data.tables import LARGEST_ID, Block, Column, TableFile
+from lcc_rl.data.tables import LARGEST_ID, Block, TableFile
 from lcc_rl.data.text import lacking
 from lcc_rl.data.trajectories import (
     CAR_LENGTH,

@@ -16,10 +16,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from lcc_rl.data.columns import Column
 from lcc_rl.data.grid import places
 from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource, find_files
 from lcc_rl.data.table_source import to_trajectories
-from lcc_rl.data.tables import Column, TableFile
+from lcc_rl.data.tables import TableFile
 from lcc_rl.data.text import labels
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError

@@ -12,8 +12,8 @@ from pydantic import Field
 
 from lcc_rl.arrays import Floats, Mask
 from lcc_rl.data.agreement import OF_PAIRS, check_pairs, numbers_of_pairs
+from lcc_rl.data.columns import Units
 from lcc_rl.data.grid import ORIGIN, Place, Places, divided, stretches
-from lcc_rl.data.tables import Units
 from lcc_rl.data.trajectories import FRAME, starts_of
 from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings

@@ -16,6 +16,7 @@ from pydantic import Field
 
 import lcc_rl.assets
 from lcc_rl.data.car_following import Criteria, extract
+from lcc_rl.data.columns import SI, Column, Names, Units, check_map
 from lcc_rl.data.episodes import (
     DERIVED_POSITIONS,
     EPISODE_NAMES,
@@ -27,7 +28,6 @@ from lcc_rl.data.grid import Places, places
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.smoothing import averaged
-from lcc_rl.data.tables import SI, Column, Names, Units, check_map
 from lcc_rl.data.trajectories import Trajectories, listed
 from lcc_rl.errors import DataError, raised_as
 from lcc_rl.io.paths import matching

@@ -14,11 +14,12 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from lcc_rl.data.columns import SLOPES, Column, Names, Units
 from lcc_rl.data.grid import continuous, interpolated, places, stretches
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
 from lcc_rl.data.sources import SHIPPED_FILES, find_files, units_of
-from lcc_rl.data.tables import SLOPES, Column, Names, TableFile, Units, same_text, tables_of
+from lcc_rl.data.tables import TableFile, same_text, tables_of
 from lcc_rl.data.text import alike
 from lcc_rl.data.trajectories import ReadReport
 from lcc_rl.errors import DataError

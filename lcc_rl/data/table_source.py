@@ -13,19 +13,12 @@ from pydantic import Field
 
 from lcc_rl.arrays import Integers
 from lcc_rl.data.agreement import LEAST_WAY
+from lcc_rl.data.columns import Column, check_map
 from lcc_rl.data.episodes import NO_LEADER
 from lcc_rl.data.grid import Places, continuous, cut_by_files, on_grid, places
 from lcc_rl.data.plausible import SMOOTHING
 from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource, find_files, read_as, units_of
-from lcc_rl.data.tables import (
-    Column,
-    TableFile,
-    check_map,
-    joined,
-    same_text,
-    tables_of,
-    whole_numbers,
-)
+from lcc_rl.data.tables import TableFile, joined, same_text, tables_of, whole_numbers
 from lcc_rl.data.trajectories import (
     CAR_LENGTH,
     FRAME,

@@ -10,9 +10,7 @@ import logging
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import chain
-from math import pi
 from os.path import expanduser, getsize, isfile  # pathlib's raises for an unknown user
 from pathlib import Path
 from time import monotonic
@@ -26,6 +24,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pandas.api.types import union_categoricals
 
+from lcc_rl.data.columns import SI, UNITS, Column, Names, Units, named_unit, unit_size
 from lcc_rl.data.text import (
     NO_TABLE,
     NUMBER,
@@ -42,123 +41,23 @@ from lcc_rl.data.text import (
     stem,
     unended,
 )
-from lcc_rl.data.trajectories import FOOT, listed
-from lcc_rl.errors import Concern, ConfigError, DataError, raised_as, require_known, unknown_name
+from lcc_rl.data.trajectories import listed
+from lcc_rl.errors import Concern, DataError, raised_as
 from lcc_rl.io.memory import require_memory
 
 log = logging.getLogger("lcc_rl")
 
 PARQUET = (".parquet", ".pq")
 EVERY = 10.0  # time between lines on the progress [s]
-LARGEST_CELL = 1e12  # in SI: beyond any time or position, and within every type
 LONGEST_TEXT = 1000  # most characters of a name
 LARGEST_ID = 2**53  # larger whole numbers do not fit a float
 THOUSANDS = r"^-?[0-9]{1,3}(,[0-9]{3})+(\.[0-9]*)?$"
 NUMERIC_TYPES = (pa.types.is_floating, pa.types.is_integer, pa.types.is_null, pa.types.is_decimal)
-ISO, FRAMES = "iso", "frames/"  # dates and times of ISO 8601; prefix of the frames per second
-CLOCK, CLOCK_TIME = "hh:mm:ss", r"^ *([01]?[0-9]|2[0-3]):[0-5][0-9]:[0-5][0-9]([.,][0-9]+)? *$"
-SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": FOOT, "kn": 1852 / 3600}
-# Units by quantity and their sizes; the first is the SI unit.
-UNITS: dict[str, dict[str, float]] = {
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, ISO: 1.0, CLOCK: 1.0},
-    "speed": {**SPEEDS, "kph": SPEEDS["km/h"]},
-    "length": {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": FOOT},
-    "grade": {"rad": 1.0, "deg": pi / 180, "%": 0.01, "m/m": 1.0},
-}
-SLOPES = ("%", "m/m")  # units of grades that are slopes, the tangent of the angle
-SI = {quantity: next(iter(units)) for quantity, units in UNITS.items()}
-# Spellings of units other than SI in names of columns; "min" may also mean the minimum.
-UNIT_WORDS = {
-    "time": {"ms": "ms|msecs?|milliseconds?", "us": "us|µs|microseconds?", "ns": "ns|nanoseconds?"},
-    "speed": {
-        "km/h": "km ?/?h|kmph|kph|(kilomet(re|er)s|km) per h(ou)?r?",
-        "mph": "mph|mi/h|miles? (per|an) hour",
-        "ft/s": "ft/s|fps|(feet|ft) per s(ec(ond)?)?",
-        "kn": "kn|kts?|knots?",
-    },
-    "length": {"ft": "ft|feet|foot", "cm": "cm", "km": "km"},
-}
+CLOCK_TIME = r"^ *([01]?[0-9]|2[0-3]):[0-5][0-9]:[0-5][0-9]([.,][0-9]+)? *$"
 APART = "no row has all columns: merge signals at their own times, such as by table.set_index"
 APART += "({time!r}).interpolate('index').dropna() of pandas"
 Cells = Any  # a pyarrow array, chunked or not
-Names = Mapping[str, str | None]  # names of columns in a file, by key
-Units = Mapping[str, str]  # units of columns, by key
 Fault = Callable[[int, str], DataError]  # returns the error for a row and words
-
-
-@dataclass(frozen=True)
-class Column:
-    """Column of a table.
-
-    Args:
-        key: its name in the program.
-        quantity: ``time``, ``speed``, ``length``, ``number`` or ``text``.
-        least, most: range of its numbers, in SI.
-        whole: whether its numbers are whole.
-        blank: whether cells may be blank: NaN, or ``""`` of text.
-        required: whether a table must have it.
-    """
-
-    key: str
-    quantity: str = "number"
-    least: float = -LARGEST_CELL
-    most: float = LARGEST_CELL
-    whole: bool = False
-    blank: bool = False
-    required: bool = True
-
-    @property
-    def expected(self) -> str:
-        """Description of valid values for messages."""
-        unit = f" {SI[self.quantity]}" if self.quantity in SI else ""
-        unit += "; is it in ms, us or ns (units.time)?" * (self.quantity == "time")
-        return f"a {'whole ' * self.whole}number from {self.least:g} to {self.most:g}{unit}"
-
-
-def check_map(columns: Iterable[Column], names: Names, units: Units, at: str) -> None:
-    """Check the names and units of columns in a configuration.
-
-    Args:
-        columns: all possible columns.
-        names: the file's names, by key.
-        units: units by key; by default SI.
-        at: the node of the configuration, ``data`` or ``leader``.
-
-    Raises:
-        ConfigError: naming an unknown key or unit, a required column without name, or a column that
-            is named twice.
-    """
-    known = {column.key: column for column in columns}
-    measured = {key: UNITS[c.quantity] for key, c in known.items() if c.quantity in UNITS}
-    require_known(f"key of {at}.columns", names, known)
-    require_known(f"key of {at}.units", units, measured)
-    for key, name in names.items():
-        if not (isinstance(name, str) or (name is None and not known[key].required)):
-            raise ConfigError(f"{at}.columns.{key} must name a column, got {name!r}")
-        if name is not None and [*names.values()].count(name) > 1:
-            raise ConfigError(f"{at}.columns names the column {name!r} twice")
-    for key, unit in units.items():
-        more = {"frames/<rate>": 1.0} if known[key].quantity == "time" else {}
-        if unit_size(known[key].quantity, str(unit)) is None:
-            raise unknown_name(f"unit in {at}.units.{key}:", str(unit), {**measured[key], **more})
-
-
-def unit_size(quantity: str, unit: str) -> float | None:
-    """Return the size of a unit in SI, including ``frames/25``; None if it is unknown."""
-    if quantity == "time" and unit.startswith(FRAMES):
-        with suppress(ValueError):
-            rate = float(unit.removeprefix(FRAMES))
-            return 1 / rate if 0.0 < rate < LARGEST_CELL else None
-    return UNITS[quantity].get(unit)
-
-
-def named_unit(name: str, quantity: str) -> str | None:
-    """Return the unit in the name of a column, unless it is SI: ``mph`` for ``v (mph)``."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^\w/]|_", " ", name).lower()
-    for unit, spelled in UNIT_WORDS.get(quantity, {}).items():
-        if re.search(rf"(?<![^\W\d])({spelled})(?![^\W\d])", words):
-            return unit
-    return None
 
 
 class TableFile:

@@ -78,6 +78,19 @@ def export(
     Examples:
         >>> export("pretrained/alcc_limits", "alcc.pt2")  # doctest: +SKIP
     """
+    return _written(policy, path, trust, variant, overrides, normalize, safety)[0]
+
+
+def _written(
+    policy: Any,
+    path: str | Path,
+    trust: Sequence[str],
+    variant: str = "alcc",
+    overrides: Sequence[str] = (),
+    normalize: Any = None,
+    safety: Safety = None,
+) -> tuple[Path, list[str]]:
+    """Write the file, see :func:`export`; return its path and the inputs of its program."""
     path = new_file(path, "name")
     require_known("ending", path.suffix, [*EXPORTERS, PAGE])
     cfg, page = None, path.suffix == PAGE
@@ -94,14 +107,15 @@ def export(
         words = f"{' '.join(overrides)}: a program ({path.suffix}) has no road, a page ({PAGE}) has"
         require(all(key_of(item).startswith("safety.") for item in overrides), words)
         safety = dict(OmegaConf.from_dotlist(list(overrides)).safety)
+    names: list[str] = []
     if page:
         content = ring_page(policy, trust, overrides).encode()
     else:
         own = _rule(policy, trust, safety) if rule else program(policy, trust, cfg, safety)
-        content = EXPORTERS[path.suffix](own, _name(policy))
+        content, names = EXPORTERS[path.suffix](own, _name(policy)), own.names
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
-    return path
+    return path, names
 
 
 def _rule(name: Any, trust: Sequence[str], safety: Safety) -> DrivingProgram:
@@ -183,12 +197,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = "of a page's ring (drivers=i80) or of a program's filter (safety.margin=2)"
     parser.add_argument("settings", nargs="*", default=[], help=words)
     options = parser.parse_args(arguments)
-    path = export(options.policy, options.path, options.trust, overrides=options.settings)
+    given = options.policy, options.path, options.trust
+    path, names = _written(*given, overrides=options.settings)
     if path.suffix == PAGE:
         print(f"{path}: the ring road in the browser, with {options.policy}")
         return 0
-    made = program if is_policy(options.policy) else _rule
-    for item in map(described_input, made(options.policy, options.trust, None).names):
+    for item in map(described_input, names):
         print(f"  {item.name} [{item.unit}]: {item.meaning}")
     print(f"{path}: maps these inputs, in this order, to the acceleration [m/s²]")
     return 0

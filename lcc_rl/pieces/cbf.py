@@ -155,9 +155,9 @@ class CBFFilter(RoleTransform):
             same = given.pop() > self.sensing.oldest
             given[len(FILTER_READS)] = torch.where(same, given[len(FILTER_READS)], 0.0)
         command, agreed = self.filtered(wanted, *given)
-        return command if step is None else torch.where(
-            step < self.from_step, wanted, command
-        ), agreed
+        if step is not None:
+            command = torch.where(step < self.from_step, wanted, command)
+        return command, agreed
 
     def kept(self, memories: Sequence[Tensor], nothing: Tensor) -> list[Tensor]:
         """Return the memories of actuation and sensors; ``nothing``, one column, for none."""

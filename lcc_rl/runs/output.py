@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
 from io import TextIOWrapper
 from typing import Any, cast
 
 from rich import box
+
+from lcc_rl.errors import Concern
 
 # Level of headlines, between INFO (details) and WARNING.
 HEADLINE = 25
@@ -34,6 +36,12 @@ class ShortFormatter(logging.Formatter):
 def show_headline(text: str) -> None:
     """Log a headline, which :func:`headlines` shows on the terminal."""
     log.log(HEADLINE, text)
+
+
+def log_report(lines: Iterable[str]) -> None:
+    """Log lines of a report; lines on changes of the results also appear on the terminal."""
+    for line in lines:
+        log.log(logging.WARNING if isinstance(line, Concern) else logging.INFO, line)
 
 
 @contextmanager

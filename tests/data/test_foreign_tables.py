@@ -13,9 +13,9 @@ import pytest
 from page_files import highd
 from table_text import BY_GAP, LENGTH, long_table, written
 
+from lcc_rl.data.columns import UNITS, named_unit
 from lcc_rl.data.leaders import DriveLeaders
 from lcc_rl.data.table_source import TableSource
-from lcc_rl.data.tables import UNITS, named_unit
 from lcc_rl.errors import Concern, DataError
 
 NAMED = {

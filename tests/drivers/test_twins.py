@@ -11,7 +11,6 @@ import pandas as pd
 import pytest
 import torch
 
-from lcc_rl.commands.pipeline import _pass_on
 from lcc_rl.drivers import twins
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.observed import observe
@@ -33,6 +32,7 @@ from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.functional.driver_models import PARAMETERS
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.power import acceleration_loss
+from lcc_rl.runs.output import log_report
 
 STEP, SAMPLES = 0.1, 601
 
@@ -119,7 +119,7 @@ def test_forgotten_units_and_bounds_are_said(caplog) -> None:
     speeds = episodes.filter(like="speed").columns
     wrong = episodes.assign(**{name: 3.6 * episodes[name] for name in speeds})  # km/h
     result = Calibrator()(wrong)
-    _pass_on(result.report)
+    log_report(result.report)
     loud = "\n".join(x.message for x in caplog.records if x.levelno >= logging.WARNING)
     assert re.search(r"lie on a bound: \d+ % on 5, \d+ % on \d+ \(calibration.bounds", loud)
     assert "IMPLAUSIBLE FIT: the gap of the median driver is off by" in loud
