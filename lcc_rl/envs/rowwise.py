@@ -8,6 +8,7 @@ statements are recorded from the function itself.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -21,6 +22,8 @@ from lcc_rl.functional.recorder import Recorder, TensorsOnly, Untranslatable
 from lcc_rl.pieces.base import Key, State
 
 log = logging.getLogger("lcc_rl")
+
+FRACTION = re.compile(r"(f32|f64)\((-?\d+\.\d*[1-9]\d*(?:e[-+]?\d+)?|-?\d+e-\d+)\)")
 
 Array = np.ndarray[Any, Any]
 TensorFunction = Callable[..., Sequence[Tensor]]
@@ -121,18 +124,22 @@ def recorded(
 def translated(function: TensorFunction, examples: Sequence[Tensor]) -> tuple[str, list[Array]]:
     """Return the source of a function of numbers, and the tables that are its last arguments."""
     recorder, outputs = recorded(function, examples)
-    needed = recorder.needed(variable for output in outputs for variable in output)
-    lines = []
-    for i in needed:
+    lines, constants = [], list[float]()
+    for i in recorder.needed(variable for output in outputs for variable in output):
         expression, reads = recorder.statements[i]
+        # One source, compiled once, for functions that differ in their settings.
+        if found := FRACTION.fullmatch(expression):
+            expression = f"{found[1]}(c0[{len(constants)}])"
+            constants.append(float(found[2]))
         lines.append(f"v{i} = " + expression.format(*(f"v{x}" for x in reads)))
     lines += [
         f"y{place}[row, {column}] = v{variable}"
         for place, output in enumerate(outputs)
         for column, variable in enumerate(output)
     ]
-    counts = (("x", examples), ("y", outputs), ("t", recorder.tables))
+    tables = [*(table.detach().numpy() for table in recorder.tables), np.array(constants)]
+    counts = (("x", examples), ("y", outputs), ("t", recorder.tables), ("c", [constants]))
     names = ", ".join(f"{name}{i}" for name, each in counts for i in range(len(each)))
     body = "".join(f"        {line}\n" for line in lines)
     source = f"def kernel({names}):\n    for row in range(len(x0)):\n{body}"
-    return source, [table.numpy() for table in recorder.tables]
+    return source, tables

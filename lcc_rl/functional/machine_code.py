@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import logging
 from collections.abc import Callable
@@ -11,6 +10,8 @@ from typing import Any
 
 import numba
 import numpy as np
+from llvmlite import binding
+from numba import types
 from numba.extending import get_cython_function_address
 
 log = logging.getLogger("lcc_rl")
@@ -42,13 +43,24 @@ def layer(weights: Any, bias: Any, inputs: Any) -> Any:
     return found
 
 
+@numba.njit
+def rectified(values: Any) -> Any:
+    """Return the values of an array with zero instead of negative ones."""
+    found = values.copy()
+    for place, value in enumerate(values):
+        found[place] = pick(value < 0, np.float32(0), value)
+    return found
+
+
+# By name: machine code with an address in it could not be kept for later processes.
+NDTRI = "lcc_rl_ndtri"
+binding.add_symbol(NDTRI, get_cython_function_address("scipy.special.cython_special", "ndtri"))
 SCOPE = {
     "pick": pick,
     "layer": layer,
+    "rectified": rectified,
     "read": read,
-    "ndtri": ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(
-        get_cython_function_address("scipy.special.cython_special", "ndtri")
-    ),
+    "ndtri": types.ExternalFunction(NDTRI, types.float64(types.float64)),
     "f32": np.float32,
     "f64": np.float64,
     "i64": np.int64,
@@ -57,12 +69,6 @@ SCOPE = {
     "inf": np.inf,
     "nan": np.nan,
 }
-
-
-@cache
-def compiled(source: str) -> Callable[..., None]:
-    """Return the function ``kernel`` of a source as machine code, shared by equal sources."""
-    return numba.njit(error_model="numpy")(_made(source, "<recorded>", "kernel"))
 
 
 def _made(source: str, file: str, name: str) -> Callable[..., None]:
@@ -81,8 +87,6 @@ def kept(source: str, fused: bool = False) -> Callable[..., None]:
     folder (``NUMBA_CACHE_DIR``), under a name that contains a hash of the source. If it cannot be
     kept or read, the function is compiled for this process.
     """
-    if "ndtri(" in source:  # a pointer into this process
-        return compiled(source)
     fastmath = {"contract"} if fused else False
     compile_it = partial(numba.njit, fastmath=fastmath, error_model="numpy", nogil=True)
     name = f"{'fused' if fused else 'kernel'}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"

@@ -108,6 +108,7 @@ class Recorder(TorchDispatchMode):
         self.known: dict[tuple[str, tuple[int, ...]], int] = {}
         self.variables: dict[int, tuple[Tensor, Tensor]] = {}  # by the id of the tensor
         self.tables: list[Tensor] = []
+        self.layers: dict[tuple[int, ...], int] = {}  # variables of whole arrays, and the array's
 
     def add(self, tensor: Tensor, variables: Tensor) -> None:
         """Record the variables of a tensor."""
@@ -175,10 +176,14 @@ class Recorder(TorchDispatchMode):
         formula = COMPARISONS.get(name) or ARITHMETIC[name]
         if f"{{{len(values) - 1}}}" not in formula:
             raise Untranslatable(f"{name} of {len(values)} arguments")
+        if name == "relu" and self.layers:
+            return self._rectified(formula, self.numbers(values[0], dtype))
         return self._stated(formula, [self.numbers(x, dtype) for x in values])
 
     def _stated(self, formula: str, parts: Sequence[Tensor]) -> Tensor:
         """Record a formula for every entry of variables; return the variables of the results."""
+        if formula == "{0}":
+            return parts[0]
         parts = torch.broadcast_tensors(*parts)
         rows = zip(*(part.flatten().tolist() for part in parts), strict=True)
         found = [self.variable(formula, row) for row in rows]
@@ -229,9 +234,26 @@ class Recorder(TorchDispatchMode):
         rows = []
         for row in self.numbers(value, result.dtype).tolist():
             numbers = "".join(f"{{{place}}}, " for place in range(len(row)))
-            array = self.variable(f"layer({tables}, ({numbers}))", tuple(row))
-            rows.append([self.variable(f"{{0}}[{place}]", (array,)) for place in range(len(bias))])
+            inputs, reads = f"({numbers})", tuple(row)
+            if (whole := self.layers.get(reads)) is not None:
+                inputs, reads = "{0}", (whole,)
+            rows.append(self._array(f"layer({tables}, {inputs})", reads, len(bias)))
         return torch.tensor(rows, dtype=torch.int64)
+
+    def _array(self, expression: str, reads: tuple[int, ...], size: int) -> list[int]:
+        """Record an array; return the variables of its entries."""
+        array = self.variable(expression, reads)
+        entries = [self.variable(f"{{0}}[{place}]", (array,)) for place in range(size)]
+        self.layers[tuple(entries)] = array
+        return entries
+
+    def _rectified(self, formula: str, variables: Tensor) -> Tensor:
+        """Record ReLU, of a whole layer in one statement."""
+        rows = [tuple(row) for row in variables.reshape(-1, variables.shape[-1]).tolist()]
+        if not all(row in self.layers for row in rows):
+            return self._stated(formula, [variables])
+        found = [self._array("rectified({0})", (self.layers[x],), len(x)) for x in rows]
+        return torch.tensor(found, dtype=torch.int64).reshape(variables.shape)
 
     def _bitwise_not(self, result: Tensor, value: Tensor) -> Tensor:
         return self._each("bitwise_xor", result.dtype, value, -1)

@@ -83,9 +83,18 @@ def _statement(i: int, formula: str, reads: tuple[int, ...], types: dict[int, st
     if formula.startswith("layer("):
         weights, bias = re.findall(r"t\d+", formula)
         units, types[i] = f"sizeof {bias} / sizeof *{bias}", "layer"
-        inputs = f"in{i}[] = {{{', '.join(given)}}}"
-        call = f"layer({weights}, {bias}, in{i}, {len(given)}, v{i}, {units});"
-        return [f"float v{i}[{units}], {inputs};", call]
+        before, inputs, count = "", given[0], f"sizeof {given[0]} / sizeof *{given[0]}"
+        if types[reads[0]] != "layer":
+            before, inputs, count = f", in{i}[] = {{{', '.join(given)}}}", f"in{i}", f"{len(given)}"
+        call = f"layer({weights}, {bias}, {inputs}, {count}, v{i}, {units});"
+        return [f"float v{i}[{units}]{before};", call]
+    if formula.startswith("rectified("):
+        units, types[i] = f"sizeof {given[0]} / sizeof *{given[0]}", "layer"
+        each = f"v{i}[unit] = {given[0]}[unit] < 0 ? 0 : {given[0]}[unit];"
+        return [
+            f"float v{i}[{units}];",
+            f"for (int unit = 0; unit < (int)({units}); unit++) {each}",
+        ]
     if "**" in formula:
         formula = "powf({0}, {1})"
     elif re.search("ndtri|read|searchsorted", formula):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
-from lcc_rl.envs.rowwise import Rowwise
+from lcc_rl.envs.rowwise import Rowwise, translated
 
 TABLE = torch.linspace(-1.0, 1.0, 12).reshape(4, 3)
 LAYERS = torch.nn.Sequential(torch.nn.Linear(4, 6), torch.nn.ReLU(), torch.nn.Linear(6, 2))
@@ -52,6 +55,26 @@ def test_a_translated_function_gives_what_torch_gives(subtests) -> None:
             (found,), (wanted,) = rows(*(x.numpy() for x in given)), function(*given)
             assert found.dtype == wanted.numpy().dtype
             np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6)
+
+
+def test_functions_that_differ_in_their_settings_are_one_kernel_that_is_kept() -> None:
+    def made(gain: float, layers: nn.Module) -> Rowwise:
+        def function(x: torch.Tensor, n: torch.Tensor) -> tuple[torch.Tensor]:
+            noise = torch.special.ndtri((0.3 * x[..., :1]).sin().abs().double())
+            return (gain * layers(x) + noise,)
+
+        rows, given = Rowwise(function, examples(1), "a test"), examples(9)
+        (found,), (wanted,) = rows(*(x.numpy() for x in given)), function(*given)
+        np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
+        return rows
+
+    wide = [nn.Sequential(nn.Linear(4, 90), nn.ReLU(), nn.Linear(90, 2)) for _ in range(2)]
+    first, other = made(1.25, wide[0]), made(-0.7, wide[1])
+    assert first.kernel is other.kernel  # the noise, whose function has an address, included
+    stored = Path(first.kernel.chosen.stats.cache_path)
+    assert any(stored.glob(f"*{first.kernel.chosen.py_func.__name__}*.nbc"))
+    source, _ = translated(lambda x, n: (wide[0](x),), examples(1))
+    assert source.count("\n") < 20  # a layer is one statement, not one for each unit
 
 
 def test_what_has_no_translation_is_computed_by_tensors(subtests) -> None:
