@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.envs.clock import option_specs
-from lcc_rl.envs.compiled import Compiled
+from lcc_rl.envs.compiled import Traced
 from lcc_rl.envs.rowwise import Rows, Rowwise
 from lcc_rl.envs.step import (
     TERMINATED,
@@ -24,6 +24,7 @@ from lcc_rl.envs.step import (
 )
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.finite import require_finite
+from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.functional.random import LOW_BITS, STREAM_INCREMENT, hash_bits
 from lcc_rl.pieces.base import ACTION, SEED, STEP, Key, Piece, State, as_key
@@ -47,8 +48,8 @@ class Player:
         policy: writes the action; None if none is needed.
         keys: entries to keep; unknown ones are ignored.
         label: name of the strategy in messages.
-        compiled: compile the step and the policy; without a compiler the plain step is used, which
-            is logged.
+        compiled: compile the step, not the policy; without a compiler the plain step is used,
+            which is logged.
         rowwise: play each episode as a row of numbers, in machine code (:class:`Rowwise`); the
             policy must be a function of its entries, without a memory of its own.
 
@@ -85,10 +86,12 @@ class Player:
         ]
         driven = [] if policy is None else [ACTION]
         self.checked = list(dict.fromkeys([*driven, *wishes, *self.kept]))
-        self.compiled = compiled
         self.record: Record = {}
         self.start: State = {}  # before the first step
-        self.advance = Compiled(self._advance, "the evaluation", compiled, env.device)
+        # Compiled code is for one layout in memory.
+        self.arranged = batch_innermost if compiled else lambda entry: entry
+        self.moved: tuple[list[Key], list[Key]] = ([], [])  # what a step reads, what it writes
+        self.move = Traced(self._move, "the evaluation", compiled)
 
     @torch.no_grad()
     def play(
@@ -110,13 +113,14 @@ class Player:
                 to keep is not finite.
         """
         state, record = self._begin(given), self.record
+        state = {key: self.arranged(value) for key, value in state.items()}
         self.start = state
         if self.rowwise:
             return self._checked(*self._by_rows(state), named)
         running, alive = torch.ones_like(state[TERMINATED]), []
         for step in range(self.horizon):
             alive.append(running)
-            before, (state, kept, running) = state, self.advance(state, running)
+            before, (state, kept, running) = state, self._advance(state, running)
             for key, value in zip(self.checked, kept, strict=True):
                 first = int(key[-1] == "speed")
                 if key not in record:  # written in place: a stack would need twice the memory
@@ -188,11 +192,26 @@ class Player:
 
     def _advance(self, state: State, running: Tensor) -> Advanced:
         """Return the next state, the entries to keep, and which episodes still run."""
-        before = {**state, **self._action(state, self.env.batch_size)}
+        action = self._action(state, self.env.batch_size)
+        before = {**state, **{key: self.arranged(value) for key, value in action.items()}}
+        self.moved = [*before], self.moved[1]
+        *found, running = self.move(*before.values(), running)
+        changed = dict(zip(self.moved[1], found, strict=False))
+        return state | changed, found[len(changed) :], running
+
+    def _move(self, *tensors: Tensor) -> Sequence[Tensor]:
+        """Return entries of the next state, those to keep, and which episodes still run.
+
+        Args:
+            *tensors: the entries before the step and the action; which episodes run.
+        """
+        before = dict(zip(self.moved[0], tensors[:-1], strict=True))
         reached = self.step(before)
-        after = {key: reached.get(key, value) for key, value in state.items()}
+        changed = [key for key in before if key in reached and key != ACTION]
+        self.moved = self.moved[0], changed
         shown = {**before, **reached}
-        return after, [shown[key] for key in self.checked], running & ~reached[TERMINATED]
+        kept = [self.arranged(shown[key]) for key in (*changed, *self.checked)]
+        return *kept, tensors[-1] & ~reached[TERMINATED]
 
     def _action(self, state: State, batch: torch.Size) -> State:
         """Return the action of the policy for a batch; none without a policy."""

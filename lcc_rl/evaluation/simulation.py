@@ -185,10 +185,10 @@ def _simulated(strategy: Strategy, inputs: Inputs, repeats: int, seed: int) -> S
         words = "the leader exceeds the desired speed of %d of %d human drivers, who fall behind; "
         log.warning(words + "drivers=highway in overrides has faster ones", slow, people)
     env = build_env(cfg, inputs.evaluation, inputs.population, batch, 0, cfg.device, nominal=True)
-    fast = cfg.scenario.horizon >= LONG and len(cfg.scenario.vehicles) <= SHORT_STRING
-    fast = fast and not isinstance(strategy.policy, GivenPolicy)  # it has a memory of its own
+    long, short = cfg.scenario.horizon >= LONG, len(cfg.scenario.vehicles) <= SHORT_STRING
+    rows = long and short and not isinstance(strategy.policy, GivenPolicy)  # has its own memory
     keys = [LEADER, CLASS, INDEX, *(("vehicles", name) for name in MOTION)]
-    player = Player(env, strategy.policy, keys, strategy.title, rowwise=fast)
+    player = Player(env, strategy.policy, keys, strategy.title, long and not rows, rows)
     given = reset_options(env, profile, repeat % people, seed, people, repeat // people)
     record, alive = player.play(given)
     start = player.start["vehicles", "gap"].unsqueeze(0)

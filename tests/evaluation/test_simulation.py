@@ -69,12 +69,20 @@ def test_the_steps_are_a_motion(subtests) -> None:
                 assert (steps.drop_duplicates(by)["role"] == "automated").sum() == 4
 
 
-def test_machine_code_drives_the_same(monkeypatch) -> None:
-    monkeypatch.setattr("lcc_rl.evaluation.simulation.LONG", 1)
-    fast = lcc_rl.simulate(WAVE, "automated human", "idm_acc").steps
-    monkeypatch.setattr("lcc_rl.evaluation.simulation.LONG", 10**6)
-    plain = lcc_rl.simulate(WAVE, "automated human", "idm_acc").steps
-    pd.testing.assert_frame_equal(fast, plain, rtol=1e-4, atol=1e-3)
+def test_compiled_code_drives_the_same(monkeypatch, subtests) -> None:
+    where = "lcc_rl.evaluation.simulation."
+
+    def steps(name: str, value: int) -> pd.DataFrame:
+        monkeypatch.setattr(where + name, value)
+        steps = lcc_rl.simulate(WAVE, "automated human", "pretrained/alcc").steps
+        return steps.assign(power_w=steps["power_w"] / 1000.0)  # of as many digits as the others
+
+    plain = steps("LONG", 10**6)
+    for made, few in [("rows of numbers", 40), ("by torch, around the policy", 0)]:
+        with subtests.test(made):
+            monkeypatch.setattr(where + "LONG", 1)
+            fast = steps("SHORT_STRING", few)
+            pd.testing.assert_frame_equal(fast, plain, rtol=1e-4, atol=1e-3)
 
 
 def test_wrong_arguments_are_named() -> None:
