@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from math import exp, inf, log
 from typing import Any
@@ -64,14 +64,13 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     gap, *speeds = (episodes[name].to_numpy(np.float64) for name in PAIR_SIGNALS.values())
     series = [gap, *(np.cumsum((v + np.append(0.0, v[:-1])) * FRAME / 2) for v in speeds)]
 
-    fit = partial(_fit, series, pair, pairs, width)
-    shifts = [k * signal for k in range(-reach, reach + 1) if k for signal in np.eye(3)]
-    lags = np.stack([np.zeros(3), *shifts])
+    fits = partial(_fits, series, pair, pairs, width)
+    lags = [(0, 0), *((i, k) for k in range(-reach, reach + 1) if k for i in range(3))]
     with np.errstate(all="ignore"):  # pairs without a change
-        *first, sums = fit(lags[0], rows)
+        ((*first, sums),) = fits(rows, lags[:1])
         unclear = rows[(first[1] > GAIN * FLOOR)[pair[rows]]]  # elsewhere no lag could be accepted
-        fits = [first, *(fit(late, unclear)[:2] for late in shifts if len(unclear))]
-    found, rest = (np.array(x) for x in zip(*fits, strict=True))
+        others = fits(unclear, lags[1:]) if len(unclear) else []
+        found, rest = (np.array(x) for x in zip(first, *(fit[:2] for fit in others), strict=True))
     best = np.where(rest[0] >= GAIN * rest.min(axis=0), rest.argmin(axis=0), 0)
     best[-1] = 0
     each, count = np.arange(pairs + 1), sums[2, 2]
@@ -83,8 +82,8 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
         fit=1 - rest[best, each],
         motion=np.sqrt(sums[:2, :2].sum(axis=(0, 1)).clip(0.0) / count.clip(1.0)),
         change=np.sqrt(sums[3, 3] / count.clip(1.0)),
-        late=FRAME * lags[best].sum(axis=1),
-        signal=np.array([*PAIR_SIGNALS])[np.abs(lags[best]).argmax(axis=1)],
+        late=FRAME * np.array(lags)[best, 1],
+        signal=np.array([*PAIR_SIGNALS])[np.array(lags)[best, 0]],
         ahead=ahead,
         own=own,
         grown=grown,
@@ -99,26 +98,48 @@ def numbers_of_pairs(episodes: pd.DataFrame) -> NDArray[np.int64]:
     return np.asarray(found, np.int64)
 
 
-def _fit(
+def _fits(
     series: Sequence[Floats],
     pair: NDArray[Any],
     pairs: int,
     width: int,
-    late: Floats,
     rows: NDArray[np.intp],
-) -> tuple[Floats, Floats, Floats]:
-    """Return coefficients, constant, slope of each pair and of all, residuals and products.
+    lags: Iterable[tuple[int, int]],
+) -> Iterator[tuple[Floats, Floats, Floats]]:
+    """Yield coefficients, constant, slope of each pair and of all, residuals and products.
 
-    ``series`` are the gap and the distances of leader and follower, each shifted by ``late``.
-    Changes over ``width`` samples begin at ``rows``; ``pair`` is the number of each row's pair.
+    ``series`` are the gap and the distances of leader and follower; a lag is the place of the one
+    that is late, and its samples. Changes over ``width`` samples begin at ``rows``; ``pair`` is the
+    number of each row's pair.
     """
-    shifted, at = [rows + k for k in late.astype(int)], pair[rows]
-    grown, ahead, own = (x[k + width] - x[k] for x, k in zip(series, shifted, strict=True))
-    terms = ahead, -own, np.ones(len(rows)), grown
-    sums = np.array([[np.bincount(at, x * y, pairs) for x in terms] for y in terms])
-    sums = np.append(sums, sums.sum(axis=-1, keepdims=True), axis=-1)  # of all
+    at = pair[rows]
+    begins = np.flatnonzero(np.diff(at, prepend=-1))  # of rows of one pair
+
+    def change(place: int, late: int = 0) -> Floats:
+        values = series[place]
+        return values[rows + late + width] - values[rows + late]
+
+    def products(sums: Floats, terms: Sequence[Floats], changed: Iterable[int]) -> Floats:
+        """Return sums with those of the changed terms."""
+        for i in changed:
+            for j, other in enumerate(terms):
+                each = np.bincount(at[begins], np.add.reduceat(terms[i] * other, begins), pairs)
+                sums[i, j] = sums[j, i] = np.append(each, each.sum())
+        return sums
+
+    terms = [change(1), -change(2), np.ones(len(rows)), change(0)]
+    sums = products(np.zeros((4, 4, pairs + 1)), terms, range(4))
+    for place, late in lags:
+        term = (3, 0, 1)[place]
+        moved = [*terms]
+        moved[term] = change(place, late) * (-1.0 if place == 2 else 1.0)
+        yield _solved(products(sums.copy(), moved, [term]) if late else sums)
+
+
+def _solved(sums: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return coefficients, constant and slope of sums of products, the residuals, and the sums."""
     known = np.moveaxis(sums[:3, :3], -1, 0) + RIDGE
-    found = np.linalg.solve(known, sums[:3, 3].T[..., None])[..., 0].T
+    found = np.linalg.solve(known, sums[:3, 3].T[..., None]).astype(np.float64)[..., 0].T
     rest = sums[3, 3] - (found * sums[:3, 3]).sum(axis=0)
     rest /= sums[3, 3] - sums[2, 3] ** 2 / sums[2, 2]
     slope = sums[:2, 3].sum(axis=0) / sums[:2, :2].sum(axis=(0, 1))
