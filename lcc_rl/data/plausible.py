@@ -206,7 +206,10 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
     # Sensors hold a value until the next one: linear between the samples at which it changes.
     last = np.append(starts_of(number)[1:], len(gap)) - 1  # of each record
     long = time[ends] - time[starts] > HELD_S  # not measured
-    nodes = np.union1d(np.union1d(starts, last), ends[long])
+    node = np.zeros(len(gap), bool)
+    for places in (starts, last, ends[long]):
+        node[places] = True
+    nodes = np.flatnonzero(node)
     rest = pd.Series(np.interp(np.arange(len(gap)), nodes, gap[nodes]) - way)
     given = len(starts_of(table["row"].to_numpy())) if "row" in table else len(table)
     reach = max(round(JUMP_S / FRAME), round(len(table) / given))  # or a step of the recording
