@@ -42,7 +42,7 @@ from lcc_rl.data.text import (
     unended,
 )
 from lcc_rl.data.trajectories import listed
-from lcc_rl.errors import Concern, DataError, raised_as
+from lcc_rl.errors import Concern, DataError, in_short, raised_as
 from lcc_rl.io.memory import require_memory
 
 log = logging.getLogger("lcc_rl")
@@ -396,7 +396,7 @@ def joined(parts: Sequence[Any]) -> Any:
 
 def _shown(cell: pa.Scalar) -> str:
     value = cell.as_py()
-    return "nothing" if value is None else repr(value)[:40]
+    return "nothing" if value is None else in_short(value, 40)
 
 
 def _seconds(cells: Cells) -> Cells:

@@ -21,7 +21,7 @@ from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import POPULATION, Inputs, build_drivers, build_energy, constant_profiles
-from lcc_rl.errors import ConfigError, raised_as, require
+from lcc_rl.errors import ConfigError, in_short, raised_as, require
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.metrics import energy_measures
@@ -125,7 +125,7 @@ def simulate(
     if drivers is not None:
         people = bootstrap(drivers) if isinstance(drivers, (str, PathLike)) else drivers
         fits = all(hasattr(people, name) for name in POPULATION)
-        require(fits, f"drivers: not a population: {people!r:.80}")
+        require(fits, f"drivers: not a population: {in_short(people, 80)}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, own=spec is None).strategies(inputs)[-1]
     return _simulated(strategy, inputs, repeats, seed)
@@ -144,7 +144,10 @@ def _profiles(leader: Any, time_step: float, seconds: float | None) -> Profiles:
     whole = abs(steps - round(steps)) < 1e-6
     require(whole, f"simulate: seconds={seconds or 0.0:g} is no multiple of time_step={time_step}")
     if leader is None:
-        require(seconds is not None, "simulate: a ring has no leader's record; give seconds=…")
+        require(
+            seconds is not None,
+            "simulate: leader=None is a ring: give overrides=['scenario=ring'] and seconds=…",
+        )
         return constant_profiles(0.0, round(steps), time_step, ["ring"])
     listed = isinstance(leader, (list, tuple)) and len(leader) > 0
     several = listed and not all(isinstance(x, (int, float, np.number)) for x in leader)
