@@ -168,6 +168,11 @@ def band(curves: Floats) -> Floats:
     return bounds(curves @ resample_weights(curves.shape[1], WITHOUT_WINDOWS)[: RESAMPLES // 9].T)
 
 
+def per_distance(energy: Any, way: Any) -> Any:
+    """Return energy per distance; NaN for vehicles that do not move."""
+    return energy / np.where(way > 0.0, way, np.nan)
+
+
 def share_saved(value: Any, baseline: Any) -> Any:
     """Return the saved share of a baseline's energy, which may be negative (recuperation)."""
     return (baseline - value) / abs(baseline)
@@ -210,7 +215,7 @@ def equal_seeds(*sides: Collection[object]) -> bool:
 
 
 def _saved(ours: Side, theirs: Side) -> Any:
-    own, other = (side["energy"] / side["way"] for side in (ours, theirs))
-    if other.min() <= 0.0 <= other.max():
+    own, other = (per_distance(side["energy"], side["way"]) for side in (ours, theirs))
+    if (other <= 0.0).any() and (other >= 0.0).any():
         return np.full_like(own, np.nan)
     return share_saved(own, other)

@@ -15,7 +15,15 @@ import pandas as pd
 
 from lcc_rl.arrays import Floats
 from lcc_rl.errors import ResultsError
-from lcc_rl.results.bootstrap import NOTHING, Estimate, Side, equal_seeds, estimate, share_saved
+from lcc_rl.results.bootstrap import (
+    NOTHING,
+    Estimate,
+    Side,
+    equal_seeds,
+    estimate,
+    per_distance,
+    share_saved,
+)
 from lcc_rl.results.measures import DISTANCE, FLOW, LONG_GAPS, PATH
 from lcc_rl.results.windows import DRIVE, STRATEGY, TRAINED, with_equal_seeds
 
@@ -115,7 +123,7 @@ def saving_at(
 
 def energy_per_distance(curve: Curve) -> Floats:
     """Return the energy, the first column, per distance, ``[..., limits]``."""
-    return next(iter(curve.values())) / curve[DISTANCE]
+    return per_distance(next(iter(curve.values())), curve[DISTANCE])
 
 
 def fleet_saved(point: Curve, baseline: Curve) -> Any:

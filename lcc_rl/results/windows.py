@@ -13,7 +13,15 @@ import pyarrow as pa
 
 from lcc_rl.energy import AVERAGED, BURNT, SECOND
 from lcc_rl.io.files import Rows, read_parquet
-from lcc_rl.results.bootstrap import NOTHING, Estimate, equal_seeds, estimate, saving, share_saved
+from lcc_rl.results.bootstrap import (
+    NOTHING,
+    Estimate,
+    equal_seeds,
+    estimate,
+    per_distance,
+    saving,
+    share_saved,
+)
 from lcc_rl.results.measures import DAMPING, DISTANCE, MEASURES, SHARE, WAYS, aggregates
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import EPISODES
@@ -220,7 +228,7 @@ def ratio(rows: pd.DataFrame, column: str, strategy: str, per: Sequence[str]) ->
         return NOTHING
     energy, way, drives = _by_window(rows[rows[STRATEGY] == strategy], column, per)
     side = {"energy": energy.to_numpy(), "way": way.to_numpy()}
-    return estimate(lambda x: x["energy"] / x["way"], side, drives=drives) if way.size else NOTHING
+    return estimate(lambda x: per_distance(**x), side, drives=drives) if way.size else NOTHING
 
 
 def with_equal_seeds(rows: pd.DataFrame, strategy: str, baseline: str) -> pd.DataFrame:
