@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lcc_rl.config import check_overrides, load
 from lcc_rl.config.schemas import StudyConfig, TimeStep
+from lcc_rl.config.words import key_of
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
@@ -32,7 +33,7 @@ from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.base import Key
 from lcc_rl.pieces.features import CLASS
-from lcc_rl.settings import Count, Positive, Seed, checked
+from lcc_rl.settings import TARGET, Count, Positive, Seed, checked
 
 log = logging.getLogger("lcc_rl")
 
@@ -40,6 +41,7 @@ log = logging.getLogger("lcc_rl")
 # vehicles takes longer than their steps.
 LONG, SHORT_STRING = 2_000, 40
 LEADER: Key = ("leader", "speed")
+FILTER = f"scenario.filters.{AUTOMATED}"
 SCENE = {f"scenario.{name}" for name in ("string", "time_step", "horizon")}
 OF_ARGUMENTS = SCENE | {"leader", "data", "split", "compare", "policy", "seed", "evaluation"}
 MOTION = {
@@ -87,7 +89,8 @@ def simulate(
             these, each an episode of the length of the shortest; None on a ring.
         string: the vehicles behind the leader from front to back, see docs/strings.md.
         controller: controller or policy of the automated vehicles, as for
-            :func:`lcc_rl.compare`; None: an IDM driver without noise.
+            :func:`lcc_rl.compare`, or a mapping of one by its name, with ``_filtered`` to put it
+            behind the safety filter; None: an IDM driver without noise.
         drivers: a table of ``lcc-rl calibrate`` or a population of
             :mod:`lcc_rl.drivers.population`; None: those of ``overrides`` or the shipped ones. The
             first human is the first driver of it in the first repeat, the second in the next one.
@@ -108,14 +111,16 @@ def simulate(
     given = OF_ARGUMENTS | ({"drivers"} if drivers is not None else set())
     check_overrides(overrides, given, "has no effect in simulate: see the arguments")
     profiles = _profiles(leader, time_step, seconds)
-    spec = None if controller is None else setting_of(controller, "controller")
+    given, spec = _given(controller)
     words = (
         *("evaluation.baselines=[]", "evaluation.behind_filter=[]", "evaluation.warm_up=0"),
         *(f"variant={'alcc' if is_policy(spec) else 'idm'}", *overrides),
         *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
     )
-    cfg = load("evaluate", words).with_(compare=[] if spec is None else [spec])
+    cfg = load("evaluate", words).with_(
+        compare={label: spec} if label else [] if spec is None else [spec]
+    )
     require(
         (cfg.scenario.road == RING) == (leader is None),
         "simulate: a ring (scenario=ring in overrides) has leader=None, an open road has a leader",
@@ -128,7 +133,24 @@ def simulate(
         require(fits, f"drivers: not a population: {in_short(people, 80)}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, own=spec is None).strategies(inputs)[-1]
+    if strategy.cfg.scenario.filters.get(AUTOMATED) is None:
+        words = f"has no effect on {strategy.name}, which drives without the filter"
+        words += f"; controller={{'{strategy.name}_filtered': …}} puts it behind the filter"
+        of_filter = {x for x in map(key_of, overrides) if x.startswith(("filter", FILTER))}
+        check_overrides(overrides, of_filter, words)
     return _simulated(strategy, inputs, repeats, seed)
+
+
+def _named(controller: Any) -> tuple[str, Any]:
+    """Return the name that a mapping gives to a controller, if any, and its setting."""
+    if controller is None:
+        return "", None
+    if not isinstance(controller, Mapping) or TARGET in controller:
+        return "", setting_of(controller, "controller")
+    words = f"controller: expected one, such as {{'name': MyACC()}}, got {in_short(controller)}"
+    require(len(controller) == 1, words)
+    ((name, one),) = controller.items()
+    return str(name), setting_of(one, f"controller.{name}")
 
 
 def _words(string: str | Mapping[str, Any]) -> str:
