@@ -108,8 +108,8 @@ def simulate(
         >>> found.steps.shape[0], found.vehicles["vehicle"].tolist()
         (1204, [0, 1, 2, 3])
     """
-    given = OF_ARGUMENTS | ({"drivers"} if drivers is not None else set())
-    check_overrides(overrides, given, "has no effect in simulate: see the arguments")
+    fixed = OF_ARGUMENTS | ({"drivers"} if drivers is not None else set())
+    check_overrides(overrides, fixed, "has no effect in simulate: see the arguments")
     profiles = _profiles(leader, time_step, seconds)
     given, spec = _given(controller)
     words = (
@@ -118,9 +118,7 @@ def simulate(
         *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
     )
-    cfg = load("evaluate", words).with_(
-        compare={label: spec} if label else [] if spec is None else [spec]
-    )
+    cfg = load("evaluate", words).with_(compare=given)
     require(
         (cfg.scenario.road == RING) == (leader is None),
         "simulate: a ring (scenario=ring in overrides) has leader=None, an open road has a leader",
@@ -141,16 +139,18 @@ def simulate(
     return _simulated(strategy, inputs, repeats, seed)
 
 
-def _named(controller: Any) -> tuple[str, Any]:
-    """Return the name that a mapping gives to a controller, if any, and its setting."""
+def _given(controller: Any) -> tuple[Any, Any]:
+    """Return the value of ``compare`` for a controller, and its setting; None without one."""
     if controller is None:
-        return "", None
+        return [], None
     if not isinstance(controller, Mapping) or TARGET in controller:
-        return "", setting_of(controller, "controller")
+        spec = setting_of(controller, "controller")
+        return [spec], spec
     words = f"controller: expected one, such as {{'name': MyACC()}}, got {in_short(controller)}"
     require(len(controller) == 1, words)
     ((name, one),) = controller.items()
-    return str(name), setting_of(one, f"controller.{name}")
+    spec = setting_of(one, f"controller.{name}")
+    return {name: spec}, spec
 
 
 def _words(string: str | Mapping[str, Any]) -> str:
@@ -168,7 +168,7 @@ def _profiles(leader: Any, time_step: float, seconds: float | None) -> Profiles:
     if leader is None:
         require(
             seconds is not None,
-            "simulate: leader=None is a ring: give overrides=['scenario=ring'] and seconds=…",
+            "simulate: leader=None is a ring; give overrides=['scenario=ring'] and seconds=…",
         )
         return constant_profiles(0.0, round(steps), time_step, ["ring"])
     listed = isinstance(leader, (list, tuple)) and len(leader) > 0

@@ -137,7 +137,7 @@ def test_wrong_arguments_are_named() -> None:
         *(
             (
                 {**BEHIND, "controller": one, "overrides": words},
-                f"{words[-1]}: has no effect on {who}",
+                f"has no effect on {who}, which",
             )
             for one, who in (({"mine": Follow()}, "mine"), (Follow(), "Follow"), ("acc", "acc"))
             for words in (["+filter=cbf"], ["task=i24-follow5", f"{MARGIN}=2"])
