@@ -131,7 +131,7 @@ def input_error(error: BaseException) -> LccError | None:
     return cause
 
 
-def in_short(value: Any, most: int = 200) -> str:
+def in_short(value: Any, most: int = 80) -> str:
     """Return the representation of a value in one line, cut to some characters."""
     return one_line(repr(value))[:most]
 

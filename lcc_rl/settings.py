@@ -193,7 +193,7 @@ def _reason(error: Any, kind: Any, where: str) -> str:
     if first["type"] == "value_error":
         return f"{key}: {first['ctx']['error']}"
     wanted = re.sub(r"^\w+ should", "must", first["msg"])
-    return f"{key} {wanted}, got {in_short(first['input'])}"
+    return f"{key} {wanted}, got {in_short(first['input'], 200)}"
 
 
 def checked(function: Callable[..., R]) -> Callable[..., R]:

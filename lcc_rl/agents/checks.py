@@ -53,7 +53,7 @@ def check_learner(
     for name, value in values.items():
         words = "learn returns numbers by name, anneal the policy's learning rate"
         single = isinstance(value, (SupportsFloat, Tensor)) and np.size(value) == 1
-        require(single, f"{name} is {in_short(value, 80)}; {words}")
+        require(single, f"{name} is {in_short(value)}; {words}")
         if not math.isfinite(value):
             raise Diverged(f"{name} became {float(value)}", advice)
     found = nonfinite_weight(policy.state_dict())

@@ -357,7 +357,10 @@ def checked_cells(
         wrong &= ~np.isnan(values)
     if wrong.any():
         row = int(np.argmax(wrong))
-        raise fault(row, f"holds {_shown(cells[row])}; expected {column.expected}")
+        words = f"holds {_shown(cells[row])}; expected {column.expected}"
+        if scale != 1.0:
+            words += f", {column.least / scale:g} to {column.most / scale:g} in its unit"
+        raise fault(row, words)
     return values
 
 

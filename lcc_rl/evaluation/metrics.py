@@ -200,11 +200,6 @@ def _extreme(value: Tensor) -> Tensor:
     return torch.where(value.isfinite(), value, torch.nan)
 
 
-def _from_start(entry: Tensor, change: Tensor) -> Tensor:
-    """Return an entry from before the first step on; ``change`` is that of each step."""
-    return torch.cat([entry[:1] - change[:1], entry])
-
-
 # Measures of the automated vehicles of a string by column of episodes.parquet. Each is a function
 # of the entries that it names, see :func:`safety_measures`. Without an entry there is no column.
 METRICS: dict[str, Metric] = {
@@ -222,8 +217,10 @@ METRICS: dict[str, Metric] = {
     ),
     "rms_jerk_mps3": lambda over, jerk: over.mean(jerk**2).sqrt(),
     "max_jerk_mps3": lambda over, jerk: over.highest(jerk.abs()),
-    "max_jerk_1s_mps3": lambda over, acceleration, jerk: _extreme(
-        over.highest(over.slope(_from_start(acceleration, jerk * over.time_step)).abs())
+    "max_jerk_1s_mps3": lambda over, acceleration, jerk: _extreme(  # also before the first step
+        over.highest(
+            over.slope(torch.cat([(acceleration - jerk * over.time_step)[:1], acceleration])).abs()
+        )
     ),
     "max_deceleration_mps2": lambda over, acceleration: over.highest(-acceleration),
     "max_deceleration_1s_mps2": lambda over, speed: _extreme(over.highest(-over.slope(speed))),

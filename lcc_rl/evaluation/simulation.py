@@ -41,7 +41,6 @@ log = logging.getLogger("lcc_rl")
 # vehicles takes longer than their steps.
 LONG, SHORT_STRING = 2_000, 40
 LEADER: Key = ("leader", "speed")
-FILTER = f"scenario.filters.{AUTOMATED}"
 SCENE = {f"scenario.{name}" for name in ("string", "time_step", "horizon")}
 OF_ARGUMENTS = SCENE | {"leader", "data", "split", "compare", "policy", "seed", "evaluation"}
 MOTION = {
@@ -128,29 +127,24 @@ def simulate(
     if drivers is not None:
         people = bootstrap(drivers) if isinstance(drivers, (str, PathLike)) else drivers
         fits = all(hasattr(people, name) for name in POPULATION)
-        require(fits, f"drivers: not a population: {in_short(people, 80)}")
+        require(fits, f"drivers: not a population: {in_short(people)}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, own=spec is None).strategies(inputs)[-1]
     if strategy.cfg.scenario.filters.get(AUTOMATED) is None:
         words = f"has no effect on {strategy.name}, which drives without the filter"
         words += f"; controller={{'{strategy.name}_filtered': …}} puts it behind the filter"
-        of_filter = {x for x in map(key_of, overrides) if x.startswith(("filter", FILTER))}
-        check_overrides(overrides, of_filter, words)
+        check_overrides(overrides, {x for x in map(key_of, overrides) if "filter" in x}, words)
     return _simulated(strategy, inputs, repeats, seed)
 
 
 def _given(controller: Any) -> tuple[Any, Any]:
     """Return the value of ``compare`` for a controller, and its setting; None without one."""
-    if controller is None:
-        return [], None
-    if not isinstance(controller, Mapping) or TARGET in controller:
-        spec = setting_of(controller, "controller")
-        return [spec], spec
+    named = isinstance(controller, Mapping) and TARGET not in controller
     words = f"controller: expected one, such as {{'name': MyACC()}}, got {in_short(controller)}"
-    require(len(controller) == 1, words)
-    ((name, one),) = controller.items()
-    spec = setting_of(one, f"controller.{name}")
-    return {name: spec}, spec
+    require(not named or len(controller) == 1, words)
+    name, one = next(iter(controller.items())) if named else ("", controller)
+    spec = None if one is None else setting_of(one, "controller")
+    return {name: spec} if named else [spec] * (spec is not None), spec
 
 
 def _words(string: str | Mapping[str, Any]) -> str:
@@ -166,10 +160,7 @@ def _profiles(leader: Any, time_step: float, seconds: float | None) -> Profiles:
     whole = abs(steps - round(steps)) < 1e-6
     require(whole, f"simulate: seconds={seconds or 0.0:g} is no multiple of time_step={time_step}")
     if leader is None:
-        require(
-            seconds is not None,
-            "simulate: leader=None is a ring; give overrides=['scenario=ring'] and seconds=…",
-        )
+        require(seconds is not None, "simulate: leader=None needs scenario=ring and seconds=…")
         return constant_profiles(0.0, round(steps), time_step, ["ring"])
     listed = isinstance(leader, (list, tuple)) and len(leader) > 0
     several = listed and not all(isinstance(x, (int, float, np.number)) for x in leader)

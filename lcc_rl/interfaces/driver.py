@@ -175,10 +175,10 @@ class Driver:
         command, *memory = self._rows(state, *[self.memory] * (self.program.width > 0))
         if not np.isfinite(command).all():
             row = int(np.isfinite(command).argmin())
+            lost = [x for x, value in zip(self.names, state[row], strict=True) if np.isnan(value)]
+            lost = [x for x in lost if x not in self.program.stand_ins]
             what = f"the command of {self.cars[row]} is {command[row, 0]}"
-            for name, value in zip(self.names, state[row], strict=True):
-                if np.isnan(value) and name not in self.program.stand_ins:
-                    what = f"{name} is nan in row {row} of the cars"
+            what = f"{lost[0]} is nan in row {row} of the cars" if lost else what
             self.cars, self.memory = before
             raise Diverged(f"{self.name}: {what}")
         if memory:

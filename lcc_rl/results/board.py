@@ -224,9 +224,7 @@ def check_row(row: BoardRow, where: str) -> None:
     Raises:
         ConfigError: naming the contradiction.
     """
-    require(
-        isinstance(row, Mapping), f"{where}: expected a row with names, got {in_short(row, 80)}"
-    )
+    require(isinstance(row, Mapping), f"{where}: expected a row with names, got {in_short(row)}")
     lacking = ", ".join(name for name in SHAPE if name not in row)
     require(not lacking, f"{where}: it lacks {lacking}")
     parse(ScoreRow, {name: row[name] for name in SHAPE}, where)

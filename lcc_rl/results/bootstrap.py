@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcc_rl.arrays import Floats
+from lcc_rl.arrays import Floats, per_distance
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
@@ -166,11 +166,6 @@ def band(curves: Floats) -> Floats:
         curves: ``[points, seeds]``, at least two seeds.
     """
     return bounds(curves @ resample_weights(curves.shape[1], WITHOUT_WINDOWS)[: RESAMPLES // 9].T)
-
-
-def per_distance(energy: Any, way: Any) -> Any:
-    """Return energy per distance; NaN for vehicles that do not move."""
-    return energy / np.where(way > 0.0, way, np.nan)
 
 
 def share_saved(value: Any, baseline: Any) -> Any:

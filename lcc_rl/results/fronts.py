@@ -13,17 +13,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lcc_rl.arrays import Floats
+from lcc_rl.arrays import Floats, per_distance
 from lcc_rl.errors import ResultsError
-from lcc_rl.results.bootstrap import (
-    NOTHING,
-    Estimate,
-    Side,
-    equal_seeds,
-    estimate,
-    per_distance,
-    share_saved,
-)
+from lcc_rl.results.bootstrap import NOTHING, Estimate, Side, equal_seeds, estimate, share_saved
 from lcc_rl.results.measures import DISTANCE, FLOW, LONG_GAPS, PATH
 from lcc_rl.results.windows import DRIVE, STRATEGY, TRAINED, with_equal_seeds
 

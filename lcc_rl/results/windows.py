@@ -11,17 +11,10 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
+from lcc_rl.arrays import per_distance
 from lcc_rl.energy import AVERAGED, BURNT, SECOND
 from lcc_rl.io.files import Rows, read_parquet
-from lcc_rl.results.bootstrap import (
-    NOTHING,
-    Estimate,
-    equal_seeds,
-    estimate,
-    per_distance,
-    saving,
-    share_saved,
-)
+from lcc_rl.results.bootstrap import NOTHING, Estimate, equal_seeds, estimate, saving, share_saved
 from lcc_rl.results.measures import DAMPING, DISTANCE, MEASURES, SHARE, WAYS, aggregates
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import EPISODES

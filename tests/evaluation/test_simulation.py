@@ -110,7 +110,7 @@ def test_a_name_puts_a_controller_behind_the_filter() -> None:
 
 def test_wrong_arguments_are_named() -> None:
     cases = [
-        ({"leader": None}, r"leader=None is a ring; give overrides=\['scenario=ring'\] and sec"),
+        ({"leader": None}, "leader=None needs scenario=ring and sec"),
         ({"leader": None, "seconds": 5.0}, "a ring .*has leader=None, an open road has a leader"),
         ({"leader": WAVE, "overrides": ["scenario=ring"]}, "an open road has a leader"),
         ({"leader": [3.0]}, "at least two speeds"),
@@ -124,7 +124,10 @@ def test_wrong_arguments_are_named() -> None:
             ({"leader": WAVE, "overrides": [f"{key}=2"]}, f"{key}=2: has no effect in simulate")
             for key in ("scenario.horizon", "scenario.string", "seed", "compare", "leader.path")
         ),
-        ({"leader": "nowhere.csv"}, "nowhere.csv: no such file"),
+        *(
+            ({"leader": x}, rf"{x}: no such file, and none of .*\(hwfet, udds, us06, wltc_3b\)")
+            for x in ("nowhere.csv", "drives", "platoons")
+        ),
         ({"leader": WAVE, "seconds": 99.0}, "seconds=99, and the leader drives for 20 s"),
         ({"leader": WAVE, "seconds": 1.25}, "seconds=1.25 is no multiple of time_step=0.1"),
         ({"leader": WAVE, "drivers": POPULATION, "overrides": ["drivers=highway"]}, "drivers=high"),

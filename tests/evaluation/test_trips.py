@@ -99,11 +99,19 @@ def test_the_command_prints_and_writes_the_trips(tmp_path, path, capsys, subtest
             pd.testing.assert_frame_equal(read(tmp_path / name), expected)
 
 
+def test_trips_are_sorted_by_their_numbers(path) -> None:
+    names = ["trip 10", "trip 2", "a", "1", "trip 2b"]
+    pd.concat([made()[:61].assign(trip=name) for name in names]).to_csv(path, index=False)
+    found = lcc_rl.trip_energies(path, ["energy=fuel", COLUMNS])
+    assert found["trip"].tolist() == ["1", "a", "trip 2", "trip 2b", "trip 10"]
+
+
 def test_refused_trips(path) -> None:
     trips = made()
     faults = {
         "word": (trips.assign(v=trips["v"].astype(str).where(trips.index != 70, "x")), []),
         "fast": (trips.assign(v=3.6 * trips["v"]), []),
+        "steep": (trips.assign(slope=15.0 * trips["slope"]), GRADED),
     }
 
     def call(*words: str) -> None:
@@ -120,6 +128,7 @@ def test_refused_trips(path) -> None:
             ("energy=mixture", "a mixture has several models"),
             ("leader.columns.drive=id", "lacks the column id; it has trip, t, v, slope"),
             (GRADED[0], r"data row 62, column 'slope' holds '3\.0'.*0\.3 rad"),
+            ("steep", *GRADED, r"column 'slope' holds '45\.0'; .* 0\.3 rad, -30 to 30 in its unit"),
             (*GRADED, "energy=alcc", "PaperMotor has no grade"),
         ],
     )
