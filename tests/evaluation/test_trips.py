@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 from helpers import check_refused
+from page_blocks import blocks
 
 import lcc_rl
 from lcc_rl.commands.energy import main
@@ -139,3 +143,27 @@ def test_refused_trips(path) -> None:
             (3, [], r"trip_energies\.path"),
         ],
     )
+
+
+def test_a_simulated_drive_on_hills_is_priced_as_the_pages_show(tmp_path, monkeypatch) -> None:
+    pages = Path(__file__).parents[2] / "docs"
+    (car,) = (x.text for x in blocks(pages / "your_car.md") if "class MyCar" in x.text)
+    (drive,) = (x.text for x in blocks(pages / "energy.md") if "hills.parquet" in x.text)
+    (tmp_path / "my_car.py").write_text(car)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    names: dict = {}
+    exec(drive, names)
+    words = ["energy._target_=my_car.MyCar", "leader.columns.grade=grade"]
+    found = lcc_rl.trip_energies("hills.parquet", words)["energy_kj"].item()
+    flat = lcc_rl.trip_energies("hills.parquet", words[:1])["energy_kj"].item()
+    speed, grade = names["drive"]["speed_mps"].to_numpy(float), names["grade"]
+    v, a, share = speed[:-1], np.diff(speed) / 0.1, sys.modules.pop("my_car").MAP.numpy()
+    force = 110.0 + 1.2 * v + 0.42 * v**2 + 1650.0 * (1.04 * a + 9.81 * np.sin(grade[:-1]))
+    by_force = [np.interp(abs(force), [0.0, 2000.0, 4000.0], row) for row in share]
+    share = [
+        np.interp(x, [0.0, 15.0, 30.0], row) for x, row in zip(v, np.array(by_force).T, strict=True)
+    ]
+    power = np.where(force > 0.0, force * v / share, force * v * share) + 400.0
+    assert found == pytest.approx(power.sum() * 1e-4, rel=1e-4)
+    assert abs(found - flat) > 0.01 * flat
