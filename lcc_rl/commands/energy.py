@@ -72,8 +72,8 @@ def trip_energies(
     blocks = (slice(first, first + BLOCK) for first in range(0, len(records), BLOCK))
     rows = pd.concat([_energies(records, block, model) for block in blocks])
     trips = rows.groupby("trip").sum().reset_index()
-    names = trips["trip"].astype(str).str.replace(r"\d+", lambda x: x[0].zfill(20), regex=True)
-    trips = trips.loc[names.sort_values().index].reset_index(drop=True)  # 2 before 10
+    order = trips["trip"].astype(str).str.replace(r"\d+", lambda x: x[0].zfill(20), regex=True)
+    trips = trips.loc[order.sort_values().index].reset_index(drop=True)  # 2 before 10
     way = trips["distance_km"].where(trips["distance_km"] > 0.0)
     trips["energy_kwh"] = trips["energy_kj"] / KWH
     trips["kwh_per_100km"] = 100.0 * trips["energy_kwh"] / way

@@ -131,9 +131,9 @@ def simulate(
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, own=spec is None).strategies(inputs)[-1]
     if strategy.cfg.scenario.filters.get(AUTOMATED) is None:
-        words = f"has no effect on {strategy.name}, which drives without the filter"
-        words += f"; controller={{'{strategy.name}_filtered': …}} puts it behind the filter"
-        check_overrides(overrides, {x for x in map(key_of, overrides) if "filter" in x}, words)
+        unused = f"has no effect on {strategy.name}, which drives without the filter"
+        unused += f"; controller={{'{strategy.name}_filtered': …}} puts it behind the filter"
+        check_overrides(overrides, {x for x in map(key_of, overrides) if "filter" in x}, unused)
     return _simulated(strategy, inputs, repeats, seed)
 
 
