@@ -357,10 +357,9 @@ def checked_cells(
         wrong &= ~np.isnan(values)
     if wrong.any():
         row = int(np.argmax(wrong))
+        own = f", {column.least / scale:g} to {column.most / scale:g} in its unit"
         words = f"holds {_shown(cells[row])}; expected {column.expected}"
-        if scale != 1.0:
-            words += f", {column.least / scale:g} to {column.most / scale:g} in its unit"
-        raise fault(row, words)
+        raise fault(row, words + own * (scale != 1.0))
     return values
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from inspect import signature
@@ -283,23 +283,18 @@ def register(measure: Measure, metric: Metric, every: bool = False) -> None:
     _, *entries = signature(metric).parameters
     valid = (*SERIES, *(("free",) if every else OF_FILTER))
     require_known(f"entry of the measure {key}", entries, valid)
-    _try(key, metric, valid)
+    trial = {name: torch.ones(50 + (name == "speed"), 2, 2, 1) for name in valid}
+    try:
+        safety_measures(trial, torch.ones(50, 2, 1, 1, dtype=torch.bool), 0.1, {key: metric})
+    except LccError:
+        raise
+    except Exception as error:
+        raise ConfigError(f"measure {key}: {in_short(error)}") from error
     for table in (MEASURES, PLATOON):
         table[:] = [one for one in table if one.key != key] + [measure]
     for metrics in (METRICS, ROAD_METRICS):
         metrics.pop(key, None)
     (ROAD_METRICS if every else METRICS)[key] = metric
-
-
-def _try(key: str, metric: Metric, entries: Sequence[str]) -> None:
-    """Apply a metric to two episodes of 50 steps of two vehicles."""
-    series = {name: torch.ones(50 + (name == "speed"), 2, 2, 1) for name in entries}
-    try:
-        safety_measures(series, torch.ones(50, 2, 1, 1, dtype=torch.bool), 0.1, {key: metric})
-    except LccError:
-        raise
-    except Exception as error:
-        raise ConfigError(f"measure {key}: {in_short(error)}") from error
 
 
 def _place(metric: Metric) -> tuple[Any, ...]:
