@@ -131,6 +131,11 @@ def input_error(error: BaseException) -> LccError | None:
     return cause
 
 
+def in_short(value: Any, most: int = 80) -> str:
+    """Return the representation of a value in one line, cut to some characters."""
+    return one_line(repr(value))[:most]
+
+
 def one_line(text: str) -> str:
     """Return a text in one line without control characters."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())

@@ -43,7 +43,15 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 from pydantic.fields import FieldInfo
 
-from lcc_rl.errors import LARGEST, LARGEST_SIZE, LAST_SEED, ConfigError, LccError, unknown_name
+from lcc_rl.errors import (
+    LARGEST,
+    LARGEST_SIZE,
+    LAST_SEED,
+    ConfigError,
+    LccError,
+    in_short,
+    unknown_name,
+)
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
@@ -185,7 +193,7 @@ def _reason(error: Any, kind: Any, where: str) -> str:
     if first["type"] == "value_error":
         return f"{key}: {first['ctx']['error']}"
     wanted = re.sub(r"^\w+ should", "must", first["msg"])
-    return f"{key} {wanted}, got {repr(first['input'])[:200]}"
+    return f"{key} {wanted}, got {in_short(first['input'], 200)}"
 
 
 def checked(function: Callable[..., R]) -> Callable[..., R]:

@@ -112,7 +112,7 @@ def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> 
     for path in job.rglob("config.yaml"):
         path.write_text(path.read_text().replace("keep: null", "keep: x.csv"))
     assert "keep: x.csv" in (job / "config.yaml").read_text()
-    run_command("lcc_rl.cli.pipeline", f"resume={job}", cwd=tmp_path, check=True)
+    run_command("lcc_rl.cli.pipeline", "resume=job", cwd=tmp_path, check=True)
     again = read_parquet(job / "evaluation" / "episodes.parquet")
     pd.testing.assert_frame_equal(rows, again, check_exact=True)
     assert not list(tmp_path.rglob("x.csv"))

@@ -12,7 +12,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 
@@ -21,12 +21,14 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
+from lcc_rl.cli.guard import main_guard
 from lcc_rl.energy import CirclesFuel, ElectricCar, EnergyModel, PaperMotor
 from lcc_rl.energy.fuel import coefficients
-from lcc_rl.errors import DataError, LccError, require
+from lcc_rl.errors import DataError, require
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.bootstrap import Estimate, saving
 from lcc_rl.results.render import saved_text
+from lcc_rl.runs.arguments import Arguments
 
 Speeds = NDArray[np.float64]  # [rows, time] [m/s]
 Price = Callable[[Speeds, float], NDArray[np.float64]]  # energy less the kinetic gain, [rows] [J]
@@ -178,9 +180,12 @@ def disagreements(table: dict[str, dict[str, Estimate]]) -> list[str]:
     return lines
 
 
-def main(folder: str, baseline: str = "human") -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Print the savings [%] as Markdown, a row per model."""
-    table = savings(Path(folder), baseline)
+    parser = Arguments(prog="tools/energy_models.py", description=__doc__)
+    parser.add_argument("folder", type=Path, help="folder of an evaluation with steps.parquet")
+    parser.add_argument("baseline", nargs="?", default="human", help="strategy to compare with")
+    table = savings(**vars(parser.parse_args(arguments)))
     names = list(next(iter(table.values())))
     print("| | " + " | ".join(names) + " |\n|---|" + "---|" * len(names))
     for model, found in table.items():
@@ -193,7 +198,4 @@ def main(folder: str, baseline: str = "human") -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(*sys.argv[1:])
-    except LccError as error:
-        sys.exit(f"lcc_rl: error: {error}")
+    main_guard(main)()

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
-from lcc_rl.errors import Diverged, one_line, require
+from lcc_rl.errors import Diverged, in_short, require
 from lcc_rl.functional.finite import nonfinite_weight, require_finite
 from lcc_rl.pieces.base import ACTION, NEXT, as_key, root_key
 from lcc_rl.results.runs import flatten
@@ -53,7 +53,7 @@ def check_learner(
     for name, value in values.items():
         words = "learn returns numbers by name, anneal the policy's learning rate"
         single = isinstance(value, (SupportsFloat, Tensor)) and np.size(value) == 1
-        require(single, f"{name} is {one_line(repr(value))[:80]}; {words}")
+        require(single, f"{name} is {in_short(value)}; {words}")
         if not math.isfinite(value):
             raise Diverged(f"{name} became {float(value)}", advice)
     found = nonfinite_weight(policy.state_dict())

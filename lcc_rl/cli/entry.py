@@ -227,7 +227,7 @@ def run_folder() -> Path:
 
 
 def resumed_folder(cfg: StudyConfig, own: Sequence[str]) -> Path:
-    """Return the folder of the run ``resume``, or of the present run.
+    """Return the folder of the run ``resume``, or of the present run, as an absolute path.
 
     Args:
         cfg: the configuration, with the key ``resume``.
@@ -240,4 +240,4 @@ def resumed_folder(cfg: StudyConfig, own: Sequence[str]) -> Path:
         raise ConfigError(
             f"a resumed run keeps the settings it was started with; remove {' '.join(others)}"
         )
-    return Path(cfg.resume)
+    return Path(os.path.abspath(cfg.resume))

@@ -52,7 +52,7 @@ def trip_energies(
             "leader.units.speed=km/h", "leader.columns.grade=slope", "leader.units.grade=%"]``.
 
     Returns:
-        A row per trip, sorted by name: ``trip``, ``parts`` (records that holes divide it into),
+        A row per trip, by name: ``trip``, ``parts`` (records that holes divide it into),
         ``duration_s``, ``distance_km``, ``energy_kj`` as drawn, ``net_energy_kj``, less the gain of
         kinetic energy; and of the energy drawn ``energy_kwh``, ``kwh_per_100km``, fuel and carbon
         dioxide.
@@ -72,6 +72,8 @@ def trip_energies(
     blocks = (slice(first, first + BLOCK) for first in range(0, len(records), BLOCK))
     rows = pd.concat([_energies(records, block, model) for block in blocks])
     trips = rows.groupby("trip").sum().reset_index()
+    order = trips["trip"].astype(str).str.replace(r"\d+", lambda x: x[0].zfill(20), regex=True)
+    trips = trips.loc[order.sort_values().index].reset_index(drop=True)  # 2 before 10
     way = trips["distance_km"].where(trips["distance_km"] > 0.0)
     trips["energy_kwh"] = trips["energy_kj"] / KWH
     trips["kwh_per_100km"] = 100.0 * trips["energy_kwh"] / way

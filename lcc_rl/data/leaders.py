@@ -381,7 +381,7 @@ def varying(profiles: Profiles, least: float, fastest: float | None = None) -> P
         slow = "" if fastest is None else f" and whose mean is at most leader.fastest={fastest:g}"
         raise DataError(
             f"no held-out window in which the leader's speed changes by {least:g} m/s{slow}; "
-            "lower leader.least_variation or give another record"
+            "lower leader.least_variation, raise scenario.horizon or give another record"
         )
     return profiles.select(kept)
 

@@ -56,9 +56,10 @@ def read_speed_record(
     Raises:
         DataError: naming the file and the row or column, if a value is malformed or implausible.
     """
-    file = SHIPPED_FILES.get(path, path)
+    cycles = {name: file for name, file in SHIPPED_FILES.items() if file.endswith(".csv")}
+    file = cycles.get(path, path)
     if not Path(expanduser(file)).is_file():
-        known = ", ".join(sorted(SHIPPED_FILES))
+        known = ", ".join(sorted(cycles))
         raise DataError(f"{path}: no such file, and none of the package ({known})")
     samples, _ = _read(
         TableFile(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {}, divide=False

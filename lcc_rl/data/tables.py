@@ -42,7 +42,7 @@ from lcc_rl.data.text import (
     unended,
 )
 from lcc_rl.data.trajectories import listed
-from lcc_rl.errors import Concern, DataError, raised_as
+from lcc_rl.errors import Concern, DataError, in_short, raised_as
 from lcc_rl.io.memory import require_memory
 
 log = logging.getLogger("lcc_rl")
@@ -357,7 +357,9 @@ def checked_cells(
         wrong &= ~np.isnan(values)
     if wrong.any():
         row = int(np.argmax(wrong))
-        raise fault(row, f"holds {_shown(cells[row])}; expected {column.expected}")
+        own = f", {column.least / scale:g} to {column.most / scale:g} in its unit"
+        words = f"holds {_shown(cells[row])}; expected {column.expected}"
+        raise fault(row, words + own * (scale != 1.0))
     return values
 
 
@@ -396,7 +398,7 @@ def joined(parts: Sequence[Any]) -> Any:
 
 def _shown(cell: pa.Scalar) -> str:
     value = cell.as_py()
-    return "nothing" if value is None else repr(value)[:40]
+    return "nothing" if value is None else in_short(value, 40)
 
 
 def _seconds(cells: Cells) -> Cells:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.energy import AVERAGED, AVERAGES, Fleet, as_fleet
-from lcc_rl.errors import require, require_known
+from lcc_rl.errors import ConfigError, LccError, in_short, require, require_known
 from lcc_rl.functional.safety import NEVER
 from lcc_rl.results.measures import CALM, MEASURES, SHIPPED, Measure
 from lcc_rl.results.platoons import PLATOON
@@ -217,11 +217,16 @@ METRICS: dict[str, Metric] = {
     ),
     "rms_jerk_mps3": lambda over, jerk: over.mean(jerk**2).sqrt(),
     "max_jerk_mps3": lambda over, jerk: over.highest(jerk.abs()),
-    "max_jerk_1s_mps3": lambda over, acceleration: _extreme(
-        over.highest(over.slope(acceleration).abs())
+    "max_jerk_1s_mps3": lambda over, acceleration, jerk: _extreme(  # also before the first step
+        over.highest(
+            over.slope(torch.cat([(acceleration - jerk * over.time_step)[:1], acceleration])).abs()
+        )
     ),
     "max_deceleration_mps2": lambda over, acceleration: over.highest(-acceleration),
     "max_deceleration_1s_mps2": lambda over, speed: _extreme(over.highest(-over.slope(speed))),
+    "standstill_gap_m": lambda over, gap, speed: _extreme(
+        over.lowest(torch.where(speed[1:] < STANDSTILL, gap, torch.inf))
+    ),
     "standstill_s": lambda over, speed: over.first(speed[1:] < STANDSTILL),
     "speed_overshoot_mps": lambda over, speed, leader_speed: _extreme(
         over.highest((speed - leader_speed.cummax(0).values)[1:]).clamp(min=0.0)
@@ -265,8 +270,8 @@ def register(measure: Measure, metric: Metric, every: bool = False) -> None:
             vehicle each.
 
     Raises:
-        ConfigError: if the key is no word, is one of the package or of another ``register``, or an
-            entry is unknown.
+        ConfigError: if the key is no word, is one of the package or of another ``register``, an
+            entry is unknown, or a trial of the metric fails.
     """
     key, known = measure.key, registered().get(measure.key, metric)
     words = "expected letters, digits and _, as in the name of a column"
@@ -278,6 +283,13 @@ def register(measure: Measure, metric: Metric, every: bool = False) -> None:
     _, *entries = signature(metric).parameters
     valid = (*SERIES, *(("free",) if every else OF_FILTER))
     require_known(f"entry of the measure {key}", entries, valid)
+    trial = {name: torch.ones(50 + (name == "speed"), 2, 2, 1) for name in valid}
+    try:
+        safety_measures(trial, torch.ones(50, 2, 1, 1, dtype=torch.bool), 0.1, {key: metric})
+    except LccError:
+        raise
+    except Exception as error:
+        raise ConfigError(f"measure {key}: {in_short(error)}") from error
     for table in (MEASURES, PLATOON):
         table[:] = [one for one in table if one.key != key] + [measure]
     for metrics in (METRICS, ROAD_METRICS):
@@ -323,7 +335,7 @@ def safety_measures(
         _, *entries = signature(metric).parameters
         if all(entry in series for entry in entries):
             value = found[name] = metric(over, *(series[entry] for entry in entries))
-            shape, wanted = list(value.shape), list(alive.shape[1:-1])
+            shape, wanted = list(torch.as_tensor(value).shape), list(alive.shape[1:-1])
             words = f"measure {name}: expected a number of each episode {wanted}, got {shape}"
             require(shape == wanted, f"{words}; over reduces entries: over.mean, over.highest …")
     return found

@@ -15,13 +15,14 @@ from torch import Tensor
 
 from lcc_rl.config import check_overrides, load
 from lcc_rl.config.schemas import StudyConfig, TimeStep
+from lcc_rl.config.words import key_of
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import POPULATION, Inputs, build_drivers, build_energy, constant_profiles
-from lcc_rl.errors import ConfigError, raised_as, require
+from lcc_rl.errors import ConfigError, in_short, raised_as, require
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.metrics import energy_measures
@@ -32,7 +33,7 @@ from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.base import Key
 from lcc_rl.pieces.features import CLASS
-from lcc_rl.settings import Count, Positive, Seed, checked
+from lcc_rl.settings import TARGET, Count, Positive, Seed, checked
 
 log = logging.getLogger("lcc_rl")
 
@@ -87,7 +88,8 @@ def simulate(
             these, each an episode of the length of the shortest; None on a ring.
         string: the vehicles behind the leader from front to back, see docs/strings.md.
         controller: controller or policy of the automated vehicles, as for
-            :func:`lcc_rl.compare`; None: an IDM driver without noise.
+            :func:`lcc_rl.compare`, or a mapping of one by its name, with ``_filtered`` to put it
+            behind the safety filter; None: an IDM driver without noise.
         drivers: a table of ``lcc-rl calibrate`` or a population of
             :mod:`lcc_rl.drivers.population`; None: those of ``overrides`` or the shipped ones. The
             first human is the first driver of it in the first repeat, the second in the next one.
@@ -105,17 +107,17 @@ def simulate(
         >>> found.steps.shape[0], found.vehicles["vehicle"].tolist()
         (1204, [0, 1, 2, 3])
     """
-    given = OF_ARGUMENTS | ({"drivers"} if drivers is not None else set())
-    check_overrides(overrides, given, "has no effect in simulate: see the arguments")
+    fixed = OF_ARGUMENTS | ({"drivers"} if drivers is not None else set())
+    check_overrides(overrides, fixed, "has no effect in simulate: see the arguments")
     profiles = _profiles(leader, time_step, seconds)
-    spec = None if controller is None else setting_of(controller, "controller")
+    given, spec = _given(controller)
     words = (
         *("evaluation.baselines=[]", "evaluation.behind_filter=[]", "evaluation.warm_up=0"),
         *(f"variant={'alcc' if is_policy(spec) else 'idm'}", *overrides),
         *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
     )
-    cfg = load("evaluate", words).with_(compare=[] if spec is None else [spec])
+    cfg = load("evaluate", words).with_(compare=given)
     require(
         (cfg.scenario.road == RING) == (leader is None),
         "simulate: a ring (scenario=ring in overrides) has leader=None, an open road has a leader",
@@ -125,10 +127,24 @@ def simulate(
     if drivers is not None:
         people = bootstrap(drivers) if isinstance(drivers, (str, PathLike)) else drivers
         fits = all(hasattr(people, name) for name in POPULATION)
-        require(fits, f"drivers: not a population: {people!r:.80}")
+        require(fits, f"drivers: not a population: {in_short(people)}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, own=spec is None).strategies(inputs)[-1]
+    if strategy.cfg.scenario.filters.get(AUTOMATED) is None:
+        unused = f"has no effect on {strategy.name}, which drives without the filter"
+        unused += f"; controller={{'{strategy.name}_filtered': …}} puts it behind the filter"
+        check_overrides(overrides, {x for x in map(key_of, overrides) if "filter" in x}, unused)
     return _simulated(strategy, inputs, repeats, seed)
+
+
+def _given(controller: Any) -> tuple[Any, Any]:
+    """Return the value of ``compare`` for a controller, and its setting; None without one."""
+    named = isinstance(controller, Mapping) and TARGET not in controller
+    words = f"controller: expected one, such as {{'name': MyACC()}}, got {in_short(controller)}"
+    require(not named or len(controller) == 1, words)
+    name, one = next(iter(controller.items())) if named else ("", controller)
+    spec = None if one is None else setting_of(one, "controller")
+    return {name: spec} if named else [spec] * (spec is not None), spec
 
 
 def _words(string: str | Mapping[str, Any]) -> str:
@@ -144,7 +160,7 @@ def _profiles(leader: Any, time_step: float, seconds: float | None) -> Profiles:
     whole = abs(steps - round(steps)) < 1e-6
     require(whole, f"simulate: seconds={seconds or 0.0:g} is no multiple of time_step={time_step}")
     if leader is None:
-        require(seconds is not None, "simulate: a ring has no leader's record; give seconds=…")
+        require(seconds is not None, "simulate: leader=None needs scenario=ring and seconds=…")
         return constant_profiles(0.0, round(steps), time_step, ["ring"])
     listed = isinstance(leader, (list, tuple)) and len(leader) > 0
     several = listed and not all(isinstance(x, (int, float, np.number)) for x in leader)

@@ -165,20 +165,21 @@ class Driver:
 
         Raises:
             ConfigError: if a measurement is missing or unknown, or sizes differ.
-            Diverged: if a command is not finite, or a measurement is NaN and there is no filter;
-                memories are then unchanged.
+            Diverged: if a command is not finite, as for a NaN ahead if there is no filter and the
+                controller does not handle it; memories are then unchanged.
         """
         state, alone = self._state(measured)
         ids = range(len(state)) if cars is None else _ids(cars)
-        lost = np.isnan(state) & [name not in self.program.stand_ins for name in self.names]
-        if self.program.safety is None and lost.any():
-            row, column = np.argwhere(lost)[0]
-            raise Diverged(f"{self.name}: {self.names[column]} is nan in row {row} of the cars")
+        before = self.cars, self.memory
         self._admit(ids, state)
         command, *memory = self._rows(state, *[self.memory] * (self.program.width > 0))
         if not np.isfinite(command).all():
-            place = int(np.isfinite(command).argmin())
-            what = f"the command of {self.cars[place]} is {command[place, 0]}"
+            row = int(np.isfinite(command).argmin())
+            lost = [x for x, value in zip(self.names, state[row], strict=True) if np.isnan(value)]
+            lost = [x for x in lost if x not in self.program.stand_ins]
+            what = f"the command of {self.cars[row]} is {command[row, 0]}"
+            what = f"{lost[0]} is nan in row {row} of the cars" if lost else what
+            self.cars, self.memory = before
             raise Diverged(f"{self.name}: {what}")
         if memory:
             (self.memory,) = memory

@@ -103,7 +103,7 @@ class FollowerStopper(Averaging):
         safe = torch.minimum(ahead.clamp(min=0.0), desired)
         rising = safe * (gap - near) / (middle - near)
         freeing = safe + (desired - safe) * (gap - middle) / (far - middle)
-        commanded = torch.where(gap < far, freeing, desired)
+        commanded = torch.where(gap >= far, desired, freeing)  # NaN if the gap is NaN
         commanded = torch.where(gap < middle, rising, commanded)
         return torch.where(gap < near, torch.zeros_like(commanded), commanded)
 

@@ -14,7 +14,7 @@ import pandas as pd
 from pydantic import Field
 from rich.table import Table
 
-from lcc_rl.errors import require, require_known
+from lcc_rl.errors import in_short, require, require_known
 from lcc_rl.results import measures, render
 from lcc_rl.results.bootstrap import LEAST_DRIVES
 from lcc_rl.results.measures import FINAL_SPREAD, FLOW, MEASURES, Shown, signed
@@ -224,7 +224,7 @@ def check_row(row: BoardRow, where: str) -> None:
     Raises:
         ConfigError: naming the contradiction.
     """
-    require(isinstance(row, Mapping), f"{where}: expected a row with names, got {row!r:.80}")
+    require(isinstance(row, Mapping), f"{where}: expected a row with names, got {in_short(row)}")
     lacking = ", ".join(name for name in SHAPE if name not in row)
     require(not lacking, f"{where}: it lacks {lacking}")
     parse(ScoreRow, {name: row[name] for name in SHAPE}, where)

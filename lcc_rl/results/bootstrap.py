@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcc_rl.arrays import Floats
+from lcc_rl.arrays import Floats, per_distance
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
@@ -210,7 +210,7 @@ def equal_seeds(*sides: Collection[object]) -> bool:
 
 
 def _saved(ours: Side, theirs: Side) -> Any:
-    own, other = (side["energy"] / side["way"] for side in (ours, theirs))
-    if other.min() <= 0.0 <= other.max():
+    own, other = (per_distance(side["energy"], side["way"]) for side in (ours, theirs))
+    if (other <= 0.0).any() and (other >= 0.0).any():
         return np.full_like(own, np.nan)
     return share_saved(own, other)

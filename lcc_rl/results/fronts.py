@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lcc_rl.arrays import Floats
+from lcc_rl.arrays import Floats, per_distance
 from lcc_rl.errors import ResultsError
 from lcc_rl.results.bootstrap import NOTHING, Estimate, Side, equal_seeds, estimate, share_saved
 from lcc_rl.results.measures import DISTANCE, FLOW, LONG_GAPS, PATH
@@ -115,7 +115,7 @@ def saving_at(
 
 def energy_per_distance(curve: Curve) -> Floats:
     """Return the energy, the first column, per distance, ``[..., limits]``."""
-    return next(iter(curve.values())) / curve[DISTANCE]
+    return per_distance(next(iter(curve.values())), curve[DISTANCE])
 
 
 def fleet_saved(point: Curve, baseline: Curve) -> Any:

@@ -245,6 +245,7 @@ MEASURES = [
     Measure("rms_jerk_mps3", "RMS jerk", unit="m/s³"),
     _largest("max_jerk_mps3", "  largest jerk", unit="m/s³", limit="jerk"),
     _largest("max_jerk_1s_mps3", "  largest mean of 1 s", unit="m/s³", limit="jerk\n1 s"),
+    _least("standstill_gap_m", "smallest gap at standstill", unit="m", limit="gap\nat rest"),
     Measure("standstill_s", "time to standstill", unit="s", form="{:.1f}"),
     Measure("speed_overshoot_mps", "speed above the leader's highest", unit="m/s", aggregate="max"),
     _share(FASTER, "time with a leader faster than v0", form="{:.1%}", limit="leader\nfaster"),

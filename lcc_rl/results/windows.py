@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
+from lcc_rl.arrays import per_distance
 from lcc_rl.energy import AVERAGED, BURNT, SECOND
 from lcc_rl.io.files import Rows, read_parquet
 from lcc_rl.results.bootstrap import NOTHING, Estimate, equal_seeds, estimate, saving, share_saved
@@ -220,7 +221,7 @@ def ratio(rows: pd.DataFrame, column: str, strategy: str, per: Sequence[str]) ->
         return NOTHING
     energy, way, drives = _by_window(rows[rows[STRATEGY] == strategy], column, per)
     side = {"energy": energy.to_numpy(), "way": way.to_numpy()}
-    return estimate(lambda x: x["energy"] / x["way"], side, drives=drives) if way.size else NOTHING
+    return estimate(lambda x: per_distance(**x), side, drives=drives) if way.size else NOTHING
 
 
 def with_equal_seeds(rows: pd.DataFrame, strategy: str, baseline: str) -> pd.DataFrame:

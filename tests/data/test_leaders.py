@@ -119,7 +119,7 @@ def test_impossible_leaders() -> None:
         ({"training": {"a": {"path": "us06", "from_s": 600.0}}}, "is empty"),
         ({"training": {"a": {"path": "us06", "scale": 9.0}}}, "drives up to .*max_speed"),
         ({"training": {}}, r"leader\.training names no record"),
-        ({"least_variation": 1e6}, "least_variation"),
+        ({"least_variation": 1e6}, "least_variation, raise scenario.horizon"),
     ]
     usual = {"training": {"a": {"path": "us06"}}, "held_out": {"b": {"path": "hwfet"}}}
     check_refused(lambda own: RecordLeaders(**{**usual, **own}).load(0.1, 300, 3), cases)

@@ -81,6 +81,7 @@ def test_safety() -> None:
         "rms_jerk_mps3": [12.5**0.5, 2.0],  # √((9 + 16)/2)
         "max_jerk_mps3": [4.0, 2.0],
         "max_deceleration_1s_mps2": [torch.nan, torch.nan],  # the episodes are shorter
+        "standstill_gap_m": [torch.nan, torch.nan],
         "standstill_s": [torch.nan, torch.nan],
         "duration_s": [0.2, 0.1],
     }
@@ -89,6 +90,7 @@ def test_safety() -> None:
     filtered = {"share_ttc_unpromised", "share_turned_unsafe"}
     others = {"share_leader_faster", "share_time_gap_short", "flow_vph", "mean_speed_mps"}
     braking = {"max_deceleration_mps2", "max_jerk_1s_mps3"}  # of accelerations
+    named |= {"standstill_gap_m"}
     assert named | others | filtered | braking == set(limit_measures())
     for name, values in expected.items():
         torch.testing.assert_close(measures[name].flatten(), torch.tensor(values), equal_nan=True)
@@ -102,17 +104,21 @@ def test_braking_and_overshoot_as_standards_name_them() -> None:
     )
     speed = speed.T.reshape(81, 1, 2, 1).repeat(1, 2, 1, 1)
     acceleration = speed.diff(dim=0) / 0.1
-    jerk = torch.cat([torch.zeros(1, 2, 2, 1), acceleration.diff(dim=0) / 0.1])
+    # The first counted step changes the acceleration from 8 m/s²: a window of its own.
+    jerk = torch.cat([torch.full((1, 2, 2, 1), -80.0), acceleration.diff(dim=0) / 0.1])
+    gap = torch.linspace(40.0, 0.0, 80).view(80, 1, 1, 1).expand(80, 2, 2, 1)
     leader = (9.0 - 0.1 * time).view(81, 1, 1, 1).expand(81, 2, 1, 1)
     alive = torch.ones(80, 2, 1, 1, dtype=torch.bool)
     alive[9:, 1] = False
     series = {"speed": speed, "acceleration": acceleration, "jerk": jerk, "leader_speed": leader}
+    series["gap"] = gap
     found = safety_measures(series, alive, 0.1)
     expected = {
         "max_deceleration_mps2": [5.0, 0.0],
         "max_deceleration_1s_mps2": [5.0, torch.nan],
-        "max_jerk_mps3": [50.0, 0.0],
-        "max_jerk_1s_mps3": [5.0, torch.nan],
+        "max_jerk_mps3": [80.0, 80.0],
+        "max_jerk_1s_mps3": [8.0, torch.nan],
+        "standstill_gap_m": [0.0, torch.nan],
         "standstill_s": [6.0, torch.nan],  # of the last vehicle
         "speed_overshoot_mps": [1.0, 1.0],
     }

@@ -14,9 +14,12 @@ from lcc_rl.data.profiles import from_records, no_profiles
 from lcc_rl.envs import Inputs
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.episodes import evaluate
+from lcc_rl.pieces import Controller
 
 STEPS = 200
+MARGIN = "scenario.filters.automated.margin"
 WAVE = 8.0 + 3.0 * np.sin(0.1 * np.arange(STEPS + 1) / 4.0)
+BEHIND = {"leader": WAVE, "string": "automated"}
 QUICK = ["scenario.horizon=200", "evaluation.baselines=[]", "evaluation.warm_up=0"]
 
 
@@ -85,9 +88,29 @@ def test_compiled_code_drives_the_same(monkeypatch, subtests) -> None:
             pd.testing.assert_frame_equal(fast, plain, rtol=1e-4, atol=1e-3)
 
 
+class Follow(Controller):
+    """A controller that brakes late."""
+
+    reads = ("self.gap",)
+
+    def command(self, gap):
+        return 0.5 * (gap - 4.0)
+
+
+def test_a_name_puts_a_controller_behind_the_filter() -> None:
+    hard = np.clip(25.0 - 2.5 * (0.1 * np.arange(301) - 10.0).clip(min=0.0), 0.0, 25.0)
+    alone = lcc_rl.simulate(hard, "automated", {"mine": Follow()})
+    held = [
+        lcc_rl.simulate(hard, "automated", one, overrides=["+filter=cbf"]).vehicles["min_gap_m"][1]
+        for one in ({"mine_filtered": Follow()}, f"{__name__}.Follow_filtered")
+    ]
+    assert alone.vehicles["collided"].any()
+    assert held[0] == held[1] > 0.0
+
+
 def test_wrong_arguments_are_named() -> None:
     cases = [
-        ({"leader": None}, "a ring has no leader's record; give seconds"),
+        ({"leader": None}, "leader=None needs scenario=ring and sec"),
         ({"leader": None, "seconds": 5.0}, "a ring .*has leader=None, an open road has a leader"),
         ({"leader": WAVE, "overrides": ["scenario=ring"]}, "an open road has a leader"),
         ({"leader": [3.0]}, "at least two speeds"),
@@ -101,7 +124,10 @@ def test_wrong_arguments_are_named() -> None:
             ({"leader": WAVE, "overrides": [f"{key}=2"]}, f"{key}=2: has no effect in simulate")
             for key in ("scenario.horizon", "scenario.string", "seed", "compare", "leader.path")
         ),
-        ({"leader": "nowhere.csv"}, "nowhere.csv: no such file"),
+        *(
+            ({"leader": x}, rf"{x}: no such file, and none of .*\(hwfet, udds, us06, wltc_3b\)")
+            for x in ("nowhere.csv", "drives", "platoons")
+        ),
         ({"leader": WAVE, "seconds": 99.0}, "seconds=99, and the leader drives for 20 s"),
         ({"leader": WAVE, "seconds": 1.25}, "seconds=1.25 is no multiple of time_step=0.1"),
         ({"leader": WAVE, "drivers": POPULATION, "overrides": ["drivers=highway"]}, "drivers=high"),
@@ -111,5 +137,15 @@ def test_wrong_arguments_are_named() -> None:
         ({"leader": WAVE, "string": "car*3"}, "car"),
         ({"leader": WAVE, "string": "human", "controller": "idm_acc"}, "no vehicle"),
         ({"leader": WAVE, "string": "automated", "controller": "nobody"}, "unknown strategy"),
+        *(
+            (
+                {**BEHIND, "controller": one, "overrides": words},
+                f"has no effect on {who}, which",
+            )
+            for one, who in (({"mine": Follow()}, "mine"), (Follow(), "Follow"), ("acc", "acc"))
+            for words in (["+filter=cbf"], ["task=i24-follow5", f"{MARGIN}=2"])
+        ),
+        ({**BEHIND, "controller": {"a": "idm", "b": "acc"}}, "controller: expected one, such as"),
+        ({**BEHIND, "controller": {"a_filtered": Follow()}}, "a_filtered needs the safety filter"),
     ]
     check_refused(lambda given: lcc_rl.simulate(**given), cases)

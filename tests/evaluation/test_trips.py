@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 from helpers import check_refused
+from page_blocks import blocks
 
 import lcc_rl
 from lcc_rl.commands.energy import main
@@ -99,11 +103,19 @@ def test_the_command_prints_and_writes_the_trips(tmp_path, path, capsys, subtest
             pd.testing.assert_frame_equal(read(tmp_path / name), expected)
 
 
+def test_trips_are_sorted_by_their_numbers(path) -> None:
+    names = ["trip 10", "trip 2", "a", "1", "trip 2b"]
+    pd.concat([made()[:61].assign(trip=name) for name in names]).to_csv(path, index=False)
+    found = lcc_rl.trip_energies(path, ["energy=fuel", COLUMNS])
+    assert found["trip"].tolist() == ["1", "a", "trip 2", "trip 2b", "trip 10"]
+
+
 def test_refused_trips(path) -> None:
     trips = made()
     faults = {
         "word": (trips.assign(v=trips["v"].astype(str).where(trips.index != 70, "x")), []),
         "fast": (trips.assign(v=3.6 * trips["v"]), []),
+        "steep": (trips.assign(slope=15.0 * trips["slope"]), GRADED),
     }
 
     def call(*words: str) -> None:
@@ -120,6 +132,7 @@ def test_refused_trips(path) -> None:
             ("energy=mixture", "a mixture has several models"),
             ("leader.columns.drive=id", "lacks the column id; it has trip, t, v, slope"),
             (GRADED[0], r"data row 62, column 'slope' holds '3\.0'.*0\.3 rad"),
+            ("steep", *GRADED, r"column 'slope' holds '45\.0'; .* 0\.3 rad, -30 to 30 in its unit"),
             (*GRADED, "energy=alcc", "PaperMotor has no grade"),
         ],
     )
@@ -130,3 +143,27 @@ def test_refused_trips(path) -> None:
             (3, [], r"trip_energies\.path"),
         ],
     )
+
+
+def test_a_simulated_drive_on_hills_is_priced_as_the_pages_show(tmp_path, monkeypatch) -> None:
+    pages = Path(__file__).parents[2] / "docs"
+    (car,) = (x.text for x in blocks(pages / "your_car.md") if "class MyCar" in x.text)
+    (drive,) = (x.text for x in blocks(pages / "energy.md") if "hills.parquet" in x.text)
+    (tmp_path / "my_car.py").write_text(car)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    names: dict = {}
+    exec(drive, names)
+    words = ["energy._target_=my_car.MyCar", "leader.columns.grade=grade"]
+    found = lcc_rl.trip_energies("hills.parquet", words)["energy_kj"].item()
+    flat = lcc_rl.trip_energies("hills.parquet", words[:1])["energy_kj"].item()
+    speed, grade = names["drive"]["speed_mps"].to_numpy(float), names["grade"]
+    v, a, share = speed[:-1], np.diff(speed) / 0.1, sys.modules.pop("my_car").MAP.numpy()
+    force = 110.0 + 1.2 * v + 0.42 * v**2 + 1650.0 * (1.04 * a + 9.81 * np.sin(grade[:-1]))
+    by_force = [np.interp(abs(force), [0.0, 2000.0, 4000.0], row) for row in share]
+    share = [
+        np.interp(x, [0.0, 15.0, 30.0], row) for x, row in zip(v, np.array(by_force).T, strict=True)
+    ]
+    power = np.where(force > 0.0, force * v / share, force * v * share) + 400.0
+    assert found == pytest.approx(power.sum() * 1e-4, rel=1e-4)
+    assert abs(found - flat) > 0.01 * flat

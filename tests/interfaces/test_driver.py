@@ -23,7 +23,7 @@ from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.evaluation.strategies import baseline, trained
 from lcc_rl.interfaces.driver import MEASURED, Driver
 from lcc_rl.interfaces.sumo import Bridge
-from lcc_rl.pieces import CBFFilter
+from lcc_rl.pieces import CBFFilter, Controller
 from lcc_rl.pieces.base import SEED
 from lcc_rl.results.policies import load_policy
 
@@ -276,7 +276,7 @@ def test_bad_input_is_one_clear_error() -> None:
 
 
 def test_no_driver_takes_a_measurement_that_is_no_number() -> None:
-    """Behind a filter it brakes; without one every controller ends in one error."""
+    """Behind a filter it brakes; without one a command that depends on it ends in one error."""
     given = dict.fromkeys(MEASURED, np.full(2, 12.0))
     for name in ("follower_stopper", "constant", "ovm", "idm_acc", "human", "pretrained/alcc"):
         driver = Driver(name, 0.1)
@@ -286,15 +286,40 @@ def test_no_driver_takes_a_measurement_that_is_no_number() -> None:
                 assert np.ptp(driver.step(bad)) < 1e-5
                 driver.reset()
                 continue
+            if (name, entry) in (("constant", "self.speed"), ("ovm", "ahead.speed")):
+                found = driver.step(bad)  # it does not depend on it
+                driver.reset()
+                np.testing.assert_array_equal(found, driver.step(given))
+                driver.reset()
+                continue
             with pytest.raises(Diverged, match=f"{re.escape(entry)} is nan in row 1 of the cars"):
                 driver.step(bad)
-            assert not len(driver.cars)
+            assert len(driver.cars) == len(driver.memory) == 0
     for name in (POLICY, "idm_acc_filtered", "pretrained/i80-follow"):
         for entry in Driver(name, 0.1).names:
             found = Driver(name, 0.1).step({**given, entry: np.array([12.0, np.nan])})
             rear = entry.startswith("behind.")
             assert found[1] == pytest.approx(found[0] if rear else -3.0), (name, entry)
             assert found[0] > -3.0
+
+
+class Careful(Controller):
+    """Holds its last command over a gap that is no number."""
+
+    reads = ("self.gap",)
+    remembers = ("last",)
+
+    def command(self, gap, last):
+        wanted = torch.where(gap.isfinite(), 0.1 * (gap - 30.0), last)
+        return wanted, wanted
+
+
+def test_a_controller_of_ones_own_handles_a_nan_as_in_the_exported_program() -> None:
+    driver, program, memory = Driver(Careful, 0.1), Driver(Careful, 0.1).program, torch.zeros(1, 2)
+    gaps = [20.0, np.nan, np.nan, 40.0]
+    for gap, wanted in zip(gaps, [-1.0, -1.0, -1.0, 1.0], strict=True):
+        command, memory = program(torch.tensor([[gap]]), memory)
+        assert driver.step({"self.gap": gap}) == pytest.approx(float(command)) == wanted
 
 
 def test_a_bridge_names_the_time_of_a_measurement_or_command_that_is_no_number(monkeypatch) -> None:

@@ -140,8 +140,15 @@ def test_less_drawn_is_saved_also_where_the_baseline_gains() -> None:
     assert saving([[-110.0]], [[-100.0]]).value == pytest.approx(0.1)
     # A share of something that may be more or less than nothing has no interval.
     mixed, gained = np.array([[-3.0], [1.0], [-2.0]]), np.array([[-3.0], [-1.0], [-2.0]])
+    still, ways = np.zeros((3, 1)), np.ones((3, 1))
     assert np.isnan(saving(mixed - 1.0, mixed).low)
     assert np.isnan(saving(mixed, np.zeros((3, 1))).value)
+    # A strategy, or a baseline, that does not move has no energy per distance.
+    for ours, theirs in ((still, ways), (ways, still), (still, still)):
+        assert np.isnan(saving(gained, gained, ways=(ours, theirs)).value)
+    halves = saving(-gained, -gained, ways=([[0.0], [1.0], [0.0]], ways))
+    assert halves.value == pytest.approx(-2.0)
+    assert np.isfinite([halves.low, halves.high]).all()
     # Nothing is saved in either window, but less is driven where it costs more.
     two = saving([[2.0], [9.0]], [[18.0], [1.0]], ways=([[1.0], [9.0]], [[9.0], [1.0]]))
     assert (two.low, two.high) == (0.0, two.value)

@@ -112,6 +112,9 @@ REFUSED = [
     ("min_gap_m", {}, lambda over, gap: gap, "the package has one of this key"),
     ("mine", {}, lambda over, gapp: gapp, "entry of the measure mine 'gapp'.*'gap'"),
     ("mine", {"bound": "≥"}, None, "bound of mine '≥'; valid: .*at least"),
+    ("mine", {}, lambda over, gap: over.worst(gap), "measure mine: .*no attribute 'worst'"),
+    ("mine", {}, lambda over, gap: 1.0, r"mine: expected a number .* \[2, 1\], got \[\]"),
+    ("mine", {}, lambda over, gap, speed: over.mean(gap * speed), "measure mine: .*51"),
     ("mine", {"aggregate": "maximum"}, None, "aggregate of mine 'maximum'.*'max'"),
 ]
 

@@ -23,6 +23,15 @@ def folder(tmp_path_factory):
     return place
 
 
+def test_its_arguments_are_named() -> None:
+    cases = [
+        ([], "arguments are required: folder"),
+        (["nowhere"], "nowhere: no steps.parquet: evaluate with"),
+        (["a", "b", "c"], "unrecognized arguments: c"),
+    ]
+    check_refused(energy_models.main, cases)
+
+
 def test_the_same_model_gives_the_energies_of_the_evaluation(folder) -> None:
     driven, profiles, step = energy_models.motions(pd.read_parquet(folder / "steps.parquet"))
     rows = pd.read_parquet(folder / "episodes.parquet").set_index(["strategy", "profile"])
