@@ -6,18 +6,19 @@ import time
 from abc import abstractmethod
 from collections.abc import Mapping
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.collectors import BaseCollector, Collector
 
-from lcc_rl.agents.actor import shared_policy
+from lcc_rl.agents.actor import ONE, shared_policy
 from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.checks import check_batch, check_learner
 from lcc_rl.agents.loop import REPORTED, AgentT, TrainingLoop
 from lcc_rl.envs import StringCollector
 from lcc_rl.errors import require
-from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD
+from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD, STEP
 
 # Entries of transitions: their keys in the environment and in the losses.
 LEARNED_FROM = {
@@ -47,6 +48,8 @@ class CollectingLoop(TrainingLoop[AgentT]):
             f"agent: setup of {type(self.agent).__name__} must make noise, the exploration, such "
             "as GaussianExploration(0.3), or None",
         )
+        self.every = getattr(self.agent, "every", 1)
+        self.rule = getattr(self.agent, "rule", None)
 
     @abstractmethod
     def learn(self, batch: TensorDictBase, before: int) -> dict[str, float]:
@@ -72,7 +75,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
         if self.settings.collector == "torchrl":
             how = {"total_frames": -1, "auto_register_policy_transforms": False}
             return Collector(self.env, policy, frames_per_batch=frames, **how)
-        keys = (*LEARNED_FROM, *REPORTED)
+        keys = (*LEARNED_FROM, *REPORTED, STEP)
         return StringCollector(
             self.env, policy, frames_per_batch=frames, keys=keys, compiled=compiled
         )
@@ -100,6 +103,10 @@ class CollectingLoop(TrainingLoop[AgentT]):
             batch = next(segments)
             check_batch(batch, part * steps)
             played.append(batch.select(*REPORTED))
+            batch = decisions(batch, self.every)
+            if self.rule is not None:  # the policy's part of the action
+                own = batch.get(ACTION) - self.rule(batch.get(OBSERVATION))
+                batch.set(ACTION, own.clamp(-ONE, ONE))
             collected, size = time.perf_counter(), batch.get(("next", *REWARD)).numel()
             before = self.iteration * (self.horizon // steps) + part
             losses.append(self.learn(batch, before * size))
@@ -113,6 +120,26 @@ class CollectingLoop(TrainingLoop[AgentT]):
             spent[1] += time.perf_counter() - collected
         begin = {"exploration_sigma": sigma, "learning_rate": rate}
         return self._record(played, losses, spent, size * len(played), begin)
+
+
+def decisions(batch: TensorDictBase, every: int) -> TensorDictBase:
+    """Return the transitions from one decision to the next, with the sums of the rewards.
+
+    Args:
+        batch: transitions of single steps, ``[environments, steps]``.
+        every: steps for which an action is executed; divides the steps.
+    """
+    if every == 1:
+        return batch
+    parts = batch.unflatten(1, (batch.shape[1] // every, every))
+    begun, reached = parts[:, :, 0], parts[:, :, -1].get("next").clone()
+    ended = parts.get(("next", "done")).cumsum(2) > 0
+    before = torch.cat([torch.zeros_like(ended[:, :, :1]), ended[:, :, :-1]], 2)  # by step
+    reward = parts.get(("next", *REWARD))
+    reached.set(REWARD, (reward * ~before.unsqueeze(-1)).sum(2))
+    for key in ("done", "terminated"):
+        reached.set(key, (parts.get(("next", key)) & ~before).any(2))
+    return begun.set("next", reached)
 
 
 def transitions(batch: TensorDictBase) -> TensorDictBase:

@@ -133,6 +133,13 @@ def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
     return cfg.with_(scenario=changes)
 
 
+def with_hold(cfg: StudyConfig, seconds: float) -> StudyConfig:
+    """Return a configuration in which an action is executed for a time [s]; 0: one step."""
+    drivers = cfg.scenario.controllers
+    changed = {AUTOMATED: drivers[AUTOMATED].changed(hold=seconds)} if seconds else {}
+    return cfg.with_(scenario={"controllers": {**drivers, **changed}})
+
+
 def after_uncounted(cfg: StudyConfig) -> tuple[StudyConfig, int, int]:
     """Return the configuration of an evaluation, the steps of human drivers and of the warm-up.
 
@@ -212,7 +219,7 @@ def _watchers(drivers: Sequence[Controller | CBFFilter], world: World) -> list[P
     """Build the pieces that record the filters' guarantees and corrections."""
     filters = {piece.role: piece for piece in drivers if isinstance(piece, CBFFilter)}
     changed = [
-        Corrected(max_acceleration=piece.max_acceleration).bind(world, piece.role)
+        Corrected().bind(world, piece.role)
         for piece in drivers
         if isinstance(piece, Action) and piece.role in filters
     ]
