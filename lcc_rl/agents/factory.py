@@ -92,6 +92,11 @@ def check_lengths(cfg: StudyConfig) -> None:
         f"training.segment ({settings.segment}) must divide scenario.horizon ({horizon})"
         + f" without the steps of agent.warm_up ({counted})" * (counted < horizon),
     )
+    every = getattr(cfg.agent.made(), "hold", 0.0) / cfg.scenario.time_step
+    require(
+        settings.segment % max(every, 1.0) < 1e-6,
+        f"agent.hold ({every:g} steps) must divide training.segment ({settings.segment})",
+    )
     window = getattr(cfg.agent.made(), "best_window", None) or 0
     count = settings.environments
     require(

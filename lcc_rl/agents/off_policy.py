@@ -224,7 +224,7 @@ class OffPolicy(Sampling):
         return {
             "count": self.count,
             "loss": dict(self.loss.state_dict()),
-            **({} if self.rule is None else {"rule": self.rule.state_dict()}),
+            **{name: part.state_dict() for name, part in self._more().items()},
             "optimizers": {name: part.state_dict() for name, part in self.optimizers.items()},
         }
 
@@ -233,6 +233,8 @@ class OffPolicy(Sampling):
         self.loss.load_state_dict(state["loss"])
         for name, part in self.optimizers.items():
             part.load_state_dict(state["optimizers"][name])
+        for name, part in self._more().items():
+            part.load_state_dict(state[name])
 
 
 def leaves(parameters: TensorDictBase) -> list[Tensor]:

@@ -15,7 +15,7 @@ from torchrl.objectives.value import GAE
 
 from lcc_rl.agents.actor import seeded_mlp
 from lcc_rl.agents.agent import Fraction, Scene, Schedule, anneal, derived_seed
-from lcc_rl.agents.collecting import CollectingLoop, transitions
+from lcc_rl.agents.collecting import CollectingLoop, of_decisions, transitions
 from lcc_rl.agents.sac import SampledAction, tanh_gaussian
 from lcc_rl.agents.sampling import Sampling
 from lcc_rl.pieces.base import REWARD
@@ -111,7 +111,7 @@ class PPO(Sampling):
             with torch.no_grad():
                 data = self.advantage(data)
                 data[LOG_PROB] = self.actor.get_dist(data).log_prob(data["action"])
-            rows = data.reshape(-1)
+            rows = of_decisions(data.reshape(-1))
             shuffled = (torch.randperm(len(rows)) for _ in range(self.epochs))
             parts = (part for order in shuffled for part in order.split(self.batch_size))
             found = [self._step(rows[part]) for part in parts]
@@ -127,6 +127,9 @@ class PPO(Sampling):
         nn.utils.clip_grad_norm_(self.weights, self.clip_norm)
         self.optimizer.step()
         return actor.detach(), value.detach()
+
+    def _parts(self) -> dict[str, Any]:
+        return {**super()._parts(), **self._more()}
 
     def state_dict(self) -> dict[str, Any]:
         return {"count": self.count, **super().state_dict()}

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from tensordict.nn import TensorDictModule
 from torch import nn
 
 from lcc_rl.agents.actor import Activation, make_actor
-from lcc_rl.agents.agent import Agent, Scene
+from lcc_rl.agents.agent import Scene
+from lcc_rl.agents.objective import Aiming, Objective
 from lcc_rl.agents.rules import NETWORK_ALONE, RESIDUAL, Residual, make_policy
 from lcc_rl.errors import require
 from lcc_rl.settings import Count, NonNegative, Positive, Share
 
 
-class Sampling(Agent):
+class Sampling(Aiming):
     """Settings of agents that learn from transitions between decisions."""
 
     gamma: Share  # discount per decision
@@ -29,7 +31,14 @@ class Sampling(Agent):
     # Time after which a reward counts for 1/e, instead of gamma [s].
     horizon: Positive | None = None
 
-    LATER = ("policy", "constants", "hold", "horizon")
+    LATER = ("policy", "constants", "hold", "horizon", "surrogates", "regularizers", "limits")
+    LATER += ("limit_rate",)
+
+    def _more(self) -> dict[str, Any]:
+        """Return further parts of the state: the rule and the prices of limits, if there are."""
+        parts = {"rule": self.rule, "limits": self.objective.limits}
+        used = {"rule": self.rule is not None, "limits": bool(self.objective.limits.largest)}
+        return {name: part for name, part in parts.items() if used[name]}
 
     def make_actor(self, scene: Scene) -> TensorDictModule:
         """Make ``policy``, and its ``rule`` if it has one; return the learned part.
@@ -41,6 +50,7 @@ class Sampling(Agent):
         self.every = max(scene.world.steps(self.hold, "agent.hold"), 1)
         if self.horizon is not None:
             self.gamma = math.exp(-self.every * scene.world.time_step / self.horizon)
+        self.objective = Objective(self, scene.device, scene.world)
         self.rule = None
         if kind == NETWORK_ALONE:
             learned = make_actor(size, 1, self.hidden, scene.seed, self.activation)
