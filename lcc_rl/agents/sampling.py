@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -23,7 +23,7 @@ class Sampling(Aiming):
     gamma: Share  # discount per decision
     hidden: Sequence[Count]
     activation: Activation = "relu"  # between the layers of networks
-    policy: str = NETWORK_ALONE  # or a network on top of a rule, such as residual_idm
+    policy: Any = NETWORK_ALONE  # or a network on top of a rule, such as residual_idm
     constants: dict[str, Positive] | None = None  # of the rule; the others keep their defaults
     # Time between two decisions in training, in which the action is held [s]; 0: a step. A trained
     # policy decides in every step.
@@ -31,8 +31,10 @@ class Sampling(Aiming):
     # Time after which a reward counts for 1/e, instead of gamma [s].
     horizon: Positive | None = None
 
-    LATER = ("policy", "constants", "hold", "horizon", "surrogates", "regularizers", "limits")
-    LATER += ("limit_rate",)
+    LATER: ClassVar[Sequence[str]] = (
+        *("policy", "constants", "hold", "horizon"),
+        *("surrogates", "regularizers", "limits", "limit_rate"),
+    )
 
     def _more(self) -> dict[str, Any]:
         """Return further parts of the state: the rule and the prices of limits, if there are."""
