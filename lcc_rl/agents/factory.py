@@ -17,7 +17,7 @@ from lcc_rl.config import identity
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
-from lcc_rl.envs.factory import after_humans, with_hold, world_of
+from lcc_rl.envs.factory import after_humans, world_of
 from lcc_rl.errors import ConfigError, raised_as, require
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import Observation
@@ -66,8 +66,11 @@ def training_env(cfg: StudyConfig, profiles: Profiles, population: Population) -
         ConfigError: naming the option at fault.
     """
     agent = cfg.agent.made(Agent)
-    held = with_hold(cfg, getattr(agent, "hold", 0.0))
-    driven = after_humans(held, getattr(agent, "humans_first", 0.0))
+    if hold := getattr(agent, "hold", 0.0):
+        drivers = cfg.scenario.controllers
+        held = {**drivers, AUTOMATED: drivers[AUTOMATED].changed(hold=hold)}
+        cfg = cfg.with_(scenario={"controllers": held})
+    driven = after_humans(cfg, getattr(agent, "humans_first", 0.0))
     return build_env(driven, profiles, population, cfg.training.environments, 0, cfg.device)
 
 

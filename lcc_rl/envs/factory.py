@@ -133,13 +133,6 @@ def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
     return cfg.with_(scenario=changes)
 
 
-def with_hold(cfg: StudyConfig, seconds: float) -> StudyConfig:
-    """Return a configuration in which an action is executed for a time [s]; 0: one step."""
-    drivers = cfg.scenario.controllers
-    changed = {AUTOMATED: drivers[AUTOMATED].changed(hold=seconds)} if seconds else {}
-    return cfg.with_(scenario={"controllers": {**drivers, **changed}})
-
-
 def after_uncounted(cfg: StudyConfig) -> tuple[StudyConfig, int, int]:
     """Return the configuration of an evaluation, the steps of human drivers and of the warm-up.
 
