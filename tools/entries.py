@@ -58,7 +58,8 @@ def configurations() -> Iterator[StudyConfig]:
     knowledge = ["+knowledge=[spread,preview]", "scenario.pieces.memory.kind=stacked"]
     cfg = load("train", ["variant=alcc", SIZES, "+filter=cbf", "+faults=all", *knowledge])
     yield cfg
-    yield load("train", ["variant=alcc", SIZES, "+event=cut_in"])
+    held = "scenario.controllers.automated.hold=0.5"
+    yield load("train", ["variant=alcc", SIZES, "+event=cut_in", held])
     for drawn_or_single in ({"size": 6, "penetration": 0.34}, "automated human*4"):
         yield cfg.with_(scenario={"string": drawn_or_single})
     human = "scenario.controllers.human"

@@ -16,6 +16,7 @@ from torchrl.modules import MLP
 from lcc_rl.functional.random import normal, stream_id
 from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP
 
+ONE = 1.0 - 1e-6  # largest action with a finite inverse tanh in single precision
 ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "silu": nn.SiLU}
 Activation = Literal["relu", "tanh", "elu", "silu"]
 

@@ -11,24 +11,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import torch
-from pydantic import Field, InstanceOf
+from pydantic import Field
 from torch import Tensor, nn
 
 from lcc_rl.agents.actor import Activation, seeded_mlp
-from lcc_rl.agents.agent import Agent, Fraction, Scene, Schedule, anneal
+from lcc_rl.agents.agent import Fraction, Scene, Schedule, anneal
 from lcc_rl.agents.gradient import GradientLoop
-from lcc_rl.agents.objective import Objective
+from lcc_rl.agents.objective import Aiming, Objective
 from lcc_rl.agents.rules import make_policy
-from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import require
-from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.settings import Count, NonNegative, Positive, Share
 
 
-class Analytic(Agent):
+class Analytic(Aiming):
     """A policy, its optimizer, the objective's smooth terms and, if asked for, a value.
 
     Once started, ``policy`` is the module.
@@ -40,17 +38,8 @@ class Analytic(Agent):
     constants: dict[str, Positive] | None = None  # of a rule at the start; the others keep theirs
     hidden: Sequence[Count] = (200, 100, 50)  # layers of a network
     activation: Activation = "relu"  # between the layers of networks
-    # Reward terms that take the place of those of the same name in the objective; their
-    # weights multiply the terms' own. Those of terms that the reward lacks are ignored.
-    surrogates: dict[str, InstanceOf[RewardTerm] | None] = field(default_factory=dict)
-    # Largest share of the time in which a surrogate's limit may be missed, by its name, or that of
-    # the recorded drivers; its weight is the price at the start, see lcc_rl.agents.limits.
-    limits: dict[str, Share | Literal["recorded"] | None] = field(default_factory=dict)
-    # Likewise, but behind each record of leaders by itself, each with a price of its own.
+    # As limits, but behind each record of leaders by itself, each with a price of its own.
     limits_each: dict[str, Share | None] = field(default_factory=dict)
-    limit_rate: Positive = 0.1  # largest change of the logarithm of such a price at once
-    # Terms of the objective only.
-    regularizers: dict[str, InstanceOf[RewardTerm] | None] = field(default_factory=dict)
     learning_rate: Positive = 3e-3  # of the policy at the start
     final_lr_fraction: Fraction = 0.05  # of it that is left at the end
     schedule: Schedule = "cosine"  # how the learning rate falls
@@ -108,10 +97,6 @@ class Analytic(Agent):
             betas=(0.9, 0.99),
         )
         self.value_optimizer = torch.optim.Adam(self.value.parameters(), lr=self.value_lr)
-
-    def take(self, profiles: Profiles) -> None:
-        """Take the limits that recorded drivers set."""
-        self.objective.limits.take(profiles)
 
     def anneal(self, share: float) -> float:
         """Set and return the learning rate after this share of the training."""

@@ -6,18 +6,22 @@ import time
 from abc import abstractmethod
 from collections.abc import Mapping
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.collectors import BaseCollector, Collector
 
-from lcc_rl.agents.actor import shared_policy
+from lcc_rl.agents.actor import ONE, shared_policy
 from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.checks import check_batch, check_learner
-from lcc_rl.agents.loop import REPORTED, AgentT, TrainingLoop
+from lcc_rl.agents.loop import REPORTED, AgentT, TrainingLoop, mean_of
+from lcc_rl.agents.objective import Objective
 from lcc_rl.envs import StringCollector
+from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import require
-from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD
+from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD, STEP, Key, as_key, next_key
+from lcc_rl.pieces.rewards import RewardTerm
 
 # Entries of transitions: their keys in the environment and in the losses.
 LEARNED_FROM = {
@@ -28,6 +32,8 @@ LEARNED_FROM = {
     ("next", "done"): ("next", "done"),
     ("next", "terminated"): ("next", "terminated"),
 }
+
+BEGINS = "begins"  # whether a transition begins with a decision, if actions are held
 
 # Steps of a training from which compiling the environment, 5 to 10 s, pays off.
 COMPILED_TRAINING_STEPS = 40_000
@@ -47,6 +53,14 @@ class CollectingLoop(TrainingLoop[AgentT]):
             f"agent: setup of {type(self.agent).__name__} must make noise, the exploration, such "
             "as GaussianExploration(0.3), or None",
         )
+        self.every = getattr(self.agent, "every", 1)
+        self.rule = getattr(self.agent, "rule", None)
+        self.objective: Objective | None = getattr(self.agent, "objective", None)
+        self.wanted: list[Key] = []
+        if self.objective is not None and self.objective.differs:
+            self.objective.replace([x for x in pieces_of(self.env) if isinstance(x, RewardTerm)])
+            known = set(map(as_key, self.env.full_observation_spec.keys(True, True)))
+            self.wanted = [next_key(key) for key in self.objective.wanted(known)]
 
     @abstractmethod
     def learn(self, batch: TensorDictBase, before: int) -> dict[str, float]:
@@ -72,7 +86,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
         if self.settings.collector == "torchrl":
             how = {"total_frames": -1, "auto_register_policy_transforms": False}
             return Collector(self.env, policy, frames_per_batch=frames, **how)
-        keys = (*LEARNED_FROM, *REPORTED)
+        keys = (*LEARNED_FROM, *REPORTED, STEP, *self.wanted)
         return StringCollector(
             self.env, policy, frames_per_batch=frames, keys=keys, compiled=compiled
         )
@@ -93,13 +107,18 @@ class CollectingLoop(TrainingLoop[AgentT]):
         self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
         collector.reset()
         segments = iter(collector)
-        played, losses, spent = [], [], [0.0, 0.0]
+        played, losses, missed, spent = [], [], [], [0.0, 0.0]
         for part in range(self.horizon // steps):
             begun = time.perf_counter()
             self.explore(share)
             batch = next(segments)
             check_batch(batch, part * steps)
             played.append(batch.select(*REPORTED))
+            missed.append(self._scored(batch))
+            batch = decisions(batch.exclude(*self.wanted), self.every)
+            if self.rule is not None:  # the policy's part of the action
+                own = batch.get(ACTION) - self.rule(batch.get(OBSERVATION))
+                batch.set(ACTION, own.clamp(-ONE, ONE))
             collected, size = time.perf_counter(), batch.get(("next", *REWARD)).numel()
             before = self.iteration * (self.horizon // steps) + part
             losses.append(self.learn(batch, before * size))
@@ -112,7 +131,46 @@ class CollectingLoop(TrainingLoop[AgentT]):
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected
         begin = {"exploration_sigma": sigma, "learning_rate": rate}
-        return self._record(played, losses, spent, size * len(played), begin)
+        shares = mean_of(missed)
+        limits = self.objective.row(shares) if self.objective is not None else {}
+        if self.objective is not None:
+            self.objective.limits.update(shares)
+        return self._record(played, losses, spent, size * len(played), begin, limits)
+
+    def _scored(self, batch: TensorDictBase) -> dict[str, float]:
+        """Set the objective as the reward; return the share of the time beyond each limit."""
+        if self.objective is None or not self.wanted:
+            return {}
+        batch.set(("next", *REWARD), self.objective.score(batch).unsqueeze(-1))
+        return self.objective.missed(batch, torch.ones_like(batch.get(("next", "done"))))
+
+
+def decisions(batch: TensorDictBase, every: int) -> TensorDictBase:
+    """Return the transitions from one decision to the next, with the sums of the rewards.
+
+    Args:
+        batch: transitions of single steps, ``[environments, steps]``.
+        every: steps for which an action is executed; divides the steps.
+    """
+    if every == 1:
+        return batch
+    parts = batch.unflatten(1, (batch.shape[1] // every, every))
+    begun, reached = parts[:, :, 0], parts[:, :, -1].get("next").clone()
+    ended = parts.get(("next", "done")).cumsum(2) > 0
+    before = torch.cat([torch.zeros_like(ended[:, :, :1]), ended[:, :, :-1]], 2)  # by step
+    reward = parts.get(("next", *REWARD))
+    reached.set(REWARD, (reward * ~before.unsqueeze(-1)).sum(2))
+    for key in ("done", "terminated"):
+        reached.set(key, (parts.get(("next", key)) & ~before).any(2))
+    # After a collision decisions no longer begin with the parts.
+    begun.set(BEGINS, (begun.get(STEP) % every == 0).unsqueeze(-1))
+    return begun.set("next", reached)
+
+
+def of_decisions(rows: TensorDictBase) -> TensorDictBase:
+    """Return the transitions, ``[rows]``, that begin with a decision."""
+    begins = rows.get(BEGINS, None)
+    return rows if begins is None else rows[begins.squeeze(-1)].exclude(BEGINS)
 
 
 def transitions(batch: TensorDictBase) -> TensorDictBase:
@@ -123,8 +181,10 @@ def transitions(batch: TensorDictBase) -> TensorDictBase:
     """
     shape = batch.get(("next", *REWARD)).shape[:-1]
     rows = TensorDict(batch_size=[shape.numel()], device=batch.device)
-    for source, target in LEARNED_FROM.items():
-        entry = batch.get(source)
+    for source, target in {**LEARNED_FROM, (BEGINS,): (BEGINS,)}.items():
+        entry = batch.get(source, None)
+        if entry is None:
+            continue
         if entry.ndim == len(shape):
             entry = entry.unsqueeze(-2).expand(*shape, 1)
         rows.set(target, entry.reshape(-1, entry.shape[-1]))

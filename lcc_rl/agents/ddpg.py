@@ -28,7 +28,7 @@ class DDPG(OffPolicy):
     def setup(self, scene: Scene) -> None:
         super().setup(scene)
         loss = DDPGLoss(
-            self.policy, self.values[0], loss_function="l2", delay_actor=True, delay_value=True
+            self.actor, self.values[0], loss_function="l2", delay_actor=True, delay_value=True
         )
         self._complete(loss, ("actor", "value"))
 

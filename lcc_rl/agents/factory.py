@@ -65,7 +65,12 @@ def training_env(cfg: StudyConfig, profiles: Profiles, population: Population) -
     Raises:
         ConfigError: naming the option at fault.
     """
-    driven = after_humans(cfg, getattr(cfg.agent.made(Agent), "humans_first", 0.0))
+    agent = cfg.agent.made(Agent)
+    if hold := getattr(agent, "hold", 0.0):
+        drivers = cfg.scenario.controllers
+        held = {**drivers, AUTOMATED: drivers[AUTOMATED].changed(hold=hold)}
+        cfg = cfg.with_(scenario={"controllers": held})
+    driven = after_humans(cfg, getattr(agent, "humans_first", 0.0))
     return build_env(driven, profiles, population, cfg.training.environments, 0, cfg.device)
 
 
@@ -89,6 +94,11 @@ def check_lengths(cfg: StudyConfig) -> None:
         counted > 0 and counted % settings.segment == 0,
         f"training.segment ({settings.segment}) must divide scenario.horizon ({horizon})"
         + f" without the steps of agent.warm_up ({counted})" * (counted < horizon),
+    )
+    every = getattr(cfg.agent.made(), "hold", 0.0) / cfg.scenario.time_step
+    require(
+        settings.segment % max(every, 1.0) < 1e-6,
+        f"agent.hold ({every:g} steps) must divide training.segment ({settings.segment})",
     )
     window = getattr(cfg.agent.made(), "best_window", None) or 0
     count = settings.environments

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -64,15 +63,6 @@ class GradientLoop(TrainingLoop[Any]):
             compiled=next(x for x in chosen if x is not None),
         )
 
-    def _limits_row(self, shares: Mapping[str, float]) -> dict[str, float]:
-        """Return the columns of the limits: share missed and price."""
-        price, largest = self.objective.limits.price, self.objective.limits.largest
-        return {
-            **{f"limit_{name}": largest[name] for name in shares},
-            **{f"share_{name}": share for name, share in shares.items()},
-            **{f"price_{name}": price(name) for name in shares},
-        }
-
     def _iterate(self, source: DifferentiableRollout) -> dict[str, float]:
         """Play one batch of episodes with a gradient step after every segment."""
         rate = self.agent.anneal(self.iteration / self.iterations)
@@ -104,7 +94,7 @@ class GradientLoop(TrainingLoop[Any]):
             spent[1] += time.perf_counter() - collected
         self.updates += len(losses)
         shares = mean_of(missed)
-        limits = self._limits_row(shares)
+        limits = self.objective.row(shares)
         self.objective.limits.update(shares)
         behind = {name: torch.stack([row[name] for row in each]).mean(0) for name in each[0]}
         limits |= self.objective.each.update(behind)

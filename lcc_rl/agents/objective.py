@@ -2,27 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import Any
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import field
+from typing import Any, Literal
 
 import torch
+from pydantic import InstanceOf
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from lcc_rl.agents.agent import Agent
 from lcc_rl.agents.limits import Limits, LimitsEach
+from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.functional.finite import any_nonfinite
 from lcc_rl.pieces.base import Key, next_key
 from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.pieces.world import World
+from lcc_rl.settings import Positive, Share
+
+
+class Aiming(Agent):
+    """Settings of agents with an objective, which may differ from the reward."""
+
+    # Reward terms that take the place of those of the same name in the objective; their
+    # weights multiply the terms' own. Those of terms that the reward lacks are ignored.
+    surrogates: dict[str, InstanceOf[RewardTerm] | None] = field(default_factory=dict)
+    # Largest share of the time in which a surrogate's limit may be missed, by its name, or that of
+    # the recorded drivers; its weight is the price at the start, see lcc_rl.agents.limits.
+    limits: dict[str, Share | Literal["recorded"] | None] = field(default_factory=dict)
+    limit_rate: Positive = 0.1  # largest change of the logarithm of such a price at once
+    # Terms of the objective only.
+    regularizers: dict[str, InstanceOf[RewardTerm] | None] = field(default_factory=dict)
+
+    def take(self, profiles: Profiles) -> None:
+        """Take the limits that recorded drivers set."""
+        self.objective.limits.take(profiles)
 
 
 class Objective:
     """The terms of an objective and the prices of its limits.
 
     Args:
-        settings: its ``surrogates``, ``regularizers``, ``limits``, ``limits_each`` and
-            ``limit_rate``, see :class:`lcc_rl.agents.analytic.Analytic`.
+        settings: see :class:`Aiming`; its ``limits_each`` if it has any.
         device: device of the terms.
         world: see :class:`lcc_rl.pieces.world.World`.
 
@@ -40,8 +62,15 @@ class Objective:
 
         self.surrogates, self.regularizers = made("surrogates"), made("regularizers")
         self.limits = Limits(settings.limits, settings.limit_rate, self.surrogates)
-        self.each = LimitsEach(settings.limits_each, settings.limit_rate, self.surrogates)
+        self.each = LimitsEach(
+            getattr(settings, "limits_each", {}), settings.limit_rate, self.surrogates
+        )
         self.terms: list[tuple[RewardTerm, float]] = []
+
+    @property
+    def differs(self) -> bool:
+        """Whether it differs from the reward."""
+        return bool(self.surrogates or self.regularizers)
 
     def replace(self, terms: Sequence[RewardTerm]) -> None:
         """Replace the reward's terms by their surrogates, and add the regularizers.
@@ -115,6 +144,15 @@ class Objective:
         return {
             name: float(self._missed(term, data, running, (0, 1, 2)))
             for name, term in self.limited(self.limits).items()
+        }
+
+    def row(self, shares: Mapping[str, float]) -> dict[str, float]:
+        """Return columns of a record: the largest share, the share missed and the price."""
+        price, largest = self.limits.price, self.limits.largest
+        return {
+            **{f"limit_{name}": largest[name] for name in shares},
+            **{f"share_{name}": share for name, share in shares.items()},
+            **{f"price_{name}": price(name) for name in shares},
         }
 
     def missed_each(self, data: TensorDictBase, running: Tensor) -> dict[str, Tensor]:

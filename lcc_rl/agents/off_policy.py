@@ -17,10 +17,11 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import HardUpdate
 from torchrl.objectives.common import LossModule
 
-from lcc_rl.agents.actor import Activation, GaussianExploration, make_actor, seeded_mlp
-from lcc_rl.agents.agent import Agent, Fraction, Scene, Schedule, anneal, derived_seed
+from lcc_rl.agents.actor import GaussianExploration, seeded_mlp
+from lcc_rl.agents.agent import Fraction, Scene, Schedule, anneal, derived_seed
 from lcc_rl.agents.fused import ActorCritic
 from lcc_rl.agents.replay import ReplayLoop
+from lcc_rl.agents.sampling import Sampling
 from lcc_rl.agents.vectors import as_vector, take_step, vector_adam, views
 from lcc_rl.errors import ConfigError
 from lcc_rl.settings import Count, NonNegative, Positive, Settings, Share, Whole
@@ -49,7 +50,7 @@ class Exploration(Settings):
         return self.initial + (self.final - self.initial) * min(share / self.decay_share, 1.0)
 
 
-class OffPolicy(Agent):
+class OffPolicy(Sampling):
     """A policy, its Q networks, their loss and optimizers; a subclass defines the update.
 
     Each step moves target networks by a share of the difference (HCFS H9–H10).
@@ -57,7 +58,6 @@ class OffPolicy(Agent):
 
     gamma: Share = 0.9  # discount
     hidden: Sequence[Count] = (200, 100, 50)  # layers of policy and Q networks
-    activation: Activation = "relu"  # between the layers of networks
     actor_lr: Positive = 1e-3  # learning rate of the policy
     critic_lr: Positive = 1e-3  # learning rate of the Q networks
     batch_size: Count = 1024  # transitions per update
@@ -82,7 +82,7 @@ class OffPolicy(Agent):
     # less time. False, or networks without ReLU: differentiate the loss automatically.
     fused: bool = True
 
-    LATER = ("activation", "schedule", "clip_norm")
+    LATER = ("activation", "schedule", "clip_norm", *Sampling.LATER)
     loop = ReplayLoop
     critics: ClassVar[int] = 1
     joint: ClassVar[bool] = True  # whether one optimizer steps all networks at once
@@ -98,7 +98,7 @@ class OffPolicy(Agent):
     def setup(self, scene: Scene) -> None:
         size, seed, kind = scene.observation_size, scene.seed, self.activation
         self.count, self.generator = 0, torch.Generator(scene.device)
-        self.policy = make_actor(size, 1, self.hidden, seed, kind).to(scene.device)
+        self.actor = self.make_actor(scene)
         self.noise: TensorDictModuleBase = GaussianExploration(0.0)
         keys = ["observation", "action"]
         self.values = [
@@ -196,7 +196,7 @@ class OffPolicy(Agent):
 
     def _penalty(self, batch: TensorDictBase) -> Tensor:
         """Return the penalty on the actor's output before its tanh."""
-        raw = self.policy.module[0](batch["observation"])
+        raw = self.actor.module[0](batch["observation"])
         return self.saturation * raw.square().mean()
 
     def _differentiate(self, loss: Tensor) -> None:
@@ -224,6 +224,7 @@ class OffPolicy(Agent):
         return {
             "count": self.count,
             "loss": dict(self.loss.state_dict()),
+            **{name: part.state_dict() for name, part in self._more().items()},
             "optimizers": {name: part.state_dict() for name, part in self.optimizers.items()},
         }
 
@@ -232,6 +233,8 @@ class OffPolicy(Agent):
         self.loss.load_state_dict(state["loss"])
         for name, part in self.optimizers.items():
             part.load_state_dict(state["optimizers"][name])
+        for name, part in self._more().items():
+            part.load_state_dict(state[name])
 
 
 def leaves(parameters: TensorDictBase) -> list[Tensor]:

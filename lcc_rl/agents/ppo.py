@@ -13,10 +13,11 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from lcc_rl.agents.actor import Activation, make_actor, seeded_mlp
-from lcc_rl.agents.agent import Agent, Fraction, Scene, Schedule, anneal, derived_seed
-from lcc_rl.agents.collecting import CollectingLoop, transitions
+from lcc_rl.agents.actor import seeded_mlp
+from lcc_rl.agents.agent import Fraction, Scene, Schedule, anneal, derived_seed
+from lcc_rl.agents.collecting import CollectingLoop, of_decisions, transitions
 from lcc_rl.agents.sac import SampledAction, tanh_gaussian
+from lcc_rl.agents.sampling import Sampling
 from lcc_rl.pieces.base import REWARD
 from lcc_rl.settings import Count, NonNegative, Positive, Share
 
@@ -50,13 +51,12 @@ class OnPolicyLoop(CollectingLoop[Any]):
         return {name: float(value) for name, value in losses.items()}
 
 
-class PPO(Agent):
+class PPO(Sampling):
     """A Gaussian policy and a value network with clipped ratios; the stored policy is the mean."""
 
     gamma: Share = 0.99  # discount
     td_lambda: Annotated[float, Field(ge=0.0, le=1.0)] = 0.95  # weight of longer returns, per step
     hidden: Sequence[Count] = (64, 64)  # layers of policy and value
-    activation: Activation = "relu"  # between the layers of networks
     learning_rate: Positive = 1e-3  # of both networks at the start
     final_lr_fraction: Fraction = 0.1  # final learning rate as a fraction of the initial one
     schedule: Schedule = "cosine"  # shape of the learning rates
@@ -67,15 +67,15 @@ class PPO(Agent):
     sigma: Positive = 0.5  # standard deviation before the tanh at the start
     clip_norm: Positive = 0.5  # largest norm of a gradient
 
-    LATER = ("activation", "schedule")
+    LATER = ("activation", "schedule", *Sampling.LATER)
     loop = OnPolicyLoop
 
     def setup(self, scene: Scene) -> None:
         size, device, kind = scene.observation_size, scene.device, self.activation
         self.count = 0
-        self.policy = make_actor(size, 1, self.hidden, scene.seed, kind).to(device)
-        self.head = head = Gaussian(self.policy.module[0], self.sigma).to(device)
-        self.noise = SampledAction(head)
+        learned = self.make_actor(scene)
+        self.head = head = Gaussian(learned.module[0], self.sigma).to(device)
+        self.noise = SampledAction(head, self.rule)
         self.actor = tanh_gaussian(head)
         value = ValueOperator(seeded_mlp(size, 1, self.hidden, scene.seed + 1, kind)).to(device)
         self.advantage = GAE(gamma=self.gamma, lmbda=self.td_lambda, value_network=value)
@@ -111,7 +111,7 @@ class PPO(Agent):
             with torch.no_grad():
                 data = self.advantage(data)
                 data[LOG_PROB] = self.actor.get_dist(data).log_prob(data["action"])
-            rows = data.reshape(-1)
+            rows = of_decisions(data.reshape(-1))
             shuffled = (torch.randperm(len(rows)) for _ in range(self.epochs))
             parts = (part for order in shuffled for part in order.split(self.batch_size))
             found = [self._step(rows[part]) for part in parts]
@@ -127,6 +127,9 @@ class PPO(Agent):
         nn.utils.clip_grad_norm_(self.weights, self.clip_norm)
         self.optimizer.step()
         return actor.detach(), value.detach()
+
+    def _parts(self) -> dict[str, Any]:
+        return {**super()._parts(), **self._more()}
 
     def state_dict(self) -> dict[str, Any]:
         return {"count": self.count, **super().state_dict()}

@@ -11,7 +11,7 @@ from torchrl.collectors import BaseCollector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from lcc_rl.agents.agent import derived_seed
-from lcc_rl.agents.collecting import CollectingLoop, transitions
+from lcc_rl.agents.collecting import CollectingLoop, of_decisions, transitions
 from lcc_rl.io.tensors import check_like
 
 
@@ -58,7 +58,7 @@ class ReplayLoop(CollectingLoop[Any]):
     def learn(self, batch: TensorDictBase, before: int) -> dict[str, float]:
         """Make the updates that are due after a segment."""
         new, settings = transitions(batch), self.agent
-        self.buffer.extend(new)
+        self.buffer.extend(of_decisions(new))
         ratio = settings.updates_per_transition
         ready = len(self.buffer) >= max(settings.batch_size, settings.learning_starts)
         count = int((before + len(new)) * ratio) - int(before * ratio) if ready else 0

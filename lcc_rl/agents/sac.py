@@ -14,15 +14,13 @@ from torch.nn.functional import softplus
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss
 
-from lcc_rl.agents.actor import action_noise, seeded_mlp
+from lcc_rl.agents.actor import ONE, action_noise, seeded_mlp
 from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.fused import ActorCritic, Network
 from lcc_rl.agents.off_policy import Exploration, OffPolicy
 from lcc_rl.functional.random import stream_id
 from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP
 from lcc_rl.settings import Number, Positive
-
-ONE = 1.0 - 1e-6  # largest action with a finite inverse tanh in single precision
 
 
 class Head(nn.Module):
@@ -50,21 +48,25 @@ class SampledAction(TensorDictModuleBase):
 
     Args:
         head: the distribution; ``sigma`` multiplies its standard deviation.
+        rule: its action is added.
     """
 
     sigma: Tensor
 
-    def __init__(self, head: nn.Module) -> None:
+    def __init__(self, head: nn.Module, rule: nn.Module | None = None) -> None:
         self.in_keys = [OBSERVATION, SEED, STEP]
         self.out_keys = [ACTION]
         super().__init__()
-        self.head, self.stream = head, stream_id("exploration")
+        self.head, self.rule, self.stream = head, rule, stream_id("exploration")
         self.register_buffer("sigma", torch.tensor(1.0))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        mean, spread = self.head(tensordict.get(OBSERVATION))
+        seen = tensordict.get(OBSERVATION)
+        mean, spread = self.head(seen)
         noise = action_noise(mean, tensordict, self.stream)
-        return tensordict.set(ACTION, (mean + self.sigma * spread * noise).tanh().clamp(-ONE, ONE))
+        action = (mean + self.sigma * spread * noise).tanh()
+        action = action if self.rule is None else action + self.rule(seen)
+        return tensordict.set(ACTION, action.clamp(-ONE, ONE))
 
 
 def tanh_gaussian(head: nn.Module) -> ProbabilisticActor:
@@ -106,8 +108,8 @@ class SAC(OffPolicy):
         super().setup(scene)
         size, seed, device = scene.observation_size, scene.seed, scene.device
         spread = seeded_mlp(size, 1, self.hidden[-1:], seed + 2, self.activation).to(device)
-        head = Head(self.policy.module[0], spread)
-        self.noise = SampledAction(head)
+        head = Head(self.actor.module[0], spread)
+        self.noise = SampledAction(head, self.rule)
         loss = SACLoss(
             tanh_gaussian(head),
             self.values,

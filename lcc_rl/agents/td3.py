@@ -26,7 +26,7 @@ class TD3(OffPolicy):
     def setup(self, scene: Scene) -> None:
         super().setup(scene)
         loss = TD3Loss(
-            self.policy,
+            self.actor,
             self.values,
             bounds=(-1.0, 1.0),
             policy_noise=self.policy_noise,

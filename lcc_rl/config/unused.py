@@ -103,10 +103,11 @@ def _of_agent(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
 def _of_objective(
     cfg: StudyConfig, written: Any, typed: AbstractSet[str]
 ) -> Iterator[tuple[str, str]]:
-    """Yield settings of terms and surrogates that a training by the gradient ignores, and why."""
+    """Yield settings of terms and surrogates that a training ignores, and why."""
     kinds = ("surrogates", "limits", "limits_each")
-    surrogates, limits, each = (cfg.agent.settings[key] for key in kinds)
-    if not cfg.agent.settings["bootstrap"]:
+    surrogates, limits, each = (cfg.agent.settings.get(key, {}) for key in kinds)
+    by_gradient = "bootstrap" in cfg.agent.settings
+    if by_gradient and not cfg.agent.settings["bootstrap"]:
         for key in ("value_lr", "value_every", "td_lambda", "tau"):
             yield f"agent.{key}", "agent.bootstrap=false learns no value"
     given = (*limits.items(), *each.items())
@@ -116,7 +117,7 @@ def _of_objective(
         for key in kinds:
             yield f"agent.{key}.{name}", f"the reward has no term {name}"
     for name, term in terms.items():
-        if name not in surrogates and not getattr(term.kind, "graded", True):
+        if by_gradient and name not in surrogates and not getattr(term.kind, "graded", True):
             for key in term.settings:
                 yield f"reward.terms.{name}.{key}", f"{term.kind.__name__} has no gradient"
     if not limited:

@@ -212,7 +212,7 @@ def _watchers(drivers: Sequence[Controller | CBFFilter], world: World) -> list[P
     """Build the pieces that record the filters' guarantees and corrections."""
     filters = {piece.role: piece for piece in drivers if isinstance(piece, CBFFilter)}
     changed = [
-        Corrected(max_acceleration=piece.max_acceleration).bind(world, piece.role)
+        Corrected().bind(world, piece.role)
         for piece in drivers
         if isinstance(piece, Action) and piece.role in filters
     ]

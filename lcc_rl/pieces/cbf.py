@@ -260,19 +260,17 @@ class CBFFilter(RoleTransform):
 
 
 class Corrected(RoleTransform):
-    """Writes the command minus a policy's action: zero where the filter is inactive."""
-
-    max_acceleration: Positive = MAX_ACCELERATION  # acceleration of action 1 [m/s²]
+    """Writes the change of a policy's command by the filter: zero where the filter is inactive."""
 
     writes = (
         Entry("role.correction", "m/s²", "change of a policy's command by the safety filter"),
     )
 
     def setup(self, world: World) -> None:
-        self.declare(world, (f"{self.role}.action", f"next.{self.role}.command"))
+        self.declare(world, (f"next.{self.role}.wanted", f"next.{self.role}.command"))
 
-    def compute(self, action: Tensor, command: Tensor) -> Tensor:
-        return command - self.max_acceleration * action
+    def compute(self, wanted: Tensor, command: Tensor) -> Tensor:
+        return command - wanted
 
 
 class CBFGuarantee(RoleTransform):

@@ -29,7 +29,7 @@ from lcc_rl.pieces.base import ACTION, ROLE, Entry, RoleTransform, as_key
 from lcc_rl.pieces.string import COMMANDED, WISHED
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF
 from lcc_rl.pieces.world import World
-from lcc_rl.settings import Number, Positive, find_target
+from lcc_rl.settings import NonNegative, Number, Positive, find_target
 
 # Names of the random streams; a seed gives the same episode under either name.
 STREAMS = {AUTOMATED: "cav", HUMAN: "hdv"}
@@ -129,17 +129,27 @@ class Action(Controller):
     """
 
     max_acceleration: Positive = MAX_ACCELERATION  # of action 1, in both directions [m/s²]
+    hold: NonNegative = 0.0  # time for which an action is executed [s]; 0: one step
 
+    LATER = ("hold",)
     reads = (".".join(ACTION),)
+    held = Entry("role.held", "–", "action of a policy that is executed since its last decision")
 
     def setup(self, world: World) -> None:
-        self.declare(world, [f"{self.name}.action"])
+        self.every = max(world.steps(self.hold, f"scenario.controllers.{self.name}.hold"), 1)
+        reads, kept = [f"{self.name}.action"], self.every > 1
+        self.declare(world, reads + ["episode.step"] * kept, remembers=[self.held] * kept)
         assert self.limits is not None
         if max(self.limits[0], -self.limits[1]) <= -self.max_acceleration:
             self.limits = None  # the action is clamped when it is read
 
-    def command(self, action: Tensor) -> Tensor:
-        return action * self.max_acceleration
+    def command(self, action: Tensor, *memory: Tensor) -> Any:
+        """Return the commands, and the action if it is held; the memory is step and action."""
+        if not memory:
+            return action * self.max_acceleration
+        step, held = memory
+        action = torch.where(step % self.every == 0, action, held)
+        return action * self.max_acceleration, action
 
 
 class ConstantAcceleration(Controller):

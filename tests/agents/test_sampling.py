@@ -1,0 +1,83 @@
+"""Held actions, discounts by time, rules under a policy and objectives of learners from samples."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from helpers import check_refused, check_resuming, compose, make_agent, small_loop
+from tensordict import TensorDict
+
+from lcc_rl.agents.collecting import decisions, of_decisions, transitions
+from lcc_rl.agents.factory import check_lengths
+from lcc_rl.envs import make_env
+from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD, STEP
+
+LEARNERS = ("ppo", "sac", "td3", "ddpg")
+
+
+def test_a_decision_sums_the_rewards_up_to_a_collision() -> None:
+    # One environment and six steps; a collision in the second step begins an episode in the third.
+    hit = torch.tensor([0, 1, 0, 0, 0, 0]).bool().view(1, 6, 1)
+    step = torch.tensor([0, 1, 0, 1, 2, 3]).view(1, 6, 1)
+    number = torch.arange(6.0).view(1, 6, 1, 1)
+    batch = TensorDict(batch_size=[1, 6])
+    for key, value in {OBSERVATION: number, ACTION: number, STEP: step}.items():
+        batch.set(key, value)
+    after = {OBSERVATION: number + 1.0, REWARD: number + 1.0, ("done",): hit, ("terminated",): hit}
+    for key, value in after.items():
+        batch.set(("next", *key), value)
+    assert decisions(batch, 1) is batch
+    rows = of_decisions(transitions(decisions(batch, 3)))  # the second part begins at step 1
+    assert rows["observation"].tolist() == [[0.0]]
+    assert rows["next", "reward"].tolist() == [[3.0]]
+    assert rows["next", "terminated"].tolist() == [[True]]
+    rows = of_decisions(transitions(decisions(batch, 2)))
+    assert rows["action"].flatten().tolist() == [0.0, 2.0, 4.0]
+    assert rows["next", "reward"].flatten().tolist() == [3.0, 7.0, 11.0]
+    assert rows["next", "observation"].flatten().tolist() == [2.0, 4.0, 6.0]
+
+
+def test_an_action_is_executed_until_the_next_decision() -> None:
+    env = make_env("alcc", 2, ["scenario.controllers.automated.hold=0.3"], seed=1, single=False)
+    played = env.rollout(9, policy=None)
+    drawn, found = played[ACTION], played["next", "automated", "command"]
+    expected = 3.0 * drawn.clamp(-1.0, 1.0)[:, [0, 0, 0, 3, 3, 3, 6, 6, 6]]
+    torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("agent", LEARNERS)
+def test_a_network_on_a_rule_is_the_rule_at_first(agent: str) -> None:
+    words = (f"agent={agent}", "agent.hold=0.5", "agent.horizon=10")
+    residual = make_agent(compose("alcc", *words, "agent.policy=residual_idm"))
+    assert residual.gamma == pytest.approx(math.exp(-0.05))
+    seen = torch.rand(5, 7)
+    torch.testing.assert_close(residual.policy.module(seen), residual.rule(seen))
+
+
+@pytest.mark.parametrize("agent", ["ppo", "td3"])
+def test_prices_of_limits_are_recorded_and_resume(tmp_path, agent: str) -> None:
+    words = (f"agent={agent}", "surrogates@agent=limits", "agent.policy=residual_idm")
+    sizes = ("scenario.horizon=20", "training.segment=10", "agent.hold=0.5", "agent.batch_size=8")
+    sizes += ("training.environments=4", "training.episodes=24", "training.checkpoint_every=2")
+    check_resuming(lambda folder: small_loop(folder, *words, *sizes), tmp_path)
+    record = small_loop(tmp_path, *words, *sizes).run()
+    assert {"price_safety", "share_efficiency", "reward_cav_energy"} <= {*record.columns}
+    assert record["price_efficiency"].nunique() > 1
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    def built(*words: str) -> None:
+        cfg = compose("alcc", "agent=ppo", "training.segment=20", *words)
+        check_lengths(cfg)
+        make_agent(cfg)
+
+    cases = (
+        ("agent.policy=idm", "only agent=analytic learns the constants.*residual_idm"),
+        ("agent.policy=residual_none", "agent.policy"),
+        ("agent.hold=0.15", "agent.hold"),
+        ("agent.hold=0.3", r"agent.hold \(3 steps\) must divide training.segment \(20\)"),
+        ("agent.limits.safety=0.1", "agent.limits.safety: there is no agent.surrogates.safety"),
+    )
+    check_refused(built, cases)
