@@ -310,6 +310,8 @@ def program(
         assert isinstance(learned, TensorDictModule)
         network = learned.module
     (observation,), (action,) = found.values()
+    held = f"{policy}: scenario.controllers.automated.hold, an action that is held, has no program"
+    require(action.every == 1, held)
     world = replace(
         measuring(scenario.time_step, BEHIND_PRESENT not in observation.names),
         max_braking=scenario.max_braking,

@@ -182,3 +182,6 @@ def test_bad_input_is_one_clear_error() -> None:
         (["human", "x.c"], "human draws noise from seeds: it cannot be exported"),
     ]
     check_refused(main, cases, ConfigError)
+    held = ["scenario.controllers.automated.hold=0.5"]
+    with pytest.raises(ConfigError, match=r"controllers\.automated\.hold.* has no program"):
+        lcc_rl.export(nn.Linear(7, 1), "x.onnx", overrides=held)
