@@ -29,9 +29,9 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 CEILINGS = {
     "lcc_rl + tools": {"lines": 43_440, "code": 28_620},
     "tests": {"lines": 25_600},
-    "conf": {"yaml": 157},
+    "conf": {"yaml": 159},
 }
-CASES = 1_225  # ceiling of all quick tests, see tests/tools/test_size.py
+CASES = 1_240  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {
     "names in several modules": 60,
     "floors": 10,

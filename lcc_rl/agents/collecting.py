@@ -163,7 +163,7 @@ def decisions(batch: TensorDictBase, every: int) -> TensorDictBase:
     for key in ("done", "terminated"):
         reached.set(key, (parts.get(("next", key)) & ~before).any(2))
     # After a collision decisions no longer begin with the parts.
-    begun.set(BEGINS, (begun.get(STEP) % every == 0).unsqueeze(-1))
+    begun.set(BEGINS, begun.get(STEP) % every == 0)
     return begun.set("next", reached)
 
 

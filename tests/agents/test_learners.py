@@ -48,7 +48,8 @@ def test_resuming_equals_never_having_stopped(tmp_path, agent) -> None:
     check_resuming(lambda place: make(place, agent), tmp_path)
 
 
-def test_every_vehicle_is_a_trajectory_of_its_own(tmp_path, monkeypatch) -> None:
+@pytest.mark.parametrize(("hold", "decisions"), [(0.0, 10), (0.5, 2)])
+def test_every_vehicle_is_a_trajectory_of_its_own(tmp_path, monkeypatch, hold, decisions) -> None:
     seen, update = [], PPO.update
 
     def seeing(self, data):
@@ -56,10 +57,11 @@ def test_every_vehicle_is_a_trajectory_of_its_own(tmp_path, monkeypatch) -> None
         return update(self, data)
 
     monkeypatch.setattr(PPO, "update", seeing)
-    loop = make(tmp_path, "ppo", "scenario.string='automated human automated human'")
+    string = "scenario.string='automated human automated human'"
+    loop = make(tmp_path, "ppo", string, f"agent.hold={hold}")
     loop.run()
     data = seen[0]
-    assert data.batch_size == (8, 10)  # 4 environments × 2 vehicles, 10 steps
+    assert data.batch_size == (8, decisions)  # 4 environments × 2 vehicles
     running = ~data["next", "done"][:, :-1]
     same = (data["next", "observation"][:, :-1] == data["observation"][:, 1:]).all(-1, keepdim=True)
     assert same[running].all()

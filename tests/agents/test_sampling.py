@@ -78,6 +78,6 @@ def test_what_does_not_fit_is_refused() -> None:
         ("agent.policy=residual_none", "agent.policy"),
         ("agent.hold=0.15", "agent.hold"),
         ("agent.hold=0.3", r"agent.hold \(3 steps\) must divide training.segment \(20\)"),
-        ("agent.limits.safety=0.1", "agent.limits.safety: there is no agent.surrogates.safety"),
+        ("agent.limits.jerk=0.1", "agent.limits.jerk=0.1 has no effect: the reward has no term"),
     )
     check_refused(built, cases)
