@@ -20,7 +20,7 @@ from lcc_rl.agents.objective import Objective
 from lcc_rl.envs import StringCollector
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import require
-from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD, STEP, Key, as_key, next_key
+from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD, STEP, Key, next_key
 from lcc_rl.pieces.rewards import RewardTerm
 
 # Entries of transitions: their keys in the environment and in the losses.
@@ -59,8 +59,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
         self.wanted: list[Key] = []
         if self.objective is not None and self.objective.differs:
             self.objective.replace([x for x in pieces_of(self.env) if isinstance(x, RewardTerm)])
-            known = set(map(as_key, self.env.full_observation_spec.keys(True, True)))
-            self.wanted = [next_key(key) for key in self.objective.wanted(known)]
+            self.wanted = [next_key(key) for key in self.objective.wanted(self.env)]
 
     @abstractmethod
     def learn(self, batch: TensorDictBase, before: int) -> dict[str, float]:
@@ -86,7 +85,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
         if self.settings.collector == "torchrl":
             how = {"total_frames": -1, "auto_register_policy_transforms": False}
             return Collector(self.env, policy, frames_per_batch=frames, **how)
-        keys = (*LEARNED_FROM, *REPORTED, STEP, *self.wanted)
+        keys = (*LEARNED_FROM, *REPORTED, *[STEP] * (self.every > 1), *self.wanted)
         return StringCollector(
             self.env, policy, frames_per_batch=frames, keys=keys, compiled=compiled
         )
@@ -131,10 +130,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected
         begin = {"exploration_sigma": sigma, "learning_rate": rate}
-        shares = mean_of(missed)
-        limits = self.objective.row(shares) if self.objective is not None else {}
-        if self.objective is not None:
-            self.objective.limits.update(shares)
+        limits = {} if self.objective is None else self.objective.update(mean_of(missed))
         return self._record(played, losses, spent, size * len(played), begin, limits)
 
     def _scored(self, batch: TensorDictBase) -> dict[str, float]:

@@ -16,7 +16,7 @@ from lcc_rl.agents.loop import REPORTED, TrainingLoop, mean_of
 from lcc_rl.agents.objective import Objective
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
-from lcc_rl.pieces.base import REWARD, as_key, next_key
+from lcc_rl.pieces.base import REWARD, next_key
 from lcc_rl.pieces.leader import PROFILE, NGSIMLeader
 from lcc_rl.pieces.rewards import RewardTerm
 
@@ -54,11 +54,10 @@ class GradientLoop(TrainingLoop[Any]):
         # The iterations are those of the whole training, so that resuming changes nothing.
         long = self.iterations * self.horizon >= COMPILED_GRADIENT_STEPS
         chosen = (self.agent.compiled, self.settings.compiled, long)
-        known = set(map(as_key, self.env.full_observation_spec.keys(True, True)))
         return DifferentiableRollout(
             self.env,
             self.agent.policy.module,
-            wanted=self.objective.wanted(known),
+            wanted=self.objective.wanted(self.env),
             observed=[REWARD, *(term.targets[0] for term in self.terms)],
             compiled=next(x for x in chosen if x is not None),
         )
@@ -93,9 +92,7 @@ class GradientLoop(TrainingLoop[Any]):
             spent[0] += collected - begun
             spent[1] += time.perf_counter() - collected
         self.updates += len(losses)
-        shares = mean_of(missed)
-        limits = self.objective.row(shares)
-        self.objective.limits.update(shares)
+        limits = self.objective.update(mean_of(missed))
         behind = {name: torch.stack([row[name] for row in each]).mean(0) for name in each[0]}
         limits |= self.objective.each.update(behind)
         count = sum(part.numel() for part in played)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field
 from typing import Any, Literal
 
@@ -10,13 +10,14 @@ import torch
 from pydantic import InstanceOf
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from lcc_rl.agents.agent import Agent
 from lcc_rl.agents.limits import Limits, LimitsEach
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.functional.finite import any_nonfinite
-from lcc_rl.pieces.base import Key, next_key
+from lcc_rl.pieces.base import Key, as_key, next_key
 from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import Positive, Share
@@ -85,15 +86,13 @@ class Objective:
         ]
         self.terms = chosen + [(term, 1.0) for term in self.regularizers.values()]
 
-    def wanted(self, known: Collection[Key]) -> list[Key]:
+    def wanted(self, env: EnvBase) -> list[Key]:
         """Return the entries of the next state that the terms read.
 
-        Args:
-            known: keys of all entries.
-
         Raises:
-            ConfigError: naming a term that reads an unknown entry.
+            ConfigError: naming a term that reads an entry that the environment lacks.
         """
+        known = set(map(as_key, env.full_observation_spec.keys(True, True)))
         read = [(term, key) for term, _ in self.terms for _, key in term.needs]
         for term, key in read:
             if key not in known:
@@ -146,14 +145,20 @@ class Objective:
             for name, term in self.limited(self.limits).items()
         }
 
-    def row(self, shares: Mapping[str, float]) -> dict[str, float]:
-        """Return columns of a record: the largest share, the share missed and the price."""
+    def update(self, shares: Mapping[str, float]) -> dict[str, float]:
+        """Change the prices of limits by the shares of the time in which they were missed.
+
+        Returns:
+            Columns of a record: the largest share, the share missed and the price until then.
+        """
         price, largest = self.limits.price, self.limits.largest
-        return {
+        row = {
             **{f"limit_{name}": largest[name] for name in shares},
             **{f"share_{name}": share for name, share in shares.items()},
             **{f"price_{name}": price(name) for name in shares},
         }
+        self.limits.update(shares)
+        return row
 
     def missed_each(self, data: TensorDictBase, running: Tensor) -> dict[str, Tensor]:
         """Return the shares of the time in each episode, ``[batch]``; see :meth:`missed`."""

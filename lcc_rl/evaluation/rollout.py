@@ -90,7 +90,7 @@ class Player:
         self.start: State = {}  # before the first step
         # Compiled code is for one layout in memory.
         self.arranged = batch_innermost if compiled else lambda entry: entry
-        self.moved: tuple[list[Key], list[Key]] = ([], [])  # what a step reads, what it writes
+        self.names: list[Key] = []  # of the state
         self.move = Traced(self._move, "the evaluation", compiled)
 
     @torch.no_grad()
@@ -114,7 +114,7 @@ class Player:
         """
         state, record = self._begin(given), self.record
         state = {key: self.arranged(value) for key, value in state.items()}
-        self.start = state
+        self.start, self.names = state, [*state]
         if self.rowwise:
             return self._checked(*self._by_rows(state), named)
         running, alive = torch.ones_like(state[TERMINATED]), []
@@ -192,26 +192,21 @@ class Player:
 
     def _advance(self, state: State, running: Tensor) -> Advanced:
         """Return the next state, the entries to keep, and which episodes still run."""
-        action = self._action(state, self.env.batch_size)
-        before = {**state, **{key: self.arranged(value) for key, value in action.items()}}
-        self.moved = [*before], self.moved[1]
-        *found, running = self.move(*before.values(), running)
-        changed = dict(zip(self.moved[1], found, strict=False))
-        return state | changed, found[len(changed) :], running
+        action = self._action(state, self.env.batch_size).values()
+        *found, running = self.move(*state.values(), *map(self.arranged, action), running)
+        count = len(self.names)
+        return dict(zip(self.names, found[:count], strict=True)), found[count:], running
 
     def _move(self, *tensors: Tensor) -> Sequence[Tensor]:
-        """Return entries of the next state, those to keep, and which episodes still run.
+        """Return the next state, the entries to keep, and which episodes still run.
 
         Args:
-            *tensors: the entries before the step and the action; which episodes run.
+            *tensors: the state, the action if there is a policy, and which episodes run.
         """
-        before = dict(zip(self.moved[0], tensors[:-1], strict=True))
-        reached = self.step(before)
-        changed = [key for key in before if key in reached and key != ACTION]
-        self.moved = self.moved[0], changed
-        shown = {**before, **reached}
-        kept = [self.arranged(shown[key]) for key in (*changed, *self.checked)]
-        return *kept, tensors[-1] & ~reached[TERMINATED]
+        before = dict(zip((*self.names, ACTION), tensors[:-1], strict=False))
+        shown = {**before, **self.step(before)}
+        kept = [self.arranged(shown[key]) for key in (*self.names, *self.checked)]
+        return *kept, tensors[-1] & ~shown[TERMINATED]
 
     def _action(self, state: State, batch: torch.Size) -> State:
         """Return the action of the policy for a batch; none without a policy."""
