@@ -147,8 +147,8 @@ def compare(
         >>> found = compare([run, "pretrained/alcc_limits", "idm_acc"])  # doctest: +SKIP
         >>> found = compare({"slow": PID(gain=0.1), "fast": PID(gain=0.4)})  # doctest: +SKIP
     """
-    target = _folder("evaluate", variant, folder)
-    cfg = load("evaluate", with_variant(variant, overrides))
+    target, words = _folder("evaluate", variant, folder), with_variant(variant, overrides)
+    cfg = load("evaluate", words)
     if isinstance(strategies, (str, PathLike)) or not isinstance(strategies, Iterable):
         strategies = [strategies]
     named = isinstance(strategies, Mapping)
@@ -164,8 +164,8 @@ def compare(
         spec = [setting_of(one) for _, one in others]
     cfg = cfg.with_(compare=spec)
     if not policies:  # these drive with the settings of the variant's controller
-        check_used(cfg, overrides)
-    rows = evaluation.run(cfg, target, own=False, quiet=True, policies=policies)
+        check_used(cfg, words)
+    rows = evaluation.run(cfg, target, own=False, quiet=True, policies=policies, typed=words)
     if folder is not None:
         evaluation.draw(rows, cfg, target)
     return Run(target, rows, cfg)

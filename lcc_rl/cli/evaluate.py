@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 
+from hydra.core.hydra_config import HydraConfig
+
 from lcc_rl.cli.entry import entry_point, resumed_folder
 from lcc_rl.config import is_sweep
 from lcc_rl.config.schemas import EvaluateConfig
@@ -20,7 +22,7 @@ def main(cfg: EvaluateConfig) -> None:
     if is_sweep():
         complete(cfg, folder)
     else:
-        run(cfg, folder)
+        run(cfg, folder, typed=HydraConfig.get().overrides.task)
     log.info("results in %s", folder)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -47,6 +47,7 @@ def run(
     quiet: bool = False,
     replace: bool = False,
     policies: Mapping[str, GivenPolicy] | None = None,
+    typed: Sequence[str] = (),
 ) -> Rows:
     """Evaluate a policy or rule, compared strategies and baselines.
 
@@ -61,6 +62,7 @@ def run(
         quiet: write the rows only, without tables and figures.
         replace: overwrite an evaluation of other settings.
         policies: further policies by their names in tables.
+        typed: overrides, to refuse those without effect.
 
     Returns:
         The rows of episodes.parquet; many rows as a dataset, which is read on demand.
@@ -76,7 +78,7 @@ def run(
     with claim(folder):
         if not replace:
             check_folder(cfg, folder)
-        return _run(cfg, folder, own, quiet, replace, policies or {})
+        return _run(cfg, folder, own, quiet, replace, policies or {}, typed)
 
 
 def made_by(table: Path) -> str | None:
@@ -102,10 +104,11 @@ def _run(
     quiet: bool,
     replace: bool,
     policies: Mapping[str, GivenPolicy],
+    typed: Sequence[str],
 ) -> Rows:
     prepare_torch(cfg)
     check_measured(cfg)
-    entrants = Entrants(cfg, own, policies)
+    entrants = Entrants(cfg, own, policies, typed)
     inputs = load_inputs(cfg)
     for line in filter(None, [*inputs.report, other_drivers(cfg), classes(cfg)]):
         log.info(line)

@@ -11,7 +11,7 @@ from typing import Any
 
 from lcc_rl.config.nodes import Node, nodes_in
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
-from lcc_rl.config.words import FILTERED, RECORDED
+from lcc_rl.config.words import FILTERED, RECORDED, key_of
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.fit import check_policy, check_variant, other_traffic, task_of
@@ -46,6 +46,7 @@ class Entrants:
         cfg: configuration of the entry point ``evaluate``.
         own: include the configuration's variant, unless ``compare`` names every policy.
         further: further policies by their names in tables.
+        typed: overrides; those of a filter behind which nothing drives are refused.
 
     Raises:
         LccError: if two share a name, a name is reserved, or a controller or policy is unknown,
@@ -57,6 +58,7 @@ class Entrants:
         cfg: EvaluateConfig,
         own: bool = True,
         further: Mapping[str, GivenPolicy] | None = None,
+        typed: Sequence[str] = (),
     ) -> None:
         self.cfg, self.further, self.task = cfg, further or {}, task_of(cfg)
         if cfg.policy not in (None, PRETRAINED) and not cfg.learns and cfg.automated:
@@ -66,6 +68,7 @@ class Entrants:
         if self.own:
             check_variant(cfg)
         self.rivals, self.paths = self._compared()
+        self._check_filter(typed)
         self.policy, self.policies = self._read_policies()
         check_installed(cfg, list(self.rivals.values()))
         recorded = RECORDED in {*self.rivals, *cfg.evaluation.baselines}
@@ -102,6 +105,19 @@ class Entrants:
             words = f"compare={label}: it has no vehicle to drive in this string"
             require(applies(cfg, label), words)
         return rivals, policies
+
+    def _check_filter(self, typed: Sequence[str]) -> None:
+        """Refuse settings of the safety filter if nothing drives behind it."""
+        rows = [*self.rivals, *self.cfg.evaluation.baselines]
+        named = map(str, [*rows, *self.rivals.values()])
+        learned = self.paths or self.further or (self.own and self.cfg.automated)
+        if learned or self.cfg.variant in rows or any(x.endswith(FILTERED) for x in named):
+            return
+        who = ", ".join(self.rivals or rows) if self.cfg.automated else "no vehicle is automated"
+        words = f"has no effect: nothing drives behind the filter ({who}); it needs a name that "
+        for word in typed:
+            used = not key_of(word).startswith(("filter", "scenario.filters"))
+            require(used, f"{word.removeprefix('++')} {words}ends in {FILTERED}")
 
     def _of_task(self, path: str) -> str:
         return of_task(path, None if self.task is None else self.task.name)

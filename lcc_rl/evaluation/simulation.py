@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from lcc_rl.config import check_overrides, load
-from lcc_rl.config.schemas import StudyConfig, TimeStep
-from lcc_rl.config.words import key_of
+from lcc_rl.config.nodes import Node
+from lcc_rl.config.schemas import RewardConfig, StudyConfig, TimeStep
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
@@ -26,14 +26,16 @@ from lcc_rl.errors import ConfigError, in_short, raised_as, require
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.metrics import energy_measures
-from lcc_rl.evaluation.named import is_policy, setting_of
+from lcc_rl.evaluation.named import controller_of, is_policy, setting_of
 from lcc_rl.evaluation.rollout import Player, Record, reset_options
 from lcc_rl.evaluation.rows import INDEX
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.base import Key
+from lcc_rl.pieces.connected import CACC, DeadBeat
 from lcc_rl.pieces.features import CLASS
-from lcc_rl.settings import TARGET, Count, Positive, Seed, checked
+from lcc_rl.pieces.rewards import CollisionPenalty
+from lcc_rl.settings import TARGET, Count, Positive, Seed, checked, path_of
 
 log = logging.getLogger("lcc_rl")
 
@@ -43,6 +45,8 @@ LONG, SHORT_STRING = 2_000, 40
 LEADER: Key = ("leader", "speed")
 SCENE = {f"scenario.{name}" for name in ("string", "time_step", "horizon")}
 OF_ARGUMENTS = SCENE | {"leader", "data", "split", "compare", "policy", "seed", "evaluation"}
+# Nothing reads the reward; this term fits any scenario.
+UNREAD = RewardConfig(terms={"collision": Node.of({TARGET: path_of(CollisionPenalty)}, "reward")})
 MOTION = {
     "speed": "speed_mps",
     "gap": "gap_m",
@@ -113,11 +117,12 @@ def simulate(
     given, spec = _given(controller)
     words = (
         *("evaluation.baselines=[]", "evaluation.behind_filter=[]", "evaluation.warm_up=0"),
-        *(f"variant={'alcc' if is_policy(spec) else 'idm'}", *overrides),
+        f"variant={'alcc' if is_policy(spec) else 'idm'}",
+        *(["scenario=platoon"] * _connected(spec) + list(overrides)),
         *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
     )
-    cfg = load("evaluate", words).with_(compare=given)
+    cfg = load("evaluate", words).with_(compare=given, reward=UNREAD)
     require(
         (cfg.scenario.road == RING) == (leader is None),
         "simulate: a ring (scenario=ring in overrides) has leader=None, an open road has a leader",
@@ -129,11 +134,7 @@ def simulate(
         fits = all(hasattr(people, name) for name in POPULATION)
         require(fits, f"drivers: not a population: {in_short(people)}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
-    strategy = Entrants(cfg, own=spec is None).strategies(inputs)[-1]
-    if strategy.cfg.scenario.filters.get(AUTOMATED) is None:
-        unused = f"has no effect on {strategy.name}, which drives without the filter"
-        unused += f"; controller={{'{strategy.name}_filtered': …}} puts it behind the filter"
-        check_overrides(overrides, {x for x in map(key_of, overrides) if "filter" in x}, unused)
+    strategy = Entrants(cfg, spec is None, typed=overrides).strategies(inputs)[-1]
     return _simulated(strategy, inputs, repeats, seed)
 
 
@@ -145,6 +146,12 @@ def _given(controller: Any) -> tuple[Any, Any]:
     name, one = next(iter(controller.items())) if named else ("", controller)
     spec = None if one is None else setting_of(one, "controller")
     return {name: spec} if named else [spec] * (spec is not None), spec
+
+
+def _connected(spec: Any) -> bool:
+    """Return whether a controller reads messages of a platoon."""
+    rule = spec is not None and not is_policy(spec)
+    return rule and issubclass(controller_of(spec).kind, (CACC, DeadBeat))
 
 
 def _words(string: str | Mapping[str, Any]) -> str:

@@ -40,6 +40,7 @@ REFUSED = {
     "run variant=idm": "variant=idm has no effect on lcc-rl run",
     f"train -m variant=idm {' '.join(LISTS)}": "at most 100000 runs",
     "train filter=cbf": r"write \+filter=",
+    "evaluate compare=[acc] +filter=cbf": r"drives behind the filter \(acc\); .* _filtered",
     "train ~agent.gamma": "~agent.gamma: no file sets it",
     "export policy.pt": "required: path ",
     "train out=x": "hydra.run.dir=… sets the folder",

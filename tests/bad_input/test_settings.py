@@ -137,6 +137,8 @@ def test_options_without_effect_are_refused() -> None:
     words = [stronger, "compare=[idm_acc]"]
     cases = [(lambda: load("evaluate", words), "has no effect: compare names every controller")]
     cases += [(lambda: lcc_rl.compare("idm_acc", overrides=words[:1]), cases[0][1])]
+    idle = r"\+filter=cbf has no effect: nothing drives behind the filter \(acc\)"
+    cases += [(lambda: lcc_rl.compare("acc", overrides="+filter=cbf"), idle)]
     check_refused(lambda call: call(), cases, ConfigError)
     assert load("evaluate", [f"{AUTO}.time_gap=1.5", words[1], "variant=idm"]).compare
     words = ["variants=[alcc]", "evaluation.baselines=[human]"]  # a job compares

@@ -108,6 +108,16 @@ def test_a_name_puts_a_controller_behind_the_filter() -> None:
     assert held[0] == held[1] > 0.0
 
 
+def test_controllers_with_messages_and_other_scenarios_need_no_reward() -> None:
+    for one, words in (("cacc", []), ("deadbeat", []), ("acc", ["scenario=platoon"])):
+        found = lcc_rl.simulate(WAVE, "automated*2 human", one, overrides=words).vehicles
+        assert (found["min_gap_m"][1:] > 0.0).all(), one
+        if not words:  # equal to their own variant
+            of_variant = [f"variant={one}"]
+            same = lcc_rl.simulate(WAVE, "automated*2 human", one, overrides=of_variant).vehicles
+            pd.testing.assert_frame_equal(found, same)
+
+
 def test_wrong_arguments_are_named() -> None:
     cases = [
         ({"leader": None}, "leader=None needs scenario=ring and sec"),
@@ -137,10 +147,11 @@ def test_wrong_arguments_are_named() -> None:
         ({"leader": WAVE, "string": "car*3"}, "car"),
         ({"leader": WAVE, "string": "human", "controller": "idm_acc"}, "no vehicle"),
         ({"leader": WAVE, "string": "automated", "controller": "nobody"}, "unknown strategy"),
+        ({"leader": WAVE, "overrides": ["+filter=cbf"]}, r"no effect: .*\(no vehicle is automated"),
         *(
             (
                 {**BEHIND, "controller": one, "overrides": words},
-                f"has no effect on {who}, which",
+                rf"has no effect: nothing drives behind the filter \({who}\)",
             )
             for one, who in (({"mine": Follow()}, "mine"), (Follow(), "Follow"), ("acc", "acc"))
             for words in (["+filter=cbf"], ["task=i24-follow5", f"{MARGIN}=2"])
