@@ -133,6 +133,10 @@ class TableFile:
         missing = [name for name in self.names.values() if name not in self.header]
         if missing:
             raise lacking(str(self.path), missing, self.header, option)
+        for key in (c.key for c in columns if c.key in self.header and c.key not in names):
+            if key not in self.names.values():
+                words = f"column {key!r} is not read unless {option}.{key} names it"
+                self.notes.append(Concern(f"{self.path}: {words}"))
         wanted = {
             column: self._scale(column, units or {}, option)
             for column in columns

@@ -15,6 +15,7 @@ from table_text import BY_GAP, LENGTH, long_table, written
 
 from lcc_rl.data.columns import UNITS, named_unit
 from lcc_rl.data.leaders import DriveLeaders
+from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.errors import Concern, DataError
 
@@ -66,6 +67,22 @@ def test_a_gap_by_the_name_of_a_headway_is_loud(tmp_path) -> None:
         report = TableSource(path=path, columns={**BY_GAP, "gap": name}).load().report
         found = [x for x in report if isinstance(x, Concern) and f"column {name!r}: does" in x]
         assert len(found) == loud, (name, report)
+
+
+def test_a_known_column_that_nothing_reads_is_loud(tmp_path) -> None:
+    pairs = {"time": "t", "follower_speed": "v", "leader_speed": "w", "gap": "d"}
+    log = pd.DataFrame({"t": 0.1 * np.arange(200), "v": 9.0, "w": 9.0, "d": 20.0, "valid": 1})
+    drives = pd.DataFrame({"time_s": np.arange(400.0), "speed_mps": 9.0, "grade": 0.01})
+    drives["speed_mps"] += 3.0 * np.sin(0.5 * drives["time_s"])
+    path, other = written(tmp_path, log, "log.csv"), written(tmp_path, drives, "drives.csv")
+    words = "column 'valid' is not read unless data.columns.valid names it"
+    for read in ({"valid": "valid"}, {"valid": None}, {}):
+        report = EpisodesSource(path=path, columns=pairs | read).load().report
+        found = [x for x in report if isinstance(x, Concern)]
+        assert found == ([] if read else [f"{path}: {words}"]), read
+    report = DriveLeaders(path=other, evaluation_share=1.0).load(0.1, 300).report
+    words = "column 'grade' is not read unless leader.columns.grade names it"
+    assert [x for x in report if isinstance(x, Concern)] == [f"{other}: {words}"]
 
 
 def test_an_empty_last_column_is_left_out_with_and_without_a_name(tmp_path) -> None:
