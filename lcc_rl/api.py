@@ -16,7 +16,6 @@ from rich.console import Console
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load, with_variant
 from lcc_rl.config.schemas import StudyConfig
-from lcc_rl.config.unused import check_used
 from lcc_rl.errors import require
 from lcc_rl.evaluation.foreign import as_given
 from lcc_rl.evaluation.named import setting_of
@@ -163,8 +162,6 @@ def compare(
     else:
         spec = [setting_of(one) for _, one in others]
     cfg = cfg.with_(compare=spec)
-    if not policies:  # these drive with the settings of the variant's controller
-        check_used(cfg, words)
     rows = evaluation.run(cfg, target, own=False, quiet=True, policies=policies, typed=words)
     if folder is not None:
         evaluation.draw(rows, cfg, target)

@@ -67,7 +67,8 @@ def trip_energies(
     (model, *others), step = build_energy(cfg).models, cfg.scenario.time_step
     require(not others, "energy: a mixture has several models; choose one, such as fuel")
     source = cfg.leader.made(DriveLeaders)
-    records, lines = read_drives(source.path, source.columns, step, source.plausible, source.units)
+    how = (source.plausible, source.units, source.average_s)
+    records, lines = read_drives(source.path, source.columns, step, *how)
     log_report(lines)
     blocks = (slice(first, first + BLOCK) for first in range(0, len(records), BLOCK))
     rows = pd.concat([_energies(records, block, model) for block in blocks])

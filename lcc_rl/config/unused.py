@@ -7,7 +7,7 @@ from collections.abc import Set as AbstractSet
 from typing import Any
 
 from lcc_rl.config.nodes import nodes_in, takes_action
-from lcc_rl.config.schemas import AUTO, BaseConfig, EvaluateConfig, StudyConfig, TrainConfig
+from lcc_rl.config.schemas import BaseConfig, StudyConfig, TrainConfig
 from lcc_rl.config.words import RECORDED, key_of, typed_keys
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, RING
@@ -42,8 +42,6 @@ def check_used(
         if seen[TARGET] == OBSERVATION and "behind" not in (seen.get("scales") or ()):
             for key in ("visible", "presence"):
                 reasons[f"observation.{key}"] = "observation.scales names no vehicle behind"
-        if isinstance(cfg, EvaluateConfig) and cfg.compare and not cfg.policy and cfg.agent:
-            reasons[AUTO] = "compare names every controller, with its own settings"
         plain = type(cfg) is TrainConfig and BASELINES in map(key_of, overrides)
         if plain and RECORDED not in cfg.evaluation.baselines:
             reasons[BASELINES] = "a training evaluates its own policy; lcc-rl evaluate compares"

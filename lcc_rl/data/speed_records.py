@@ -138,7 +138,8 @@ def _read(
     average_s: float = 0.0,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Return recording, episode and motion of the plausible samples of a file, and the report."""
-    samples, report = _samples(table, columns, units), ReadReport([str(table.path)])
+    option = "leader.columns" if divide else ""
+    samples, report = _samples(table, columns, units, option), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
     samples = continuous(samples, "drive", place, report, divide)
     known = units_of(DRIVE_FIELDS, DRIVE_COLUMNS, units) if divide else {}
@@ -166,7 +167,7 @@ def _averaged(samples: pd.DataFrame, seconds: float, source: str) -> pd.DataFram
     return kept.reset_index(drop=True)
 
 
-def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:
+def _samples(table: TableFile, columns: Names, units: Units, option: str) -> pd.DataFrame:
     """Return drive (as recording), time and speed of every row with a speed."""
     single = columns["drive"] is None
     if table.preamble:
@@ -174,7 +175,7 @@ def _samples(table: TableFile, columns: Names, units: Units) -> pd.DataFrame:
         columns = {key: native.get(str(columns[key]), columns[key]) for key in ("time", "speed")}
     elif columns["drive"] == DRIVE_COLUMNS["drive"] and columns["drive"] not in table.header:
         columns = {**columns, "drive": None}  # each file is one drive
-    read = table.read(DRIVE_FIELDS, columns, units, "leader.columns", ["time", "speed"])
+    read = table.read(DRIVE_FIELDS, columns, units, option, ["time", "speed"])
     rows = read["row"]
     if not len(rows):
         raise DataError(f"{table.path}: holds 0 samples, at least 2 are needed")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lcc_rl.config.nodes import Node, nodes_in
-from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
+from lcc_rl.config.schemas import AUTO, EvaluateConfig, StudyConfig
 from lcc_rl.config.words import FILTERED, RECORDED, key_of
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError, require
@@ -46,7 +46,7 @@ class Entrants:
         cfg: configuration of the entry point ``evaluate``.
         own: include the configuration's variant, unless ``compare`` names every policy.
         further: further policies by their names in tables.
-        typed: overrides; those of a filter behind which nothing drives are refused.
+        typed: overrides; those of a controller or filter that no row has are refused.
 
     Raises:
         LccError: if two share a name, a name is reserved, or a controller or policy is unknown,
@@ -68,7 +68,7 @@ class Entrants:
         if self.own:
             check_variant(cfg)
         self.rivals, self.paths = self._compared()
-        self._check_filter(typed)
+        self._check_used(typed)
         self.policy, self.policies = self._read_policies()
         check_installed(cfg, list(self.rivals.values()))
         recorded = RECORDED in {*self.rivals, *cfg.evaluation.baselines}
@@ -106,18 +106,21 @@ class Entrants:
             require(applies(cfg, label), words)
         return rivals, policies
 
-    def _check_filter(self, typed: Sequence[str]) -> None:
-        """Refuse settings of the safety filter if nothing drives behind it."""
+    def _check_used(self, typed: Sequence[str]) -> None:
+        """Refuse settings of a controller or a safety filter that no row has."""
         rows = [*self.rivals, *self.cfg.evaluation.baselines]
-        named = map(str, [*rows, *self.rivals.values()])
-        learned = self.paths or self.further or (self.own and self.cfg.automated)
-        if learned or self.cfg.variant in rows or any(x.endswith(FILTERED) for x in named):
+        if self.own or self.further or self.cfg.variant in rows or not self.cfg.automated:
             return
-        who = ", ".join(self.rivals or rows) if self.cfg.automated else "no vehicle is automated"
-        words = f"has no effect: nothing drives behind the filter ({who}); it needs a name that "
+        unused = {AUTO: "every controller is named and has its own settings"}
+        named = any(str(x).endswith(FILTERED) for x in (*rows, *self.rivals.values()))
+        if not self.paths and not named:
+            words = f"nothing drives behind the filter ({', '.join(self.rivals or rows)}); "
+            words += f"it needs a name that ends in {FILTERED}"
+            unused |= dict.fromkeys(("filter", "scenario.filters"), words)
         for word in typed:
-            used = not key_of(word).startswith(("filter", "scenario.filters"))
-            require(used, f"{word.removeprefix('++')} {words}ends in {FILTERED}")
+            for key, reason in unused.items():
+                used = not key_of(word).startswith(key)
+                require(used, f"{word.lstrip('+')} has no effect: {reason}")
 
     def _of_task(self, path: str) -> str:
         return of_task(path, None if self.task is None else self.task.name)

@@ -44,7 +44,16 @@ log = logging.getLogger("lcc_rl")
 LONG, SHORT_STRING = 2_000, 40
 LEADER: Key = ("leader", "speed")
 SCENE = {f"scenario.{name}" for name in ("string", "time_step", "horizon")}
-OF_ARGUMENTS = SCENE | {"leader", "data", "split", "compare", "policy", "seed", "evaluation"}
+OF_ARGUMENTS = SCENE | {
+    "leader",
+    "data",
+    "split",
+    "compare",
+    "policy",
+    "seed",
+    "evaluation",
+    "reward",
+}
 # Nothing reads the reward; this term fits any scenario.
 UNREAD = RewardConfig(terms={"collision": Node.of({TARGET: path_of(CollisionPenalty)}, "reward")})
 MOTION = {
@@ -63,8 +72,8 @@ class Simulation:
         steps: a row per episode, time and vehicle; vehicle 0 is the leader, the others are from
             front to back. ``acceleration_mps2`` and ``power_w`` are those of the step that ends at
             ``time_s``. An episode ends with its first collision, a gap of 0 m or less.
-        vehicles: a row per episode and vehicle: ``mean_speed_mps``, ``min_gap_m``, ``mean_gap_m``,
-            ``collided``, and distance and energies of
+        vehicles: a row per episode and vehicle: ``mean_speed_mps`` (of the rows of ``steps``),
+            ``min_gap_m``, ``mean_gap_m``, ``collided``, and distance and energies of
             :func:`lcc_rl.evaluation.metrics.energy_measures`.
     """
 

@@ -18,6 +18,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config.words import FILTERED
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import constant_profiles
@@ -329,7 +330,8 @@ def filter_of(safety: Safety, own: CBFFilter | None, name: str) -> CBFFilter | N
     if not isinstance(safety, Mapping):
         return safety or own
     if own is None:
-        raise ConfigError(f"{name} has no safety filter whose settings safety could change")
+        words = f"; a rule whose name ends in {FILTERED} has one"
+        raise ConfigError(f"{name} has no safety filter whose settings safety could change{words}")
     return parse(type(own), values(own) | dict(safety), "safety")
 
 

@@ -17,6 +17,7 @@ from lcc_rl.commands.pipeline import composed_part
 from lcc_rl.config import load
 from lcc_rl.data.leaders import Mixture
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.functional.ovm import OVMConstants
 from lcc_rl.io import memory
 from lcc_rl.pieces.controllers import ConstantAcceleration
@@ -135,8 +136,10 @@ def test_options_without_effect_are_refused() -> None:
     check_refused(lambda typed: load("train", typed.split()), cases, ConfigError)
     stronger = f"+{AUTO}.max_acceleration=6"
     words = [stronger, "compare=[idm_acc]"]
-    cases = [(lambda: load("evaluate", words), "has no effect: compare names every controller")]
-    cases += [(lambda: lcc_rl.compare("idm_acc", overrides=words[:1]), cases[0][1])]
+    named = "has no effect: every controller is named"
+    cases = [(lambda: Entrants(load("evaluate", words), typed=words), named)]
+    cases += [(lambda: lcc_rl.compare("idm_acc", overrides=words[:1]), named)]
+    cases += [(lambda: lcc_rl.simulate([9.0] * 9, "automated", "acc", overrides=words[:1]), named)]
     idle = r"\+filter=cbf has no effect: nothing drives behind the filter \(acc\)"
     cases += [(lambda: lcc_rl.compare("acc", overrides="+filter=cbf"), idle)]
     check_refused(lambda call: call(), cases, ConfigError)

@@ -147,7 +147,6 @@ def test_wrong_arguments_are_named() -> None:
         ({"leader": WAVE, "string": "car*3"}, "car"),
         ({"leader": WAVE, "string": "human", "controller": "idm_acc"}, "no vehicle"),
         ({"leader": WAVE, "string": "automated", "controller": "nobody"}, "unknown strategy"),
-        ({"leader": WAVE, "overrides": ["+filter=cbf"]}, r"no effect: .*\(no vehicle is automated"),
         *(
             (
                 {**BEHIND, "controller": one, "overrides": words},

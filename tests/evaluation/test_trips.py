@@ -94,6 +94,14 @@ def test_trips_of_files_rates_and_with_holes(tmp_path, path, subtests) -> None:
         assert (found["distance_km"] < whole["distance_km"]).all()
 
 
+def test_averaged_speeds_are_those_of_leaders(path) -> None:
+    plain, averaged = (
+        lcc_rl.trip_energies(path, [COLUMNS, *words])["net_energy_kj"]
+        for words in ([], ["leader.average_s=5"])
+    )
+    assert (averaged < plain).all()  # shorter, too, by the ends of the average
+
+
 def test_the_command_prints_and_writes_the_trips(tmp_path, path, capsys, subtests) -> None:
     expected = lcc_rl.trip_energies(path, ["energy=fuel", COLUMNS])
     for name, read in (("x.csv", pd.read_csv), ("x.parquet", pd.read_parquet)):
