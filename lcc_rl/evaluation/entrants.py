@@ -120,7 +120,7 @@ class Entrants:
         for word in typed:
             for key, reason in unused.items():
                 used = not key_of(word).startswith(key)
-                require(used, f"{word.lstrip('+')} has no effect: {reason}")
+                require(used, f"{word.removeprefix('++')} has no effect: {reason}")
 
     def _of_task(self, path: str) -> str:
         return of_task(path, None if self.task is None else self.task.name)

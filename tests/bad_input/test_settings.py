@@ -139,7 +139,8 @@ def test_options_without_effect_are_refused() -> None:
     named = "has no effect: every controller is named"
     cases = [(lambda: Entrants(load("evaluate", words), typed=words), named)]
     cases += [(lambda: lcc_rl.compare("idm_acc", overrides=words[:1]), named)]
-    cases += [(lambda: lcc_rl.simulate([9.0] * 9, "automated", "acc", overrides=words[:1]), named)]
+    own = [f"{AUTO}.time_gap=1.5"]
+    cases += [(lambda: lcc_rl.simulate([9.0] * 9, "automated", "acc", overrides=own), named)]
     idle = r"\+filter=cbf has no effect: nothing drives behind the filter \(acc\)"
     cases += [(lambda: lcc_rl.compare("acc", overrides="+filter=cbf"), idle)]
     check_refused(lambda call: call(), cases, ConfigError)
