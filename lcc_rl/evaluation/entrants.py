@@ -118,9 +118,8 @@ class Entrants:
             words += f"it needs a name that ends in {FILTERED}"
             unused |= dict.fromkeys(("filter", "scenario.filters"), words)
         for word in typed:
-            for key, reason in unused.items():
-                used = not key_of(word).startswith(key)
-                require(used, f"{word.removeprefix('++')} has no effect: {reason}")
+            for key in filter(key_of(word).startswith, unused):
+                raise ConfigError(f"{word.removeprefix('++')} has no effect: {unused[key]}")
 
     def _of_task(self, path: str) -> str:
         return of_task(path, None if self.task is None else self.task.name)

@@ -44,16 +44,7 @@ log = logging.getLogger("lcc_rl")
 LONG, SHORT_STRING = 2_000, 40
 LEADER: Key = ("leader", "speed")
 SCENE = {f"scenario.{name}" for name in ("string", "time_step", "horizon")}
-OF_ARGUMENTS = SCENE | {
-    "leader",
-    "data",
-    "split",
-    "compare",
-    "policy",
-    "seed",
-    "evaluation",
-    "reward",
-}
+OF_ARGUMENTS = SCENE | {"leader", "data", "split", "compare", "policy", "seed", "evaluation"}
 # Nothing reads the reward; this term fits any scenario.
 UNREAD = RewardConfig(terms={"collision": Node.of({TARGET: path_of(CollisionPenalty)}, "reward")})
 MOTION = {
@@ -120,14 +111,15 @@ def simulate(
         >>> found.steps.shape[0], found.vehicles["vehicle"].tolist()
         (1204, [0, 1, 2, 3])
     """
-    fixed = OF_ARGUMENTS | ({"drivers"} if drivers is not None else set())
+    fixed = OF_ARGUMENTS | {"reward"} | ({"drivers"} if drivers is not None else set())
     check_overrides(overrides, fixed, "has no effect in simulate: see the arguments")
     profiles = _profiles(leader, time_step, seconds)
     given, spec = _given(controller)
+    rule = None if spec is None or is_policy(spec) else controller_of(spec).kind
     words = (
         *("evaluation.baselines=[]", "evaluation.behind_filter=[]", "evaluation.warm_up=0"),
         f"variant={'alcc' if is_policy(spec) else 'idm'}",
-        *(["scenario=platoon"] * _connected(spec) + list(overrides)),
+        *(["scenario=platoon"] * (rule in (CACC, DeadBeat)) + list(overrides)),
         *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
     )
@@ -155,12 +147,6 @@ def _given(controller: Any) -> tuple[Any, Any]:
     name, one = next(iter(controller.items())) if named else ("", controller)
     spec = None if one is None else setting_of(one, "controller")
     return {name: spec} if named else [spec] * (spec is not None), spec
-
-
-def _connected(spec: Any) -> bool:
-    """Return whether a controller reads messages of a platoon."""
-    rule = spec is not None and not is_policy(spec)
-    return rule and issubclass(controller_of(spec).kind, (CACC, DeadBeat))
 
 
 def _words(string: str | Mapping[str, Any]) -> str:
