@@ -27,11 +27,11 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 43_440, "code": 28_620},
+    "lcc_rl + tools": {"lines": 43_460, "code": 28_640},
     "tests": {"lines": 25_600},
     "conf": {"yaml": 159},
 }
-CASES = 1_240  # ceiling of all quick tests, see tests/tools/test_size.py
+CASES = 1_243  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {
     "names in several modules": 60,
     "floors": 10,
