@@ -24,6 +24,7 @@ TOOLS = {
     "table": ("lcc_rl.cli.table", "the table of an evaluation: text, Markdown, LaTeX, CSV"),
     "repeat": ("lcc_rl.commands.repeat", "a run again, from its folder; are the rows equal?"),
     "score": ("lcc_rl.commands.score", "a policy on every task and source that it fits"),
+    "simulate": ("lcc_rl.commands.simulate", "vehicles behind a leader or on a ring: their motion"),
     "energy": ("lcc_rl.commands.energy", "energy of recorded trips: kJ, kWh, litres, grams"),
     "animate": ("lcc_rl.commands.animate", "animations of episodes: page, SVG, GIF, MP4"),
     "reproduce": ("lcc_rl.studies.reproduce", "a paper's study: tables and figures"),

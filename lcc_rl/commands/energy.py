@@ -13,13 +13,11 @@ import logging
 from collections.abc import Sequence
 from copy import copy
 from os import PathLike, fspath
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
-from pydantic import Field
 
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.config import load, quoted, top_key
@@ -29,9 +27,9 @@ from lcc_rl.data.speed_records import read_drives
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import require
 from lcc_rl.evaluation.metrics import KILO
-from lcc_rl.io.atomic import atomic_path, new_file
-from lcc_rl.io.files import write_parquet
-from lcc_rl.runs.arguments import Arguments, typed
+from lcc_rl.io.atomic import new_file
+from lcc_rl.io.files import write_table
+from lcc_rl.runs.arguments import TABLE, Arguments, files_and_settings
 from lcc_rl.runs.output import log_report
 from lcc_rl.settings import checked
 
@@ -119,22 +117,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the energy of trips, and write it to a file."""
     parser = Arguments(prog="lcc-rl energy", description=__doc__)
     parser.add_argument("words", nargs="+", help="tables, folders, patterns; settings key=value")
-    ending = typed(Annotated[str, Field(pattern=r"\.(csv|parquet)$")])
-    parser.add_argument("--out", type=ending, help="also write a row per trip: .csv, .parquet")
-    options = parser.parse_args(arguments)
-    files = [word for word in options.words if "=" not in word or Path(word).exists()]
+    parser.add_argument("--out", type=TABLE, help="also write a row per trip: .csv, .parquet")
+    options = parser.parse_intermixed_args(arguments)
+    files, settings = files_and_settings(options.words)
     out = options.out and new_file(options.out, "--out")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    trips = trip_energies(files, [word for word in options.words if word not in files])
+    trips = trip_energies(files, settings)
     print(trips.head(MOST_ROWS).to_string(index=False, float_format="{:,.4g}".format))
     sums = trips[["distance_km", "energy_kj", "energy_kwh"]].sum()
     words = "{distance_km:,.1f} km, {energy_kj:,.0f} kJ, {energy_kwh:,.1f} kWh".format(**sums)
     print(f"{len(trips):,} trips: {words}")
-    if out and out.suffix == ".parquet":
-        write_parquet(trips, out)
-    elif out:
-        with atomic_path(out) as temporary:
-            trips.to_csv(temporary, index=False)
+    if out:
+        write_table(trips, out)
 
 
 if __name__ == "__main__":

@@ -68,6 +68,15 @@ def write_parquet(
             file.write_table(_finite(part, path).cast(schema))
 
 
+def write_table(frame: pd.DataFrame, path: Path) -> None:
+    """Write a table for other programs atomically: ``.csv``, or as :func:`write_parquet` does."""
+    if path.suffix == ".parquet":
+        write_parquet(frame, path)
+    else:
+        with atomic_path(path) as temporary:
+            frame.to_csv(temporary, index=False)
+
+
 def _finite(frame: pd.DataFrame, path: str | Path) -> pa.Table:
     """Return a data frame as a table after a check for infinite numbers."""
     table = pa.Table.from_pandas(frame, preserve_index=False)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from textwrap import fill
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from lcc_rl.errors import ConfigError
 
@@ -49,3 +50,12 @@ def typed(kind: Any) -> Callable[[str], Any]:
             raise ArgumentTypeError(f"{wanted}, got {word!r}") from None
 
     return read
+
+
+TABLE = typed(Annotated[str, Field(pattern=r"\.(csv|parquet)$")])  # a file to write a table to
+
+
+def files_and_settings(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Divide the words of a command into names, such as files, and settings ``key=value``."""
+    files = [word for word in words if "=" not in word or Path(word).exists()]
+    return files, [word for word in words if word not in files]

@@ -9,6 +9,7 @@ import torch
 from helpers import POPULATION, check_refused
 
 import lcc_rl
+from lcc_rl.commands.simulate import main
 from lcc_rl.config import load
 from lcc_rl.data.profiles import from_records, no_profiles
 from lcc_rl.envs import Inputs
@@ -159,3 +160,24 @@ def test_wrong_arguments_are_named() -> None:
         ({**BEHIND, "controller": {"a_filtered": Follow()}}, "a_filtered needs the safety filter"),
     ]
     check_refused(lambda given: lcc_rl.simulate(**given), cases)
+
+
+def test_the_command_drives_as_the_function_does(tmp_path, capsys) -> None:
+    leader, steps, vehicles = (tmp_path / x for x in ("a.csv", "steps.parquet", "vehicles.csv"))
+    time = 0.1 * np.arange(len(WAVE))
+    pd.DataFrame({"time_s": time, "speed_mps": WAVE}).to_csv(leader, index=False)
+    found = lcc_rl.simulate(leader, "automated human", "idm_acc", overrides=["energy=bolt"], seed=2)
+    words = f"{leader} --string automated+human --controller idm_acc --seed 2 energy=bolt"
+    words = [word.replace("+", " ") for word in words.split()]
+    main([*words, "--steps", f"{steps}", "--vehicles", f"{vehicles}"])
+    assert "path_energy_kj" in capsys.readouterr().out
+    pd.testing.assert_frame_equal(pd.read_parquet(steps), found.steps, check_dtype=False)
+    pd.testing.assert_frame_equal(pd.read_csv(vehicles), found.vehicles, check_dtype=False)
+    cases = [
+        ([*words, "--repeats", "0"], "argument --repeats: must be greater than or equal to 1"),
+        ([*words, "--steps", f"{steps}"], "exists already; choose another --steps"),
+        ([*words, "--steps", "steps.txt"], "argument --steps: .*csv|parquet"),
+        (["none.csv"], r"none\.csv: no such file"),
+        (["scenario=ring"], "leader=None needs scenario=ring and seconds"),
+    ]
+    check_refused(main, cases)

@@ -1,0 +1,57 @@
+"""Simulate a string of vehicles behind leaders; print a row per vehicle.
+
+lcc-rl simulate us06 drivers=highway --string 'automated human*4'
+lcc-rl simulate drive.csv --repeats 20 energy=bolt --steps steps.parquet
+lcc-rl simulate scenario=ring --string 'human*22' --seconds 300
+
+Leaders are shipped cycles or files with the columns time_s and speed_mps, an episode each. Words
+with = are settings. More with lcc_rl.simulate in Python.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+from lcc_rl.cli.guard import main_guard
+from lcc_rl.config.schemas import TimeStep
+from lcc_rl.evaluation.simulation import simulate
+from lcc_rl.io.atomic import new_file
+from lcc_rl.io.files import write_table
+from lcc_rl.runs.arguments import TABLE, Arguments, files_and_settings, typed
+from lcc_rl.settings import Count, Positive, Seed
+
+ARGUMENTS = {
+    "string": (str, "vehicles from front to back, by default human*10"),
+    "controller": (str, "of automated vehicles: a name, a file, a run, my_module.Class"),
+    "time_step": (typed(TimeStep), "duration of a step [s], by default 0.1"),
+    "seconds": (typed(Positive), "duration [s], by default that of the leader"),
+    "repeats": (typed(Count), "episodes behind each leader, by default 1"),
+    "seed": (typed(Seed), "of the noise, by default 0"),
+}
+TABLES = {"steps": "a row per time and vehicle", "vehicles": "the printed table"}
+MOST_ROWS = 40  # most vehicles that are printed
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print a row per vehicle, and write tables to files."""
+    parser = Arguments(prog="lcc-rl simulate", description=__doc__)
+    parser.add_argument("words", nargs="+", help="leaders; settings key=value")
+    for name, (kind, text) in ARGUMENTS.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", type=kind, help=text)
+    for name, text in TABLES.items():
+        parser.add_argument(f"--{name}", type=TABLE, help=f"file for {text}: .csv, .parquet")
+    options = vars(parser.parse_intermixed_args(arguments))
+    files = {name: options.pop(name) for name in TABLES}
+    written = {name: new_file(file, f"--{name}") for name, file in files.items() if file}
+    leaders, settings = files_and_settings(options.pop("words"))
+    given = {name: value for name, value in options.items() if value is not None}
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    found = simulate(leaders or None, overrides=settings, **given)
+    print(found.vehicles.head(MOST_ROWS).to_string(index=False, float_format="{:,.4g}".format))
+    for name, path in written.items():
+        write_table(getattr(found, name), path)
+
+
+if __name__ == "__main__":
+    main_guard(main)()
