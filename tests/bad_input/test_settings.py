@@ -34,6 +34,7 @@ WRONG = {
     "variant=[alcc,reference]": "variant takes one choice; for a run of each: -m variant=alcc,refe",
     "energy=[fuel,bolt]": "energy takes one choice",
     "leader=[udds,us06]": "leader takes one choice",
+    "+scenario.filters.automated.margin=1": "'automated'.*valid: none; .filter=cbf adds a filter",
     "+scenario.fleet.t={_target_: builtins.dict}": "scenario.fleet.t.*",
     "scenario.string='automated human*٢٥'": "expected .* at character 16",
     "agent=dddpg": "agent 'dddpg'.*'ddpg'.* agent/dddpg.yaml, needs --config-dir",
