@@ -107,6 +107,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
         collector.reset()
         segments = iter(collector)
         played, losses, missed, spent = [], [], [], [0.0, 0.0]
+        returns, last = getattr(self.agent, "returns", None), 0.0
         for part in range(self.horizon // steps):
             begun = time.perf_counter()
             self.explore(share)
@@ -118,6 +119,8 @@ class CollectingLoop(TrainingLoop[AgentT]):
             if self.rule is not None:  # the policy's part of the action
                 own = batch.get(ACTION) - self.rule(batch.get(OBSERVATION))
                 batch.set(ACTION, own.clamp(-ONE, ONE))
+            if returns is not None:
+                last = returns.add(batch.get(("next", *REWARD)), batch.get(("next", "done")), last)
             collected, size = time.perf_counter(), batch.get(("next", *REWARD)).numel()
             before = self.iteration * (self.horizon // steps) + part
             losses.append(self.learn(batch, before * size))

@@ -46,6 +46,7 @@ class OnPolicyLoop(CollectingLoop[Any]):
         vehicles = batch.get(("next", *REWARD)).shape[2]
         # One row per vehicle, time last: advantages are computed along trajectories.
         rows = transitions(batch).reshape(*batch.shape, vehicles).permute(0, 2, 1)
+        rows.set(("next", "reward"), self.agent.scaled(rows.get(("next", "reward"))))
         losses = self.agent.update(rows.reshape(-1, batch.shape[1]).contiguous())
         self.updates += 1
         return {name: float(value) for name, value in losses.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from typing import Any
 
 import torch
@@ -63,9 +64,9 @@ class ReplayLoop(CollectingLoop[Any]):
         ready = len(self.buffer) >= max(settings.batch_size, settings.learning_starts)
         count = int((before + len(new)) * ratio) - int(before * ratio) if ready else 0
         sums = {"loss_actor": torch.zeros(()), "loss_value": torch.zeros(())}
-        draw = draws(self.buffer, self.sampler)
-        for _ in range(count):
-            losses = self.agent.update(next(draw))
+        for drawn in islice(draws(self.buffer, self.sampler), count):
+            drawn.set_(("next", "reward"), settings.scaled(drawn.get(("next", "reward"))))
+            losses = settings.update(drawn)
             sums = {name: total + losses[name] for name, total in sums.items()}
         self.updates += count
         return {name: float(total) / max(count, 1) for name, total in sums.items()}

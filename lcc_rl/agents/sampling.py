@@ -6,8 +6,9 @@ import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+import torch
 from tensordict.nn import TensorDictModule
-from torch import nn
+from torch import Tensor, nn
 
 from lcc_rl.agents.actor import Activation, make_actor
 from lcc_rl.agents.agent import Scene
@@ -15,6 +16,35 @@ from lcc_rl.agents.objective import Aiming, Objective
 from lcc_rl.agents.rules import NETWORK_ALONE, RESIDUAL, Residual, make_policy
 from lcc_rl.errors import require
 from lcc_rl.settings import Count, NonNegative, Positive, Share
+
+
+class Returns(nn.Module):
+    """Number, total and total of the squares of the discounted sums of rewards of a training."""
+
+    moments: Tensor
+
+    def __init__(self, gamma: float) -> None:
+        super().__init__()
+        self.gamma = gamma
+        self.register_buffer("moments", torch.zeros(3, dtype=torch.float64))
+
+    def add(self, reward: Tensor, done: Tensor, before: Tensor | float) -> Tensor | float:
+        """Add a segment after sums ``[environments, A, 1]``, or 0; return its last sums.
+
+        Args:
+            reward, done: after each decision, ``[environments, decisions, …]``.
+            before: the last sums of the segment before.
+        """
+        for now, ended in zip(reward.unbind(1), done.unsqueeze(-1).unbind(1), strict=True):
+            sums = now + self.gamma * before
+            self.moments += torch.stack([(sums.double() ** power).sum() for power in range(3)])
+            before = sums * ~ended
+        return before
+
+    def deviation(self) -> Tensor:
+        """Return the standard deviation of the sums."""
+        count, total, square = self.moments
+        return (square / count - (total / count).square()).clamp(min=1e-12).sqrt()
 
 
 class Sampling(Aiming):
@@ -30,17 +60,23 @@ class Sampling(Aiming):
     hold: NonNegative = 0.0
     # Time after which a reward counts for 1/e, instead of gamma [s].
     horizon: Positive | None = None
+    # Learn from rewards over the running standard deviation of their discounted sum.
+    scale_rewards: bool = False
 
     LATER: ClassVar[Sequence[str]] = (
-        *("policy", "constants", "hold", "horizon"),
+        *("policy", "constants", "hold", "horizon", "scale_rewards"),
         *("surrogates", "regularizers", "limits", "limit_rate"),
     )
 
     def _more(self) -> dict[str, Any]:
-        """Return further parts of the state: the rule and the prices of limits, if there are."""
-        parts = {"rule": self.rule, "limits": self.objective.limits}
-        used = {"rule": self.rule is not None, "limits": bool(self.objective.limits.largest)}
-        return {name: part for name, part in parts.items() if used[name]}
+        """Return further parts of the state, if there are: rule, prices of limits and scale."""
+        limits = self.objective.limits if self.objective.limits.largest else None
+        parts = {"rule": self.rule, "limits": limits, "returns": self.returns}
+        return {name: part for name, part in parts.items() if part is not None}
+
+    def scaled(self, reward: Tensor) -> Tensor:
+        """Return rewards in the units of the losses."""
+        return reward if self.returns is None else reward / self.returns.deviation().to(reward)
 
     def make_actor(self, scene: Scene) -> TensorDictModule:
         """Make ``policy``, and its ``rule`` if it has one; return the learned part.
@@ -53,6 +89,7 @@ class Sampling(Aiming):
         if self.horizon is not None:
             self.gamma = math.exp(-self.every * scene.world.time_step / self.horizon)
         self.objective = Objective(self, scene.device, scene.world)
+        self.returns = Returns(self.gamma).to(scene.device) if self.scale_rewards else None
         self.rule = None
         if kind == NETWORK_ALONE:
             learned = make_actor(size, 1, self.hidden, scene.seed, self.activation)

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 
 from lcc_rl.agents.collecting import decisions, of_decisions, transitions
 from lcc_rl.agents.factory import check_lengths
+from lcc_rl.agents.sampling import Returns
 from lcc_rl.envs import make_env
 from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD, STEP
 
@@ -60,11 +61,32 @@ def test_a_network_on_a_rule_is_the_rule_at_first(agent: str) -> None:
 def test_prices_of_limits_are_recorded_and_resume(tmp_path, agent: str) -> None:
     words = (f"agent={agent}", "surrogates@agent=limits", "agent.policy=residual_idm")
     sizes = ("scenario.horizon=20", "training.segment=10", "agent.hold=0.5", "agent.batch_size=8")
-    sizes += ("training.environments=4", "training.episodes=24", "training.checkpoint_every=2")
+    sizes += (
+        "agent.scale_rewards=true",
+        "training.environments=4",
+        "training.episodes=24",
+        "training.checkpoint_every=2",
+    )
     check_resuming(lambda folder: small_loop(folder, *words, *sizes), tmp_path)
     record = small_loop(tmp_path, *words, *sizes).run()
     assert {"price_safety", "share_efficiency", "reward_cav_energy"} <= {*record.columns}
     assert record["price_efficiency"].nunique() > 1
+
+
+def test_the_scale_of_rewards_is_that_of_discounted_sums() -> None:
+    reward, done = torch.randn(2, 6, 3, 1), torch.zeros(2, 6, 1, dtype=torch.bool)
+    done[0, 2] = True
+    returns, sums = Returns(0.5), []
+    for environment in range(2):
+        last = torch.zeros(3)
+        for step in range(6):
+            last = reward[environment, step, :, 0] + 0.5 * last
+            sums.append(last)
+            last = last * ~done[environment, step]
+    middle = returns.add(reward[:, :4], done[:, :4], 0.0)
+    returns.add(reward[:, 4:], done[:, 4:], middle)
+    expected = torch.stack(sums).double().std(correction=0)
+    torch.testing.assert_close(returns.deviation(), expected, rtol=1e-5, atol=0.0)
 
 
 def test_what_does_not_fit_is_refused() -> None:
