@@ -140,7 +140,7 @@ def test_what_a_learner_of_ones_own_lacks_is_one_line(tmp_path, my_learner) -> N
 )
 def test_activation_schedule_and_clipping_are_settings_of_every_learner(tmp_path, agent) -> None:
     words = (f"agent={agent}", *SMALL, "agent.final_lr_fraction=0.2", "agent.clip_norm=1e-12")
-    words += ("agent.activation=tanh", "agent.schedule=linear")
+    words += ("agent.activation=tanh", "agent.schedule=linear", "agent.policy=network")
     if agent in ("ddpg", "td3", "sac"):
         words += ("agent.batch_size=16", "agent.saturation=0")
     loop = small_loop(tmp_path, *words)

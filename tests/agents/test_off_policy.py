@@ -30,6 +30,8 @@ SMALL = (
     "agent.batch_size=32",
     "agent.buffer_size=200",
     "agent.hidden=[16,16]",
+    "agent.policy=network",
+    "agent.actor_lr=1e-3",
 )
 EACH = pytest.mark.parametrize("agent", ["td3", "sac"])
 
