@@ -72,18 +72,9 @@ class Analytic(Aiming):
         require(not self.bootstrap or self.gamma < 1.0, "agent.bootstrap needs agent.gamma below 1")
 
     def setup(self, scene: Scene) -> None:
-        assert scene.observation is not None
         self.objective = Objective(self, scene.device, scene.world)
-        module = make_policy(
-            self.policy,
-            scene.observation,
-            self.hidden,
-            scene.seed,
-            self.constants,
-            scene.max_acceleration,
-            self.activation,
-        )
-        self.policy = module.to(scene.device)
+        given = self.hidden, self.constants, self.activation
+        self.policy = make_policy(self.policy, scene, *given)
         size, seed = scene.observation_size, scene.seed + 1
         self.burn_in = scene.world.steps(self.humans_first, "agent.humans_first")
         self.uncounted = scene.world.steps(self.warm_up, "agent.warm_up")

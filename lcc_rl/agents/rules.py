@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from lcc_rl.agents.actor import Activation, make_actor, seeded_mlp
+from lcc_rl.agents.agent import Scene
 from lcc_rl.errors import ConfigError, require, require_known, unknown_name
 from lcc_rl.functional.layout import total
 from lcc_rl.pieces.cruise import IDMACC, Cruise, LinearACC
@@ -97,11 +98,9 @@ RESIDUAL = "residual_"
 
 def make_policy(
     kind: str,
-    observation: Observation,
+    scene: Scene,
     hidden: Sequence[int],
-    seed: int,
     constants: Mapping[str, float] | None,
-    max_acceleration: float | None,
     activation: Activation = "relu",
 ) -> TensorDictModule:
     """Build the policy of an agent.
@@ -109,35 +108,36 @@ def make_policy(
     Args:
         kind: ``"network"``; a rule with learned constants, ``"idm"``, ``"acc"`` or ``"calm"``; or a
             rule with a network, such as ``"residual_idm"``.
-        observation: the observation of the policy.
+        scene: where the agent learns; rules need its observation.
         hidden: sizes of the hidden layers of a network.
-        seed: seed of its initial weights.
         constants: initial constants of a rule.
-        max_acceleration: acceleration of action 1 [m/s²]; None if it is unknown.
         activation: activation between the layers of a network.
 
     Returns:
         A module that reads ``"observation"`` ``[*batch, n]`` and writes ``"action"``
-        ``[*batch, 1]``.
+        ``[*batch, 1]``, on the device of the scene.
 
     Raises:
         ConfigError: if the kind is unknown, constants are given without a rule, or the acceleration
             of action 1 is unknown for a rule.
     """
-    size = observation.event_shape[-1]
+    size, seed = scene.observation_size, scene.seed
     if kind == NETWORK_ALONE:
         require(not constants, "agent.constants belong to a rule: use agent.policy=idm or acc")
-        return make_actor(size, 1, hidden, seed, activation)
+        return make_actor(size, 1, hidden, seed, activation).to(scene.device)
     name = kind.removeprefix(RESIDUAL)
     if name not in RULE_KINDS:
         known = (NETWORK_ALONE, *RULE_KINDS, *(RESIDUAL + rule for rule in RULE_KINDS))
         raise unknown_name("agent.policy", kind, known)
-    if max_acceleration is None:
+    if scene.max_acceleration is None:
         raise ConfigError(
             f"agent.policy={kind} needs the acceleration of action 1, but the controller of "
             "automated vehicles has no setting max_acceleration [m/s²]"
         )
-    module: nn.Module = Rule(RULE_KINDS[name], observation, constants, max_acceleration)
+    assert scene.observation is not None
+    rule = Rule(RULE_KINDS[name], scene.observation, constants, scene.max_acceleration)
+    module: nn.Module = rule
     if kind != name:
-        module = Residual(module, seeded_mlp(size, 1, hidden, seed, activation))  # type: ignore[arg-type]
-    return TensorDictModule(module, in_keys=["observation"], out_keys=["action"])
+        module = Residual(rule, seeded_mlp(size, 1, hidden, seed, activation))
+    policy = TensorDictModule(module, in_keys=["observation"], out_keys=["action"])
+    return policy.to(scene.device)

@@ -10,7 +10,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from lcc_rl.agents.actor import Activation, make_actor
+from lcc_rl.agents.actor import Activation
 from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.objective import Aiming, Objective
 from lcc_rl.agents.rules import NETWORK_ALONE, RESIDUAL, Residual, make_policy
@@ -29,12 +29,7 @@ class Returns(nn.Module):
         self.register_buffer("moments", torch.zeros(3, dtype=torch.float64))
 
     def add(self, reward: Tensor, done: Tensor, before: Tensor | float) -> Tensor | float:
-        """Add a segment after sums ``[environments, A, 1]``, or 0; return its last sums.
-
-        Args:
-            reward, done: after each decision, ``[environments, decisions, …]``.
-            before: the last sums of the segment before.
-        """
+        """Add a segment ``[environments, decisions, …]`` after given sums; return its last sums."""
         for now, ended in zip(reward.unbind(1), done.unsqueeze(-1).unbind(1), strict=True):
             sums = now + self.gamma * before
             self.moments += torch.stack([(sums.double() ** power).sum() for power in range(3)])
@@ -84,26 +79,22 @@ class Sampling(Aiming):
         Raises:
             ConfigError: if the policy is a rule alone.
         """
-        kind, size = self.policy, scene.observation_size
+        kind = self.policy
         self.every = max(scene.world.steps(self.hold, "agent.hold"), 1)
         if self.horizon is not None:
             self.gamma = math.exp(-self.every * scene.world.time_step / self.horizon)
         self.objective = Objective(self, scene.device, scene.world)
         self.returns = Returns(self.gamma).to(scene.device) if self.scale_rewards else None
         self.rule = None
-        if kind == NETWORK_ALONE:
-            learned = make_actor(size, 1, self.hidden, scene.seed, self.activation)
-            self.policy = learned.to(scene.device)
-            return self.policy
         require(
-            kind.startswith(RESIDUAL),
+            kind == NETWORK_ALONE or kind.startswith(RESIDUAL),
             f"agent.policy={kind}: only agent=analytic learns the constants of a rule; expected "
             f"{NETWORK_ALONE} or {RESIDUAL}{kind}",
         )
-        assert scene.observation is not None
-        given = kind, scene.observation, self.hidden, scene.seed, self.constants
-        self.policy = make_policy(*given, scene.max_acceleration, self.activation).to(scene.device)
-        whole: Residual = self.policy.module
+        self.policy = make_policy(kind, scene, self.hidden, self.constants, self.activation)
+        whole = self.policy.module
+        if not isinstance(whole, Residual):
+            return self.policy
         self.rule = whole.rule
         own = nn.Sequential(whole.network, nn.Tanh())
         return TensorDictModule(own, in_keys=["observation"], out_keys=["action"])

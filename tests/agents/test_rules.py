@@ -7,6 +7,7 @@ import torch
 from commands import tiny
 from helpers import compose, make_agent
 
+from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.rules import make_policy
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config.nodes import Node
@@ -23,10 +24,11 @@ def seen(speed: float, gap: float, relative: float) -> torch.Tensor:
     return torch.tensor([[[0.1 * (speed + relative), 0.1 * speed, 0.5 * relative, 0.1 * gap]]])
 
 
-def policy(kind: str, observation: Observation | None = None, **settings):
-    given = {"constants": None, "max_acceleration": 3.0} | settings
+def policy(kind: str, observation: Observation | None = None, constants=None, limit=3.0):
     observation = observation or Observation(scales=SCALES).bind()
-    return make_policy(kind, observation, (8, 8), 0, **given).module
+    size = observation.event_shape[-1]
+    scene = Scene(size, observation=observation, max_acceleration=limit)
+    return make_policy(kind, scene, (8, 8), constants).module
 
 
 @pytest.mark.parametrize("state", [(8.0, 15.0, 0.5), (0.0, 2.5, 1.0), (12.0, 18.0, -2.0)])
@@ -35,7 +37,7 @@ def test_the_rules_are_those_of_the_equations(state) -> None:
     idm = IDMConstants(1.2, 1.7, 1.5)(speed, gap, -relative, 20.0, 1.1)
     constants = {"desired_speed": 20.0, "time_gap": 1.1, "acceleration": 1.2}
     constants |= {"deceleration": 1.7, "min_gap": 1.5}
-    action = policy("idm", constants=constants, max_acceleration=4.0)(seen(*state))
+    action = policy("idm", constants=constants, limit=4.0)(seen(*state))
     assert action.item() == pytest.approx(float(idm) / 4.0, rel=1e-4)
     acc = LinearACC.law(speed, gap, relative, 25.0, 1.5, 2.0, 0.1, 0.5)
     assert policy("acc")(seen(*state)).item() == pytest.approx(float(acc) / 3.0, rel=1e-4)
