@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from abc import abstractmethod
 from collections.abc import Mapping
+from itertools import islice
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -54,6 +55,9 @@ class CollectingLoop(TrainingLoop[AgentT]):
             "as GaussianExploration(0.3), or None",
         )
         self.every = getattr(self.agent, "every", 1)
+        self.skipped, rest = divmod(getattr(self.agent, "burn_in", 0), self.settings.segment)
+        require(not rest, "training.segment must divide the steps of agent.humans_first")
+        self.horizon -= self.skipped * self.settings.segment
         self.rule = getattr(self.agent, "rule", None)
         self.objective: Objective | None = getattr(self.agent, "objective", None)
         self.wanted: list[Key] = []
@@ -105,7 +109,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
         sigma, rate = self.explore(share), self.agent.anneal(share)
         self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
         collector.reset()
-        segments = iter(collector)
+        segments = islice(collector, self.skipped, None)
         played, losses, missed, spent = [], [], [], [0.0, 0.0]
         returns, last = getattr(self.agent, "returns", None), 0.0
         for part in range(self.horizon // steps):

@@ -55,11 +55,13 @@ class Sampling(Aiming):
     hold: NonNegative = 0.0
     # Time after which a reward counts for 1/e, instead of gamma [s].
     horizon: Positive | None = None
+    # Time in which humans drive before every episode; nothing is learned from it [s].
+    humans_first: NonNegative = 0.0
     # Learn from rewards over the running standard deviation of their discounted sum.
     scale_rewards: bool = False
 
     LATER: ClassVar[Sequence[str]] = (
-        *("policy", "constants", "hold", "horizon", "scale_rewards"),
+        *("policy", "constants", "hold", "horizon", "scale_rewards", "humans_first"),
         *("surrogates", "regularizers", "limits", "limit_rate"),
     )
 
@@ -81,6 +83,7 @@ class Sampling(Aiming):
         """
         kind = self.policy
         self.every = max(scene.world.steps(self.hold, "agent.hold"), 1)
+        self.burn_in = scene.world.steps(self.humans_first, "agent.humans_first")
         if self.horizon is not None:
             self.gamma = math.exp(-self.every * scene.world.time_step / self.horizon)
         self.objective = Objective(self, scene.device, scene.world)

@@ -6,11 +6,19 @@ import math
 
 import pytest
 import torch
-from helpers import check_refused, check_resuming, compose, make_agent, small_loop
+from helpers import (
+    POPULATION,
+    check_refused,
+    check_resuming,
+    compose,
+    make_agent,
+    small_loop,
+    wavy_profiles,
+)
 from tensordict import TensorDict
 
 from lcc_rl.agents.collecting import decisions, of_decisions, transitions
-from lcc_rl.agents.factory import check_lengths
+from lcc_rl.agents.factory import check_lengths, make_trainer, training_env
 from lcc_rl.agents.sampling import Returns
 from lcc_rl.envs import make_env
 from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD, STEP
@@ -87,6 +95,28 @@ def test_the_scale_of_rewards_is_that_of_discounted_sums() -> None:
     returns.add(reward[:, 4:], done[:, 4:], middle)
     expected = torch.stack(sums).double().std(correction=0)
     torch.testing.assert_close(returns.deviation(), expected, rtol=1e-5, atol=0.0)
+
+
+def test_nothing_is_learned_from_the_time_of_human_drivers(tmp_path, monkeypatch) -> None:
+    words = ("scenario=ring", "scenario.string=automated human*3", "agent=ppo", "agent.hold=0.5")
+    words += ("agent.humans_first=2", "scenario.horizon=20")
+    sizes = ("training.environments=2", "training.episodes=2")
+
+    def begins(segment: int) -> list[int]:
+        cfg = compose("alcc", *words, *sizes, f"training.segment={segment}")
+        env = training_env(cfg, wavy_profiles(), POPULATION)
+        loop, steps = make_trainer(cfg, make_agent(cfg), env, tmp_path), []
+
+        def learn(batch: TensorDict, before: int) -> dict[str, float]:
+            steps.append(int(batch.get(STEP)[0, 0]))
+            return {"loss_value": 0.0}
+
+        monkeypatch.setattr(loop, "learn", learn)
+        loop.run()
+        return steps
+
+    assert begins(10) == [20, 30]
+    check_refused(begins, ((40, "training.segment must divide the steps of agent.humans_first"),))
 
 
 def test_what_does_not_fit_is_refused() -> None:
