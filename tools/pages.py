@@ -164,7 +164,6 @@ def averaged(rows: pd.DataFrame) -> str:
 def learners(reference: Path, docs: Path) -> None:
     """Write the scores of learners: a row per task and learner, with the range of seeds."""
     rows = worded(read_parquet(reference / "learners.parquet")).replace({"strategy": LEARNERS})
-    rows = rows.rename(columns={"minutes_until_there": "minutes_to_95_%"})
     scores = {"score": "mean", "score_low": "min", "score_high": "max"}
     how = {name: ("score", kind) for name, kind in scores.items()}
     how |= {name: (name, "mean") for name in rows.columns[4:]}
