@@ -55,9 +55,10 @@ class CollectingLoop(TrainingLoop[AgentT]):
             "as GaussianExploration(0.3), or None",
         )
         self.every = getattr(self.agent, "every", 1)
-        self.skipped, rest = divmod(getattr(self.agent, "burn_in", 0), self.settings.segment)
+        burn_in: int = getattr(self.agent, "burn_in", 0)
+        self.skipped, rest = divmod(burn_in, self.settings.segment)
         require(not rest, "training.segment must divide the steps of agent.humans_first")
-        self.horizon -= self.skipped * self.settings.segment
+        self.horizon -= burn_in
         self.rule = getattr(self.agent, "rule", None)
         self.objective: Objective | None = getattr(self.agent, "objective", None)
         self.wanted: list[Key] = []
