@@ -29,7 +29,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 CEILINGS = {
     "lcc_rl + tools": {"lines": 43_600, "code": 28_750},
     "tests": {"lines": 25_600},
-    "conf": {"yaml": 159},
+    "conf": {"yaml": 162},
 }
 CASES = 1_243  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {
