@@ -328,6 +328,9 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         return ConfigError(
             f"{key}={value}: several values are runs of a sweep, -m; a list is {key}=[{value}]"
         )
+    if found := re.match(r"(\w+)\S* appears more than once", str(error)):
+        group = found.group(1)
+        return ConfigError(f"+{group}=… is chosen already: leave it out, or write {group}=…")
     cause = error.__cause__
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)
     words = [*overrides, *text.partition("See https://")[0].split()]

@@ -43,6 +43,7 @@ log = logging.getLogger("lcc_rl")
 # vehicles takes longer than their steps.
 LONG, SHORT_STRING = 2_000, 40
 LEADER: Key = ("leader", "speed")
+OF_LEADER: Key = ("leader", "acceleration")  # at a change of the leader, of the new vehicle
 SCENE = {f"scenario.{name}" for name in ("string", "time_step", "horizon")}
 OF_ARGUMENTS = SCENE | {"leader", "data", "split", "compare", "policy", "seed", "evaluation"}
 # Nothing reads the reward; this term fits any scenario.
@@ -205,7 +206,7 @@ def _simulated(strategy: Strategy, inputs: Inputs, repeats: int, seed: int) -> S
     env = build_env(cfg, inputs.evaluation, inputs.population, batch, 0, cfg.device, nominal=True)
     long, short = cfg.scenario.horizon >= LONG, len(cfg.scenario.vehicles) <= SHORT_STRING
     rows = long and short and not isinstance(strategy.policy, GivenPolicy)  # has its own memory
-    keys = [LEADER, CLASS, INDEX, *(("vehicles", name) for name in MOTION)]
+    keys = [LEADER, OF_LEADER, CLASS, INDEX, *(("vehicles", name) for name in MOTION)]
     player = Player(env, strategy.policy, keys, strategy.title, long and not rows, rows)
     given = reset_options(env, profile, repeat % people, seed, people, repeat // people)
     record, alive = player.play(given)
@@ -230,8 +231,7 @@ class _Motion:
         self.groups = [own | {"gap": torch.cat([start, own["gap"]])}]
         self.kinds = [record[CLASS][0] if CLASS in record else None]
         if LEADER in record:
-            speed = record[LEADER].unsqueeze(-2)
-            change = speed.diff(dim=0) / self.time_step
+            speed, change = (record[key].unsqueeze(-2) for key in (LEADER, OF_LEADER))
             ahead = {"speed": speed, "gap": torch.full_like(speed, torch.nan)}
             ahead |= {"acceleration": change, "power": self.energy.power(speed[:-1], change)}
             self.groups, self.kinds = [ahead, *self.groups], [None, *self.kinds]
