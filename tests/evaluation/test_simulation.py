@@ -162,6 +162,16 @@ def test_wrong_arguments_are_named() -> None:
     check_refused(lambda given: lcc_rl.simulate(**given), cases)
 
 
+def test_a_leader_that_is_replaced_does_not_jump() -> None:
+    words = ["+event=cut_in", "scenario.pieces.leader.at=[3,4]"]
+    words += ["scenario.pieces.leader.excess=[-5,-4]", "scenario.pieces.leader.settling=5"]
+    steps = lcc_rl.simulate([12.0] * 101, "automated", overrides=words).steps
+    leader = steps[steps["vehicle"] == 0]
+    assert leader["speed_mps"].diff().min() < -3.9  # of two vehicles
+    assert leader["acceleration_mps2"].abs().max() < 1.1
+    assert leader["power_w"].min() > 0.0  # no braking
+
+
 def test_the_command_drives_as_the_function_does(tmp_path, capsys) -> None:
     leader, steps, vehicles = (tmp_path / x for x in ("a.csv", "steps.parquet", "vehicles.csv"))
     time = 0.1 * np.arange(len(WAVE))
