@@ -224,7 +224,8 @@ def described_records(profiles: Profiles, horizon: int) -> list[str]:
         short += [f"{name} ({seconds:g} s)"] * (len(x) <= horizon)
     more = [f"… and {len(lines) - MOST_LINES:,} slower records"] if len(lines) > MOST_LINES else []
     words = f"left out {len(short):,} of {len(profiles):,} record(s), shorter than an episode of"
-    more += [f"{words} {horizon * profiles.time_step:g} s: {listed(short)}"] * bool(short)
+    words += f" {horizon * profiles.time_step:g} s (scenario.horizon={horizon})"
+    more += [f"{words}: {listed(short)}"] * bool(short)
     return [
         line for _, line in (sorted(lines)[:MOST_LINES] if len(lines) > MOST_LINES else lines)
     ] + more

@@ -182,7 +182,8 @@ def _profiles(leader: Any, time_step: float, seconds: float | None) -> Profiles:
 def _record(leader: Any, time_step: float) -> Tensor:
     """Return a leader's speed at every step, ``[steps + 1]`` [m/s]."""
     if isinstance(leader, (str, PathLike)):
-        return resample(*read_speed_record(fspath(leader)), time_step)
+        hard = Plausible(max_hard=1.0)  # tests of brakes; the column names the unit
+        return resample(*read_speed_record(fspath(leader), hard), time_step)
     words = "simulate: leader must be speeds [m/s], a shipped cycle or a file"
     with raised_as(ConfigError, words, ValueError, TypeError):
         speeds = np.asarray(np.ma.filled(leader, np.nan), dtype=np.float32)

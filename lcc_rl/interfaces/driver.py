@@ -61,6 +61,8 @@ class Driver:
             returns.
         drivers: population of rules with human drivers, such as ``"human"``: a table of ``lcc-rl
             calibrate`` or a population of :mod:`lcc_rl.drivers.population`; None: the shipped one.
+        limits: ``max_braking`` and ``max_acceleration`` of the car [m/s²]; by default those of the
+            policy's training, for rules 3.
 
     Attributes:
         names: the inputs of :meth:`step`, in SI units: ``"self.gap"`` …
@@ -86,6 +88,7 @@ class Driver:
         safety: Safety = None,
         seed: int = 0,
         drivers: Population | str | Path | None = None,
+        limits: Mapping[str, float] | None = None,
     ) -> None:
         usable = isinstance(time_step, (int, float)) and 0.0 < time_step < math.inf
         require(usable, f"time_step must be a positive number of seconds, got {time_step!r}")
@@ -96,7 +99,7 @@ class Driver:
         self.time_step, self.seed = time_step, first or 0
         if is_policy(spec):
             require(drivers is None, f"drivers needs a rule; {self.name} is a policy")
-            self.program = program(spec, trust, safety=safety)
+            self.program = program(spec, trust, safety=safety, limits=limits)
             trained = self.program.controller.time_step
             if abs(trained - time_step) > 1e-9:
                 raise ConfigError(
@@ -105,20 +108,20 @@ class Driver:
                 )
         else:
             own = bootstrap(drivers) if isinstance(drivers, (str, Path)) else drivers
-            self.program = self._rule(spec, safety, measuring(time_step, True, own))
+            self.program = self._rule(spec, safety, measuring(time_step, True, own), limits)
         self.names = self.program.names
         self.behind = {x for x in self.names if x.startswith("behind.")} - {BEHIND_PRESENT}
         self._check()
         self.reset()
 
-    def _rule(self, spec: Any, safety: Safety, world: World) -> DrivingProgram:
+    def _rule(self, spec: Any, safety: Safety, world: World, limits: Any) -> DrivingProgram:
         own = None
         if isinstance(spec, str) and spec.endswith(FILTERED):
             filters = load("evaluate", ["variant=idm", "+filter=cbf"]).scenario.filters
             own = filters[AUTOMATED].made(CBFFilter)
         own = filter_of(safety, own, self.name)
         node = controller_of(spec, own is not None and own.time_gap is not None)
-        return driving([node.made(Controller)], own, world)
+        return driving([node.made(Controller)], own, world, limits)
 
     def _check(self) -> None:
         for name in self.names:

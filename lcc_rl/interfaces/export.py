@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from os import PathLike
 from pathlib import Path
@@ -42,6 +42,7 @@ def export(
     overrides: Sequence[str] = (),
     normalize: Any = None,
     safety: Safety = None,
+    limits: Mapping[str, float] | None = None,
 ) -> Path:
     """Write a trained policy, with its safety filter, for other software.
 
@@ -61,11 +62,13 @@ def export(
         path: the file to write.
         trust: modules outside this package that the policy may name.
         variant, overrides: environment in which a model or module was trained; for a page the
-            overrides are settings of its ring, for a trained policy's program settings of its
-            filter, such as ``safety.margin=2``.
+            overrides are settings of its ring, for a trained policy's program those of its filter
+            and of the car, such as ``safety.margin=2``, ``limits.max_braking=6``.
         normalize: ``VecNormalize`` of a model; by default that of its environment.
         safety: the safety filter of a program, or changed settings of its own, such as
             ``{"margin": 2.0}``.
+        limits: ``max_braking`` and ``max_acceleration`` of the car [m/s²]; by default those of the
+            training, for rules 3.
 
     Returns:
         The path of the file.
@@ -78,7 +81,7 @@ def export(
     Examples:
         >>> export("pretrained/alcc_limits", "alcc.pt2")  # doctest: +SKIP
     """
-    return _written(policy, path, trust, variant, overrides, normalize, safety)[0]
+    return _written(policy, path, trust, variant, overrides, normalize, safety, limits)[0]
 
 
 def _written(
@@ -89,6 +92,7 @@ def _written(
     overrides: Sequence[str] = (),
     normalize: Any = None,
     safety: Safety = None,
+    limits: Mapping[str, float] | None = None,
 ) -> tuple[Path, list[str]]:
     """Write the file, see :func:`export`; return its path and the inputs of its program."""
     path = new_file(path, "name")
@@ -102,25 +106,30 @@ def _written(
         cfg = load("train", with_variant(variant, overrides))
     rule = cfg is None and not is_policy(str(policy))
     words = f"{policy}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
-    require(not page or (cfg is None and safety is None and not rule), words)
+    require(not page or (cfg is None and not (safety or limits or rule)), words)
     if cfg is None and not page and overrides:
-        words = f"{' '.join(overrides)}: a program ({path.suffix}) has no road, a page ({PAGE}) has"
-        require(all(key_of(item).startswith("safety.") for item in overrides), words)
-        safety = dict(OmegaConf.from_dotlist(list(overrides)).safety)
+        words = (
+            f"{' '.join(overrides)}: a program ({path.suffix}) takes safety.… and limits.…, no road"
+        )
+        known = ("safety.", "limits.")
+        require(all(key_of(item).startswith(known) for item in overrides), words)
+        changed: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)))
+        safety, limits = changed.get("safety", safety), changed.get("limits", limits)
     names: list[str] = []
     if page:
         content = ring_page(policy, trust, overrides).encode()
     else:
-        own = _rule(policy, trust, safety) if rule else program(policy, trust, cfg, safety)
+        how = (safety, limits)
+        own = _rule(policy, trust, *how) if rule else program(policy, trust, cfg, *how)
         content, names = EXPORTERS[path.suffix](own, _name(policy)), own.names
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path, names
 
 
-def _rule(name: Any, trust: Sequence[str], safety: Safety) -> DrivingProgram:
+def _rule(name: Any, trust: Sequence[str], safety: Safety, limits: Any) -> DrivingProgram:
     """Return the program of a rule with steps of 0.1 s."""
-    found = Driver(str(name), 0.1, trust, safety).program
+    found = Driver(str(name), 0.1, trust, safety, limits=limits).program
     require(SEED not in found.kept, f"{name} draws noise from seeds: it cannot be exported")
     return found
 
@@ -194,7 +203,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("policy", help="run folder, policy.pt, pretrained/<name> or a rule")
     parser.add_argument("path", help="file: a program (.onnx, .pt2, .c) or a page (.html)")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
-    words = "of a page's ring (drivers=i80) or of a program's filter (safety.margin=2)"
+    words = "of a page's ring (drivers=i80), of a program (safety.margin=2 limits.max_braking=6)"
     parser.add_argument("settings", nargs="*", default=[], help=words)
     options = parser.parse_args(arguments)
     given = options.policy, options.path, options.trust

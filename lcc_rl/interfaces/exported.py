@@ -46,7 +46,7 @@ from lcc_rl.pieces.knowledge import ObservationMemory
 from lcc_rl.pieces.views import BEHIND, SELF, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.results.policies import load_policy
-from lcc_rl.settings import Positive, parse, values
+from lcc_rl.settings import Positive, Settings, parse, values
 
 # Entries that are computed from other measurements: v_ahead − v.
 DERIVED_INPUTS = {
@@ -58,6 +58,17 @@ COMMAND_KEY = (AUTOMATED, "command")
 
 
 Safety = CBFFilter | Mapping[str, Any] | None  # a filter, or changed settings of a given one
+
+
+class Limits(Settings):
+    """Brakes and drive of the vehicle; None: those of the training, 3 m/s² for a rule."""
+
+    max_braking: Positive | None = None  # [m/s²]
+    max_acceleration: Positive | None = None  # [m/s²]
+
+    def of(self, world: World) -> World:
+        """Return a world with these limits of automated vehicles."""
+        return replace(world, **{name: x for name, x in values(self).items() if x is not None})
 
 
 class Input(NamedTuple):
@@ -264,6 +275,7 @@ def program(
     trust: Sequence[str] = (),
     cfg: StudyConfig | None = None,
     safety: Safety = None,
+    limits: Mapping[str, float] | None = None,
 ) -> DrivingProgram:
     """Build the program of a trained policy.
 
@@ -273,6 +285,7 @@ def program(
         trust: modules outside this package that the policy may name.
         cfg: the configuration in which a network was trained.
         safety: the safety filter, or changed settings of its own; None: its own.
+        limits: settings of :class:`Limits`.
 
     Raises:
         ConfigError: if no network drives, its filter depends on delays of a scenario, or its
@@ -322,7 +335,7 @@ def program(
     memory = [p for p in pieces if isinstance(p, ObservationMemory) and p.view in seen]
     largest = action.max_acceleration
     network = NetworkController(network=network, max_acceleration=largest)
-    return driving([*memory, observation, network], safety, world)
+    return driving([*memory, observation, network], safety, world, limits)
 
 
 def filter_of(safety: Safety, own: CBFFilter | None, name: str) -> CBFFilter | None:
@@ -335,11 +348,17 @@ def filter_of(safety: Safety, own: CBFFilter | None, name: str) -> CBFFilter | N
     return parse(type(own), values(own) | dict(safety), "safety")
 
 
-def driving(pieces: Sequence[Piece], safety: CBFFilter | None, world: World) -> DrivingProgram:
+def driving(
+    pieces: Sequence[Piece],
+    safety: CBFFilter | None,
+    world: World,
+    limits: Mapping[str, float] | None,
+) -> DrivingProgram:
     """Return the program of pieces and a filter in a world; the filter acts from the start.
 
-    All are bound here, see :class:`DrivingProgram` and :func:`measuring`.
+    All are bound here, see :class:`DrivingProgram`, :func:`measuring` and :class:`Limits`.
     """
+    world = parse(Limits, limits or {}, "limits").of(world)
     if safety is not None:
         world = replace(world, filtered=[AUTOMATED])
         pieces = [*pieces, type(safety)(**values(safety) | {"from_s": 0.0})]

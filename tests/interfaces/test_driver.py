@@ -184,6 +184,17 @@ def test_a_driver_keeps_the_margin_of_its_filter_behind_a_car_at_standstill() ->
             assert gap >= (margin or 0.2) - 0.01
 
 
+def test_brakes_and_drive_are_those_of_the_car() -> None:
+    near = STEADY | {"ahead.speed": 2.0, "self.speed": 15.0, "self.gap": 12.0}
+    far = STEADY | {"ahead.speed": 15.0, "self.speed": 2.0, "self.gap": 300.0}
+    limits = {"max_braking": 6.0, "max_acceleration": 1.5}
+    for name in (POLICY, "idm_acc_filtered"):
+        usual, own = Driver(name, 0.1), Driver(name, 0.1, limits=limits)
+        assert usual.step(near) == pytest.approx(-3.0)
+        assert own.step(near) == pytest.approx(-6.0)
+        assert own.step(far, ["other"]) <= 1.5 + 1e-6
+
+
 def test_without_a_vehicle_behind() -> None:
     measured, _ = driven(POLICY)
     here = at(0, measured)
@@ -244,6 +255,7 @@ def test_bad_input_is_one_clear_error() -> None:
         ("idm_acc", None, "time_step must be a positive number of seconds, got None"),
         ("idm_acc", 0.1, (), {"margin": 2.0}, "idm_acc has no safety filter whose settings"),
         (POLICY, 0.1, (), {"margins": 2.0}, "Did you mean 'margin'"),
+        (POLICY, 0.1, (), None, 0, None, {"max_brake": 6}, "Did you mean 'max_braking'"),
         *(("human", 0.1, (), None, x, "seed must be a whole") for x in (-1, 2**40, 0.5, None)),
     ]
     check_refused(Driver, making, ConfigError)

@@ -177,6 +177,11 @@ def test_bad_input_is_one_clear_error() -> None:
         (["pretrained/nobody", "x.onnx"], "nobody"),
         (["pretrained/alcc", "x.onnx", "safety.margin=2"], "alcc has no safety filter"),
         (["pretrained/i80-follow", "x.onnx", "safety.margin=-2"], r"safety.margin must be greater"),
+        (["idm_acc", "x.c", "limits.max_braking=0"], "limits.max_braking must be greater than 0"),
+        (
+            ["idm_acc", "x.c", "scenario.max_braking=6"],
+            r"a program \(.c\) takes safety.… and limits.…",
+        ),
         (["idm_ac", "x.onnx"], "idm_acc"),
         (["idm_acc", "x.html"], r"idm_acc: a page \(.html\) needs a run or a policy file"),
         (["human", "x.c"], "human draws noise from seeds: it cannot be exported"),
