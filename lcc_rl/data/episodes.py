@@ -110,11 +110,11 @@ def read_episodes(
 
 
 def _table(
-    file: TableFile, columns: Names, units: Units, place: Places, recordings: Set[str], count: int
+    file: TableFile, columns: Names, units: Units, place: Places, seen: Set[str], count: int
 ) -> tuple[pd.DataFrame, list[str]]:
     """Read a file after ``count`` episodes of the recordings ``seen``, and resample it."""
     names = _names(file, columns)
-    table, numbers = _rows(file, names, units, recordings, count)
+    table, numbers = _rows(file, names, units, seen, count)
     notes = list(file.notes)
     for name, note in (
         ("recording", "no column recording: each file is one recording"),
@@ -140,7 +140,7 @@ def _table(
 
 
 def _rows(
-    file: TableFile, names: Names, units: Units, recordings: Set[str], count: int
+    file: TableFile, names: Names, units: Units, seen: Set[str], count: int
 ) -> tuple[pd.DataFrame, NDArray[np.int64]]:
     """Return rows of a file with episodes numbered from 0, and the file's own numbers."""
     read = file.read(PAIR_FIELDS, names, units, "data.columns", PAIR_MEASURED)
@@ -155,7 +155,7 @@ def _rows(
     if numbers is None or (np.abs(numbers) >= 2**31).any():
         numbers = np.arange(len(distinct))
     recording = read.get("recording", same_text(file.label, rows))
-    before = count * bool(recordings & {*recording.categories})
+    before = count * bool(seen & {*recording.categories})
     # Unknown vehicles of several files are different ones.
     follower = 2 * (pd.factorize(cars)[0] + before) + 2
     values = {

@@ -181,7 +181,7 @@ class _Rows:
     blank_classes: int = 0
 
     def add(self, file: str, block: Block, location: str | None) -> None:
-        """Add the rows of a block; with ``wanted``, those of that location only."""
+        """Add the rows of a block; with ``location``, those of that location only."""
         self.report.rows_read += len(block)
         names, places = [""], np.zeros(len(block), dtype=np.int64)
         if "Location" in block.cells.column_names:
