@@ -96,7 +96,7 @@ def settings_of_run(study: Study, entry: str, variant: str, change: Change, *own
         users = [x for x in users if x not in moved]
         changed = (*changed, *(x.replace("split.", "split.held_out.", 1) for x in moved))
     drivers = ("drivers=calibrated", f"drivers.path={quoted(study.folder / DRIVERS_FILE)}")
-    lines = [
+    options = [
         f"experiment=[{','.join([*filter(None, [study.recipe]), *change.recipes])}]",
         f"variant={variant}",
         "data=episodes",
@@ -106,7 +106,7 @@ def settings_of_run(study: Study, entry: str, variant: str, change: Change, *own
         *changed,
         *own,
     ]
-    return load(entry, lines)
+    return load(entry, options)
 
 
 def alcc_trainings(study: Study, change: Change) -> dict[str, TrainConfig]:

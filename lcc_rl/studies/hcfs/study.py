@@ -54,8 +54,8 @@ def evaluation(study: Study, *own: str) -> StudyConfig:
     """Return the configuration of an evaluation of the hybrid."""
     shared = known_settings(list(study.overrides), "evaluate")
     leader = () if any(top_key(item) == "leader" for item in study.overrides) else (WLTC,)
-    lines = [f"experiment={study.recipe}", "variant=hcfs", *leader, *shared, *own]
-    cfg: StudyConfig = load("evaluate", lines)
+    options = [f"experiment={study.recipe}", "variant=hcfs", *leader, *shared, *own]
+    cfg: StudyConfig = load("evaluate", options)
     return cfg
 
 
