@@ -11,7 +11,7 @@ with = are settings. More with lcc_rl.simulate in Python.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.config.schemas import TimeStep
@@ -21,7 +21,7 @@ from lcc_rl.io.files import write_table
 from lcc_rl.runs.arguments import TABLE, Arguments, files_and_settings, typed
 from lcc_rl.settings import Count, Positive, Seed
 
-ARGUMENTS = {
+ARGUMENTS: dict[str, tuple[Callable[[str], object], str]] = {
     "string": (str, "vehicles from front to back, by default human*10"),
     "controller": (str, "of automated vehicles: a name, a file, a run, my_module.Class"),
     "time_step": (typed(TimeStep), "duration of a step [s], by default 0.1"),
