@@ -63,26 +63,26 @@ def run(
     require(not steps.empty, f"{folder}: holds no sample episode; evaluate with {SAMPLES_KEPT}")
     motions = {}
     with naming_run(folder):
-        known = list(dict.fromkeys(map(str, steps["strategy"])))
-        named = [name.partition(": ")[::2] for name in strategies or known[-1:]]
-        for given, words in named:
-            strategy = strategy_named(given, known)
+        names = list(dict.fromkeys(map(str, steps["strategy"])))
+        named = [name.partition(": ")[::2] for name in strategies or names[-1:]]
+        for key, title in named:
+            strategy = strategy_named(key, names)
             label, rows = _episode(steps, strategy, episode)
             scenario = stored_config(folder)["scenario"]
             motion = _cut(motion_of(rows, scenario), start, duration)
             # Side by side, only a short title fits.
             name = in_words(strategy) + (f": {label}" if len(named) == 1 else "")
-            motions[words or name] = motion
+            motions[title or name] = motion
     default = folder / "figures" / f"animation_{in_file(named[0][0])}_{episode}.html"
     return animate(motions, out or default)
 
 
 def _episode(steps: pd.DataFrame, strategy: str, episode: int) -> tuple[str, pd.DataFrame]:
     """Return name and rows of a sample episode."""
-    found = list(sample_episodes(steps, strategy).items())
-    if not 0 <= episode < len(found):
-        raise ConfigError(f"--episode must lie from 0 to {len(found) - 1}, got {episode}")
-    return found[episode]
+    episodes = list(sample_episodes(steps, strategy).items())
+    if not 0 <= episode < len(episodes):
+        raise ConfigError(f"--episode must lie from 0 to {len(episodes) - 1}, got {episode}")
+    return episodes[episode]
 
 
 def _cut(motion: SampleMotion, start: float, duration: float | None) -> SampleMotion:
@@ -100,9 +100,9 @@ def _cut(motion: SampleMotion, start: float, duration: float | None) -> SampleMo
 
 def with_steps(folder: Path) -> Path:
     """Return the folder of a run's sample episodes; for a main job, of its evaluation."""
-    for place in (folder, folder / "evaluation"):
-        if (place / STEPS).is_file():
-            return place
+    for path in (folder, folder / "evaluation"):
+        if (path / STEPS).is_file():
+            return path
     if not (folder / CONFIG).is_file():
         raise no_run(folder)
     raise ResultsError(f"{folder}: holds no {STEPS}: not evaluated yet?")

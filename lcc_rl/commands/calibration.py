@@ -133,21 +133,21 @@ def _summary(drivers: pd.DataFrame) -> Table:
     """Return means and standard deviations of errors and parameters, by mode."""
     modes = list(drivers["mode"].unique())
     table = Table("", *modes, title="calibrated drivers, mean ± standard deviation", **PLAIN)
-    parts = {mode: drivers[drivers["mode"] == mode] for mode in modes}
-    table.add_row("fitted", *map(count_records, parts.values()))
+    groups = {mode: drivers[drivers["mode"] == mode] for mode in modes}
+    table.add_row("fitted", *map(count_records, groups.values()))
     errors = [(column, column, label) for column, label in ERROR_HEADINGS]
     errors += [(column + OUT, column, f"{label}, held out") for column, label in ERROR_HEADINGS]
     for column, kind, label in errors:
         if column in drivers:
             scale = 1.0 if kind.endswith("_m") else 100.0
-            table.add_row(escape(label), *(_spread(scale * p[column]) for p in parts.values()))
-    for one in parameters_of(drivers[MODEL].unique()).values():
-        row = (_spread(part[one.column]) for part in parts.values())
-        table.add_row(escape(re.sub(r" \$.*\$", "", one.label)), *row)
-        for gap, label in BESIDE_T if one.column == PARAMETERS["time_gap"].column else ():
-            times = (_spread(part[gap] / part[MEAN_SPEED]) for part in parts.values())
+            table.add_row(escape(label), *(_spread(scale * p[column]) for p in groups.values()))
+    for parameter in parameters_of(drivers[MODEL].unique()).values():
+        row = (_spread(part[parameter.column]) for part in groups.values())
+        table.add_row(escape(re.sub(r" \$.*\$", "", parameter.label)), *row)
+        for gap, label in BESIDE_T if parameter.column == PARAMETERS["time_gap"].column else ():
+            times = (_spread(part[gap] / part[MEAN_SPEED]) for part in groups.values())
             table.add_row(escape(label), *times)
-    populations = [from_table(part).summary() for part in parts.values()]
+    populations = [from_table(part).summary() for part in groups.values()]
     correlations = (row["correlation"] for row in populations)
     shown = (f"{value:.2f}" if math.isfinite(value) else DASH for value in correlations)
     table.add_row("correlation of (v0, T)", *shown)

@@ -68,19 +68,19 @@ def plan(options: Namespace, cfg: EvaluateConfig, inputs: Inputs, folder: Path) 
     """Evaluate human driver, policies and plans; write and return the rows of episodes.parquet."""
     learned = [initial_strategy(cfg, path, inputs) for path in options.policy or ["pretrained"]]
     check_distinct(learned)
-    parts = list(blocks(inputs, cfg))
-    work = len(parts) * len(learned) * (1 + options.regard) * options.iterations
-    made, done = [], count(1)
+    pieces = list(blocks(inputs, cfg))
+    work = len(pieces) * len(learned) * (1 + options.regard) * options.iterations
+    tables, done = [], count(1)
     with ProgressReporter("clairvoyant", work, folder=folder) as progress:
 
         def update(_: int, values: dict[str, float]) -> None:
             progress.update(next(done), values)
 
-        for first, block in parts:
+        for first, block in pieces:
             rows = pd.concat(block_rows(cfg, learned, block, options, update))
             rows["profile_id"] += first
-            made.append(rows)
-    episodes = pd.concat(made, ignore_index=True)
+            tables.append(rows)
+    episodes = pd.concat(tables, ignore_index=True)
     write_parquet(episodes, folder / EPISODES)
     return episodes
 
@@ -124,7 +124,7 @@ def block_rows(
     task = task_of(cfg)
     rival = baseline(cfg, task.against if task else "idm")
     yield from (drive(strategy) for strategy in (rival, *learned))
-    for own in (False, True) if options.regard else (False,):
+    for alone in (False, True) if options.regard else (False,):
         plans = [
             clairvoyant(
                 strategy,
@@ -133,7 +133,7 @@ def block_rows(
                 size.seed,
                 options.iterations,
                 not options.no_compile,
-                own,
+                alone,
                 hold,
                 update,
             )
@@ -151,13 +151,13 @@ def best(plans: list[pd.DataFrame]) -> pd.DataFrame:
 
 def regard(episodes: pd.DataFrame) -> str:
     """Return a sentence on the largest saving by regard for the drivers behind."""
-    found = savings(episodes, PATH_ENERGY[BOUND_BOTH], BOUND_BOTH, BOUND_OWN)
+    saved = savings(episodes, PATH_ENERGY[BOUND_BOTH], BOUND_BOTH, BOUND_OWN)
     energy = episodes.groupby("strategy")[PATH_ENERGY[BOUND_BOTH]].mean()
     share = (energy[BOUND_OWN] - energy[BOUND_BOTH]) / energy["idm"]
     return (
-        f"With plans for all vehicles, their path energy is {100 * found.value:.2f} % lower than "
-        f"with plans for the car only (95 % interval over windows: {100 * found.low:.2f} … "
-        f"{100 * found.high:.2f}); {share:.2%} of idm's."
+        f"With plans for all vehicles, their path energy is {100 * saved.value:.2f} % lower than "
+        f"with plans for the car only (95 % interval over windows: {100 * saved.low:.2f} … "
+        f"{100 * saved.high:.2f}); {share:.2%} of idm's."
     )
 
 

@@ -56,31 +56,31 @@ def trip_energies(
         dioxide.
     """
     for word in overrides:
-        known = top_key(word) in ("energy", "leader", "scenario", "trust")
-        require(known, f"{word} has no effect on the energy of given trips")
+        valid = top_key(word) in ("energy", "leader", "scenario", "trust")
+        require(valid, f"{word} has no effect on the energy of given trips")
     names = [path] if isinstance(path, (str, PathLike)) else path
     listed = ",".join(quoted(fspath(name)) for name in names)
-    words = ["variant=direct", "leader=drives", f"leader.path=[{listed}]", *overrides]
-    cfg = load("evaluate", words)
-    (model, *others), step = build_energy(cfg).models, cfg.scenario.time_step
-    require(not others, "energy: a mixture has several models; choose one, such as fuel")
+    settings = ["variant=direct", "leader=drives", f"leader.path=[{listed}]", *overrides]
+    cfg = load("evaluate", settings)
+    (model, *further), step = build_energy(cfg).models, cfg.scenario.time_step
+    require(not further, "energy: a mixture has several models; choose one, such as fuel")
     source = cfg.leader.made(DriveLeaders)
-    how = (source.plausible, source.units, source.average_s)
-    records, lines = read_drives(source.path, source.columns, step, *how)
+    options = (source.plausible, source.units, source.average_s)
+    records, lines = read_drives(source.path, source.columns, step, *options)
     log_report(lines)
     blocks = (slice(first, first + BLOCK) for first in range(0, len(records), BLOCK))
     rows = pd.concat([_energies(records, block, model) for block in blocks])
     trips = rows.groupby("trip").sum().reset_index()
     order = trips["trip"].astype(str).str.replace(r"\d+", lambda x: x[0].zfill(20), regex=True)
     trips = trips.loc[order.sort_values().index].reset_index(drop=True)  # 2 before 10
-    way = trips["distance_km"].where(trips["distance_km"] > 0.0)
+    km = trips["distance_km"].where(trips["distance_km"] > 0.0)
     trips["energy_kwh"] = trips["energy_kj"] / KWH
-    trips["kwh_per_100km"] = 100.0 * trips["energy_kwh"] / way
+    trips["kwh_per_100km"] = 100.0 * trips["energy_kwh"] / km
     if model.heating_value:
         drawn = torch.from_numpy(trips["energy_kj"].to_numpy() / KILO)
         trips["fuel_l"], trips["co2_g"] = (x.numpy() for x in model.burnt(drawn))
-        trips["l_per_100km"] = 100.0 * trips["fuel_l"] / way
-        trips["co2_g_per_km"] = trips["co2_g"] / way
+        trips["l_per_100km"] = 100.0 * trips["fuel_l"] / km
+        trips["co2_g_per_km"] = trips["co2_g"] / km
     return trips
 
 
@@ -125,8 +125,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     trips = trip_energies(files, settings)
     print(trips.head(MOST_ROWS).to_string(index=False, float_format="{:,.4g}".format))
     sums = trips[["distance_km", "energy_kj", "energy_kwh"]].sum()
-    words = "{distance_km:,.1f} km, {energy_kj:,.0f} kJ, {energy_kwh:,.1f} kWh".format(**sums)
-    print(f"{len(trips):,} trips: {words}")
+    totals = "{distance_km:,.1f} km, {energy_kj:,.0f} kJ, {energy_kwh:,.1f} kWh".format(**sums)
+    print(f"{len(trips):,} trips: {totals}")
     if out:
         write_table(trips, out)
 

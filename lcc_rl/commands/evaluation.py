@@ -117,8 +117,8 @@ def _run(
         (folder / EPISODES).unlink(missing_ok=True)
     save_config(cfg, folder)
     rows = evaluate_and_write(comparison, inputs, folder, quiet)
-    for words in filter(None, (policy.clipped() for policy in policies.values())):
-        log.warning(words)
+    for message in filter(None, (policy.clipped() for policy in policies.values())):
+        log.warning(message)
     if not quiet:
         draw(rows, cfg, folder)
     return rows
@@ -132,8 +132,8 @@ def draw(rows: Rows, cfg: EvaluateConfig, folder: Path) -> None:
     # Here, because a training draws nothing and need not load matplotlib.
     from lcc_rl.figures.evaluation import write_figures
 
-    own = [name for name in rows["strategy"].unique() if not is_shipped(name)]
-    write_figures(folder, cfg.evaluation.rows, list(reports(rows, cfg)), own)
+    names = [name for name in rows["strategy"].unique() if not is_shipped(name)]
+    write_figures(folder, cfg.evaluation.rows, list(reports(rows, cfg)), names)
 
 
 def evaluate_and_write(comparison: Comparison, inputs: Inputs, folder: Path, quiet: bool) -> Rows:
@@ -155,17 +155,17 @@ def evaluate_and_write(comparison: Comparison, inputs: Inputs, folder: Path, qui
 def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterator[Report]:
     """Yield the report of each source of leaders or case of a platoon."""
     if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":
-        for source, part in by_source(rows):
+        for source, group in by_source(rows):
             of = f"{source}: " if source else ""
-            for case in dict.fromkeys(part["case"]):
-                yield case_report(part, case, f"{of}{case}")
+            for case in dict.fromkeys(group["case"]):
+                yield case_report(group, case, f"{of}{case}")
         return
     filtered = cfg.scenario.filters.get(AUTOMATED) is not None
-    words = list(filter(None, [other_drivers(cfg), classes(cfg)]))
+    notes = list(filter(None, [other_drivers(cfg), classes(cfg)]))
     of_sweep = rows.attrs.get("remarks", ()) if isinstance(rows, pd.DataFrame) else ()
-    for source, part in by_source(windows_for(rows)):
-        one = report(
-            part,
+    for source, group in by_source(windows_for(rows)):
+        result = report(
+            group,
             task_of(cfg),
             build_energy(cfg),
             filtered,
@@ -173,7 +173,7 @@ def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterato
             against=against,
             second=second_energy(cfg),
         )
-        yield dataclasses.replace(one, remarks=[*one.remarks, *words, *of_sweep])
+        yield dataclasses.replace(result, remarks=[*result.remarks, *notes, *of_sweep])
 
 
 def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
@@ -183,16 +183,16 @@ def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
     drivers += f" × {plan.repeats} repeats" if plan.repeats > 1 else ""
     drivers += f", shard {plan.shard} of {plan.shards}" if plan.shards > 1 else ""
     counts = Counter(inputs.evaluation.sources or [""] * plan.profiles)
-    for one in reports(rows, cfg):
-        title = one.of
-        if one.of in counts:
-            of = [x for x in (cfg.task and str(cfg.task["name"]), one.of) if x]
-            windows = counted_windows(counts[one.of], "held-out " * bool(len(inputs.training)))
+    for result in reports(rows, cfg):
+        title = result.of
+        if result.of in counts:
+            of = [x for x in (cfg.task and str(cfg.task["name"]), result.of) if x]
+            windows = counted_windows(counts[result.of], "held-out " * bool(len(inputs.training)))
             warm_up = cfg.evaluation.warm_up
             size = f"{windows} × {drivers}, {cfg.scenario.horizon} steps"
             size += f", after {warm_up:g} s" if warm_up else ""
             title = ": ".join([*of, size])
-        print_table(terminal(one, title, cfg.table == "all"))
+        print_table(terminal(result, title, cfg.table == "all"))
     seconds = cfg.scenario.horizon * cfg.scenario.time_step
-    if words := few_windows(plan.profiles, seconds):
-        log.info(words)
+    if warning := few_windows(plan.profiles, seconds):
+        log.info(warning)

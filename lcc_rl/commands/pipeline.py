@@ -108,12 +108,12 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
         else:
             raise ConfigError(f"{folder}: not the folder of a pipeline: it has no {COMMAND_FILE}")
         prepare_torch(cfg)
-        for name, part in trainings.items():
-            check_settings(part, folder / name)
+        for name, training in trainings.items():
+            check_settings(training, folder / name)
         check_measured(final)
         save_config(cfg, folder)
-        for name, own in {**trainings, FINAL: final}.items():
-            save_config(own, folder / PARTS / name)
+        for name, settings in {**trainings, FINAL: final}.items():
+            save_config(settings, folder / PARTS / name)
         with atomic_path(folder / COMMAND_FILE) as temporary:
             temporary.write_text(command, encoding="utf-8")
         return _run(cfg, trainings, final, folder, command)
@@ -123,21 +123,21 @@ def composed_part(
     cfg: PipelineConfig, overrides: list[str]
 ) -> tuple[dict[str, TrainConfig], EvaluateConfig]:
     """Compose the parts of a job: trainings by variant, and the evaluation."""
-    for item in overrides:
-        if top_key(item) == "variant":
+    for override in overrides:
+        if top_key(override) == "variant":
             raise ConfigError(
-                f"{item} has no effect on lcc-rl run, which trains several: use variants=[…]"
+                f"{override} has no effect on lcc-rl run, which trains several: use variants=[…]"
             )
-    shared = [item for item in overrides if top_key(item) not in JOB_OPTIONS]
-    learned = [item for item in shared if key_of(item) != BASELINES]
+    shared = [override for override in overrides if top_key(override) not in JOB_OPTIONS]
+    learned = [override for override in shared if key_of(override) != BASELINES]
     names = cfg.variants or NETWORKS
     trainings = {name: load("train", [*learned, f"variant={name}"]) for name in names}
     if cfg.variants is None and trainings[names[-1]].agent.kind is Analytic:
         trainings = {RULE: load("train", [*learned, f"variant={RULE}"]), **trainings}
     final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={names[-1]}"])
-    trainings = {name: part.with_(data=cfg.data) for name, part in trainings.items()}
+    trainings = {name: training.with_(data=cfg.data) for name, training in trainings.items()}
     # It reads the policies of these trainings, with classes of the same command.
-    own = (module for part in trainings.values() for module in own_modules(part))
+    own = (module for training in trainings.values() for module in own_modules(training))
     return trainings, final.with_(data=cfg.data, trust=list(dict.fromkeys([*final.trust, *own])))
 
 
@@ -153,13 +153,13 @@ def _run(
     drivers = calibrate_once(cfg, folder)
     population = Node.of({TARGET: path_of(bootstrap), "path": str(drivers)}, "drivers")
     traffic = {"data": _episodes(cfg, folder), "drivers": population}
-    trainings = {name: part.with_(**traffic) for name, part in trainings.items()}
+    trainings = {name: training.with_(**traffic) for name, training in trainings.items()}
     show_headline(f"training {', '.join(trainings)}, {cfg.jobs} at a time; details in */train.log")
     try:
         train_all(trainings, folder, cfg.jobs)
     except Interrupted:
-        words = f"stopped; complete it with: lcc-rl run resume={folder}{trust_option(final)}"
-        raise Interrupted(words) from None
+        message = f"stopped; complete it with: lcc-rl run resume={folder}{trust_option(final)}"
+        raise Interrupted(message) from None
     learned = [name for name in trainings if (folder / name / "policy.pt").exists()]
     final = final.with_(**traffic, compare=[str(folder / name) for name in learned])
     show_headline("evaluating them and the baselines on held-out windows")
@@ -167,8 +167,8 @@ def _run(
     rows = evaluation.run(final, folder / FINAL, own=False, quiet=paged)
     if final.compare:
         curve = training_figure(results.load(folder, "training"))
-        place = folder / FINAL / "figures" / "learning_curve.png"
-        save(curve, place, formats=cfg.figure_formats)
+        path = folder / FINAL / "figures" / "learning_curve.png"
+        save(curve, path, formats=cfg.figure_formats)
     if paged and isinstance(rows, pd.DataFrame):
         size = sample_of(rows)
         filtered = final.scenario.filters.get(AUTOMATED) is not None
@@ -199,10 +199,10 @@ def read_once(cfg: PipelineConfig, folder: Path, learns: bool = True) -> None:
     Raises:
         ResultsError: if existing ones are of other settings or files.
     """
-    path, own = folder / TRAJECTORIES, as_plain(cfg.data)
-    made = config_hash([own, cfg.inputs.get("data")])
+    path, data = folder / TRAJECTORIES, as_plain(cfg.data)
+    digest = config_hash([data, cfg.inputs.get("data")])
     if path.exists():
-        if parquet_metadata(path).get(MADE, made) != made:
+        if parquet_metadata(path).get(MADE, digest) != digest:
             raise ResultsError(f"{path} is of other data; choose another folder, or remove this")
         return
     loaded = cfg.data.made(LOADS).load()
@@ -212,18 +212,18 @@ def read_once(cfg: PipelineConfig, folder: Path, learns: bool = True) -> None:
     if learns:
         load_inputs(cfg, loaded.episodes).to_learn_from()
     episodes = loaded.episodes[list(SCHEMA)].astype({**SCHEMA, "recording": str})
-    write_parquet(episodes, path, {MADE: made, "report": "\n".join(loaded.report)})
+    write_parquet(episodes, path, {MADE: digest, "report": "\n".join(loaded.report)})
 
 
 def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
     """Calibrate drivers to the trajectories in the folder, unless this is done."""
     drivers = folder / "calibration" / "drivers.parquet"
-    shared = {item.name: getattr(cfg, item.name) for item in fields(CalibrateConfig)}
-    own = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})
-    check_folder(own, drivers.parent)
+    shared = {field.name: getattr(cfg, field.name) for field in fields(CalibrateConfig)}
+    settings = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})
+    check_folder(settings, drivers.parent)
     if not drivers.exists():
-        found = calibration.run(own, drivers.parent, Console(quiet=True), emit=log_report)
-        modes = {str(mode): rows for mode, rows in found.groupby("mode", sort=False)}
+        fits = calibration.run(settings, drivers.parent, Console(quiet=True), emit=log_report)
+        modes = {str(mode): rows for mode, rows in fits.groupby("mode", sort=False)}
         errors = (f"{mode} {100.0 * x['rmspe'].mean():.2f} %" for mode, x in modes.items())
         records = count_records(next(iter(modes.values())))
         show_headline(f"calibrated {records}: mean RMSPE {', '.join(errors)}")
@@ -302,5 +302,5 @@ def _finished(folder: Path, cfg: TrainConfig) -> bool:
 
 def known_settings(overrides: list[str], entry: str) -> list[str]:
     """Return the overrides of settings that an entry point has."""
-    known = {"experiment", *KINDS[entry].__dataclass_fields__}
-    return [item for item in overrides if top_key(item) in known]
+    names = {"experiment", *KINDS[entry].__dataclass_fields__}
+    return [override for override in overrides if top_key(override) in names]

@@ -76,9 +76,9 @@ def compared(folder: Path, target: Path) -> Iterator[tuple[str, bool]]:
         else:
             named = [str(key) for key in one if not one[key].equals(other[key])]
             size = max(_largest(one[key], other[key]) for key in named)
-            words = ", ".join(named[:3]) + ", …" * (len(named) > 3)
-            what = f"{len(named)} of {one.shape[1]} columns differ ({words}), by up to {size:.2g}"
-            yield f"{name}: {len(one):,} rows, {what}", False
+            columns = ", ".join(named[:3]) + ", …" * (len(named) > 3)
+            text = f"{len(named)} of {one.shape[1]} columns differ ({columns}), by up to {size:.2g}"
+            yield f"{name}: {len(one):,} rows, {text}", False
 
 
 def _largest(one: pd.Series, other: pd.Series) -> float:
@@ -99,9 +99,9 @@ def main(arguments: Sequence[str] | None = None) -> Any:
     options = parser.parse_args(arguments)
     target = options.out or Path("outputs", "repeat", options.run.resolve().name)
     repeat(options.run, target, options.trust)
-    found = [*compared(options.run, target)]
-    print("\n".join(sentence for sentence, _ in found))
-    equal = bool(found) and all(same for _, same in found)
+    tables = [*compared(options.run, target)]
+    print("\n".join(sentence for sentence, _ in tables))
+    equal = bool(tables) and all(alike for _, alike in tables)
     print(f"{target}: {'all rows are equal' if equal else 'rows differ'}")
     return int(not equal)
 

@@ -101,7 +101,7 @@ class Scored(NamedTuple):
         """
         population, scenario = build_drivers(cfg), cfg.scenario
         if self.policy is not None:
-            found = replace(trained(cfg, self.spec, self.policy, population), name=self.label)
+            entry = replace(trained(cfg, self.spec, self.policy, population), name=self.label)
         else:
             require(applies(cfg, self.label), "it has no vehicle to drive in this string")
             require(
@@ -109,10 +109,10 @@ class Scored(NamedTuple):
                 f"the task has no safety filter: score {self.spec.removesuffix(FILTERED)} without "
                 "one; with +filter=cbf the leaderboard refuses the row",
             )
-            found = baseline(cfg, self.label, self.spec)
+            entry = baseline(cfg, self.label, self.spec)
         road = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["trial"])
-        build_env(found.cfg.for_any_leader(), road, population, 1, nominal=True)
-        return found
+        build_env(entry.cfg.for_any_leader(), road, population, 1, nominal=True)
+        return entry
 
     def files(self) -> list[Path]:
         """Return its files; none for a controller of the package.
@@ -147,18 +147,18 @@ def roads(
     Raises:
         LccError: if a setting is wrong, or the policy does not fit the task.
     """
-    words = (f"task={task}", *further)
-    own: EvaluateConfig = load("evaluate", words)
-    entrant.strategy(own)
-    if own.scenario.road == RING:
-        return {"ring": own}
-    if own.leader is not None and "held_out" in own.leader.settings:
-        return {" ".join(own.leader.settings["held_out"]): own}
+    overrides = (f"task={task}", *further)
+    base: EvaluateConfig = load("evaluate", overrides)
+    entrant.strategy(base)
+    if base.scenario.road == RING:
+        return {"ring": base}
+    if base.leader is not None and "held_out" in base.leader.settings:
+        return {" ".join(base.leader.settings["held_out"]): base}
     # Fixed drivers belong to a task; a population belongs to the source.
-    people = HUMAN in own.scenario.vehicles.names and own.drivers.kind is not fixed
-    left = () if people else ("drivers",)
+    people = HUMAN in base.scenario.vehicles.names and base.drivers.kind is not fixed
+    dropped = () if people else ("drivers",)
     return {
-        name: load("evaluate", [*words, *(word for word in of if top_key(word) not in left)])
+        name: load("evaluate", [*overrides, *(word for word in of if top_key(word) not in dropped)])
         for name, of in given.items()
     }
 
@@ -202,14 +202,14 @@ def hash_of(windows: Profiles) -> str:
 def about(entrant: Scored) -> dict[str, Any]:
     """Return the hash of the scored policy's files, and versions."""
     contents = [file.read_bytes() for file in entrant.files()]
-    found: dict[str, str | None] = {}
+    installed: dict[str, str | None] = {}
     for name in ("lcc_rl", *SCORED_WITH):
         try:
-            found[name] = version(name)
+            installed[name] = version(name)
         except PackageNotFoundError:
-            found[name] = None
+            installed[name] = None
     digest = hashlib.sha256(b"".join(contents)).hexdigest() if contents else None
-    versions = {"python": platform.python_version(), **found}
+    versions = {"python": platform.python_version(), **installed}
     return {"sha256": digest, "versions": versions}
 
 
@@ -234,29 +234,29 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
 def _run(
     entrant: Scored, name: str, folder: Path, options: Namespace, further: Sequence[str]
 ) -> dict[str, Any]:
-    own = dict(map(_source, options.source))
-    given, wanted = {**LEADER_SOURCES, **own}, {*options.on, *own} if options.on else None
-    found: list[dict[str, Any]] = []
+    users = dict(map(_source, options.source))
+    offered, selected = {**LEADER_SOURCES, **users}, {*options.on, *users} if options.on else None
+    scores: list[dict[str, Any]] = []
     left_out: list[str] = []
     for task in options.task or choices("task"):
         sources: dict[str, EvaluateConfig] = {}
         with leaving_out(task, left_out):
-            sources = roads(entrant, task, given, further)
-        chosen = [one for one in sources if one in (wanted or [one])]
+            sources = roads(entrant, task, offered, further)
+        chosen = [one for one in sources if one in (selected or [one])]
         if sources and not chosen:
             left_out.append(f"{task}: no such source, only {', '.join(sources)}")
         for source in chosen:
             with leaving_out(f"{task}, {source}", left_out):
-                found.append(play_source(entrant, source, sources[source], folder / task / source))
-    why = "; ".join(left_out) or f"no such source, only {', '.join(given)}"
-    require(bool(found), f"nothing could be played: {why}")
-    document = {"name": name, **about(entrant), "results": found, "left_out": left_out}
+                scores.append(play_source(entrant, source, sources[source], folder / task / source))
+    why = "; ".join(left_out) or f"no such source, only {', '.join(offered)}"
+    require(bool(scores), f"nothing could be played: {why}")
+    document = {"name": name, **about(entrant), "results": scores, "left_out": left_out}
     with atomic_path(folder / FILE) as temporary:
         temporary.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", "utf-8")
     forget(folder)
     show_headline(f"scores in {folder / FILE}")
-    played = {row["source"] for row in found}
-    for source in own:
+    played = {row["source"] for row in scores}
+    for source in users:
         require(source in played, f"--source {source} could not be played: {'; '.join(left_out)}")
     return document
 
@@ -282,21 +282,21 @@ def _own_name(name: str) -> str:
     return name
 
 
-def _source(given: Sequence[str]) -> tuple[str, tuple[str, ...]]:
+def _source(arguments: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     """Return name and settings of a source of the command line."""
-    name, *words = given
+    name, *settings = arguments
     require(
         re.fullmatch(r"\w[\w-]*", name) is not None and name not in LEADER_SOURCES,
         f"--source {name}: expected a new name of letters, digits, - and _",
     )
-    for word in words:
+    for word in settings:
         require(
             "=" in word and top_key(word) in OF_A_SOURCE,
             f"--source {name}: expected settings of {', '.join(OF_A_SOURCE)}, got {word}; put "
             "others before --source",
         )
-    people = () if any(top_key(word) == "drivers" for word in words) else ("drivers=highway",)
-    return name, (*people, *words)
+    people = () if any(top_key(word) == "drivers" for word in settings) else ("drivers=highway",)
+    return name, (*people, *settings)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

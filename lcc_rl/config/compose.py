@@ -116,9 +116,9 @@ def composed(entry: str | None, overrides: Sequence[str] = ()) -> DictConfig:
     try:
         where = str(hydra.config_loader().get_search_path()) if hydra.is_initialized() else ""
         chosen = tuple(filter(_is_choice, meant))
-        own = OWN_FILES.search(where) or any("searchpath" in word for word in chosen)
-        made = _composed.__wrapped__ if own else _composed  # own files change
-        cfg = deepcopy(made(entry, chosen, where))
+        user_files = OWN_FILES.search(where) or any("searchpath" in word for word in chosen)
+        compose = _composed.__wrapped__ if user_files else _composed  # own files change
+        cfg = deepcopy(compose(entry, chosen, where))
         read = OverridesParser.create().parse_overrides([x for x in meant if not _is_choice(x)])
         ConfigLoaderImpl.validate_sweep_overrides_legal(read, RunMode.RUN, from_shell=False)
         ConfigLoaderImpl._apply_overrides_to_config(read, cfg)
@@ -148,29 +148,29 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
         >>> as_meant(["compare=['a=1,b=2_1f']"])
         ["++compare=['a=1,b=2_1f']"]
     """
-    found = []
+    converted = []
     for item in overrides:
         key, equals, value = item.partition("=")
         group = key.lstrip("+").partition("@")[0]
-        one = group not in (*ADDED, "experiment") and (Path(str(files(CONF))) / group).is_dir()
-        if one and re.match(r"\[.+,", value):
+        single = group not in (*ADDED, "experiment") and (Path(str(files(CONF))) / group).is_dir()
+        if single and re.match(r"\[.+,", value):
             raise ConfigError(
                 f"{item}: {group} takes one choice; for a run of each: -m {key}={value.strip('[]')}"
             )
         if key.lstrip("+") in ("variant", "variants"):
-            found.append(f"{key}{equals}{value.lower()}")
+            converted.append(f"{key}{equals}{value.lower()}")
         elif key in ("compare", "policy", "resume"):  # folders of a sweep: seed=0_…
             quoted = "'" in value or '"' in value
-            found.append(f"++{key}{equals}{value if quoted else NAMED.sub(QUOTED, value)}")
+            converted.append(f"++{key}{equals}{value if quoted else NAMED.sub(QUOTED, value)}")
         else:
-            own = key.partition(".")[0] in _top_level() and not _is_choice(item)
-            found.append(f"++{item}" if equals and own else item)
-    return found
+            setting = key.partition(".")[0] in _top_level() and not _is_choice(item)
+            converted.append(f"++{item}" if equals and setting else item)
+    return converted
 
 
-def _is_choice(item: str) -> bool:
+def _is_choice(override: str) -> bool:
     """Whether an override chooses files or sets Hydra's own settings; others are applied later."""
-    key, _, value = item.lstrip("+~").partition("=")
+    key, _, value = override.lstrip("+~").partition("=")
     group = key.partition("@")[0]
     return "/" in group or group.startswith("hydra") or (value[:1] != "{" and bool(choices(group)))
 
@@ -202,8 +202,8 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     try:
         # Settings may refer to defaults of classes.
         written = OmegaConf.to_container(cfg, resolve=False)
-        whole = OmegaConf.create(with_defaults(written))
-        content: Any = OmegaConf.to_container(whole, resolve=True)
+        complete = OmegaConf.create(with_defaults(written))
+        content: Any = OmegaConf.to_container(complete, resolve=True)
     except InterpolationKeyError as error:
         missing = re.search("'[^']+'", str(error))
         raise ConfigError(
@@ -221,8 +221,8 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     try:
         tree = parse_config(content, KINDS[entry])
     except ConfigError as error:  # another choice of the group may have the setting
-        found = re.match(r"unknown setting of (\w+) \(", str(error))
-        group = found.group(1) if found else ""
+        match = re.match(r"unknown setting of (\w+) \(", str(error))
+        group = match.group(1) if match else ""
         if not group or not choices(group):
             raise
         raise ConfigError(f"{error} Other choices: {group}={'|'.join(choices(group))}") from None
@@ -278,15 +278,15 @@ def leave_out_foreign(content: dict[str, Any], overrides: Sequence[str]) -> None
         overrides: overrides of the command line.
     """
     typed = set().union(*map(typed_keys, overrides))
-    for place in (key.removesuffix(f".{TARGET}") for key in typed if key.endswith(f".{TARGET}")):
+    for path in (key.removesuffix(f".{TARGET}") for key in typed if key.endswith(f".{TARGET}")):
         node: Any = content
-        for part in place.split("."):
-            node = node.get(part) if isinstance(node, dict) else None
+        for step in path.split("."):
+            node = node.get(step) if isinstance(node, dict) else None
         if not isinstance(node, dict) or TARGET not in node:
             continue
-        known = settings_of(find_target(str(node[TARGET]), place))
-        for key in [key for key in node if known is not None and key != TARGET]:
-            if key not in (known or ()) and f"{place}.{key}" not in typed:
+        names = settings_of(find_target(str(node[TARGET]), path))
+        for key in [key for key in node if names is not None and key != TARGET]:
+            if key not in (names or ()) and f"{path}.{key}" not in typed:
                 del node[key]
 
 
@@ -301,10 +301,10 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         if group == "hydra/launcher" and name in EXTRAS:
             return ConfigError(f"{group}/{name} is not installed: {how_to_install(EXTRAS[name])}")
-        known = error.options or ()
+        options = error.options or ()
         if not group:
-            return unknown_name("option", name, known)
-        error = unknown_name(f"choice of {group}", name, known)
+            return unknown_name("option", name, options)
+        error = unknown_name(f"choice of {group}", name, options)
         return ConfigError(f"{error} {own_file(group, name)}")
     if isinstance(error, OverrideParseException):
         key, equals, value = str(error.override).lstrip("+").partition("=")
@@ -316,15 +316,15 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
             f"{typed}: cannot be read as a setting. Brackets must be closed, and text "
             f"with spaces, commas or signs needs quotes within quotes: \"{key}='…'\"{names}"
         )
-    found = re.search(
+    match = re.search(
         r"Could not (override|append to config|delete from config)\S* '([^']+)'", str(error)
     )
-    if found is not None and found.group(1).startswith("delete"):
-        return ConfigError(f"~{found.group(2)}: no file sets it: there is nothing to leave out")
-    if found is not None:
-        return _unknown_option(found.group(2))
-    if found := re.search(r"Ambiguous value for argument '\+*([^']+?)=([^']+)'", str(error)):
-        key, value = found.groups()
+    if match is not None and match.group(1).startswith("delete"):
+        return ConfigError(f"~{match.group(2)}: no file sets it: there is nothing to leave out")
+    if match is not None:
+        return _unknown_option(match.group(2))
+    if match := re.search(r"Ambiguous value for argument '\+*([^']+?)=([^']+)'", str(error)):
+        key, value = match.groups()
         return ConfigError(
             f"{key}={value}: several values are runs of a sweep, -m; a list is {key}=[{value}]"
         )
@@ -333,8 +333,8 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         return ConfigError(f"+{group}=… is chosen already: leave it out, or write {group}=…")
     cause = error.__cause__
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)
-    words = [*overrides, *text.partition("See https://")[0].split()]
-    return ConfigError(" ".join(words))
+    tokens = [*overrides, *text.partition("See https://")[0].split()]
+    return ConfigError(" ".join(tokens))
 
 
 def _unknown_option(name: str) -> ConfigError:
@@ -342,14 +342,14 @@ def _unknown_option(name: str) -> ConfigError:
     places = {key: at for at, kind in SECTIONS.items() for key in settings_of(kind) or ()}
     folder = Path(str(files(CONF)))
     groups = {path.parts[len(folder.parts)] for path in folder.glob("*/**/*.yaml")}
-    root, known = name.partition(".")[0], _top_level() | groups
+    root, names = name.partition(".")[0], _top_level() | groups
     if root in places:
         return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")
     if root in ADDED:
         return ConfigError(f"{root} is added: write +{root}=…")
-    if root in known:
+    if root in names:
         return ConfigError(f"this command has no option {root!r}, as others have: -h shows its own")
-    error = unknown_name("option", name, known)
+    error = unknown_name("option", name, names)
     return ConfigError(f"{error}; hydra.run.dir=… sets the folder") if root == "out" else error
 
 
@@ -389,8 +389,8 @@ def identity(cfg: Any, *unused: str, changed: bool = False) -> str:
     for key in (*NOT_IDENTITY, *unused, *LATER):
         *path, last = key.split(".")
         node = content
-        for part in path:
-            node = node.get(part) or {}
+        for name in path:
+            node = node.get(name) or {}
         if key not in LATER or not node.get(last):
             node.pop(last, None)
     if not any((content.get("inputs") or {}).values()):

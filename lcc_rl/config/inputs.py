@@ -44,7 +44,7 @@ def inputs_of(content: Mapping[str, Any]) -> FileHashes:
     Returns:
         By section of the configuration: hashes of files by their given path, of modules by name.
     """
-    found: FileHashes = {}
+    hashes: FileHashes = {}
     for key, holder, value in settings_at(content):
         section = key.partition(".")[0]
         named = section in NAMING_SECTIONS and (holder is content or holder is content[section])
@@ -54,11 +54,11 @@ def inputs_of(content: Mapping[str, Any]) -> FileHashes:
             with suppress(OSError, ValueError, ResultsError):  # the reader raises the error later
                 for path in filter(Path.is_file, _files(key, named, holder, name)):
                     digest = _digest(path)
-                    known = found.setdefault(section, {})
+                    digests = hashes.setdefault(section, {})
                     label = path.name if path.suffix == ".py" else str(path)
-                    same = known.get(label, digest) == digest
-                    known[label if same else str(path)] = digest
-    return found
+                    equal = digests.get(label, digest) == digest
+                    digests[label if equal else str(path)] = digest
+    return hashes
 
 
 def _files(key: str, named: bool, holder: Any, name: str) -> Iterator[Path]:
@@ -103,17 +103,17 @@ def _own_files(module: str) -> Iterator[Path]:
     if not f"{module}.".startswith(OURS) and "/" not in module:
         with suppress(ConfigError):
             path = Path(getattr(load_module(module, TARGET), "__file__", None) or "")
-    known = INSTALLED.intersection(path.parts) or path.is_relative_to(PYTHON)
-    if path.suffix != ".py" or known:
+    installed = INSTALLED.intersection(path.parts) or path.is_relative_to(PYTHON)
+    if path.suffix != ".py" or installed:
         return
     depth = module.count(".") + (path.name == "__init__.py")
-    found, root = [path], path.parents[depth]
-    for file in found:  # the list grows
+    files, root = [path], path.parents[depth]
+    for file in files:  # the list grows
         yield file
         for name in _imports(file, ".".join(file.parent.relative_to(root).parts)):
             stem = root.joinpath(*name.split("."))
             beside = (stem.with_suffix(".py"), stem / "__init__.py")
-            found += [x for x in beside if x.is_file() and x not in found]
+            files += [x for x in beside if x.is_file() and x not in files]
 
 
 def _imports(path: Path, package: str) -> set[str]:

@@ -112,13 +112,13 @@ class Node:
         Raises:
             ConfigError: if it cannot be built, or has another class.
         """
-        made = self._object if has_settings(self.kind) else self._made()
+        value = self._object if has_settings(self.kind) else self._made()
         if isinstance(needed, type):
-            fits, called = isinstance(made, needed), f"a subclass of {_place(needed)}"
+            fits, expected = isinstance(value, needed), f"a subclass of {_place(needed)}"
         else:
-            fits, called = all(hasattr(made, x) for x in needed), f"an object with {needed[0]}"
-        require(fits, f"{self.where}: expected {called}, got {_place(type(made))}")
-        return made
+            fits, expected = all(hasattr(value, x) for x in needed), f"an object with {needed[0]}"
+        require(fits, f"{self.where}: expected {expected}, got {_place(type(value))}")
+        return value
 
     def check(self) -> None:
         """Check the settings; a class or function without :class:`Settings` is not called."""
@@ -132,21 +132,21 @@ class Node:
         return self._made()
 
     def _made(self) -> Any:
-        own = defaults(self.kind) if has_settings(self.kind) else {}
-        given = {
+        presets = defaults(self.kind) if has_settings(self.kind) else {}
+        arguments = {
             key: value
             for key, value in self.settings.items()
             # A default need not have the annotated type, and may be any object.
-            if not (key == TARGET or (key in own and _same(as_plain(value), own[key])))
+            if not (key == TARGET or (key in presets and _same(as_plain(value), presets[key])))
         }
         try:
-            given = {key: _objects(value) for key, value in given.items()}
+            arguments = {key: _objects(value) for key, value in arguments.items()}
             if has_settings(self.kind):
-                return parse(self.kind, given, self.where)
+                return parse(self.kind, arguments, self.where)
             self._check_names()
-            for key in (key for key, value in given.items() if value == MISSING):
+            for key in (key for key, value in arguments.items() if value == MISSING):
                 raise ConfigError(f"{self.where}.{key} is required: use {self.where}.{key}=…")
-            return self.kind(**given)
+            return self.kind(**arguments)
         except (LccError, OSError):  # an OSError names its file
             raise
         except Exception as error:  # a user's class may raise any error
@@ -154,11 +154,11 @@ class Node:
             raise ConfigError(f"{self.where}: {reason}") from error
 
     def _check_names(self) -> None:
-        known = settings_of(self.kind)
-        for key in self.settings if known is not None else ():
-            if key not in (known or ()) and key != TARGET:
-                what = f"setting of {self.where} ({self.kind.__name__})"
-                raise unknown_name(what, key, known or ())
+        names = settings_of(self.kind)
+        for key in self.settings if names is not None else ():
+            if key not in (names or ()) and key != TARGET:
+                subject = f"setting of {self.where} ({self.kind.__name__})"
+                raise unknown_name(subject, key, names or ())
 
 
 def _same(one: Any, other: Any) -> bool:
@@ -187,7 +187,7 @@ def as_nodes(value: Any, where: str = "") -> Any:
 def _mapped(value: Any, where: str, change: Callable[[dict[str, Any], str], Any]) -> Any:
     """Change every mapping, the inner ones first, by itself and its place."""
     if isinstance(value, list):
-        return [_mapped(item, f"{where}[{place}]", change) for place, item in enumerate(value)]
+        return [_mapped(item, f"{where}[{index}]", change) for index, item in enumerate(value)]
     if not isinstance(value, Mapping):
         return value
     places = {key: f"{where}.{key}".removeprefix(".") for key in value}
@@ -200,17 +200,17 @@ def without_defaults(value: Any) -> Any:
     Settings that a later version adds are thus absent if their default changes nothing.
     """
     if isinstance(value, Node):
-        own = defaults(value.kind) if has_settings(value.kind) else {}
+        presets = defaults(value.kind) if has_settings(value.kind) else {}
         value = value.settings
     elif isinstance(value, Settings):
-        own, value = defaults(type(value)), values(value)
+        presets, value = defaults(type(value)), values(value)
     elif isinstance(value, Mapping):
-        own = {}
+        presets = {}
     else:
         return [without_defaults(item) for item in value] if isinstance(value, list) else value
     missing = object()
-    kept = {key: x for key, x in value.items() if as_plain(x) != own.get(key, missing)}
-    return {key: without_defaults(item) for key, item in kept.items()}
+    changed = {key: x for key, x in value.items() if as_plain(x) != presets.get(key, missing)}
+    return {key: without_defaults(item) for key, item in changed.items()}
 
 
 def nodes_in(value: Any) -> Iterator[Node]:
@@ -240,12 +240,12 @@ def has_settings(kind: Any) -> bool:
 def settings_of(target: Any) -> list[str] | None:
     """Return the names of a class's or function's settings; None if it takes any."""
     try:
-        found = inspect.signature(target).parameters
+        params = inspect.signature(target).parameters
     except (TypeError, ValueError):  # some builtins have no signature
         return None
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in found.values()):
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in params.values()):
         return None
-    return list(found)
+    return list(params)
 
 
 def with_defaults(value: Any, where: str = "") -> Any:
@@ -261,20 +261,20 @@ def with_defaults(value: Any, where: str = "") -> Any:
     return _mapped(value, where, _completed)
 
 
-def _completed(found: dict[str, Any], where: str) -> dict[str, Any]:
-    kind: Any = find_target(str(found[TARGET]), where) if TARGET in found else None
-    for key in found if kind is not None else ():
+def _completed(settings: dict[str, Any], where: str) -> dict[str, Any]:
+    kind: Any = find_target(str(settings[TARGET]), where) if TARGET in settings else None
+    for key in settings if kind is not None else ():
         if str(key).startswith("_") and key != TARGET:
             raise ConfigError(f"{where}.{key} has no effect: a node has {TARGET} and settings")
     if has_settings(kind):
         later = getattr(kind, "LATER", ())
         for key, default in defaults(kind).items():
-            if key in later and key not in found:
+            if key in later and key not in settings:
                 continue
-            own = found.setdefault(key, default)
-            if isinstance(own, Mapping) and isinstance(default, Mapping):
-                found[key] = {**default, **own}
-    return found
+            value = settings.setdefault(key, default)
+            if isinstance(value, Mapping) and isinstance(default, Mapping):
+                settings[key] = {**default, **value}
+    return settings
 
 
 def takes_action(node: Node) -> bool:
@@ -297,8 +297,8 @@ def check_numbers(value: Any, where: str) -> None:
 def settings_at(content: Any, where: str = "") -> Iterator[tuple[str, Any, Any]]:
     """Yield dotted key, container and value of every value in nested mappings and lists."""
     if isinstance(content, (Mapping, list)):
-        items = content.items() if isinstance(content, Mapping) else enumerate(content)
-        for key, value in items:
+        entries = content.items() if isinstance(content, Mapping) else enumerate(content)
+        for key, value in entries:
             name = f"{where}.{key}" if where else str(key)
             yield name, content, value
             yield from settings_at(value, name)

@@ -53,9 +53,7 @@ def _described(node: Any) -> Any:
 def _all_described(nodes: dict[str, Any]) -> Mapping[str, Any]:
     for name, node in nodes.items():
         if isinstance(node, Mapping):
-            known = (
-                ", ".join(key for key in nodes if key != name) or "none; +filter=cbf adds a filter"
-            )
+            known = ", ".join(x for x in nodes if x != name) or "none; +filter=cbf adds a filter"
             raise ValueError(f"unknown name {name!r}, which has no {TARGET}; valid: {known}")
         if node is not None and not isinstance(node, Node):
             raise ValueError(f"{name}: expected a node with {TARGET} or null, got {node!r}")
@@ -93,9 +91,9 @@ class Section(Settings):
         Examples:
             >>> cfg.with_(seed=3, scenario={"filters": {"automated": None}})  # doctest: +SKIP
         """
-        known = values(self)
-        found = {key: _changed(known.get(key), value) for key, value in changes.items()}
-        return type(self)(**{**known, **found})
+        stored = values(self)
+        changed = {key: _changed(stored.get(key), value) for key, value in changes.items()}
+        return type(self)(**{**stored, **changed})
 
 
 def _is_nodes(value: Any) -> bool:
@@ -174,11 +172,11 @@ class TrainingConfig(Section):
     gap_range: list[float]
 
     def validate(self) -> None:
-        size, wanted = self.environments, self.episodes
-        vars(self).update(episodes=-(-wanted // size) * size)
-        if self.episodes > wanted:
+        size, episodes = self.environments, self.episodes
+        vars(self).update(episodes=-(-episodes // size) * size)
+        if self.episodes > episodes:
             text = "training.episodes=%d is rounded up to %d, whole batches of %d environments"
-            log.warning(text, wanted, self.episodes, size)
+            log.warning(text, episodes, self.episodes, size)
 
 
 class EvaluationConfig(Section):
@@ -347,14 +345,14 @@ def parse_config(content: Mapping[str, Any], kind: type[BaseConfig] | None = Non
     """
     kind = kind or _kind_of(content)
     check_numbers(content, "")
-    found, known = as_nodes(content), {item.name for item in dataclasses.fields(kind)}
-    check_nodes(found)
+    nodes, names = as_nodes(content), {field.name for field in dataclasses.fields(kind)}
+    check_nodes(nodes)
     for name, section in SECTIONS.items():
-        if name in found and name in known:
-            if not isinstance(found[name], Mapping):
-                raise ConfigError(f"{name} must be a mapping of settings, got {found[name]!r}")
-            found[name] = parse(section, found[name], name)
-    return parse(kind, found, "")
+        if name in nodes and name in names:
+            if not isinstance(nodes[name], Mapping):
+                raise ConfigError(f"{name} must be a mapping of settings, got {nodes[name]!r}")
+            nodes[name] = parse(section, nodes[name], name)
+    return parse(kind, nodes, "")
 
 
 def _kind_of(content: Mapping[str, Any]) -> type[BaseConfig]:

@@ -35,11 +35,11 @@ def check_used(
     if not isinstance(cfg, StudyConfig):
         return
     reasons = dict(_of_road(cfg))
-    typed = {item: typed_keys(item) for item in overrides}
+    typed = {option: typed_keys(option) for option in overrides}
     if not sweep:
         reasons |= dict(_of_roles(cfg)) | dict(_of_agent(cfg))
-        seen = cfg.observation.settings
-        if seen[TARGET] == OBSERVATION and "behind" not in (seen.get("scales") or ()):
+        observation = cfg.observation.settings
+        if observation[TARGET] == OBSERVATION and "behind" not in (observation.get("scales") or ()):
             for key in ("visible", "presence"):
                 reasons[f"observation.{key}"] = "observation.scales names no vehicle behind"
         plain = type(cfg) is TrainConfig and BASELINES in map(key_of, overrides)
@@ -48,11 +48,11 @@ def check_used(
         reasons["sweep"] = "it names the folder of a sweep, -m"
     if written is not None and cfg.agent is not None and "surrogates" in cfg.agent.settings:
         reasons |= dict(_of_objective(cfg, written["agent"], set().union(*typed.values())))
-    for item, keys in typed.items():
+    for option, keys in typed.items():
         for unused, reason in reasons.items():
             used = (key != unused and not key.startswith(f"{unused}.") for key in keys)
-            if not all(used) and item not in NO_AGENT:
-                raise ConfigError(f"{item.removeprefix('++')} has no effect: {reason}")
+            if not all(used) and option not in NO_AGENT:
+                raise ConfigError(f"{option.removeprefix('++')} has no effect: {reason}")
 
 
 def _of_road(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
@@ -108,8 +108,8 @@ def _of_objective(
     if by_gradient and not cfg.agent.settings["bootstrap"]:
         for key in ("value_lr", "value_every", "td_lambda", "tau"):
             yield f"agent.{key}", "agent.bootstrap=false learns no value"
-    given = (*limits.items(), *each.items())
-    limited = {name for name, share in given if share is not None}
+    shares = (*limits.items(), *each.items())
+    limited = {name for name, share in shares if share is not None}
     terms = {name: term for name, term in cfg.reward.terms.items() if term.settings.get("weight")}
     for name in {*surrogates, *limits, *each} - {*terms}:
         for key in kinds:
@@ -120,21 +120,21 @@ def _of_objective(
                 yield f"reward.terms.{name}.{key}", f"{term.kind.__name__} has no gradient"
     if not limited:
         yield "agent.limit_rate", "agent.limits has no limit"
-    for name, own in surrogates.items():
-        if name not in terms or own is None:
+    for name, surrogate in surrogates.items():
+        if name not in terms or surrogate is None:
             continue
         at, term = f"agent.surrogates.{name}", f"reward.terms.{name}"
         text = str(written["surrogates"][name])
-        if name not in limited and "limit" in own.settings and "{.limit}" not in text:
+        if name not in limited and "limit" in surrogate.settings and "{.limit}" not in text:
             yield f"{at}.limit", f"it belongs to agent.limits.{name}=<share>"
         if name in limited:
             yield f"{term}.weight", f"agent.limits.{name} sets the price of the term"
-        elif not own.settings["weight"]:
-            idle = [f"{at}.{key}" for key in own.settings if key != "weight"]
+        elif not surrogate.settings["weight"]:
+            idle = [f"{at}.{key}" for key in surrogate.settings if key != "weight"]
             for key in (*idle, *(f"{term}.{key}" for key in terms[name].settings)):
                 yield key, f"{at}.weight is 0"
             continue
         for key in terms[name].settings if not {at, f"{at}.{TARGET}"} & typed else ():
             if key != "weight" and f"{term}.{key}" not in text:
-                what = f"{at} ({own.kind.__name__}) takes the term's place in the objective"
-                yield f"{term}.{key}", f"{what} and has its own settings"
+                owner = f"{at} ({surrogate.kind.__name__}) takes the term's place in the objective"
+                yield f"{term}.{key}", f"{owner} and has its own settings"

@@ -59,8 +59,8 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     pair = numbers_of_pairs(episodes)
     number, pairs = episodes["episode"].to_numpy(), int(pair.max(initial=-1)) + 1
     width, every, reach = (round(seconds / FRAME) for seconds in (CHANGE_S, EVERY_S, LONGEST_LAG))
-    whole = width + 2 * reach
-    rows = np.flatnonzero(number[whole:] == number[:-whole])[::every] + reach
+    span = width + 2 * reach
+    rows = np.flatnonzero(number[span:] == number[:-span])[::every] + reach
     gap, *speeds = (episodes[name].to_numpy(np.float64) for name in PAIR_SIGNALS.values())
     series = [gap, *(np.cumsum((v + np.append(0.0, v[:-1])) * FRAME / 2) for v in speeds)]
 
@@ -69,17 +69,17 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     with np.errstate(all="ignore"):  # pairs without a change
         ((*first, sums),) = fits(rows, lags[:1])
         unclear = rows[(first[1] > GAIN * FLOOR)[pair[rows]]]  # elsewhere no lag could be accepted
-        others = fits(unclear, lags[1:]) if len(unclear) else []
-        found, rest = (np.array(x) for x in zip(first, *(fit[:2] for fit in others), strict=True))
+        lagged = fits(unclear, lags[1:]) if len(unclear) else []
+        coefs, rest = (np.array(x) for x in zip(first, *(fit[:2] for fit in lagged), strict=True))
     best = np.where(rest[0] >= GAIN * rest.min(axis=0), rest.argmin(axis=0), 0)
     best[-1] = 0
-    each, count = np.arange(pairs + 1), sums[2, 2]
+    index, count = np.arange(pairs + 1), sums[2, 2]
     ahead, own, grown = sums[[0, 1, 3], 2] * [[1], [-1], [1]] * EVERY_S / CHANGE_S
     names = ["leader", "follower", "constant", "slope"]
-    return pd.DataFrame(found[best, :, each], columns=names).assign(
+    return pd.DataFrame(coefs[best, :, index], columns=names).assign(
         row=np.append(np.unique(pair, return_index=True)[1], 0),
         seconds=EVERY_S * count,
-        fit=1 - rest[best, each],
+        fit=1 - rest[best, index],
         motion=np.sqrt(sums[:2, :2].sum(axis=(0, 1)).clip(0.0) / count.clip(1.0)),
         change=np.sqrt(sums[3, 3] / count.clip(1.0)),
         late=FRAME * np.array(lags)[best, 1],
@@ -94,8 +94,8 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
 def numbers_of_pairs(episodes: pd.DataFrame) -> NDArray[np.int64]:
     """Return the number of the pair of each row, from 0; see :func:`agreement`."""
     keys = [name for name in ("recording", "follower_id", "leader_id") if name in episodes]
-    found = episodes.groupby(keys or ["episode"], sort=False).ngroup()
-    return np.asarray(found, np.int64)
+    numbers = episodes.groupby(keys or ["episode"], sort=False).ngroup()
+    return np.asarray(numbers, np.int64)
 
 
 def _fits(
@@ -115,36 +115,36 @@ def _fits(
     at = pair[rows]
     begins = np.flatnonzero(np.diff(at, prepend=-1))  # of rows of one pair
 
-    def change(place: int, late: int = 0) -> Floats:
-        values = series[place]
+    def change(signal: int, late: int = 0) -> Floats:
+        values = series[signal]
         return values[rows + late + width] - values[rows + late]
 
     def products(sums: Floats, terms: Sequence[Floats], changed: Iterable[int]) -> Floats:
         """Return sums with those of the changed terms."""
         for i in changed:
             for j, other in enumerate(terms):
-                each = np.bincount(at[begins], np.add.reduceat(terms[i] * other, begins), pairs)
-                sums[i, j] = sums[j, i] = np.append(each, each.sum())
+                total = np.bincount(at[begins], np.add.reduceat(terms[i] * other, begins), pairs)
+                sums[i, j] = sums[j, i] = np.append(total, total.sum())
         return sums
 
     terms = [change(1), -change(2), np.ones(len(rows)), change(0)]
     sums = products(np.zeros((4, 4, pairs + 1)), terms, range(4))
-    for place, late in lags:
-        term = (3, 0, 1)[place]
+    for signal, late in lags:
+        term = (3, 0, 1)[signal]
         moved = [*terms]
-        moved[term] = change(place, late) * (-1.0 if place == 2 else 1.0)
+        moved[term] = change(signal, late) * (-1.0 if signal == 2 else 1.0)
         yield _solved(products(sums.copy(), moved, [term]) if late else sums)
 
 
 def _solved(sums: Floats) -> tuple[Floats, Floats, Floats]:
     """Return coefficients, constant and slope of sums of products, the residuals, and the sums."""
-    known = np.moveaxis(sums[:3, :3], -1, 0) + RIDGE
-    found = np.linalg.solve(known, sums[:3, 3].T[..., None]).astype(np.float64)[..., 0].T
-    rest = sums[3, 3] - (found * sums[:3, 3]).sum(axis=0)
+    matrix = np.moveaxis(sums[:3, :3], -1, 0) + RIDGE
+    coefs = np.linalg.solve(matrix, sums[:3, 3].T[..., None]).astype(np.float64)[..., 0].T
+    rest = sums[3, 3] - (coefs * sums[:3, 3]).sum(axis=0)
     rest /= sums[3, 3] - sums[2, 3] ** 2 / sums[2, 2]
     slope = sums[:2, 3].sum(axis=0) / sums[:2, :2].sum(axis=(0, 1))
-    found = np.vstack([found[:2], found[2:] / CHANGE_S, slope])
-    return found, np.nan_to_num(rest, nan=9.0).clip(FLOOR, 9.0), sums
+    coefs = np.vstack([coefs[:2], coefs[2:] / CHANGE_S, slope])
+    return coefs, np.nan_to_num(rest, nan=9.0).clip(FLOOR, 9.0), sums
 
 
 def mistakes(units: Units) -> Iterator[tuple[bool, str, str, float, float]]:
@@ -170,13 +170,13 @@ def mistakes(units: Units) -> Iterator[tuple[bool, str, str, float, float]]:
             factor = size / UNITS[quantity][declared]
             if factor != 1.0 and len({units[key] for key in named}) < 2:
                 option = " ".join(f"data.units.{key}={unit}" for key in named)
-                words = f"{subject} in {unit}{option and f' ({option})'}?"
-                yield declared == SI[quantity], signal, words, factor**leader, factor**follower
+                question = f"{subject} in {unit}{option and f' ({option})'}?"
+                yield declared == SI[quantity], signal, question, factor**leader, factor**follower
     time = units.get("time", "")
     period = (unit_size("time", time) or 0.0) if time.startswith(FRAMES) else 0.0  # [s]
     for rate in RATES if period else ():
-        words = f"is the time in frames/{rate} (data.units.time=frames/{rate})?"
-        yield False, "gap", words, 1 / (rate * period), 1 / (rate * period)
+        question = f"is the time in frames/{rate} (data.units.time=frames/{rate})?"
+        yield False, "gap", question, 1 / (rate * period), 1 / (rate * period)
 
 
 def check_pairs(
@@ -200,17 +200,17 @@ def check_pairs(
         itself = (episodes["follower_id"] == episodes["leader_id"]).to_numpy()
         if itself.any():
             raise DataError(f"{place(int(itself.argmax()), 'leader_id')} is the follower itself")
-    found = agreement(episodes)
-    pairs, every = found.iloc[:-1], found.iloc[-1]
-    moves, span = found["motion"] >= LEAST_MOTION, (1 / max_mismatch, max_mismatch)
+    fits = agreement(episodes)
+    pairs, every = fits.iloc[:-1], fits.iloc[-1]
+    moves, span = fits["motion"] >= LEAST_MOTION, (1 / max_mismatch, max_mismatch)
     clear = moves[:-1] & (pairs["seconds"] >= LEAST_S) & (pairs["fit"] >= LEAST_FIT)
     right = clear & pairs["leader"].between(*span) & pairs["follower"].between(*span)
 
     def middle(cases: list[tuple[int, str, str]]) -> Iterator[str]:
         """Yield a line on the middle one of several cases."""
-        for row, signal, words in cases[len(cases) // 2 :][:1]:
+        for row, signal, text in cases[len(cases) // 2 :][:1]:
             count = f"; {len(cases):,} of {len(pairs):,} pairs" if len(pairs) > 1 else ""
-            yield f"{place(row, PAIR_SIGNALS[signal])}: {words}{count}"
+            yield f"{place(row, PAIR_SIGNALS[signal])}: {text}{count}"
 
     wrong = [
         fit
@@ -218,8 +218,8 @@ def check_pairs(
         for fit in _mistaken(pair, units, max_mismatch)
     ]
     same = pairs[(pairs["motion"] < SAME) & (pairs["change"] > LEAST_MOTION)]
-    words = "both speeds are equal, but the gap changes; does one column hold both?"
-    wrong += [(row, "leader", words) for row in same["row"]]
+    text = "both speeds are equal, but the gap changes; does one column hold both?"
+    wrong += [(row, "leader", text) for row in same["row"]]
     late, too_late = [], []
     for pair in pairs[right & (pairs["late"].abs() > LOUD - FRAME / 2)].to_dict("records"):
         most = " or more" * (abs(pair["late"]) > LONGEST_LAG - FRAME / 2)
@@ -231,12 +231,12 @@ def check_pairs(
     odd = pairs[clear & ~right & ~pairs["slope"].between(*span)].to_dict("records")
     sure = right & (pairs["fit"] >= SURE_FIT)  # noise lowers the coefficients
     biased = [x for pair in pairs[sure].to_dict("records") for x in _biased(pair)]
-    words = "the gap changes by {:.2f} m where both speeds give 1 m, and no unit fits"
-    strange = [(pair["row"], "gap", words.format(pair["slope"])) for pair in odd]
+    text = "the gap changes by {:.2f} m where both speeds give 1 m, and no unit fits"
+    strange = [(pair["row"], "gap", text.format(pair["slope"])) for pair in odd]
     enough = every["seconds"] >= LEAST_ALL_S and moves.iloc[-1]
     if (enough or clear.any()) and not (right.any() or span[0] <= every["slope"] <= span[1]):
         raise DataError(
-            f"{words.format(every['slope'])}: are times in another unit, speeds to be smoothed, or "
+            f"{text.format(every['slope'])}: are times in another unit, speeds to be smoothed, or "
             f"biased (the gap changes by {every['rate']:+.1f} m/s against them)?"
         )
     lines = [Concern(line) for cases in (late, biased, strange) for line in middle(cases)]
@@ -252,17 +252,17 @@ def _mistaken(
     less by the growth of the gap. The nearer value counts, because a gap may jump to another car.
     """
     own, ahead, a, b = (pair[name] for name in ("own", "ahead", "leader", "follower"))
-    ways = (max(way, 1.0) for way in (ahead, ahead - pair["grown"]))
-    apart = min((log(max(own, 1.0) / way) for way in ways), key=abs)
-    words = (
+    distances = (max(distance, 1.0) for distance in (ahead, ahead - pair["grown"]))
+    apart = min((log(max(own, 1.0) / distance) for distance in distances), key=abs)
+    message = (
         f"where the leader drives 1 m, the gap changes by {a:.2f} m, where the follower does, by "
         f"{-b:.2f} m"
     )
     if not pair["clear"]:
-        words = f"by their speeds, the follower drives {own:.4g} m, the leader {ahead:.4g} m"
+        message = f"by their speeds, the follower drives {own:.4g} m, the leader {ahead:.4g} m"
         if own >= LEAST_WAY and abs(ahead - pair["grown"]) < STRAY * own:
             question = "is the leader's speed relative to the follower's? Add the follower's"
-            return [(pair["row"], "leader", f"{words}; {question}")]
+            return [(pair["row"], "leader", f"{message}; {question}")]
         if max(own, ahead) < LEAST_WAY or abs(apart) < log(max_mismatch):
             return []
     near = []
@@ -277,24 +277,24 @@ def _mistaken(
         return _mistaken({**pair, "clear": False}, units, max_mismatch) if pair["clear"] else []
     near = [x for x in sorted(near, key=lambda x: x[1:2]) if x[0] < least + log(ALIKE)]
     questions = " or ".join(x[3] for x in near)
-    return [(pair["row"], near[0][2], f"{words}; {questions}")]
+    return [(pair["row"], near[0][2], f"{message}; {questions}")]
 
 
 def _biased(pair: Mapping[Any, Any]) -> list[tuple[int, str, str]]:
     """Return row, signal and words on a clock or a speed that is slightly off; else nothing."""
     row, a, b, rate = (pair[name] for name in ("row", "leader", "follower", "rate"))
     if min(a, b) > LOUD_FACTOR or max(a, b) < 1 / LOUD_FACTOR:
-        words = f"the gap changes by {(a * b) ** 0.5:.2f} m where both speeds give 1 m"
-        return [(row, "gap", f"{words}; is a clock too fast or slow by this factor?")]
+        message = f"the gap changes by {(a * b) ** 0.5:.2f} m where both speeds give 1 m"
+        return [(row, "gap", f"{message}; is a clock too fast or slow by this factor?")]
     if abs(rate) < LOUD_RATE:
         return []
-    words = (
+    message = (
         f"the gap changes by {rate:+.1f} m/s against both speeds, fitted by {a:.2f} of the "
         f"leader's, {b:.2f} of the follower's and {pair['constant']:+.1f} m/s; is a speed biased? "
         f"Add {rate:.1f} m/s to the leader's, or multiply the follower's by "
         f"{1 - rate * pair['seconds'] / max(pair['own'], 1.0):.3f}"
     )
-    return [(row, "leader", words)]
+    return [(row, "leader", message)]
 
 
 def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Units) -> str:
@@ -305,12 +305,12 @@ def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Unit
     speed, gap = episodes["follower_speed_mps"], episodes["gap_m"]
     behind = (gap / speed)[speed > 1.0].median()
     slope, late = clear["slope"].median(), clear["late"].median()
-    known = f"slope of gaps over speeds {slope:.2f}, lag {late:.1f} s of {len(clear):,} pair(s)"
+    fitted = f"slope of gaps over speeds {slope:.2f}, lag {late:.1f} s of {len(clear):,} pair(s)"
     few = f"slope and lag unknown for {pairs - len(clear):,}"
-    parts = [known] * (len(clear) > 0) + [few] * (len(clear) < pairs)
+    phrases = [fitted] * (len(clear) > 0) + [few] * (len(clear) < pairs)
     line = (
         f"medians: speed {speed.median():.3g} m/s, gap {gap.median():.3g} m, time gap "
-        f"{behind:.2g} s above 1 m/s; {', '.join(parts)}"
+        f"{behind:.2g} s above 1 m/s; {', '.join(phrases)}"
     )
     stand = gap[episodes[["follower_speed_mps", "leader_speed_mps"]].max(axis=1) < STANDING]
     if len(stand) < LEAST_STANDING or stand.median() < FAR_STANDING or "ft" in units.values():

@@ -123,8 +123,8 @@ def extract(
             candidate.
     """
     table = trajectories.samples
-    known = [*SAMPLE_COLUMNS, *(name for name in ORIGIN if name in table)]
-    samples = {str(name): table[name].to_numpy() for name in known}
+    columns = [*SAMPLE_COLUMNS, *(name for name in ORIGIN if name in table)]
+    samples = {str(name): table[name].to_numpy() for name in columns}
     recording = table["recording"].cat
 
     def at(row: int, column: str) -> str:
@@ -149,8 +149,8 @@ def extract(
         keep &= passes
         if not keep.any():
             longest = f"the longest candidate lasts {FRAME * (lengths.max() - 1):.3g} s"
-            words = f"no episode is left after the criterion {name!r}"
-            raise DataError("; ".join([words, longest, *report.lines()]))
+            message = f"no episode is left after the criterion {name!r}"
+            raise DataError("; ".join([message, longest, *report.lines()]))
     entry = np.flatnonzero(np.repeat(keep, lengths))
     report.kept, report.rows = int(keep.sum()), len(entry)
     number = np.repeat(np.arange(report.kept, dtype=np.int32), lengths[keep])
@@ -194,15 +194,15 @@ def _pairs(
     """Return rows of followers with a leader in the same frame, and the rows of the leaders."""
     preceding, lane = samples["preceding"], samples["lane"]
     ahead = find_leaders(recording, samples["vehicle"], samples["frame"], preceding)
-    follows, seen = preceding > 0, ahead >= 0
+    follows, visible = preceding > 0, ahead >= 0
     unseen = "the preceding vehicle is not seen in that frame"
-    report.leave_out(np.flatnonzero(follows & ~seen), unseen, "preceding")
+    report.leave_out(np.flatnonzero(follows & ~visible), unseen, "preceding")
     if criteria.lane_changes == "split":
-        same = lane[ahead] == lane
+        in_lane = lane[ahead] == lane
         other = "the preceding vehicle is on another lane"
-        report.leave_out(np.flatnonzero(seen & ~same), other, "lane")
-        seen &= same
-    follower = np.flatnonzero(seen)
+        report.leave_out(np.flatnonzero(visible & ~in_lane), other, "lane")
+        visible &= in_lane
+    follower = np.flatnonzero(visible)
     if len(follower) == 0:
         raise DataError(
             f"no vehicle follows another in the same lane and frame: of {len(lane):,} samples "
@@ -226,8 +226,8 @@ def _near(
         report.leave_out(follower[wrong], f"gap beyond {name}={limit:g}", "gap_m")
         keep &= ~wrong
     if not keep.any():
-        words = "no sample is left within min_gap_m and max_gap_m"
-        raise DataError("; ".join([words, *report.lines()]))
+        message = "no sample is left within min_gap_m and max_gap_m"
+        raise DataError("; ".join([message, *report.lines()]))
     return keep
 
 

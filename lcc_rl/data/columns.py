@@ -81,18 +81,18 @@ def check_map(columns: Iterable[Column], names: Names, units: Units, at: str) ->
         ConfigError: naming an unknown key or unit, a required column without name, or a column that
             is named twice.
     """
-    known = {column.key: column for column in columns}
-    measured = {key: UNITS[c.quantity] for key, c in known.items() if c.quantity in UNITS}
-    require_known(f"key of {at}.columns", names, known)
+    by_key = {column.key: column for column in columns}
+    measured = {key: UNITS[c.quantity] for key, c in by_key.items() if c.quantity in UNITS}
+    require_known(f"key of {at}.columns", names, by_key)
     require_known(f"key of {at}.units", units, measured)
     for key, name in names.items():
-        if not (isinstance(name, str) or (name is None and not known[key].required)):
+        if not (isinstance(name, str) or (name is None and not by_key[key].required)):
             raise ConfigError(f"{at}.columns.{key} must name a column, got {name!r}")
         if name is not None and [*names.values()].count(name) > 1:
             raise ConfigError(f"{at}.columns names the column {name!r} twice")
     for key, unit in units.items():
-        more = {"frames/<rate>": 1.0} if known[key].quantity == "time" else {}
-        if unit_size(known[key].quantity, str(unit)) is None:
+        more = {"frames/<rate>": 1.0} if by_key[key].quantity == "time" else {}
+        if unit_size(by_key[key].quantity, str(unit)) is None:
             raise unknown_name(f"unit in {at}.units.{key}:", str(unit), {**measured[key], **more})
 
 
@@ -107,8 +107,8 @@ def unit_size(quantity: str, unit: str) -> float | None:
 
 def named_unit(name: str, quantity: str) -> str | None:
     """Return the unit in the name of a column, unless it is SI: ``mph`` for ``v (mph)``."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])|[^\w/]|_", " ", name).lower()
+    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|[^\w/]|_", " ", name).lower()
     for unit, spelled in UNIT_WORDS.get(quantity, {}).items():
-        if re.search(rf"(?<![^\W\d])({spelled})(?![^\W\d])", words):
+        if re.search(rf"(?<![^\W\d])({spelled})(?![^\W\d])", spaced):
             return unit
     return None

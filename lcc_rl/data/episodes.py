@@ -100,13 +100,13 @@ def read_episodes(
         seen, count = seen | {*table["recording"].cat.categories}, count + episode.nunique()
         parts.append(table.assign(file=number))
         notes += lines
-    texts = {name: joined([part.pop(name).array for part in parts]) for name in TEXTS}
-    whole = parts[0] if len(parts) == 1 else pd.concat(parts, ignore_index=True)
+    texts = {name: joined([frame.pop(name).array for frame in parts]) for name in TEXTS}
+    rows = parts[0] if len(parts) == 1 else pd.concat(parts, ignore_index=True)
     parts.clear()
-    whole = whole.assign(label=texts["label"])
-    whole.insert(1, "recording", texts["recording"].astype(str))
-    notes += cut_by_files(whole, "label", paths)
-    return whole, alike(notes, paths)
+    rows = rows.assign(label=texts["label"])
+    rows.insert(1, "recording", texts["recording"].astype(str))
+    notes += cut_by_files(rows, "label", paths)
+    return rows, alike(notes, paths)
 
 
 def _table(
@@ -116,12 +116,12 @@ def _table(
     names = _names(file, columns)
     table, numbers = _rows(file, names, units, seen, count)
     notes = list(file.notes)
-    for name, words in (
+    for name, note in (
         ("recording", "no column recording: each file is one recording"),
         ("leader_length", "no column leader_length_m: lengths are not known"),
     ):
         if names.get(name) is None:
-            notes.append(words)
+            notes.append(note)
     report = ReadReport([str(file.path)])
     table = continuous(table, "episode", place, report)
     start = table.groupby("episode")["time_s"].transform("min").to_numpy()
@@ -147,13 +147,13 @@ def _rows(
     read, cars = _targets(read, file)
     if not len(read["time"]):
         raise DataError(f"{file.path}: has no episodes; expected at least one row")
-    kept = read.pop("row")
-    rows = len(kept)
+    row = read.pop("row")
+    rows = len(row)
     labels = read.pop("episode", same_text("", rows))
-    codes, found = pd.factorize(labels)
-    numbers = whole_numbers(np.asarray(found))
+    codes, distinct = pd.factorize(labels)
+    numbers = whole_numbers(np.asarray(distinct))
     if numbers is None or (np.abs(numbers) >= 2**31).any():
-        numbers = np.arange(len(found))
+        numbers = np.arange(len(distinct))
     recording = read.get("recording", same_text(file.label, rows))
     before = count * bool(seen & {*recording.categories})
     # Unknown vehicles of several files are different ones.
@@ -165,7 +165,7 @@ def _rows(
         "follower_id": read.get("follower_id", follower),
         "leader_id": read.get("leader_id", 2 * (codes + before) + 1),
     }
-    values |= {"time_s": read["time"].round(6), "row": kept, "label": labels, "episode": codes}
+    values |= {"time_s": read["time"].round(6), "row": row, "label": labels, "episode": codes}
     table = pd.DataFrame(values, copy=False)  # times have a resolution of 1 µs
     _check_pairs(table, file)
     return table, numbers
@@ -178,36 +178,36 @@ def _targets(read: dict[str, Any], file: TableFile) -> tuple[dict[str, Any], pd.
     """
     rows, valid = len(read["time"]), read.pop("valid", None)
     target, relative = read.pop("target", None), read.pop("relative_speed", None)
-    kept, cars = np.ones(rows, dtype=bool), read.get("episode", same_text("", rows))
+    mask, cars = np.ones(rows, dtype=bool), read.get("episode", same_text("", rows))
     if relative is not None:
         read["leader_speed"] = read["follower_speed"] + relative
     if valid is not None:
         folded = np.char.lower(np.asarray(valid).astype(str))
         if (odd := ~np.isin(folded, (*VALID, *NOT_VALID))).any():
-            words = f"is {str(folded[odd][0])!r}; expected 1 or 0, true or false"
-            raise file.fault(int(read["row"][odd][0]), "valid", words)
-        kept &= np.isin(folded, VALID)
+            message = f"is {str(folded[odd][0])!r}; expected 1 or 0, true or false"
+            raise file.fault(int(read["row"][odd][0]), "valid", message)
+        mask &= np.isin(folded, VALID)
     if target is not None:
-        kept &= ~target.isin(NO_LEADER)
+        mask &= ~target.isin(NO_LEADER)
         names = np.char.add(np.asarray(cars).astype(str), " target ")
         read["episode"] = pd.Categorical(np.char.add(names, np.asarray(target).astype(str)))
-    if kept.all():
+    if mask.all():
         return read, cars
-    place = f"data row {int(read['row'][np.argmin(kept)]) + 1}"
-    file.notes.append(f"left out {int((~kept).sum()):,} rows without a valid target, {place} …")
-    return chosen(read, kept), cars[kept]
+    first = f"data row {int(read['row'][np.argmin(mask)]) + 1}"
+    file.notes.append(f"left out {int((~mask).sum()):,} rows without a valid target, {first} …")
+    return chosen(read, mask), cars[mask]
 
 
 def _numbered(episode: NDArray, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the file's numbers of episodes; parts after holes have further numbers."""
-    more = np.arange(episode.max() + 1 - len(numbers)) + numbers.max() + 1
-    return np.append(numbers, more)[episode]
+    further = np.arange(episode.max() + 1 - len(numbers)) + numbers.max() + 1
+    return np.append(numbers, further)[episode]
 
 
 def _names(file: TableFile, columns: Names) -> dict[str, str | None]:
     """Return the file's names of columns by the keys of ``FIELDS``."""
     names: dict[str, str | None] = {
-        key: own for key, own in EPISODE_NAMES.items() if own in file.header
+        key: name for key, name in EPISODE_NAMES.items() if name in file.header
     }
     names |= {
         new: old for old, new in EPISODE_ALIASES.items() if old in file.header and new not in names

@@ -55,22 +55,22 @@ def places(
     named = columns or {}
 
     def place(row: int, column: str = "") -> str:
-        known = table.iloc[row].to_dict()
+        sample = table.iloc[row].to_dict()
         role = "leader" if column.startswith("leader") else "follower"
-        at = known.get("row" if role == "follower" else "leader_row", known.get("row"))
-        vehicle = known.get(f"{role}_id", known.get("vehicle"))
+        at = sample.get("row" if role == "follower" else "leader_row", sample.get("row"))
+        vehicle = sample.get(f"{role}_id", sample.get("vehicle"))
         key = re.sub("_(m|s|mps)$", "", column)
-        own = named.get(key) or named.get(re.sub("^(leader|follower)_", "", key)) or column
-        words = [f"recording {known['recording']}" if "recording" in known else ""]
-        words.append(f"episode {known['label']}" if known.get("label") else "")
-        words.append("" if at is None else f"data row {at + 1}")
-        if vehicle is not None and "label" not in known:
+        header = named.get(key) or named.get(re.sub("^(leader|follower)_", "", key)) or column
+        details = [f"recording {sample['recording']}" if "recording" in sample else ""]
+        details.append(f"episode {sample['label']}" if sample.get("label") else "")
+        details.append("" if at is None else f"data row {at + 1}")
+        if vehicle is not None and "label" not in sample:
             name = (vehicles or {}).get(vehicle, vehicle)
-            words.append(f"vehicle {name}" + f" ({role})" * (at is None))
-        words.append(f"{known['time_s']:g} s" if at is None else "")
-        words.append(f"column {own!r}" if column else "")
-        file = f"{files[known['file']]}: " if len(files) > 1 and "file" in known else ""
-        return file + ", ".join(filter(None, words))
+            details.append(f"vehicle {name}" + f" ({role})" * (at is None))
+        details.append(f"{sample['time_s']:g} s" if at is None else "")
+        details.append(f"column {header!r}" if column else "")
+        file = f"{files[sample['file']]}: " if len(files) > 1 and "file" in sample else ""
+        return file + ", ".join(filter(None, details))
 
     return place
 
@@ -110,13 +110,13 @@ def continuous(
         return samples
     _check_clock(samples, hole, usual, place(samples), report.source)
     count = samples["episode"].nunique()
-    parts = divided(samples, alone, hole, 0.0)
+    records = divided(samples, alone, hole, 0.0)
     report.drop("alone between holes", int(alone.sum()))
-    if parts.empty:
+    if records.empty:
         raise DataError(f"{report.source}: no {what} has two samples in a row")
-    found = f"{count:,} {what}s into {parts['episode'].nunique():,}"
-    report.notes += [f"{int(hole.sum()):,} holes divide {found}"] * bool(hole.any())
-    return parts
+    counts = f"{count:,} {what}s into {records['episode'].nunique():,}"
+    report.notes += [f"{int(hole.sum()):,} holes divide {counts}"] * bool(hole.any())
+    return records
 
 
 def _sorted(samples: pd.DataFrame, report: ReadReport) -> pd.DataFrame:
@@ -138,17 +138,17 @@ def _first_of_moments(
     again[1:] &= np.diff(samples["episode"]) == 0
     if not again.any():
         return samples
-    given = samples.columns.drop(["file", "row"], errors="ignore")
-    others = again & ~samples.duplicated(given).to_numpy()
-    rows = np.flatnonzero(others if others.any() else again)
+    columns = samples.columns.drop(["file", "row"], errors="ignore")
+    differing = again & ~samples.duplicated(columns).to_numpy()
+    rows = np.flatnonzero(differing if differing.any() else again)
     where = place(samples)(int(rows[samples["row"].to_numpy()[rows].argmin()]), "time_s")
-    if others.sum() > MOST_TWICE * len(samples):
+    if differing.sum() > MOST_TWICE * len(samples):
         raise DataError(
             f"{report.source}: {where} repeats a time of its {what} with other values, as do "
-            f"{100 * others.mean():.0f} % of the rows; does a column name the {what}?"
+            f"{100 * differing.mean():.0f} % of the rows; does a column name the {what}?"
         )
-    words = f"rows that repeat a time of their {what}, {int(others.sum()):,} of them with"
-    report.drop(f"{words} other values, the first: {where}", int(again.sum()))
+    reason = f"rows that repeat a time of their {what}, {int(differing.sum()):,} of them with"
+    report.drop(f"{reason} other values, the first: {where}", int(again.sum()))
     return samples[~again].reset_index(drop=True)
 
 
@@ -167,9 +167,9 @@ def _usual_steps(samples: pd.DataFrame, same: Mask, what: str, source: str) -> F
         )
     if not ((steps - step).abs() > UNEVEN * step).any():
         return np.full(len(samples), step)
-    own = steps.groupby(samples["episode"]).transform("median")
+    medians = steps.groupby(samples["episode"]).transform("median")
     many = samples.groupby("episode")["time_s"].transform("size") > round(1 / MANY_HOLES)
-    return own.where(many, step).to_numpy()
+    return medians.where(many, step).to_numpy()
 
 
 def _check_clock(rows: pd.DataFrame, hole: Mask, usual: Floats, place: Place, source: str) -> None:
@@ -210,11 +210,11 @@ def divided(table: pd.DataFrame, wrong: Mask, begins: Mask, shortest: float) -> 
     duration = time[rows[starts + lengths - 1]] - time[rows[starts]]
     keep = ~touched[rows[starts]] | (duration > shortest - 1e-6)
     numbers = episode[rows[starts]][keep].astype(np.int64)
-    more = pd.Series(numbers).duplicated().to_numpy()
-    numbers[more] = episode.max() + 1 + np.arange(more.sum())
-    kept = table.iloc[rows[np.repeat(keep, lengths)]].reset_index(drop=True)
-    kept["episode"] = np.repeat(numbers, lengths[keep]).astype(episode.dtype)
-    return kept
+    repeated = pd.Series(numbers).duplicated().to_numpy()
+    numbers[repeated] = episode.max() + 1 + np.arange(repeated.sum())
+    rest = table.iloc[rows[np.repeat(keep, lengths)]].reset_index(drop=True)
+    rest["episode"] = np.repeat(numbers, lengths[keep]).astype(episode.dtype)
+    return rest
 
 
 def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -233,12 +233,12 @@ def cut_by_files(samples: pd.DataFrame, key: str, files: Sequence[str]) -> list[
     times = times.sort_values([key, "min"], ignore_index=True)
     usual = (times["max"] - times["min"]) / (times["size"] - 1)
     step = (times["min"] - times["max"].shift()).where(times[key] == times[key].shift())
-    found = np.flatnonzero((step > 0) & (step < HOLE * usual))
-    if not len(found):
+    rows = np.flatnonzero((step > 0) & (step < HOLE * usual))
+    if not len(rows):
         return []
-    before, after = (files[times["file"][row]] for row in (found[0] - 1, found[0]))
-    words = f"{len(found):,} records continue in another file and are read as two, the first from"
-    return [Concern(f"{words} {before} in {after}; join the files")]
+    before, after = (files[times["file"][row]] for row in (rows[0] - 1, rows[0]))
+    text = f"{len(rows):,} records continue in another file and are read as two, the first from"
+    return [Concern(f"{text} {before} in {after}; join the files")]
 
 
 # -- every 0.1 s -----------------------------------------------------------------------------------
@@ -300,14 +300,14 @@ def _interpolated(
     table, episode = samples[smooth].to_numpy(np.float64), samples["episode"].to_numpy()
     frames, before, values = [], [], []
     for start, length in zip(*stretches(episode), strict=True):
-        own = at[start : start + length]
-        grid = np.arange(np.ceil(own[0] - 1e-6), np.floor(own[-1] + 1e-6) + 1)
+        sampled = at[start : start + length]
+        grid = np.arange(np.ceil(sampled[0] - 1e-6), np.floor(sampled[-1] + 1e-6) + 1)
         if len(grid) < 2:
             report.drop("stretch without two samples on the time grid", int(length))
             continue
-        motion = PchipInterpolator(own, table[start : start + length])
-        values.append(motion(grid.clip(own[0], own[-1])))
-        before.append(start + np.searchsorted(own, grid + 1e-6, side="right") - 1)
+        motion = PchipInterpolator(sampled, table[start : start + length])
+        values.append(motion(grid.clip(sampled[0], sampled[-1])))
+        before.append(start + np.searchsorted(sampled, grid + 1e-6, side="right") - 1)
         frames.append(grid.astype(np.int64))
     if not frames:
         raise DataError(

@@ -160,18 +160,18 @@ class RecordLeaders(Settings):
             DataError: naming the file of an unusable record.
             ConfigError: naming an unknown or impossible option.
         """
-        parts: dict[str, list[Profiles]] = {}
+        groups: dict[str, list[Profiles]] = {}
         for group in ("training", "held_out"):
-            parts[group] = self._stretches(group, getattr(self, group), time_step)
-            if not parts[group]:
+            groups[group] = self._stretches(group, getattr(self, group), time_step)
+            if not groups[group]:
                 raise ConfigError(f"leader.{group} names no record")
-        windows = varying(joined(parts["held_out"]).windows(horizon), self.least_variation)
+        windows = varying(joined(groups["held_out"]).windows(horizon), self.least_variation)
         report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s"] + [
             f"{group}: {line}"
-            for group, x in parts.items()
+            for group, x in groups.items()
             for line in described_records(joined(x), horizon)
         ]
-        leaders = Leaders(joined(parts["training"]), windows, report=tuple(report))
+        leaders = Leaders(joined(groups["training"]), windows, report=tuple(report))
         if followers is None:
             return leaders
         cases = []
@@ -181,19 +181,19 @@ class RecordLeaders(Settings):
             profile = stretch(x.path, time_step, x.scale, x.start_s, end, self.plausible)
             cases.append(Case(name.replace("_", " "), profile, x.followers))
         wholes = self.full_length or {}
-        whole = self._stretches("full_length", wholes, time_step)
+        profiles = self._stretches("full_length", wholes, time_step)
         full_length = (
             Case(f"{WHOLE_RECORD} {name}", profile, followers)
-            for name, profile in zip(wholes, whole, strict=True)
+            for name, profile in zip(wholes, profiles, strict=True)
         )
         return replace(leaders, cases=tuple(cases), full_length=tuple(full_length))
 
     def _stretches(self, group: str, nodes: StretchNodes, time_step: float) -> list[Profiles]:
-        parts = []
+        profiles = []
         for name, node in nodes.items():
             x = self._parsed(Stretch, node, f"leader.{group}.{name}")
-            parts.append(stretch(x.path, time_step, x.scale, x.from_s, x.to_s, self.plausible))
-        return parts
+            profiles.append(stretch(x.path, time_step, x.scale, x.from_s, x.to_s, self.plausible))
+        return profiles
 
     def _parsed(self, kind: type[Settings], node: Mapping[str, Any] | None, where: str) -> Any:
         """Return settings of a stretch or case; it or ``self`` has a path."""
@@ -236,14 +236,14 @@ def apart(
         recording, _, number = name.rsplit("@", 1)[0].rpartition("/")
         return f"{recording}/{(vehicles or {}).get(int(number), number)}"
 
-    for what, own, others in (
+    for kind, evaluated, trained in (
         ("recordings", held_out.recordings, training.recordings),
         ("vehicles", [*map(leader, held_out.names)], [*map(leader, training.names)]),
     ):
-        if others and not set(own) & set(others):
-            names = list(dict.fromkeys(own))
-            more = f" … ({len(names)})" if len(names) > LISTED else ""
-            return [f"held out: {what} {', '.join(names[:LISTED])}{more}"]
+        if trained and not set(evaluated) & set(trained):
+            names = list(dict.fromkeys(evaluated))
+            suffix = f" … ({len(names)})" if len(names) > LISTED else ""
+            return [f"held out: {kind} {', '.join(names[:LISTED])}{suffix}"]
     return []
 
 
@@ -291,8 +291,8 @@ class DriveLeaders(Settings):
         if profiles.grades is not None:
             raise ConfigError("leader.columns.grade: only lcc-rl energy uses grades")
         drives = {*profiles.recordings}
-        each = 1 < len(drives) == len(find_files(self.path))  # a file is a drive
-        if each and self.together and len({*map(self._family, drives)}) == 1:
+        per_file = 1 < len(drives) == len(find_files(self.path))  # a file is a drive
+        if per_file and self.together and len({*map(self._family, drives)}) == 1:
             report.append(f"each file is a trip: leader.together={self.together} is in all names")
             self = copy(self)  # self is not changed
             self.together = None
@@ -315,10 +315,10 @@ class DriveLeaders(Settings):
     def _by_name(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
         """Divide drives by a hash of their names; twice for tuning."""
         share = self.evaluation_share
-        place = np.array([hashed(self._family(name)) for name in profiles.recordings])
+        hashes = np.array([hashed(self._family(name)) for name in profiles.recordings])
         if again:  # the other hashes lie in share…1
-            place = (place - share) / (1 - share)
-        held = place < share
+            hashes = (hashes - share) / (1 - share)
+        held = hashes < share
         if held.all() or not held.any():
             side = "evaluation" if held.any() else "training"
             trips = len({self._family(name) for name in profiles.recordings})
@@ -334,10 +334,10 @@ class DriveLeaders(Settings):
         """Return the part of a name that determines the side of its drive."""
         if self.together is None:
             return name
-        found = re.match(self.together, name)
-        if not found or not found.group():
+        match = re.match(self.together, name)
+        if not match or not match.group():
             raise DataError(f"{self.path}: drive {name!r} does not begin with {self.together!r}")
-        return found.group()
+        return match.group()
 
     def _by_time(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
         """Divide a single record, or the parts of one, in order of time; its end is held out."""
@@ -345,17 +345,17 @@ class DriveLeaders(Settings):
         cut = total - round(self.evaluation_share * total)
         sides: tuple[list[Any], list[Any]] = [], []
         for index, name in enumerate(profiles.names):
-            record, here = profiles.record(index), max(cut, 0)
-            later = f"{name}+{here * profiles.time_step:g}s" if here else name
-            for side, part, label in zip(
-                sides, (record[:here], record[here:]), (name, later), strict=True
+            record, split = profiles.record(index), max(cut, 0)
+            later = f"{name}+{split * profiles.time_step:g}s" if split else name
+            for side, piece, label in zip(
+                sides, (record[:split], record[split:]), (name, later), strict=True
             ):
-                side += [(part, label, profiles.recordings[index])] if len(part) > 1 else []
+                side += [(piece, label, profiles.recordings[index])] if len(piece) > 1 else []
             cut -= len(record)
         if not all(sides):
             raise DataError(f"{self.path}: {total} samples cannot be divided")
-        parts = ([[x[k] for x in side] for k in range(3)] for side in sides)
-        first, last = (from_records(x, y, z, profiles.time_step) for x, y, z in parts)
+        columns = ([[x[k] for x in side] for k in range(3)] for side in sides)
+        first, last = (from_records(x, y, z, profiles.time_step) for x, y, z in columns)
         return first, last
 
 
@@ -371,19 +371,19 @@ def varying(profiles: Profiles, least: float, fastest: float | None = None) -> P
         DataError: if there is none.
     """
     records = [profiles.record(index) for index in range(len(profiles))]
-    kept = [
+    indices = [
         index
         for index, record in enumerate(records)
         if float(record.diff().abs().sum()) >= least
         and (fastest is None or float(record.mean()) <= fastest)
     ]
-    if not kept:
+    if not indices:
         slow = "" if fastest is None else f" and whose mean is at most leader.fastest={fastest:g}"
         raise DataError(
             f"no held-out window in which the leader's speed changes by {least:g} m/s{slow}; "
             "lower leader.least_variation, raise scenario.horizon or give another record"
         )
-    return profiles.select(kept)
+    return profiles.select(indices)
 
 
 def hashed(name: str) -> float:
@@ -425,26 +425,26 @@ class Mixture:
 
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
         """Read all records; see :meth:`RecordLeaders.load`."""
-        found: dict[str, Leaders] = {}
+        loaded: dict[str, Leaders] = {}
         for name, source in self.sources.items():
             with raised_as(DataError, f"leader.{name}", DataError):
-                found[name] = source.load(time_step, horizon, followers)
+                loaded[name] = source.load(time_step, horizon, followers)
         # A source for evaluation only has no training records.
-        learned = {name: one for name, one in found.items() if len(one.training)}
-        parts = [one.training.at_least(horizon) for one in learned.values()]
-        training = joined(parts) if parts else next(iter(found.values())).training
-        each = []
-        for name, part in zip(learned, parts, strict=True):
-            even = torch.ones(len(part), dtype=torch.float64) / len(part)
-            each.append(self.weights.get(name, 1.0) * even)
-        windows = joined([one.windows for one in found.values()])
-        names = tuple(name for name, one in found.items() for _ in range(len(one.windows)))
+        learned = {name: one for name, one in loaded.items() if len(one.training)}
+        trainings = [one.training.at_least(horizon) for one in learned.values()]
+        training = joined(trainings) if trainings else next(iter(loaded.values())).training
+        shares = []
+        for name, records in zip(learned, trainings, strict=True):
+            even = torch.ones(len(records), dtype=torch.float64) / len(records)
+            shares.append(self.weights.get(name, 1.0) * even)
+        windows = joined([one.windows for one in loaded.values()])
+        names = tuple(name for name, one in loaded.items() for _ in range(len(one.windows)))
         return Leaders(
-            replace(training, weights=torch.cat(each) if each else None),
+            replace(training, weights=torch.cat(shares) if shares else None),
             replace(windows, sources=names),
-            tuple(case for one in found.values() for case in one.cases),
-            tuple(case for one in found.values() for case in one.full_length),
+            tuple(case for one in loaded.values() for case in one.cases),
+            tuple(case for one in loaded.values() for case in one.full_length),
             tuple(
-                type(line)(f"{name}: {line}") for name, one in found.items() for line in one.report
+                type(line)(f"{name}: {line}") for name, one in loaded.items() for line in one.report
             ),
         )

@@ -55,8 +55,8 @@ HEADER_ALIASES = {
 INT16 = 2**15 - 1
 
 
-def _column(name: str, least: float = -1e9, most: float = 1e9, **more: Any) -> Column:
-    return Column(name, least=least, most=most, **more)
+def _column(name: str, least: float = -1e9, most: float = 1e9, **options: Any) -> Column:
+    return Column(name, least=least, most=most, **options)
 
 
 # Columns of the files by their keys in the samples.
@@ -124,23 +124,23 @@ def read_ngsim(
     """
     paths = [path] if isinstance(path, (str, Path)) else path
     rows = _Rows(ReadReport(files=[str(name) for name in paths]), METRES[units])
-    wanted = None if location is None else location.strip().lower()
+    chosen = None if location is None else location.strip().lower()
     for name in rows.report.files:
         file = TableFile(name, _official, OFFICIAL)
         missing = [x.key for x in NGSIM_FIELDS.values() if x.required and x.key not in file.header]
         if missing:
             raise lacking(name, missing, file.header, "")
         before = rows.report.rows_read
-        for block in file.blocks([known for known in KNOWN if known in file.header]):
-            rows.add(name, block, wanted)
+        for block in file.blocks([key for key in KNOWN if key in file.header]):
+            rows.add(name, block, chosen)
         if rows.report.rows_read == before:
             raise DataError(f"{name}: is empty or has no rows; expected NGSIM trajectories")
         rows.report.notes += file.notes
     if not rows.chunks:
-        found = ", ".join(f"{name or 'blank'} ({n:,} rows)" for name, n in rows.locations.items())
+        present = ", ".join(f"{name or 'blank'} ({n:,} rows)" for name, n in rows.locations.items())
         raise DataError(
             f"{', '.join(rows.report.files)}: no row has Location {location!r}; "
-            f"the locations found are {found or 'none'}"
+            f"the locations found are {present or 'none'}"
         )
     trajectories = _sorted(rows)
     _check_units(trajectories.samples, units, rows.report.files)
@@ -180,36 +180,36 @@ class _Rows:
     filled: set[str] = field(default_factory=set)
     blank_classes: int = 0
 
-    def add(self, file: str, block: Block, wanted: str | None) -> None:
-        """Add the rows of a block; with ``wanted``, those of that location only."""
+    def add(self, file: str, block: Block, location: str | None) -> None:
+        """Add the rows of a block; with ``location``, those of that location only."""
         self.report.rows_read += len(block)
         names, places = [""], np.zeros(len(block), dtype=np.int64)
         if "Location" in block.cells.column_names:
-            places, found = pd.factorize(block.cells["Location"].fill_null("").to_numpy())
-            names = [str(name).strip().lower() for name in found]
+            places, texts = pd.factorize(block.cells["Location"].fill_null("").to_numpy())
+            names = [str(name).strip().lower() for name in texts]
         for name, rows in zip(names, np.bincount(places, minlength=len(names)), strict=True):
             self.locations[name] += int(rows)
-        if wanted is not None:
-            mask = np.array([name == wanted for name in names])[places]
+        if location is not None:
+            mask = np.array([name == location for name in names])[places]
             self.report.drop("other location", int((~mask).sum()))
             block.keep(mask)
             places = places[mask]
         if not len(block):
             return
         columns: NgsimColumns = {}
-        for own, column in NGSIM_FIELDS.items():
-            kind = SAMPLE_TYPES.get(own, np.float64)
-            given = column.key in block.cells.column_names
-            values = block.values(column, column.key) if given else np.full(len(block), np.nan)
-            if own == "vehicle_class":
+        for key, column in NGSIM_FIELDS.items():
+            kind = SAMPLE_TYPES.get(key, np.float64)
+            present = column.key in block.cells.column_names
+            values = block.values(column, column.key) if present else np.full(len(block), np.nan)
+            if key == "vehicle_class":
                 self.blank_classes += int((~(values >= 0)).sum())
                 values = values.clip(min=0.0)
             if column.blank:
                 values = np.nan_to_num(values, nan=0.0)
-            columns[own] = (values * self.metres if kind is np.float32 else values).astype(kind)
+            columns[key] = (values * self.metres if kind is np.float32 else values).astype(kind)
         preceding = columns["preceding"]
         preceding[(preceding < 0) | (preceding == columns["vehicle"])] = 0
-        self.filled |= {NGSIM_NAMES[own] for own, values in columns.items() if values.any()}
+        self.filled |= {NGSIM_NAMES[key] for key, values in columns.items() if values.any()}
         start = _frame_zero(columns.pop("clock"), columns["frame"])
         codes, pairs = pd.factorize(start * len(names) + places)
         groups = []
@@ -263,8 +263,8 @@ def _recordings(read: _Rows, group: NDArray[np.int32]) -> tuple[NDArray[np.int16
             f"{', '.join(read.report.files)}: {len(names):,} recordings; expected a handful. "
             "Global_Time does not advance by 100 ms a frame"
         )
-    place = {name: code for code, name in enumerate(names)}
-    return np.array([place[named[key]] for key in read.groups], dtype=np.int16)[group], names
+    codes = {name: code for code, name in enumerate(names)}
+    return np.array([codes[named[key]] for key in read.groups], dtype=np.int16)[group], names
 
 
 def _kept_order(
@@ -277,11 +277,11 @@ def _kept_order(
     if not repeated.any():
         return order
     first = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(key))))
-    again, kept = order[repeated], order[first[repeated]]
-    same = np.logical_and.reduce([values[again] == values[kept] for values in columns.values()])
-    report.drop(EXACT_DUPLICATE, int(same.sum()))
-    report.drop(CONFLICTING_DUPLICATE, int((~same).sum()))
-    if not same.all():
+    again, firsts = order[repeated], order[first[repeated]]
+    equal = np.logical_and.reduce([values[again] == values[firsts] for values in columns.values()])
+    report.drop(EXACT_DUPLICATE, int(equal.sum()))
+    report.drop(CONFLICTING_DUPLICATE, int((~equal).sum()))
+    if not equal.all():
         report.notes.append(
             "different rows of the same vehicle and frame: the first in the files was kept; "
             "the files may mix recordings that Global_Time does not distinguish"
@@ -295,24 +295,24 @@ def _check_units(samples: pd.DataFrame, units: str, files: Sequence[str]) -> Non
     Without lengths, the shortest headways (1 % quantile) are checked.
     """
     medians, other = median_lengths(samples), "feet" if units == "metres" else "metres"
-    for name, part in samples.groupby("recording", observed=True):
-        headways = part.loc[part["space_headway_m"] > 0, "space_headway_m"]
+    for name, rows in samples.groupby("recording", observed=True):
+        headways = rows.loc[rows["space_headway_m"] > 0, "space_headway_m"]
         hint, near = f"is the file in {other}? Use data.units={other}", False
         if name in medians:
-            what, found = "the median length of vehicles", float(medians[name])
+            quantity, size = "the median length of vehicles", float(medians[name])
             low, high = CAR_LENGTH
-            speeds = part.loc[part["speed_mps"] > MOVING, "speed_mps"]
-            own, mixed = (((headways - x) / speeds).median() for x in (found, FOOT * found))
-            near = own < CLOSE and mixed > 2 * CLOSE
+            speeds = rows.loc[rows["speed_mps"] > MOVING, "speed_mps"]
+            gap, mixed = (((headways - x) / speeds).median() for x in (size, FOOT * size))
+            near = gap < CLOSE and mixed > 2 * CLOSE
         elif len(headways):
-            what, found = "the least headway (1 % quantile)", float(headways.quantile(0.01))
+            quantity, size = "the least headway (1 % quantile)", float(headways.quantile(0.01))
             low, high = JAM, float("inf")
         else:
             continue
         if near:
-            hint = f"with a time gap of {own:.2g} s; are lengths alone in feet? Convert them"
-        if near or not low <= found <= high:
+            hint = f"with a time gap of {gap:.2g} s; are lengths alone in feet? Convert them"
+        if near or not low <= size <= high:
             raise DataError(
-                f"{', '.join(files)}: recording {name}: {what} is {found / METRES[units]:.3g} "
+                f"{', '.join(files)}: recording {name}: {quantity} is {size / METRES[units]:.3g} "
                 f"{units}; expected {low:g} to {high:g} m; {hint}"
             )

@@ -96,24 +96,24 @@ def _name_by_file(named: dict[Group, str], rows: Counter[Group]) -> list[str]:
     for group, name in named.items():
         recordings[group[:2]].add(name)
     unclocked: Counter[tuple[str, str]] = Counter()
-    own: dict[tuple[str, str], str] = {}
+    assigned: dict[tuple[str, str], str] = {}
     for group in sorted(rows.keys() - named.keys()):
-        place = group[:2]
-        unclocked[place] += rows[group]
-        if place not in own:
-            alone = len(recordings[place]) == 1
-            own[place] = min(recordings[place]) if alone else _file_name(place[0], own)
-        named[group] = own[place]
+        source = group[:2]
+        unclocked[source] += rows[group]
+        if source not in assigned:
+            alone = len(recordings[source]) == 1
+            assigned[source] = min(recordings[source]) if alone else _file_name(source[0], assigned)
+        named[group] = assigned[source]
     return [
         f"Global_Time does not identify the recording of {count:,} rows of {file}"
-        f"{f' at {location}' if location else ''}: read as {own[file, location]}"
+        f"{f' at {location}' if location else ''}: read as {assigned[file, location]}"
         for (file, location), count in unclocked.items()
     ]
 
 
-def _file_name(file: str, own: dict[tuple[str, str], str]) -> str:
+def _file_name(file: str, assigned: dict[tuple[str, str], str]) -> str:
     """Return ``<stem>#k`` with the smallest free k."""
     number = 1
-    while (name := f"{stem(file)}#{number}") in own.values():
+    while (name := f"{stem(file)}#{number}") in assigned.values():
         number += 1
     return name

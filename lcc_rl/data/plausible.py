@@ -89,51 +89,51 @@ class Plausible(Settings):
         node, known = setting.split(".")[0], units or {}
         unit = ", ".join(f"{node}.units.{x}={known[x]}" for x in known if "speed" in x) or "units"
         wrong, lines, advice = self._outside(table, place(table), setting, remedy, unit)
-        kept = divided(table, wrong, np.zeros_like(wrong), SHORTEST_PART)
-        lost = 1 - len(kept) / len(table)
-        if lost > self.max_share or kept.empty:
+        rest = divided(table, wrong, np.zeros_like(wrong), SHORTEST_PART)
+        lost = 1 - len(rest) / len(table)
+        if lost > self.max_share or rest.empty:
             raise DataError(
                 f"{source}: {100 * lost:.3g} % of the samples are implausible or lie within less "
                 f"than {SHORTEST_PART:g} s between such (at most {setting}.max_share="
                 f"{self.max_share:g} of them may), the first: {advice}"
             )
-        lines += cut_line(table, kept, wrong) if lines else []
-        kept, more_lines = _not_negative(kept)
+        lines += cut_line(table, rest, wrong) if lines else []
+        rest, more_lines = _not_negative(rest)
         agree, last = False, list[str]()
-        if set(kept.columns) >= OF_PAIRS:
-            kept, jumps = self._without_jumps(kept, source, place, setting)
+        if set(rest.columns) >= OF_PAIRS:
+            rest, jumps = self._without_jumps(rest, source, place, setting)
             more_lines += jumps
             limits = {"max_mismatch": self.max_mismatch, "max_lag": self.max_lag}
             try:
-                last, agree = check_pairs(kept, place(kept), units or {}, **limits)
+                last, agree = check_pairs(rest, place(rest), units or {}, **limits)
             except DataError as error:
                 shown = ", ".join(f"{setting}.{name}={limits[name]:g}" for name in limits)
                 raise DataError(f"{source}: {error} ({shown})") from error
         hint = f"are they in km/h, mph or ft/s ({unit}), or do they need smoothing?"
         if agree:
             hint = "gaps agree: are both in another unit, or are such changes real?"
-        more_lines += self._check_hard(kept, source, setting, hint)
-        return kept.drop(columns=ORIGIN, errors="ignore"), [*lines, *more_lines, *last]
+        more_lines += self._check_hard(rest, source, setting, hint)
+        return rest.drop(columns=ORIGIN, errors="ignore"), [*lines, *more_lines, *last]
 
     def _outside(
         self, table: pd.DataFrame, place: Place, setting: str, remedy: str, unit: str
     ) -> tuple[Mask, list[str], str]:
         """Return samples outside of a threshold, a line for each kind, and advice on the first."""
         wrong, lines, advice = np.zeros(len(table), dtype=bool), [], ""
-        for column, words, values, name, found in self._faults(table):
-            new = found & ~wrong
+        for column, form, values, name, beyond in self._faults(table):
+            new = beyond & ~wrong
             if name == "max_acceleration":  # not the change from a sample that is left out
                 new[1:] &= ~wrong[:-1]
             if not new.any():
                 continue
             row = int(np.argmax(new))
             limit = f"{setting}.{name}={getattr(self, name):g}"
-            example = f"{place(row, column)} {words.format(values[row])}, {limit}"
-            more = remedy if name == "max_acceleration" else ""
+            example = f"{place(row, column)} {form.format(values[row])}, {limit}"
+            hint = remedy if name == "max_acceleration" else ""
             line = f"left out {int(new.sum()):,} implausible sample(s), the first: {example}"
-            lines.append(f"{line}{more and '; to keep it'}{more}")
+            lines.append(f"{line}{hint and '; to keep it'}{hint}")
             fix = unit if column.endswith("speed_mps") else "units"
-            advice = advice or f"{example}; correct the file or {fix}{more}, or raise the threshold"
+            advice = advice or f"{example}; correct the file or {fix}{hint}, or raise the threshold"
             wrong |= new
         return wrong, lines, advice
 
@@ -144,20 +144,20 @@ class Plausible(Settings):
         off, wrong = gap_jumps(table, self.max_jump)
         if not wrong.any():
             return table, []
-        row, kept = int(np.argmax(wrong)), divided(table, wrong, wrong, SHORTEST_PART)
-        words = (
+        row, rest = int(np.argmax(wrong)), divided(table, wrong, wrong, SHORTEST_PART)
+        fault = (
             f"{int(wrong.sum()):,} sample(s) where the gap jumps or is held, the first: "
             f"{place(table)(row, 'gap_m')} changes by {off[row]:.3g} m more than the speeds give, "
             f"{setting}.max_jump={self.max_jump:g}"
         )
-        if len(kept) < (1 - MOST_JUMPS) * len(table):
-            raise DataError(f"{source}: has {words}; expected the gap to one leader")
-        lines = [f"left out {words}", *cut_line(table, kept, wrong)]
-        return kept, [*lines, "parts behind another car are records, too: leave out such rows"]
+        if len(rest) < (1 - MOST_JUMPS) * len(table):
+            raise DataError(f"{source}: has {fault}; expected the gap to one leader")
+        lines = [f"left out {fault}", *cut_line(table, rest, wrong)]
+        return rest, [*lines, "parts behind another car are records, too: leave out such rows"]
 
-    def _check_hard(self, kept: pd.DataFrame, source: str, setting: str, hint: str) -> list[str]:
+    def _check_hard(self, table: pd.DataFrame, source: str, setting: str, hint: str) -> list[str]:
         """Check that speeds change as those of cars; ``hint``: a probable reason."""
-        hard = hard_share(kept)
+        hard = hard_share(table)
         if hard is not None and hard > self.max_hard:
             raise DataError(
                 f"{source}: speeds change by more than {HARD:g} m/s within a second for "
@@ -200,7 +200,7 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
     """
     number, gap, time = (table[x].to_numpy(np.float64) for x in ("episode", "gap_m", "time_s"))
     relative = (table["leader_speed_mps"] - table["follower_speed_mps"]).to_numpy(np.float64)
-    way = np.cumsum(np.diff(time, prepend=time[0]) * (relative + np.append(0, relative[:-1])) / 2)
+    path = np.cumsum(np.diff(time, prepend=time[0]) * (relative + np.append(0, relative[:-1])) / 2)
     starts, lengths = stretches(number + 1j * gap)  # of equal gaps
     ends = starts + lengths - 1
     # Sensors hold a value until the next one: linear between the samples at which it changes.
@@ -210,15 +210,15 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
     for places in (starts, last, ends[long]):
         node[places] = True
     nodes = np.flatnonzero(node)
-    rest = pd.Series(np.interp(np.arange(len(gap)), nodes, gap[nodes]) - way)
-    given = len(starts_of(table["row"].to_numpy())) if "row" in table else len(table)
-    reach = max(round(JUMP_S / FRAME), round(len(table) / given))  # or a step of the recording
+    rest = pd.Series(np.interp(np.arange(len(gap)), nodes, gap[nodes]) - path)
+    rows = len(starts_of(table["row"].to_numpy())) if "row" in table else len(table)
+    reach = max(round(JUMP_S / FRAME), round(len(table) / rows))  # or a step of the recording
     change = rest.groupby(number).diff(reach)
     change -= change.groupby(number).transform("median")
     noise = change.abs().groupby(number).transform("median")
     jump = change.where(change.abs() > np.maximum(limit, NOISE * noise), 0.0)
     off = jump.shift(-(reach // 2), fill_value=0.0).to_numpy(np.float64)
-    drift = (gap - way)[ends] - (gap - way)[starts]
+    drift = (gap - path)[ends] - (gap - path)[starts]
     beside = np.logical_or.reduceat(off != 0, starts)
     held = long & (beside | (np.abs(drift) > limit))
     edges = np.flatnonzero(np.diff(numbers_of_pairs(table), prepend=-1, append=-1))
@@ -251,12 +251,12 @@ def hard_share(table: pd.DataFrame) -> float | None:
     """
     step = usual_step(table)
     reach = max(1, round(1 / step)) if step > 0 else 1
-    same = table["episode"].diff(reach) == 0
-    if same.sum() < LEAST_SAMPLES:
+    inside = table["episode"].diff(reach) == 0
+    if inside.sum() < LEAST_SAMPLES:
         return None
     names = [str(name) for name in table.columns if str(name).endswith("speed_mps")]
-    time = table["time_s"].diff(reach)[same]
-    shares = [(table[x].diff(reach)[same].abs() > HARD * time).mean() for x in names]
+    time = table["time_s"].diff(reach)[inside]
+    shares = [(table[x].diff(reach)[inside].abs() > HARD * time).mean() for x in names]
     return float(max(shares, default=0.0))
 
 

@@ -65,8 +65,8 @@ class Profiles:
     def follower(self, index: int) -> Tensor | None:
         """Return the recorded follower, ``[samples, 2]``, see ``followers``."""
         start = int(self.offsets[index])
-        whole = self.followers
-        return None if whole is None else whole[start : start + int(self.lengths[index])]
+        records = self.followers
+        return None if records is None else records[start : start + int(self.lengths[index])]
 
     def select(self, indices: Iterable[int]) -> Profiles:
         """Return the records with the given indices, in that order."""
@@ -123,8 +123,8 @@ class Profiles:
     def spread(self, limit: int | None) -> Profiles:
         """Return at most ``limit`` records of each source, spread evenly; None: all."""
         groups: dict[str, list[int]] = {}
-        for place, source in enumerate(self.sources or [""] * len(self)):
-            groups.setdefault(source, []).append(place)
+        for index, source in enumerate(self.sources or [""] * len(self)):
+            groups.setdefault(source, []).append(index)
         return self.select(g[i] for g in groups.values() for i in evenly(len(g), limit))
 
     def at_least(self, horizon: int) -> Profiles:
@@ -222,13 +222,13 @@ def described_records(profiles: Profiles, horizon: int) -> list[str]:
         line = f"{name}: {seconds:,.0f} s, speed {float(x.mean()):.3g} m/s, at most {most:.3g} m/s"
         lines.append((-most, line))
         short += [f"{name} ({seconds:g} s)"] * (len(x) <= horizon)
-    more = [f"… and {len(lines) - MOST_LINES:,} slower records"] if len(lines) > MOST_LINES else []
-    words = f"left out {len(short):,} of {len(profiles):,} record(s), shorter than an episode of"
-    words += f" {horizon * profiles.time_step:g} s (scenario.horizon={horizon})"
-    more += [f"{words}: {listed(short)}"] * bool(short)
+    notes = [f"… and {len(lines) - MOST_LINES:,} slower records"] if len(lines) > MOST_LINES else []
+    text = f"left out {len(short):,} of {len(profiles):,} record(s), shorter than an episode of"
+    text += f" {horizon * profiles.time_step:g} s (scenario.horizon={horizon})"
+    notes += [f"{text}: {listed(short)}"] * bool(short)
     return [
         line for _, line in (sorted(lines)[:MOST_LINES] if len(lines) > MOST_LINES else lines)
-    ] + more
+    ] + notes
 
 
 def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
@@ -342,10 +342,10 @@ class Split(Settings):
                 f"cannot split {len(profiles)} profiles by {self.by}: only {distinct} found; "
                 f"give more data, or use {use}; evaluations also take split.evaluation_share=1"
             )
-        held = min(max(round(self.evaluation_share * len(distinct)), 1), len(distinct) - 1)
+        count = min(max(round(self.evaluation_share * len(distinct)), 1), len(distinct) - 1)
         # Evenly spread over the sorted groups, always with the last one. No seed is used, so all
         # runs hold out the same data.
-        picks = np.linspace(len(distinct) - 1, 0, held, endpoint=False).round().astype(int)
+        picks = np.linspace(len(distinct) - 1, 0, count, endpoint=False).round().astype(int)
         evaluation = {distinct[i] for i in picks}
         inside = [i for i, group in enumerate(groups) if group in evaluation]
         outside = [i for i, group in enumerate(groups) if group not in evaluation]

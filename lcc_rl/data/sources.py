@@ -82,11 +82,11 @@ class Source(Settings):
     ) -> LoadedEpisodes:
         """Return the averaged plausible episodes; see :meth:`Plausible.select`."""
         thresholds = self.plausible or Plausible()
-        kept, notes = thresholds.select(episodes, source, place, remedy=remedy, units=units)
+        rest, notes = thresholds.select(episodes, source, place, remedy=remedy, units=units)
         if self.average_s:
-            kept, line = averaged(kept, self.average_s, source)
+            rest, line = averaged(rest, self.average_s, source)
             notes.append(line)
-        return LoadedEpisodes(kept, [*lines, *notes])
+        return LoadedEpisodes(rest, [*lines, *notes])
 
 
 class TrajectorySource(Source):
@@ -181,17 +181,17 @@ def read_as(columns: Iterable[Column], names: Names, units: Units) -> str:
         names: the file's names, by key.
         units: units by key; by default SI.
     """
-    found = units_of(columns, names, units)
-    if not found:
+    declared = units_of(columns, names, units)
+    if not declared:
         return ""
-    option = ", ".join(f"{key}: {unit}" for key, unit in found.items())
-    return f", with data.units={{{option}}} for {', '.join(repr(names[key]) for key in found)}"
+    option = ", ".join(f"{key}: {unit}" for key, unit in declared.items())
+    return f", with data.units={{{option}}} for {', '.join(repr(names[key]) for key in declared)}"
 
 
 def units_of(columns: Iterable[Column], names: Names, units: Units) -> dict[str, str]:
     """Return the units of named measured columns, by key; see :func:`read_as`."""
-    found = [x for x in columns if x.quantity in SI and names.get(x.key)]
-    return {x.key: units.get(x.key, SI[x.quantity]) for x in found}
+    measured = [x for x in columns if x.quantity in SI and names.get(x.key)]
+    return {x.key: units.get(x.key, SI[x.quantity]) for x in measured}
 
 
 def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
@@ -206,10 +206,10 @@ def find_files(path: str | Path | Sequence[str | Path]) -> list[str]:
     files: list[str] = []
     for entry in [path] if isinstance(path, (str, Path)) else path:
         name = str(expanduser(entry))
-        found = [SHIPPED_FILES[name]] if name in SHIPPED_FILES else matching(name)
-        if not found and (has_magic(name) or Path(name).is_dir()):
+        matches = [SHIPPED_FILES[name]] if name in SHIPPED_FILES else matching(name)
+        if not matches and (has_magic(name) or Path(name).is_dir()):
             raise DataError(f"{name}: no file matches this pattern")
-        files += found or [name]  # the reader refuses a missing file
+        files += matches or [name]  # the reader refuses a missing file
     if not files:
         raise DataError("no file is named; expected at least one path")
     twice = [name for name, count in Counter(map(abspath, files)).items() if count > 1]

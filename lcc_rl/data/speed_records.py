@@ -59,8 +59,8 @@ def read_speed_record(
     cycles = {name: file for name, file in SHIPPED_FILES.items() if file.endswith(".csv")}
     file = cycles.get(path, path)
     if not Path(expanduser(file)).is_file():
-        known = ", ".join(sorted(cycles))
-        raise DataError(f"{path}: no such file, and none of the package ({known})")
+        names = ", ".join(sorted(cycles))
+        raise DataError(f"{path}: no such file, and none of the package ({names})")
     samples, _ = _read(
         TableFile(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {}, divide=False
     )
@@ -95,20 +95,20 @@ def read_drives(
     files = find_files(path)
     if len(files) > 1 and columns["drive"] is None:
         raise DataError(f"{path}: {len(files)} files; leader=record drives one, see leader=drives")
-    found: dict[str, tuple[str, Tensor, Tensor | None]] = {}
+    records: dict[str, tuple[str, Tensor, Tensor | None]] = {}
     lines: list[str] = []
     for table in tables_of(files):
         samples, report = _read(table, columns, plausible, units or {}, average_s=average_s)
-        own = dict(_records(samples, time_step))
-        if twice := own.keys() & found.keys():
+        loaded = dict(_records(samples, time_step))
+        if twice := loaded.keys() & records.keys():
             raise DataError(f"{path}: drive {min(twice)!r} is in several files; expected one")
-        found |= own
+        records |= loaded
         lines += [*report, *interpolated(samples, time_step)]
-    names = [*found] if columns["drive"] is None else sorted(found)
-    drives, speeds, grades = zip(*(found[name] for name in names), strict=True)
+    names = [*records] if columns["drive"] is None else sorted(records)
+    drives, speeds, grades = zip(*(records[name] for name in names), strict=True)
     profiles = from_records(speeds, names, drives, time_step)
-    whole = torch.cat(grades) if columns.get("grade") else None
-    return replace(profiles, grades=whole), alike(lines, files)
+    joined = torch.cat(grades) if columns.get("grade") else None
+    return replace(profiles, grades=joined), alike(lines, files)
 
 
 def _records(
@@ -122,11 +122,11 @@ def _records(
     for drive, start, length in zip(drives, starts, lengths, strict=True):
         rows = slice(start, start + length)
         name = drive if count[drive] == 1 else f"{drive}+{time[start]:.12g}s"
-        own, slope = resample(time[rows], speed[rows], time_step), None
+        speeds, slope = resample(time[rows], speed[rows], time_step), None
         if grade is not None:
-            at = time[start] + time_step * np.arange(len(own))
+            at = time[start] + time_step * np.arange(len(speeds))
             slope = torch.tensor(np.interp(at, time[rows], grade[rows]), dtype=torch.float32)
-        yield name, (drive, own, slope)
+        yield name, (drive, speeds, slope)
 
 
 def _read(
@@ -142,17 +142,17 @@ def _read(
     samples, report = _samples(table, columns, units, option), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
     samples = continuous(samples, "drive", place, report, divide)
-    known = units_of(DRIVE_FIELDS, DRIVE_COLUMNS, units) if divide else {}
+    declared = units_of(DRIVE_FIELDS, DRIVE_COLUMNS, units) if divide else {}
     if average_s:
         samples = _averaged(samples, average_s, str(table.path))
     remedy = ", smooth it (leader.average_s=0.5)" if divide and not average_s else ""
-    kept, lines = (plausible or Plausible()).select(
-        samples, str(table.path), place, "leader.plausible", remedy, known
+    rows, lines = (plausible or Plausible()).select(
+        samples, str(table.path), place, "leader.plausible", remedy, declared
     )
-    line = f"read {kept['episode'].nunique():,} speed record(s), {len(kept):,} rows, {table.path}"
+    line = f"read {rows['episode'].nunique():,} speed record(s), {len(rows):,} rows, {table.path}"
     if table.preamble:
         line += ": native OpenACC, its first car"
-    return kept, [line, *table.notes, *report.left_out(), *report.notes, *lines]
+    return rows, [line, *table.notes, *report.left_out(), *report.notes, *lines]
 
 
 def _averaged(samples: pd.DataFrame, seconds: float, source: str) -> pd.DataFrame:
@@ -161,10 +161,10 @@ def _averaged(samples: pd.DataFrame, seconds: float, source: str) -> pd.DataFram
     window = samples.groupby("episode")[SPEED_COLUMN].rolling(
         round(seconds / step) | 1, center=True
     )
-    kept = samples.assign(**{SPEED_COLUMN: window.mean().to_numpy()}).dropna(subset=SPEED_COLUMN)
-    if len(kept) < 2:
+    rows = samples.assign(**{SPEED_COLUMN: window.mean().to_numpy()}).dropna(subset=SPEED_COLUMN)
+    if len(rows) < 2:
         raise DataError(f"{source}: no record is as long as leader.average_s={seconds:g}")
-    return kept.reset_index(drop=True)
+    return rows.reset_index(drop=True)
 
 
 def _samples(table: TableFile, columns: Names, units: Units, option: str) -> pd.DataFrame:

@@ -74,15 +74,15 @@ class TableSource(TrajectorySource):
     def validate(self) -> None:
         self.columns = {**TABLE_COLUMNS, **self.columns}
         check_map(TABLE_FIELDS, self.columns, self.units, "data")
-        given = {key for key, name in self.columns.items() if name is not None}
-        sized = "length" in given or self.vehicle_length is not None
-        if not ("leader" in given or {"lane", "position"} <= given):
+        keys = {key for key, name in self.columns.items() if name is not None}
+        sized = "length" in keys or self.vehicle_length is not None
+        if not ("leader" in keys or {"lane", "position"} <= keys):
             raise ConfigError("data.columns must name leader, or lane and position")
-        if not ("gap" in given or ("position" in given and sized)):
+        if not ("gap" in keys or ("position" in keys and sized)):
             raise ConfigError(
                 "data.columns must name gap, or position and length (or set data.vehicle_length)"
             )
-        if self.smoothing is not None and ("gap" in given or "position" not in given):
+        if self.smoothing is not None and ("gap" in keys or "position" not in keys):
             raise ConfigError(
                 "data.smoothing smooths positions: name data.columns.position, not gap"
             )
@@ -94,8 +94,8 @@ class TableSource(TrajectorySource):
             DataError: naming the file, row and column, if a file is missing, damaged or not valid,
                 no episode is left, or more are implausible than ``plausible`` allows.
         """
-        how = TABLE_FIELDS, self.columns, self.units
-        report = ReadReport(find_files(self.path), read_as(*how), units_of(*how))
+        layout = TABLE_FIELDS, self.columns, self.units
+        report = ReadReport(find_files(self.path), read_as(*layout), units_of(*layout))
         rows = self._rows(report)
         names = {**self.columns, "preceding": self.columns.get("leader")}
         names["gap"] = names.get("gap") or names.get("position")
@@ -103,9 +103,9 @@ class TableSource(TrajectorySource):
         if self.columns.get("recording") is None:
             report.notes += cut_by_files(rows, "vehicle", report.files)
         trajectories = to_trajectories(rows, place, report)
-        known = self.columns.get("length") is None or "length" in self.units
+        sound = self.columns.get("length") is None or "length" in self.units
         for name, length in median_lengths(trajectories.samples).items():
-            if not (known or CAR_LENGTH[0] <= length <= CAR_LENGTH[1]):
+            if not (sound or CAR_LENGTH[0] <= length <= CAR_LENGTH[1]):
                 raise DataError(
                     f"{report.source}: recording {name}: the median length of vehicles is "
                     f"{length:.3g} m; is it in ft or half? Set data.units.length=ft, or m if right"
@@ -117,25 +117,25 @@ class TableSource(TrajectorySource):
 
     def _rows(self, report: ReadReport) -> pd.DataFrame:
         """Return the rows of all files in SI."""
-        parts = []
+        blocks = []
         for number, table in enumerate(tables_of(report.files)):
-            part = table.read(
+            block = table.read(
                 TABLE_FIELDS, self.columns, self.units, "data.columns", TABLE_MEASURED
             )
             report.rows_read += table.count
-            for key in (key for key in IDENTIFYING if key in part):
-                if (blank := part[key] == "").any():
-                    raise table.fault(int(part["row"][np.argmax(blank)]), key, "is blank")
-            unsized = "gap" not in part and self.vehicle_length is None
-            if unsized and (blank := ~(part["length"] > 0)).any():
+            for key in (key for key in IDENTIFYING if key in block):
+                if (blank := block[key] == "").any():
+                    raise table.fault(int(block["row"][np.argmax(blank)]), key, "is blank")
+            unsized = "gap" not in block and self.vehicle_length is None
+            if unsized and (blank := ~(block["length"] > 0)).any():
                 remedy = "is blank or 0; data.vehicle_length sets such lengths [m]"
-                raise table.fault(int(part["row"][np.argmax(blank)]), "length", remedy)
-            _report_blank_gaps(table, part)
-            rows = len(part["row"])
+                raise table.fault(int(block["row"][np.argmax(blank)]), "length", remedy)
+            _report_blank_gaps(table, block)
+            rows = len(block["row"])
             recording = same_text(table.label, rows)
-            parts.append({"recording": recording, **part, "file": np.full(rows, number)})
+            blocks.append({"recording": recording, **block, "file": np.full(rows, number)})
             report.notes += table.notes
-        columns = {key: joined([part.pop(key) for part in parts]) for key in [*parts[0]]}
+        columns = {key: joined([block.pop(key) for block in blocks]) for key in [*blocks[0]]}
         count = len(columns["time"])
         report.drop("blank time, speed or position", report.rows_read - count)
         if not report.rows_read:
@@ -167,24 +167,24 @@ def _vehicles(
 ) -> dict[str, NDArray[np.int64]]:
     """Return vehicles and leaders as positive whole numbers; 0 for no leader."""
     ahead = same_text("", len(vehicle)) if leader is None else leader
-    own, others = (np.asarray(x.categories, dtype=object) for x in (vehicle, ahead))
-    numbers, leaders = whole_numbers(own), whole_numbers(np.where(others == "", "0", others))
+    own, fronts = (np.asarray(x.categories, dtype=object) for x in (vehicle, ahead))
+    numbers, leaders = whole_numbers(own), whole_numbers(np.where(fronts == "", "0", fronts))
     if numbers is None or numbers.min() <= 0 or leaders is None:
         if numbers is not None and leaders is not None:  # columns with blanks have "0.0" for "0"
-            own, others = numbers.astype(str), np.where(others == "", "", leaders.astype(str))
+            own, fronts = numbers.astype(str), np.where(fronts == "", "", leaders.astype(str))
         names, codes = np.unique(own, return_inverse=True)
         report.names = dict(enumerate(names.tolist(), 1))
         shown = listed(names.tolist())
         report.notes.append(f"{len(names):,} vehicles are numbered from 1 by name: {shown}")
-        numbers, known = codes.astype(np.int64) + 1, pd.Index(names).get_indexer(others) + 1
-        none = np.isin(others.astype(str), NO_LEADER) & (known == 0)
+        numbers, indices = codes.astype(np.int64) + 1, pd.Index(names).get_indexer(fronts) + 1
+        none = np.isin(fronts.astype(str), NO_LEADER) & (indices == 0)
         # A leader without a row gets a number that no vehicle has.
-        leaders = np.where(none, 0, np.where(known == 0, len(names) + 1, known))
-    found = numbers[vehicle.codes]
+        leaders = np.where(none, 0, np.where(indices == 0, len(names) + 1, indices))
+    ids = numbers[vehicle.codes]
     if leader is None:
-        return {"vehicle": found}
+        return {"vehicle": ids}
     front = leaders[ahead.codes].astype(np.int64)
-    return {"vehicle": found, "leader": np.where((front < 0) | (front == found), 0, front)}
+    return {"vehicle": ids, "leader": np.where((front < 0) | (front == ids), 0, front)}
 
 
 def to_trajectories(rows: pd.DataFrame, place: Places, report: ReadReport) -> Trajectories:
@@ -222,36 +222,36 @@ def _check_way(rows: pd.DataFrame, place: Places, report: ReadReport) -> None:
     first = rows.episode.diff() != 0
     vehicle = (rows.vehicle.diff() != 0) | (rows.recording.cat.codes.diff() != 0)
     driven = (rows.speed + rows.speed.shift()) / 2 * rows.time_s.diff()
-    ways = pd.DataFrame({"way": rows.position.diff(), "driven": driven}).mask(first, 0.0)
-    jumps = (ways.way - ways.driven).abs() > JUMP
-    each = ways.groupby(vehicle.cumsum()).sum()
-    far = each.abs().max(axis=1) >= LEAST_WAY
-    off = np.abs(np.log(each.way.clip(1.0) / each.driven.clip(1.0)))
-    worst = int(np.argmax(np.where(far, np.where(each.max(axis=1) < 0, np.inf, off), 0.0)))
+    moves = pd.DataFrame({"way": rows.position.diff(), "driven": driven}).mask(first, 0.0)
+    jumps = (moves.way - moves.driven).abs() > JUMP
+    totals = moves.groupby(vehicle.cumsum()).sum()
+    far = totals.abs().max(axis=1) >= LEAST_WAY
+    off = np.abs(np.log(totals.way.clip(1.0) / totals.driven.clip(1.0)))
+    worst = int(np.argmax(np.where(far, np.where(totals.max(axis=1) < 0, np.inf, off), 0.0)))
     where = place(rows)(int(np.flatnonzero(vehicle)[worst]), "")
-    found = [
-        (f"the vehicle from {where}, on drives", "its", each.iloc[worst]),
-        ("the vehicles drive", "their", each.sum()),
+    cases = [
+        (f"the vehicle from {where}, on drives", "its", totals.iloc[worst]),
+        ("the vehicles drive", "their", totals.sum()),
     ]
-    for subject, owner, (way, driven) in (
-        found if (far & (off < np.log(AGREE[1]))).any() else found[::-1]
+    for subject, owner, (moved, driven) in (
+        cases if (far & (off < np.log(AGREE[1]))).any() else cases[::-1]
     ):
-        agree = AGREE[0] * driven <= way <= AGREE[1] * driven  # false if both fall
-        if not agree and max(abs(way), abs(driven)) >= LEAST_WAY:
+        agree = AGREE[0] * driven <= moved <= AGREE[1] * driven  # false if both fall
+        if not agree and max(abs(moved), abs(driven)) >= LEAST_WAY:
             hint = "check data.units and data.columns of time, speed and position"
-            smooth = ways[~jumps].sum()
+            smooth = moves[~jumps].sum()
             low, high = (share * smooth.driven for share in AGREE)
-            most = jumps.any() and smooth.driven > ways.driven.sum() / 2
+            most = jumps.any() and smooth.driven > moves.driven.sum() / 2
             if most and low <= smooth.way <= high:
                 at = place(rows)(int(np.argmax(jumps)), "")
                 hint = (
                     f"positions jump {int(jumps.sum()):,} times, the first at {at}: do they begin "
                     "anew by lane or link? Give positions along the road, or leader and gap instead"
                 )
-            elif way < 0:
+            elif moved < 0:
                 hint = f"positions must grow in the direction of travel; {hint}"
             raise DataError(
-                f"{report.source}: by {owner} positions {subject} {way:.4g} m, by {owner} speeds "
+                f"{report.source}: by {owner} positions {subject} {moved:.4g} m, by {owner} speeds "
                 f"{driven:.4g} m; {hint}"
             )
 
@@ -262,21 +262,21 @@ def _samples(rows: pd.DataFrame, frame: Integers, report: ReadReport) -> Traject
     rows = rows.assign(recording=recording.codes)
     columns, zero = {str(name): rows[name].to_numpy() for name in rows}, np.zeros(len(rows))
     leader = columns["leader"] if "leader" in columns else _next_ahead(rows, frame)
-    given, gap = "gap" in columns, columns.get("gap", zero)
-    if given:  # a vehicle without a gap follows no vehicle
+    gapped, gap = "gap" in columns, columns.get("gap", zero)
+    if gapped:  # a vehicle without a gap follows no vehicle
         leader = np.where(np.isnan(gap), 0, leader)
     length = np.nan_to_num(columns.get("length", zero))
     headway = {}
-    if given:
+    if gapped:
         ahead = find_leaders(columns["recording"], columns["vehicle"], frame, leader)
         headway["space_headway_m"] = np.where(ahead >= 0, gap + length[ahead], np.nan)
     speed, segment = columns["speed"], rows["episode"].to_numpy()
     last = np.append(np.diff(segment) != 0, True)
     rate = np.where(last, 0.0, np.diff(speed, append=speed[-1]) / FRAME)
-    same = ("recording", "vehicle", "time_s", "file", "row")
+    copied = ("recording", "vehicle", "time_s", "file", "row")
     return assembled(
         {
-            **{name: columns[name] for name in same},
+            **{name: columns[name] for name in copied},
             "frame": frame,
             "segment": segment,
             "position_m": columns.get("position", zero),

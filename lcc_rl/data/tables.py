@@ -100,7 +100,7 @@ class TableFile:
                 self.header = [*pq.read_schema(self.path).names]
         else:
             self._open_text(spelled, bare)
-        keys = dict(part.split("=", 1) for part in self.path.parent.parts if "=" in part)
+        keys = dict(folder.split("=", 1) for folder in self.path.parent.parts if "=" in folder)
         self.folders = {key: keys[key] for key in keys if key not in self.header}
         self.width, self.header = len(self.header), [*self.header, *self.folders]
 
@@ -135,22 +135,22 @@ class TableFile:
             raise lacking(str(self.path), missing, self.header, option)
         for key in (c.key for c in columns if c.key in self.header and c.key not in names):
             if key not in self.names.values():
-                words = f"column {key!r} is not read unless {option}.{key} names it"
-                self.notes.append(Concern(f"{self.path}: {words}"))
-        wanted = {
+                message = f"column {key!r} is not read unless {option}.{key} names it"
+                self.notes.append(Concern(f"{self.path}: {message}"))
+        scales = {
             column: self._scale(column, units or {}, option)
             for column in columns
             if column.key in self.names
         }
-        parts = [
+        chunks = [
             [
                 block.values(column, self.names[column.key], scale)
-                for column, scale in wanted.items()
+                for column, scale in scales.items()
             ]
             for block in self.blocks([*self.names.values()])
         ]
-        whole = map(joined, zip(*parts, strict=True))
-        read = {column.key: values for column, values in zip(wanted, whole, strict=True)}
+        arrays = map(joined, zip(*chunks, strict=True))
+        read = {column.key: values for column, values in zip(scales, arrays, strict=True)}
         self.count = len(next(iter(read.values())))
         return self._measured({**read, "row": np.arange(self.count)}, measured)
 
@@ -175,13 +175,13 @@ class TableFile:
         unit, name = units.get(column.key, SI.get(column.quantity, "")), self.names[column.key]
         scale = (unit and unit_size(column.quantity, unit)) or 1.0
         if column.quantity == "speed" and is_relative(name) and column.key != "relative_speed":
-            words = f"column {name!r} holds a relative speed; add the other car's, or rename it"
+            message = f"column {name!r} holds a relative speed; add the other car's, or rename it"
             if column.key == "leader_speed":
-                words = f"column {name!r} is relative: name it data.columns.relative_speed"
-            raise DataError(f"{self.path}: {words}")
+                message = f"column {name!r} is relative: name it data.columns.relative_speed"
+            raise DataError(f"{self.path}: {message}")
         if column.key == "gap" and re.search("headway|hdwy|dhw", name.lower()):
-            words = f"{self.path}: column {name!r}: does the gap include the leader's length?"
-            self.notes.append(Concern(f"{words} It is bumper to bumper; subtract the length"))
+            message = f"{self.path}: column {name!r}: does the gap include the leader's length?"
+            self.notes.append(Concern(f"{message} It is bumper to bumper; subtract the length"))
         named = named_unit(name, column.quantity)
         if option and named and UNITS[column.quantity][named] != scale:
             where = f"{option.removesuffix('columns')}units.{column.key}={named}"
@@ -199,8 +199,8 @@ class TableFile:
         """
         for name in names:
             if self.header.count(name) > 1:
-                words = f"has column {name!r} twice; expected it once, and common times"
-                raise DataError(f"{self.path}: {words}")
+                message = f"has column {name!r} twice; expected it once, and common times"
+                raise DataError(f"{self.path}: {message}")
         for rows, before in self._rows([name for name in names if name not in self.folders]):
             for name in (name for name in names if name in self.folders):
                 cells = pa.array([self.folders[name]] * rows.num_rows, pa.string())
@@ -211,9 +211,9 @@ class TableFile:
         """Yield rows of the file, and the number of rows before them."""
         if self.parquet:
             with raised_as(DataError, f"{self.path}: not a readable table", Exception):
-                whole = pq.read_table(self.path, columns=[*names], read_dictionary=[*names])
-                whole.validate(full=True)  # else damaged text would fail only when used
-            yield whole, 0
+                content = pq.read_table(self.path, columns=[*names], read_dictionary=[*names])
+                content.validate(full=True)  # else damaged text would fail only when used
+            yield content, 0
             return
         places, row = {str(self.header.index(name)): name for name in names}, 0
         for lines in self.lines:
@@ -261,8 +261,8 @@ class TableFile:
         if len(cells) == len(self.header) + 1 and not cells[-1].strip():
             self.header.append("")  # rows end in a separator
         if self.separator != ",":
-            words = f"columns are separated by {SEPARATORS[self.separator]}"
-            self.notes.append(f"{self.path}: {words}")
+            note = f"columns are separated by {SEPARATORS[self.separator]}"
+            self.notes.append(f"{self.path}: {note}")
         self.comma = self.separator == ";" and b"," in rows and b"." not in rows
         if self.comma:
             self.notes.append(f"{self.path}: numbers have a decimal comma")
@@ -287,8 +287,8 @@ def _memory(file: str) -> float:
     """Return the memory for reading a file, as measured with millions of rows [bytes]."""
     if Path(file).suffix in PARQUET:
         with suppress(pa.ArrowException):  # the reader refuses a damaged file
-            known = pq.read_metadata(file)
-            return 60.0 * known.num_rows * known.num_columns
+            metadata = pq.read_metadata(file)
+            return 60.0 * metadata.num_rows * metadata.num_columns
     return 10.0 * getsize(file)
 
 
@@ -361,9 +361,9 @@ def checked_cells(
         wrong &= ~np.isnan(values)
     if wrong.any():
         row = int(np.argmax(wrong))
-        own = f", {column.least / scale:g} to {column.most / scale:g} in its unit"
+        span = f", {column.least / scale:g} to {column.most / scale:g} in its unit"
         words = f"holds {_shown(cells[row])}; expected {column.expected}"
-        raise fault(row, words + own * (scale != 1.0))
+        raise fault(row, words + span * (scale != 1.0))
     return values
 
 
@@ -373,18 +373,18 @@ def categorical(cells: Cells) -> pd.Categorical:
         return joined([categorical(chunk) for chunk in cells.chunks or [pa.array([], pa.string())]])
     encoded = cells.dictionary_encode()
     names = pc.utf8_trim_whitespace(pc.cast(encoded.dictionary, pa.string())).fill_null("")
-    found = [*names.to_pylist(), *[""] * (encoded.null_count > 0)]
-    texts, place = np.unique(np.array(found, dtype=object), return_inverse=True)
-    codes = place[np.asarray(encoded.indices.fill_null(len(names)))]
+    trimmed = [*names.to_pylist(), *[""] * (encoded.null_count > 0)]
+    texts, inverse = np.unique(np.array(trimmed, dtype=object), return_inverse=True)
+    codes = inverse[np.asarray(encoded.indices.fill_null(len(names)))]
     return pd.Categorical.from_codes(codes, pd.Index(texts, dtype=object))
 
 
 def chosen(read: Mapping[str, Any], rows: NDArray[np.bool_]) -> dict[str, Any]:
     """Return some rows of columns, with the categories that they use."""
-    kept = {key: values[rows] for key, values in read.items()}
+    columns = {key: values[rows] for key, values in read.items()}
     return {
         key: x.remove_unused_categories() if isinstance(x, pd.Categorical) else x
-        for key, x in kept.items()
+        for key, x in columns.items()
     }
 
 
@@ -432,7 +432,7 @@ def numbers_of(cells: Cells, fault: Fault, comma: bool = False) -> NDArray[np.fl
     if pa.types.is_dictionary(cells.type):
         cells = pc.cast(cells, cells.type.value_type)
     if pa.types.is_string(cells.type) or pa.types.is_large_string(cells.type):
-        given = cells
+        texts = cells
         if comma:
             cells = pc.replace_substring(cells, ",", ".")
         with suppress(pa.ArrowInvalid):
@@ -445,8 +445,8 @@ def numbers_of(cells: Cells, fault: Fault, comma: bool = False) -> NDArray[np.fl
         sound = np.asarray(pc.fill_null(pc.match_substring_regex(cells, NUMBER), True))
         if not sound.all():
             row = int(np.argmin(sound))
-            clock = ", or hh:mm:ss, or a time of ISO 8601" if ":" in str(given[row]) else ""
-            raise fault(row, f"holds {_shown(given[row])}; expected a number{clock}")
+            clock = ", or hh:mm:ss, or a time of ISO 8601" if ":" in str(texts[row]) else ""
+            raise fault(row, f"holds {_shown(texts[row])}; expected a number{clock}")
     elif not any(kind(cells.type) for kind in NUMERIC_TYPES):
         raise fault(0, f"is of type {cells.type}; expected numbers")
     return np.asarray(pc.cast(cells, pa.float64(), safe=False), dtype=np.float64)

@@ -165,30 +165,30 @@ def labels(files: Sequence[str]) -> list[str]:
     stems = [stem(name) for name in files]
     counts = Counter(stems)
     folders = [Path(name).parent.parts for name in files if counts[stem(name)] > 1]
-    same = len([*takewhile(lambda parts: len({*parts}) == 1, zip(*folders, strict=False))])
+    common = len([*takewhile(lambda parts: len({*parts}) == 1, zip(*folders, strict=False))])
     return [
-        x if counts[x] == 1 else "/".join(Path(name).parts[same:])
+        x if counts[x] == 1 else "/".join(Path(name).parts[common:])
         for x, name in zip(stems, files, strict=True)
     ]
 
 
 def alike(lines: Iterable[str], files: Iterable[str], most: int = 3) -> list[str]:
     """Return distinct lines, one for more than ``most`` that differ by file and numbers only."""
-    lines, known = list(dict.fromkeys(lines)), {*files}
+    lines, names = list(dict.fromkeys(lines)), {*files}
 
     def kind(line: str) -> str:
-        words = ("…" if word.rstrip(":,") in known else word for word in line.split(" "))
-        return re.sub(r"[0-9][0-9,.]*", "…", " ".join(words))
+        tokens = ("…" if word.rstrip(":,") in names else word for word in line.split(" "))
+        return re.sub(r"[0-9][0-9,.]*", "…", " ".join(tokens))
 
     kinds = list(map(kind, lines))
     counts, first = Counter(kinds), dict(zip(kinds[::-1], lines[::-1], strict=True))
-    found = []
-    for line, own in zip(lines, kinds, strict=True):
-        if counts[own] <= most:
-            found.append(line)
-        elif first[own] is line:
-            found.append(type(line)(f"{line} (and {counts[own] - 1:,} lines alike)"))
-    return found
+    merged = []
+    for line, pattern in zip(lines, kinds, strict=True):
+        if counts[pattern] <= most:
+            merged.append(line)
+        elif first[pattern] is line:
+            merged.append(type(line)(f"{line} (and {counts[pattern] - 1:,} lines alike)"))
+    return merged
 
 
 def parse_text(
@@ -218,7 +218,7 @@ def parse_text(
             pa.BufferReader(rows),
             pa_csv.ReadOptions(
                 use_threads=False,
-                column_names=[str(place) for place in range(width)],
+                column_names=[str(where) for where in range(width)],
                 block_size=min(len(rows) + 1, 1 << 30),
             ),
             pa_csv.ParseOptions(delimiter=separator, invalid_row_handler=note),
@@ -237,8 +237,8 @@ def parse_text(
     # An unclosed quote merges lines without an error.
     count = rows.count(b"\n") + (not rows.endswith(b"\n"))
     if table.num_rows != count and table.num_rows != len(re.findall(rb"[^\r\n]+", rows)):
-        place = f", from data row {before + 1} on" if before else ""
-        raise DataError(f"{source}: a quote is not closed, or a line end is stray{place}")
+        where = f", from data row {before + 1} on" if before else ""
+        raise DataError(f"{source}: a quote is not closed, or a line end is stray{where}")
     return table
 
 
@@ -256,21 +256,21 @@ def _odd_row(
     row: pa_csv.InvalidRow, rows: bytes, width: int, source: str, before: int
 ) -> DataError:
     """Return the error for a row with another number of columns."""
-    text, held = row.text.encode(), row.actual_columns
+    text, count = row.text.encode(), row.actual_columns
     lines = re.findall(rb"[^\r\n]+", rows)  # blank lines are no rows
     number = lines.index(text) if text in lines else 0
-    place = f"data row {before + number + 1}"
-    last = number == len(lines) - 1 and held < width
-    place, cut = (f"{place}, the last,", "; is the file cut off?") if last else (place, "")
-    if held > LONG_ROW * width:
+    where = f"data row {before + number + 1}"
+    last = number == len(lines) - 1 and count < width
+    where, cut = (f"{where}, the last,", "; is the file cut off?") if last else (where, "")
+    if count > LONG_ROW * width:
         cut = ": is it a whole trajectory, as in pNEUMA's files? Write a row per vehicle and time"
-    return DataError(f"{source}: {place} has {held} columns; expected {width}{cut}")
+    return DataError(f"{source}: {where} has {count} columns; expected {width}{cut}")
 
 
 def is_relative(name: str) -> bool:
     """Return whether the name of a column is that of a relative speed."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z][a-z])|[^\w/]|_", " ", name).lower()
-    return re.search(RELATIVE, words) is not None
+    spaced = re.sub(r"(?<=[a-z])(?=[A-Z][a-z])|[^\w/]|_", " ", name).lower()
+    return re.search(RELATIVE, spaced) is not None
 
 
 def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: str) -> DataError:
@@ -278,16 +278,16 @@ def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: 
     folded = {name.lower(): name for name in header}
     near = get_close_matches(missing[0].lower(), folded, n=1)
     hint = f" (is it {folded[near[0]]!r}?)" if near else ""
-    how = f"; name the columns by {option}={{…}}" if option else ""
+    fix = f"; name the columns by {option}={{…}}" if option else ""
     if relative := next(filter(is_relative, header), None) if "speed" in missing[0] else None:
         hint = f" ({relative!r} is relative: add the follower's speed)"
         if missing[0] == "leader_speed_mps":
             hint = f" (set data.columns.relative_speed={relative})"
     if "gap_m" in missing and any("pos" in name.lower() for name in header):
-        how = OF_POSITIONS
+        fix = OF_POSITIONS
     if sum(map(bool, header)) == 1 or header[0].startswith(("#", "%")):
-        how = ": is it a title or a comment? The first line must name the columns"
+        fix = ": is it a title or a comment? The first line must name the columns"
     if all(re.fullmatch(NUMBER, name) for name in header if name):
-        how = ": is the header missing? The first line must name the columns"
+        fix = ": is the header missing? The first line must name the columns"
     shown = ", ".join(header)[:400]
-    return DataError(f"{source}: lacks the column {', '.join(missing)}; it has {shown}{hint}{how}")
+    return DataError(f"{source}: lacks the column {', '.join(missing)}; it has {shown}{hint}{fix}")

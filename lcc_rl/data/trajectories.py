@@ -134,8 +134,8 @@ class Trajectories:
 
 def median_lengths(samples: pd.DataFrame) -> pd.Series:
     """Return the median length of the vehicles of each recording that have one [m]."""
-    known = samples[samples["length_m"] > 0]
-    lengths = known.groupby(["recording", "vehicle"], observed=True)["length_m"].first()
+    sized = samples[samples["length_m"] > 0]
+    lengths = sized.groupby(["recording", "vehicle"], observed=True)["length_m"].first()
     return lengths.groupby("recording", observed=True).median()
 
 
@@ -177,9 +177,9 @@ def _fill_headways(columns: dict[str, NDArray], report: ReadReport) -> None:
     code, vehicle, frame, preceding = (columns[name] for name in SAMPLE_KEYS)
     headway = columns.setdefault("space_headway_m", np.zeros(len(code)))
     follows = preceding > 0
-    given = follows & (headway != 0) & ~np.isnan(headway)
-    headway[~given] = np.nan
-    rows = np.flatnonzero(follows & ~given)
+    measured = follows & (headway != 0) & ~np.isnan(headway)
+    headway[~measured] = np.nan
+    rows = np.flatnonzero(follows & ~measured)
     if len(rows):
         index, position = RowIndex(code, vehicle, frame), columns["position_m"]
         leader = find(
@@ -187,7 +187,7 @@ def _fill_headways(columns: dict[str, NDArray], report: ReadReport) -> None:
         )
         rows, leader = rows[leader >= 0], leader[leader >= 0]
         headway[rows] = position[leader] - position[rows]
-    report.headways_given, report.headways_derived = int(given.sum()), len(rows)
+    report.headways_given, report.headways_derived = int(measured.sum()), len(rows)
     report.headways_unknown = int(follows.sum()) - report.headways_given - len(rows)
 
 
@@ -208,13 +208,13 @@ class RowIndex:
 
     def keys(self, recording: NDArray, vehicle: NDArray, frame: NDArray) -> NDArray[np.int64]:
         """Return the keys of places; −1 for an unknown vehicle or frame."""
-        rank, known = vehicle, (vehicle > 0) & (vehicle < self.vehicles)
+        rank, valid = vehicle, (vehicle > 0) & (vehicle < self.vehicles)
         if self.ids is not None:
             rank = np.minimum(np.searchsorted(self.ids, vehicle), len(self.ids) - 1)
-            known = self.ids[rank] == vehicle
-        known &= frame < self.frames
+            valid = self.ids[rank] == vehicle
+        valid &= frame < self.frames
         key = (recording.astype(np.int64) * self.vehicles + rank) * self.frames + frame
-        return np.where(known, key, -1)
+        return np.where(valid, key, -1)
 
 
 def find(wanted: NDArray[np.int64], ascending: NDArray[np.int64]) -> NDArray[np.int64]:

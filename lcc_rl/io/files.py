@@ -48,24 +48,24 @@ def write_parquet(
         ResultsError: if the file cannot be written, or naming column and row of an infinite
             number. NaN is written as null.
     """
-    own = {
+    entries = {
         "lcc_rl.schema": SCHEMA_VERSION,
         "lcc_rl.version": __version__,
         "lcc_rl.torch": installed("torch"),
         PROCESSOR: processor(),
     }
-    parts = iter([frame] if isinstance(frame, pd.DataFrame) else frame)
-    table = _finite(next(parts), path)
+    blocks = iter([frame] if isinstance(frame, pd.DataFrame) else frame)
+    table = _finite(next(blocks), path)
     schema = table.schema.with_metadata(
-        {**(table.schema.metadata or {}), **own, **(metadata or {})}
+        {**(table.schema.metadata or {}), **entries, **(metadata or {})}
     )
     with (
         atomic_path(path) as temporary,
         pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True) as file,
     ):
         file.write_table(table.cast(schema))
-        for part in parts:
-            file.write_table(_finite(part, path).cast(schema))
+        for block in blocks:
+            file.write_table(_finite(block, path).cast(schema))
 
 
 def write_table(frame: pd.DataFrame, path: Path) -> None:
@@ -91,10 +91,10 @@ def _finite(frame: pd.DataFrame, path: str | Path) -> pa.Table:
 def processor() -> str:
     """Return the name of this machine's processor."""
     try:
-        _, found, after = Path("/proc/cpuinfo").read_text(encoding="utf-8").partition("model name")
+        _, key, after = Path("/proc/cpuinfo").read_text(encoding="utf-8").partition("model name")
     except OSError:
-        found = ""
-    return after.splitlines()[0].lstrip("\t :") if found else platform.processor() or "unknown"
+        key = ""
+    return after.splitlines()[0].lstrip("\t :") if key else platform.processor() or "unknown"
 
 
 def read_parquet(path: str | Path) -> pd.DataFrame:
@@ -118,8 +118,8 @@ def read_table(path: str | Path, encoded: Sequence[str] = ()) -> pa.Table:
     """
 
     def read(place: Path) -> pa.Table:  # pq.read_table takes a third longer for small files
-        how = {"page_checksum_verification": True, "read_dictionary": list(encoded)}
-        with pq.ParquetFile(place, **how) as file:
+        options = {"page_checksum_verification": True, "read_dictionary": list(encoded)}
+        with pq.ParquetFile(place, **options) as file:
             return file.read()
 
     return _read(path, read)
@@ -166,16 +166,16 @@ def schema_of(path: str | Path, needed: Iterable[str] = ()) -> pa.Schema:
         ResultsError: if it is missing, damaged, of another schema version, no data frame, or lacks
             a needed column.
     """
-    found: pa.Schema = _read(path, pq.read_schema)
-    version = _decoded((found.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()))
+    schema: pa.Schema = _read(path, pq.read_schema)
+    version = _decoded((schema.metadata or {}).get(b"lcc_rl.schema", SCHEMA_VERSION.encode()))
     if version != SCHEMA_VERSION:
         raise ResultsError(f"{path}: schema version {version[:20]!r}; expected {SCHEMA_VERSION}")
     with raised_as(ResultsError, f"{path}: {NO_FRAME}", ValueError):
-        _ = found.pandas_metadata
+        _ = schema.pandas_metadata
     for name in needed:
-        if name not in found.names:
+        if name not in schema.names:
             raise ResultsError(f"{path}: not written by a run: it has no column {name}")
-    return _texts_encoded(found.remove_metadata())
+    return _texts_encoded(schema.remove_metadata())
 
 
 def unified(schema: pa.Schema, other: pa.Schema, path: Path) -> pa.Schema:
@@ -200,11 +200,11 @@ def _texts_encoded(schema: pa.Schema) -> pa.Schema:
 
 def _constants(columns: Mapping[str, Any]) -> ds.Expression:
     """Return constant columns as the partition expression of a file."""
-    found = ds.scalar(True)
+    partition = ds.scalar(True)
     for name, value in columns.items():
-        same = ds.field(name).is_null() if value is None else ds.field(name) == value
-        found = found & same
-    return found
+        equal = ds.field(name).is_null() if value is None else ds.field(name) == value
+        partition = partition & equal
+    return partition
 
 
 def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:

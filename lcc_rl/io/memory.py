@@ -34,10 +34,10 @@ def require_memory(needs: Mapping[str, float], device: torch.device | str = "cpu
     if free is None or total <= free:
         return
     worst = max(needs, key=lambda name: needs[name])
-    more = f" ({amount(total)} with the rest)" if needs[worst] <= free else ""
-    place = "this machine" if str(device).startswith("cpu") else f"device {device}"
+    rest = f" ({amount(total)} with the rest)" if needs[worst] <= free else ""
+    owner = "this machine" if str(device).startswith("cpu") else f"device {device}"
     raise ConfigError(
-        f"{worst} needs about {amount(needs[worst])} of memory{more}; {place} has {amount(free)} "
+        f"{worst} needs about {amount(needs[worst])} of memory{rest}; {owner} has {amount(free)} "
         "free"
     )
 
@@ -68,10 +68,10 @@ def available(device: torch.device | str = "cpu") -> int | None:
 
 def amount(size: float) -> str:
     """Return a size in bytes with its unit, e.g. ``"1.9 TiB"``."""
-    place = 0
-    while size >= 1000 and place < len(SIZE_UNITS) - 1:
-        size, place = size / 1024, place + 1
-    return f"{size:.2g} {SIZE_UNITS[place]}" if size < 100 else f"{size:.0f} {SIZE_UNITS[place]}"
+    index = 0
+    while size >= 1000 and index < len(SIZE_UNITS) - 1:
+        size, index = size / 1024, index + 1
+    return f"{size:.2g} {SIZE_UNITS[index]}" if size < 100 else f"{size:.0f} {SIZE_UNITS[index]}"
 
 
 def _of_system() -> Iterator[int]:
@@ -89,8 +89,8 @@ def _of_groups() -> Iterator[int]:
         for line in PROCESS.read_text("utf-8").splitlines():
             _, controllers, path = line.split(":", 2)
             if controllers in ("", "memory"):
-                place = GROUPS / controllers / path.strip("/")
-                for folder in (place, *place.parents):
+                group = GROUPS / controllers / path.strip("/")
+                for folder in (group, *group.parents):
                     if folder.is_relative_to(GROUPS):
                         yield from _left(folder, *(VERSION_1 if controllers else VERSION_2))
 

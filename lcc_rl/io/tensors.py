@@ -48,7 +48,7 @@ def read_torch(path: str | Path) -> Any:
     try:
         with zipfile.ZipFile(path) as archive:  # torch does not check the checksums
             damaged = archive.testzip()
-            packed = any(item.compress_type for item in archive.infolist())
+            packed = any(entry.compress_type for entry in archive.infolist())
         if packed or damaged is not None:  # torch does not compress
             raise zipfile.BadZipFile(damaged)
         return torch.load(path, weights_only=True, map_location="cpu")
@@ -63,7 +63,7 @@ def read_torch(path: str | Path) -> Any:
 def checksums(path: Path) -> tuple[int, ...]:
     """Return the checksums of the tensors of a file; none if it is damaged."""
     with suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
-        return tuple(item.CRC for item in archive.infolist() if "/data/" in item.filename)
+        return tuple(entry.CRC for entry in archive.infolist() if "/data/" in entry.filename)
     return ()
 
 
@@ -94,12 +94,12 @@ def check_like(found: Any, wanted: Any, name: str) -> None:
     elif wanted is not None and type(found) is not type(wanted):
         raise ValueError(f"{name} is {found!r}, expected {wanted!r}")
     if isinstance(found, Mapping):
-        known = wanted if isinstance(wanted, Mapping) else {}
+        reference = wanted if isinstance(wanted, Mapping) else {}
         for key, value in found.items():
-            check_like(value, known.get(key), f"{name}.{key}".removeprefix("."))
+            check_like(value, reference.get(key), f"{name}.{key}".removeprefix("."))
     elif isinstance(found, list):
-        for place, value in enumerate(found):
-            check_like(value, None, f"{name}[{place}]")
+        for index, value in enumerate(found):
+            check_like(value, None, f"{name}[{index}]")
     elif isinstance(found, Tensor):
         if found.dtype not in TENSOR_TYPES:
             raise ValueError(f"{name} is of type {found.dtype}")

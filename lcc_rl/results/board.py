@@ -99,18 +99,18 @@ def row_of(
         ``measures`` all measures, ``windows`` and ``drives`` the counts of the interval.
     """
     by_name = table.set_index("strategy")
-    found = by_name.loc[strategy]
+    values = by_name.loc[strategy]
     row: dict[str, Any] = {"task": task.name, "source": source}
     row |= {"measure": task.score, "unit": task.unit if task.measure.per else None}
     row |= {"against": task.against, "baseline": _number(by_name.loc[task.against, "score"])}
-    row |= {name: _number(found[name]) for name in COPIED}
-    row["measures"] = {measure.key: _number(found[measure.key]) for measure in MEASURES}
+    row |= {name: _number(values[name]) for name in COPIED}
+    row["measures"] = {measure.key: _number(values[measure.key]) for measure in MEASURES}
     row["limits"] = {
-        one.key: {"bound": bound, "value": _number(found[one.key])}
-        for one, bound in task.bounds.items()
+        limit.key: {"bound": bound, "value": _number(values[limit.key])}
+        for limit, bound in task.bounds.items()
     }
-    row |= {name: int(str(found[name])) for name in ("collisions", "windows", "drives")}
-    return row | {"kept": bool(found["kept"]), "drivers": drivers}
+    row |= {name: int(str(values[name])) for name in ("collisions", "windows", "drives")}
+    return row | {"kept": bool(values["kept"]), "drivers": drivers}
 
 
 def _number(value: Any) -> float | None:
@@ -167,7 +167,7 @@ def leaderboard(documents: Mapping[str, Mapping[str, Any]]) -> str:
     """
     check_alike(documents)
     every = [{**row, "by": one["name"]} for one in documents.values() for row in one["results"]]
-    parts = []
+    sections = []
     for task in dict.fromkeys(row["task"] for row in every):
         rows = [row for row in every if row["task"] == task]
         sources = list(dict.fromkeys(row["source"] for row in rows))
@@ -177,8 +177,8 @@ def leaderboard(documents: Mapping[str, Mapping[str, Any]]) -> str:
         ]
         lines = [HEAD, ["---"] * len(HEAD), *lines]
         text = "\n".join(map(markdown_row, lines))
-        parts.append(f"### {task}\n\nAgainst {in_words(rows[0]['against'])}.\n\n{text}\n")
-    return "\n".join(parts)
+        sections.append(f"### {task}\n\nAgainst {in_words(rows[0]['against'])}.\n\n{text}\n")
+    return "\n".join(sections)
 
 
 def check_alike(documents: Mapping[str, Mapping[str, Any]]) -> None:
@@ -234,8 +234,8 @@ def check_row(row: BoardRow, where: str) -> None:
     inside = low is high is None or (None not in (low, value, high) and low <= value <= high)
     require(inside, f"{where}: the saving {value} is not within its interval {low} … {high}")
     score, baseline = row["score"], row["baseline"]
-    same = value is None or (baseline and isclose(value, 1.0 - score / baseline, abs_tol=1e-4))
-    require(same, f"{where}: the saving {value} is not that of {score} against {baseline}")
+    agree = value is None or (baseline and isclose(value, 1.0 - score / baseline, abs_tol=1e-4))
+    require(agree, f"{where}: the saving {value} is not that of {score} against {baseline}")
     wrong = broken(row)
     require(
         row["kept"] is (not wrong),
@@ -263,9 +263,9 @@ def _markdown(row: BoardRow) -> list[str]:
 
 def broken(row: BoardRow) -> list[str]:
     """Return the broken limits by their first words, and the number of collisions."""
-    found = [f"{row['collisions']} coll."] if row["collisions"] else []
+    faults = [f"{row['collisions']} coll."] if row["collisions"] else []
     for name, limit in row["limits"].items():
         measure = measures.limit_measures()[name]
         if limit["value"] is not None and not measure.keeps(limit["value"], limit["bound"]):
-            found.append(measure.limited)
-    return found
+            faults.append(measure.limited)
+    return faults

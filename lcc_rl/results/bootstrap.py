@@ -82,11 +82,11 @@ def estimate(
         {key: resampled(x, stream, drives) for key, x in one.items()}
         for one, stream in zip(sides, streams, strict=True)
     )
-    found = statistic(*drawn)
-    found = found[np.isfinite(found)]
-    if not len(found):
+    draws = statistic(*drawn)
+    draws = draws[np.isfinite(draws)]
+    if not len(draws):
         return Estimate(value)
-    low, high = bounds(found)
+    low, high = bounds(draws)
     # Of two windows one is drawn, and the value of both may lie outside the values of each.
     ends = min(float(low), value), max(float(high), value)
     return Estimate(value, *ends, _over_drives(statistic, sides, drives or (), value))
@@ -102,12 +102,12 @@ def _over_drives(
     names = list(dict.fromkeys(drives))
     if not 2 <= len(names) < LEAST_DRIVES:
         return None
-    left = []
+    jackknife = []
     for name in names:
-        kept = np.array([drive != name for drive in drives])
-        means = ({key: x[..., kept, :].mean((-2, -1)) for key, x in one.items()} for one in sides)
-        left.append(float(statistic(*means)))
-    half_width = STUDENT[len(names) - 2] * float(np.std(left)) * (len(names) - 1) ** 0.5
+        mask = np.array([drive != name for drive in drives])
+        means = ({key: x[..., mask, :].mean((-2, -1)) for key, x in one.items()} for one in sides)
+        jackknife.append(float(statistic(*means)))
+    half_width = STUDENT[len(names) - 2] * float(np.std(jackknife)) * (len(names) - 1) ** 0.5
     return value - half_width, value + half_width
 
 
@@ -195,7 +195,7 @@ def saving(
     """
     sides = [np.asarray(side, dtype=np.float64) for side in (values, baseline)]
     driven = [np.asarray(side, dtype=np.float64) for side in ways or map(np.ones_like, sides)]
-    both = ({"energy": x, "way": way} for x, way in zip(sides, driven, strict=True))
+    both = ({"energy": x, "way": distance} for x, distance in zip(sides, driven, strict=True))
     return estimate(_saved, *both, drives=drives, paired=paired)
 
 
@@ -210,7 +210,7 @@ def equal_seeds(*sides: Collection[object]) -> bool:
 
 
 def _saved(ours: Side, theirs: Side) -> Any:
-    own, other = (per_distance(side["energy"], side["way"]) for side in (ours, theirs))
+    energy, other = (per_distance(side["energy"], side["way"]) for side in (ours, theirs))
     if (other <= 0.0).any() and (other >= 0.0).any():
-        return np.full_like(own, np.nan)
-    return share_saved(own, other)
+        return np.full_like(energy, np.nan)
+    return share_saved(energy, other)

@@ -165,8 +165,8 @@ def at_equal_flow(
     """
     columns = (energy, DISTANCE, FLOW)
     sides = {"own": own, "other": other, "reference": [reference]}
-    known = {*own, *other, reference} <= set(windows[STRATEGY]) and {*columns} <= set(windows)
-    if not known or not own or not other:
+    complete = {*own, *other, reference} <= set(windows[STRATEGY]) and {*columns} <= set(windows)
+    if not complete or not own or not other:
         return NOTHING
     rows = pd.concat(
         windows[windows[STRATEGY] == name].assign(strategy=side, variant=side, policy="", limit=x)

@@ -145,12 +145,12 @@ def load(
         raise ResultsError(f"{root}: not finished: {listed(states)}")
     runs, schema = _surveyed(root, table, damaged, states)
     constants = _chosen(runs, settings, schema.names)
-    parts = {}
+    tables = {}
     if not lazy:
         for path in runs:
             with damaged.noting(path.parent):
-                parts[path] = read_table(path, texts_of(schema))
-        runs = {path: runs[path] for path in parts}
+                tables[path] = read_table(path, texts_of(schema))
+        runs = {path: runs[path] for path in tables}
         if not runs:
             raise _nothing(root, table, damaged)
     states = {name: state for name, state in states.items() if name not in damaged}
@@ -163,7 +163,7 @@ def load(
         log.warning("%s: %s", root, line)
     if lazy:
         return as_dataset(constants, schema)
-    frame = _frame(parts, constants)
+    frame = _frame(tables, constants)
     frame.attrs |= {"damaged": dict(damaged)} if damaged else {}
     frame.attrs |= {"unfinished": states} if states else {}
     frame.attrs |= {"missing": missing} if missing else {}
@@ -172,15 +172,15 @@ def load(
 
 def _files(root: Path, name: str, damaged: Damaged) -> list[Path]:
     """Return the files with a name in run folders at or below a folder, sorted."""
-    found = []
-    for place, folders, files in os.walk(root, onerror=damaged.unlisted):
-        own = SUBFOLDERS if CONFIG in files else ()
-        if PARTS in folders and Path(place, FINAL, name).is_file():
+    paths = []
+    for folder, folders, files in os.walk(root, onerror=damaged.unlisted):
+        skipped = SUBFOLDERS if CONFIG in files else ()
+        if PARTS in folders and Path(folder, FINAL, name).is_file():
             folders[:] = [FINAL]  # it includes the evaluations of its trainings
-        folders[:] = [x for x in folders if not x.startswith(".") and x not in own]
+        folders[:] = [x for x in folders if not x.startswith(".") and x not in skipped]
         if name in files:
-            found.append(Path(place, name))
-    return sorted(found)
+            paths.append(Path(folder, name))
+    return sorted(paths)
 
 
 def _surveyed(
@@ -191,18 +191,18 @@ def _surveyed(
     for path in _files(root, f"{table}.parquet", damaged):
         with damaged.noting(path.parent):
             schema, config = schema_of(path, TABLES[table]), path.parent / CONFIG
-            own = flat_settings(config) if config.exists() else {}
-            runs[path] = {"run": str(path.parent.relative_to(root)), **own}
+            settings = flat_settings(config) if config.exists() else {}
+            runs[path] = {"run": str(path.parent.relative_to(root)), **settings}
             schemas[path] = schema
     # Columns are those of most tables.
-    common, whole, kept = Counter(map(str, schemas.values())), pa.schema([]), []
+    common, columns, paths = Counter(map(str, schemas.values())), pa.schema([]), []
     for path in sorted(runs, key=lambda path: -common[str(schemas[path])]):
         with damaged.noting(path.parent):
-            whole = unified(whole, schemas[path], path)
-            kept.append(path)
-    if not kept:
+            columns = unified(columns, schemas[path], path)
+            paths.append(path)
+    if not paths:
         raise _nothing(root, table, {**states, **damaged})
-    return {path: runs[path] for path in sorted(kept)}, whole
+    return {path: runs[path] for path in sorted(paths)}, columns
 
 
 def _chosen(runs: Runs, names: Sequence[str] | None, columns: Sequence[str]) -> Runs:
@@ -217,17 +217,17 @@ def _chosen(runs: Runs, names: Sequence[str] | None, columns: Sequence[str]) -> 
     def is_column(key: str) -> bool:
         if names is not None:
             return any(fnmatchcase(key, name) for name in names)
-        return key in ALWAYS or any(one.get(key) != first.get(key) for one in runs.values())
+        return key in ALWAYS or any(run.get(key) != first.get(key) for run in runs.values())
 
-    kept = [key for key in every if key == "run" or is_column(key)]
+    keys = [key for key in every if key == "run" or is_column(key)]
     of_one_type = {
-        key: _of_one_type([one.get(key) for one in runs.values()])
-        for key in kept
+        key: _of_one_type([run.get(key) for run in runs.values()])
+        for key in keys
         if key not in columns
     }
     return {
-        path: {key: values[place] for key, values in of_one_type.items()}
-        for place, path in enumerate(runs)
+        path: {key: values[index] for key, values in of_one_type.items()}
+        for index, path in enumerate(runs)
     }
 
 
@@ -242,7 +242,7 @@ def _of_one_type(values: Sequence[Any]) -> list[Any]:
 def _frame(parts: Mapping[Path, pa.Table], constants: Runs) -> pd.DataFrame:
     """Return tables with their constant columns as one data frame."""
     table = pa.concat_tables(parts.values(), promote_options="permissive")
-    counts = [len(part) for part in parts.values()]
+    counts = [len(rows) for rows in parts.values()]
     integers = {
         name: table[name].to_pandas(types_mapper=NULLABLE.get)
         for name in table.column_names
@@ -260,13 +260,13 @@ def _frame(parts: Mapping[Path, pa.Table], constants: Runs) -> pd.DataFrame:
 
 def missing_shards(runs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return a line for every evaluation with missing shards."""
-    parts: dict[str, set[int]] = {}
+    shards: dict[str, set[int]] = {}
     for settings in (x for x in runs if (x.get(SHARDS) or 1) > 1):
-        others = {key: value for key, value in settings.items() if key not in (SHARD, "run")}
-        key = json.dumps(others, sort_keys=True, default=str)
-        parts.setdefault(key, set()).add(settings[SHARD])
+        shared = {key: value for key, value in settings.items() if key not in (SHARD, "run")}
+        key = json.dumps(shared, sort_keys=True, default=str)
+        shards.setdefault(key, set()).add(settings[SHARD])
     lines = []
-    for key, present in parts.items():
+    for key, present in shards.items():
         settings = json.loads(key)
         gaps = sorted(set(range(settings[SHARDS])) - present)
         if gaps:
@@ -282,9 +282,9 @@ def listed(reasons: Mapping[str, str]) -> str:
     for name, why in reasons.items():
         short = HASH.sub("", KEY.sub("", name))
         groups.setdefault(shorten(why, 100, placeholder=" …"), []).append(short)
-    more = " and {} more"
+    rest = " and {} more"
     return "; ".join(
-        f"{', '.join(names[:MOST])}{more.format(len(names) - MOST) * (len(names) > MOST)} ({why})"
+        f"{', '.join(names[:MOST])}{rest.format(len(names) - MOST) * (len(names) > MOST)} ({why})"
         for why, names in groups.items()
     )
 

@@ -135,8 +135,8 @@ class Measure:
         if not {column, *per} <= set(part):
             return np.nan
         if per:
-            whole = episode_mean(part, per[0])
-            return self.factor * episode_mean(part, column) / whole if whole else np.nan
+            distance = episode_mean(part, per[0])
+            return self.factor * episode_mean(part, column) / distance if distance else np.nan
         if self.aggregate == "mean":
             return episode_mean(part, column)
         return float(getattr(part[column], self.aggregate)())
@@ -282,8 +282,8 @@ def table_columns() -> list[str]:
 def means(windows: pd.DataFrame, keys: tuple[str, ...]) -> pd.DataFrame:
     """Return measures by strategy, in their order."""
     chosen = [measure for measure in MEASURES if measure.key in keys]
-    parts = windows.groupby("strategy", sort=False)
-    rows = {name: {x.key: x.value(part) for x in chosen} for name, part in parts}
+    groups = windows.groupby("strategy", sort=False)
+    rows = {name: {x.key: x.value(part) for x in chosen} for name, part in groups}
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
@@ -322,6 +322,6 @@ def heading(column: str) -> str:
     suffix = next((end for end in SUFFIX_UNITS if column.endswith(f"_{end}")), "")
     words = (column.removesuffix(f"_{suffix}") if suffix else column).split("_")
     text = " ".join(word.upper() if word in INITIALS else word for word in words)
-    known = {measure.key: measure.unit for measure in MEASURES if measure.unit != SHARE}
-    unit = SUFFIX_UNITS[suffix] if suffix else known.get(column)
+    units = {measure.key: measure.unit for measure in MEASURES if measure.unit != SHARE}
+    unit = SUFFIX_UNITS[suffix] if suffix else units.get(column)
     return f"{text} [{unit}]" if unit else text

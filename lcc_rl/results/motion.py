@@ -53,8 +53,8 @@ class SampleMotion:
     @property
     def position(self) -> MotionSeries:
         """Front bumper of every vehicle, ``[T, N]`` [m]."""
-        found: MotionSeries = self.front[:, None] - np.cumsum(self.gap + self.lengths[:-1], axis=1)
-        return found
+        fronts: MotionSeries = self.front[:, None] - np.cumsum(self.gap + self.lengths[:-1], axis=1)
+        return fronts
 
     @property
     def ahead(self) -> MotionSeries:
@@ -88,16 +88,16 @@ def sample_episodes(steps: pd.DataFrame, strategy: str) -> dict[str, pd.DataFram
         raise ResultsError("no sample episode is stored")
     rows = steps[steps["strategy"] == strategy]
     if "case" in rows:
-        found = {str(case): part for case, part in rows.groupby("case", sort=False)}
+        episodes = {str(case): group for case, group in rows.groupby("case", sort=False)}
     else:
         if rows["training_seed"].notna().any():
             rows = rows[rows["training_seed"] == rows["training_seed"].min()]
         keys = [name for name in SAMPLE_KEYS if name in rows]
         groups = rows.groupby(keys, sort=False)
-        found = {f"profile {key[0]}, driver {key[1]}": part for key, part in groups}
-    if not found:
+        episodes = {f"profile {key[0]}, driver {key[1]}": group for key, group in groups}
+    if not episodes:
         raise ResultsError(f"no sample episode of {strategy} is stored")
-    return found
+    return episodes
 
 
 def most_varied(steps: pd.DataFrame) -> pd.DataFrame:
@@ -125,11 +125,11 @@ def motion_of(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> SampleMotion:
         ResultsError: if the rows lack the place of a vehicle.
     """
     read = _of_platoon if "follower" in rows else _of_string
-    time, leader, speed, gap, roles, own = read(rows, scenario)
+    time, leader, speed, gap, roles, lengths = read(rows, scenario)
     first = float(scenario["vehicle_length"])
-    if scenario["road"] == RING and own is not None:
-        first = own[-1]
-    length: Any = first if own is None else np.array([first, *own])
+    if scenario["road"] == RING and lengths is not None:
+        first = lengths[-1]
+    length: Any = first if lengths is None else np.array([first, *lengths])
     step = np.diff(time, prepend=time[0])
     if scenario["road"] == RING:
         front = np.cumsum(speed[:, 0] * step) + gap[:, 0] + first
@@ -154,8 +154,8 @@ def _of_platoon(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
     count = speed.shape[1] - 1
     # A case has its own number of vehicles, all automated.
     roles = roles if len(roles) == count else (AUTOMATED,) * count
-    leader, own = speed[0].to_numpy(float), speed.drop(columns=0).to_numpy(float)
-    return speed.index.to_numpy(float), leader, own, gap.to_numpy(float), roles, None
+    leader, speeds = speed[0].to_numpy(float), speed.drop(columns=0).to_numpy(float)
+    return speed.index.to_numpy(float), leader, speeds, gap.to_numpy(float), roles, None
 
 
 def _driver_of(scenario: Mapping[str, Any]) -> Callable[[str], str]:
@@ -168,31 +168,31 @@ def _driver_of(scenario: Mapping[str, Any]) -> Callable[[str], str]:
 
 def _of_string(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
     """Read rows of all vehicles."""
-    cars, others = _vehicles(rows, "cav"), _vehicles(rows, "hdv")
-    count = len(cars) + len(others)
+    cars, humans = _vehicles(rows, "cav"), _vehicles(rows, "hdv")
+    count = len(cars) + len(humans)
     places = _places(rows, cars, scenario)
     if len(places) != len(cars) or max(places, default=0) >= count:
         raise ResultsError("the sample episode lacks vehicles of the string")
-    own, rest = iter(cars), iter(others)
-    names = [next(own) if place in places else next(rest) for place in range(count)]
+    automated, rest = iter(cars), iter(humans)
+    names = [next(automated) if place in places else next(rest) for place in range(count)]
     roles = tuple(AUTOMATED if place in places else HUMAN for place in range(count))
     if isinstance(scenario["string"], str):
-        known = parse_string(scenario["string"], scenario["road"]).roles
-        roles = tuple(map(_driver_of(scenario), known)) if len(known) == count else roles
+        composed = parse_string(scenario["string"], scenario["road"]).roles
+        roles = tuple(map(_driver_of(scenario), composed)) if len(composed) == count else roles
     time = rows["time_s"].to_numpy(float)
     speed, gap = (rows[[f"{x}_{entry}" for x in names]] for entry in ("speed", "gap"))
     leader = rows.get("leader_speed")
     ahead = None if leader is None or leader.isna().any() else leader.to_numpy(float)
     own_length = [f"{x}_length" for x in names]
-    given = set(own_length) <= set(rows)
-    length = rows[own_length].iloc[0].to_numpy(float) if given else None
+    complete = set(own_length) <= set(rows)
+    length = rows[own_length].iloc[0].to_numpy(float) if complete else None
     return time, ahead, speed.to_numpy(float), gap.to_numpy(float), roles, length
 
 
 def _vehicles(rows: pd.DataFrame, group: str) -> list[str]:
     """Return the names of a group's vehicles in an episode, front to back."""
-    found = {str(name): re.fullmatch(rf"{group}(\d*)_speed", str(name)) for name in rows}
-    numbers = [int(x.group(1) or 0) for name, x in found.items() if x and rows[name].notna().all()]
+    fits = {str(name): re.fullmatch(rf"{group}(\d*)_speed", str(name)) for name in rows}
+    numbers = [int(x.group(1) or 0) for name, x in fits.items() if x and rows[name].notna().all()]
     return [f"{group}{number or ''}" for number in sorted(numbers)]
 
 

@@ -68,8 +68,8 @@ def in_words(name: str) -> str:
         return f"{in_words(name.removesuffix(FILTERED))}, filtered"
     first, _, rest = name.partition(" ")
     if name not in LABELS and first in SEVERAL:
-        words = rest if "=" in rest else rest.replace("_", " ")
-        return f"{SEVERAL[first]} ({words})"
+        text = rest if "=" in rest else rest.replace("_", " ")
+        return f"{SEVERAL[first]} ({text})"
     return LABELS.get(name, name)
 
 
@@ -80,7 +80,7 @@ def strategy_named(given: str, known: Iterable[object]) -> str:
         ConfigError: if there is none, naming the nearest.
     """
     names = list(map(str, known))
-    stored = {words: name for words, name in FORMER.items() if name in names}
+    stored = {label: name for label, name in FORMER.items() if name in names}
     stored |= {in_words(name): name for name in names} | {name: name for name in names}
     name = " ".join(given.split()).rstrip(f" {MARKS}")
     if name not in stored:

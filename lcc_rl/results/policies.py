@@ -65,8 +65,8 @@ class PolicyFile(Settings):
 def save_policy(weights: Mapping[str, Any], cfg: StudyConfig, path: Path) -> None:
     """Write a policy's weights and the configuration of its training as text."""
     # Copies: parts of one vector would be stored with the whole vector.
-    own = {name: weight.clone() for name, weight in weights.items()}
-    write_torch({"weights": own, "config": as_text(cfg)}, path)
+    copies = {name: weight.clone() for name, weight in weights.items()}
+    write_torch({"weights": copies, "config": as_text(cfg)}, path)
 
 
 def of_task(path: str, task: str | None) -> str:

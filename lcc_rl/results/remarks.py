@@ -37,7 +37,7 @@ def remarks(windows: pd.DataFrame) -> list[str]:
     """Return sentences on limitations of the numbers of an evaluation."""
     added = [one for one in measures.MEASURES if one.key not in measures.SHIPPED]
     means = measures.means(windows, (*REACH, BROKEN, *(one.key for one in added)))
-    found = [
+    sentences = [
         f"No episode has a number of {one.key}: its function gives NaN, or lacks an entry."
         for one in added
         if means[one.key].isna().all()
@@ -48,25 +48,25 @@ def remarks(windows: pd.DataFrame) -> list[str]:
         return ", ".join(f"{in_words(str(name))} {share:.2%}" for name, share in large)
 
     if names := named(means[list(REACH)].max(axis=1), MUCH):
-        found.append(
+        sentences.append(
             "Vehicles accelerate harder, or hold a higher speed, than their energy model allows "
             f"for more than {MUCH:.0%} of the time ({names}): their energies are lower bounds."
         )
     if names := named(means[BROKEN], 0.0):
-        found.append(
+        sentences.append(
             f"Steps that the filter's guarantee covers turn unsafe ({names}): brakes, delays or "
             "sensors differ from scenario.actuators and scenario.sensors."
         )
-    return found
+    return sentences
 
 
 def flow_note(table: pd.DataFrame) -> str:
     """Return a sentence on strategies that lose much flow; empty if none does."""
     lost = table[table[FLOW_LOST] > FLOW_NAMED]
     named = zip(lost["strategy"], lost[FLOW_LOST], strict=True)
-    parts = (f"{in_words(str(name))} {100.0 * share:.0f} %" for name, share in named)
+    losses = (f"{in_words(str(name))} {100.0 * share:.0f} %" for name, share in named)
     against = in_words(str(table["against"].iloc[0]))
-    return f"{MARK.strip()}: flow lost against {against}: {'; '.join(parts)}." if len(lost) else ""
+    return f"{MARK.strip()}: flow lost against {against}: {'; '.join(losses)}." if len(lost) else ""
 
 
 def seeds_note(table: pd.DataFrame) -> str:
@@ -74,17 +74,17 @@ def seeds_note(table: pd.DataFrame) -> str:
     rows = table[(table["left_out"] != "") & table["saving"].notna()]
     names = zip(rows["strategy"], rows["left_out"], strict=True)
     left = [f"for {in_words(str(name))} {seeds}" for name, seeds in names]
-    words = [
+    lines = [
         f"{ONE.strip()}: one training seed, so that intervals exclude the variation of trainings."
     ] * bool(table["single"].any())
-    words += [f"Savings are by equal training seeds; left out: {'; '.join(left)}."] * bool(left)
-    return " ".join(words)
+    lines += [f"Savings are by equal training seeds; left out: {'; '.join(left)}."] * bool(left)
+    return " ".join(lines)
 
 
 def by_ends(table: pd.DataFrame) -> str:
     """Return a sentence on savings that start and end of the episodes exceed; empty for none."""
-    found = table["strategy"][table["end_saving"].abs() > table["saving"].abs()]
-    names = ", ".join(in_words(str(name)) for name in found)
+    strategies = table["strategy"][table["end_saving"].abs() > table["saving"].abs()]
+    names = ", ".join(in_words(str(name)) for name in strategies)
     return (
         "Start and end of episodes (distance, stored energy) change the energy drawn more than "
         f"steady driving: {names}."
@@ -100,20 +100,20 @@ def crashed(table: pd.DataFrame) -> pd.Series:
 
 def crashes(table: pd.DataFrame) -> list[str]:
     """Return a sentence on strategies with collisions, if there are any."""
-    found = table[table["collisions"] > 0]
-    rows = zip(found["strategy"], found["collisions"], found["episodes"], strict=True)
+    collided = table[table["collisions"] > 0]
+    rows = zip(collided["strategy"], collided["collisions"], collided["episodes"], strict=True)
     names = ", ".join(f"{in_words(str(x))} {some} of {of:,}" for x, some, of in rows)
-    ahead, own = (found[f"max_{x}braking_mps2"].max() for x in ("leader_", ""))
+    ahead, own = (collided[f"max_{x}braking_mps2"].max() for x in ("leader_", ""))
     return [
         f"Episodes end in a collision, so that rows have no saving and no flow: {names}; leaders "
         f"brake by up to {ahead:.1f} m/s², automated vehicles by up to {own:.1f} m/s²."
-    ] * bool(len(found))
+    ] * bool(len(collided))
 
 
 def few_drives(table: pd.DataFrame) -> str:
     """Return a sentence with the intervals over fewer than five drives; empty without any."""
-    found = table[table[FEW_DRIVES[0]].notna()]
-    rows = zip(found["strategy"], *(100.0 * found[name] for name in FEW_DRIVES), strict=True)
+    few = table[table[FEW_DRIVES[0]].notna()]
+    rows = zip(few["strategy"], *(100.0 * few[name] for name in FEW_DRIVES), strict=True)
     text = "; ".join(f"{in_words(str(name))} {between(*bounds)}" for name, *bounds in rows)
     return f"Saved [%], t-interval over {table['drives'].max()} drives: {text}." if text else ""
 
@@ -142,8 +142,8 @@ def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
             driver = "scenario.controllers.automated"
             option = f"variant=idm controller@{driver}={name} {driver}.desired_speed=45"
             option += " 'compare=[<run>]'"
-            own = "desired_speed: 45 beside its other settings in compare="
-            remedies.setdefault(name, option if name in choices("controller") else own)
+            hint = "desired_speed: 45 beside its other settings in compare="
+            remedies.setdefault(name, option if name in choices("controller") else hint)
     return [
         f"the leaders drive faster than the desired speed of {name} for {shares[name]:.0%} of the "
         f"time (more than {MOSTLY:.0%}): savings against it are not valid. Raise v0: {remedy}"
@@ -168,8 +168,8 @@ def few_windows(windows: int, seconds: float | None = None) -> str:
     """
     if windows >= FEW_WINDOWS or windows * (seconds or 0.0) >= SHORT:
         return ""
-    found = counted_windows(windows) + (f" of {seconds:g} s" if seconds else "")
-    return f"{found} are too few for conclusions: these numbers only show that everything runs"
+    count = counted_windows(windows) + (f" of {seconds:g} s" if seconds else "")
+    return f"{count} are too few for conclusions: these numbers only show that everything runs"
 
 
 def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> str:
@@ -189,19 +189,19 @@ def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> 
         return ""
     learned = [name for name, row in rows.items() if row["seeds"] and name not in RULE_ROWS]
     names = [NETWORK] if NETWORK in rows else learned
-    words = []
+    sentences = []
     for name in names:
         if (count := rows[name]["windows"]) >= FEW_WINDOWS:
-            words.append(_sentence(windows, rows, name, other))
+            sentences.append(_sentence(windows, rows, name, other))
         elif of_few:
             both = (f"{rows[x][PATH_PER_KM]:,.1f} kJ ({in_words(x)})" for x in (name, other))
             few = f"{counted_windows(count)} are too few for a conclusion."
-            words.append(f"Per vehicle and km: {', '.join(both)}; {few}")
+            sentences.append(f"Per vehicle and km: {', '.join(both)}; {few}")
     least = min(rows, key=lambda name: rows[name][PATH_PER_KM])
     # It may be the user's rule.
-    if words and rows[least]["windows"] >= FEW_WINDOWS and least not in (*names, other):
-        words.append(f"Least energy: {in_words(least)}, {rows[least][PATH_PER_KM]:,.1f} kJ/km.")
-    return "\n".join(words)
+    if sentences and rows[least]["windows"] >= FEW_WINDOWS and least not in (*names, other):
+        sentences.append(f"Least energy: {in_words(least)}, {rows[least][PATH_PER_KM]:,.1f} kJ/km.")
+    return "\n".join(sentences)
 
 
 def _sentence(windows: pd.DataFrame, rows: Mapping[str, Any], name: str, other: str) -> str:
@@ -212,7 +212,7 @@ def _sentence(windows: pd.DataFrame, rows: Mapping[str, Any], name: str, other: 
     if saved < 0.0:
         less, saved, low, high = "more", -saved, -high, -low
     within = "" if low > 0.0 else ", within the uncertainty"
-    own, theirs = (100.0 * rows[x][LONG_GAPS] for x in (name, other))
+    ours, theirs = (100.0 * rows[x][LONG_GAPS] for x in (name, other))
     article = "the " * in_words(name).startswith("network")
     flows = [f"{rows[x][FLOW]:,.0f}" for x in (name, other, RECORDED) if x in rows]
     flow = f"; flow: {flows[0]} vehicles per hour against {flows[1]}"
@@ -221,5 +221,5 @@ def _sentence(windows: pd.DataFrame, rows: Mapping[str, Any], name: str, other: 
     return (
         f"With {article}{in_words(name)}, energy per vehicle and km is {saved:.1f} % "
         f"({between(low, high)}) {less} than with {in_words(other)}{within}; long "
-        f"time gaps: {own:.2f} % of the time against {theirs:.2f} %{flow}."
+        f"time gaps: {ours:.2f} % of the time against {theirs:.2f} %{flow}."
     )

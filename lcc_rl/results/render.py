@@ -84,8 +84,8 @@ def as_latex(frame: pd.DataFrame) -> str:
 
 def column_cells(frame: pd.DataFrame, name: str) -> list[str]:
     """Return the cells of a column as text, with its interval if the table has one."""
-    known = [key for key in (name, f"{name}_low", f"{name}_high") if key in frame]
-    places = frame.attrs.get("decimals", min(_places(frame[key]) for key in known))
+    keys = [key for key in (name, f"{name}_low", f"{name}_high") if key in frame]
+    places = frame.attrs.get("decimals", min(_places(frame[key]) for key in keys))
     cells = [_cell(value, places) for value in frame[name]]
     if f"{name}_low" not in frame:
         return cells
@@ -143,13 +143,13 @@ def terminal(report: Report, title: str = "", full: bool = False) -> RenderableT
 def as_rich(table: pd.DataFrame, shown: Sequence[Shown], title: str, caption: str) -> Table:
     """Return columns of a table for the terminal; savings have one decimal, sign and interval."""
     drawn = Table(title=escape(title), caption=escape(caption), **PLAIN)
-    for place, column in enumerate(shown):
-        drawn.add_column(escape(column.heading), justify="right" if place else "left")
+    for index, column in enumerate(shown):
+        drawn.add_column(escape(column.heading), justify="right" if index else "left")
     texts = [(one.heading, *_short_cells(table, one.key)) for one in shown]
-    first, *others = (max(len(word) for word in " ".join(text).split()) for text in texts)
+    first, *rest = (max(len(word) for word in " ".join(text).split()) for text in texts)
     drawn.columns[0].overflow = "fold"
     if first > WIDTH // 4:  # names are wrapped at spaces, if all columns have room
-        drawn.columns[0].width = max(min(first, WIDTH - sum(others) - len(others)), 1)
+        drawn.columns[0].width = max(min(first, WIDTH - sum(rest) - len(rest)), 1)
     for row in zip(*(cells for _, *cells in texts), strict=True):
         drawn.add_row(*map(escape, row))
     return drawn
@@ -171,11 +171,11 @@ def saved_text(share: float, low: float, high: float) -> str:
 
 def full_rows(report: Report) -> Iterator[tuple[str, list[str]]]:
     """Yield label and cells of every measure with a value."""
-    for one in report.rows:
-        values = report.table[one.key].astype(float)
+    for measure in report.rows:
+        values = report.table[measure.key].astype(float)
         if values.notna().any():
-            known = zip(report.table[one.key], np.isfinite(values), strict=True)
-            yield one.title, [signed(x, one.number) if k else DASH for x, k in known]
+            cells = zip(report.table[measure.key], np.isfinite(values), strict=True)
+            yield measure.title, [signed(x, measure.number) if k else DASH for x, k in cells]
 
 
 def _side_by_side(report: Report, title: str) -> Group:
@@ -214,8 +214,8 @@ def for_print(report: Report, names: Sequence[str] = ()) -> pd.DataFrame:
     """
     table = chosen(report.short, names or [column.key for column in report.shown])
     ends = ("", "_low", "_high")
-    words = {f"{one.key}{end}": f"{one.words}{end}" for one in report.shown for end in ends}
-    return table.rename(columns=words)
+    headings = {f"{one.key}{end}": f"{one.words}{end}" for one in report.shown for end in ends}
+    return table.rename(columns=headings)
 
 
 def chosen(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
@@ -227,8 +227,8 @@ def chosen(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
     known = [str(key) for key in table]
     require_known("column", names, known)
     keys = names or known
-    kept = [name for key in keys for name in (key, f"{key}_low", f"{key}_high") if name in known]
-    return table[list(dict.fromkeys(kept))]
+    shown = [name for key in keys for name in (key, f"{key}_low", f"{key}_high") if name in known]
+    return table[list(dict.fromkeys(shown))]
 
 
 def print_table(table: RenderableType) -> None:

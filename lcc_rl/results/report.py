@@ -141,15 +141,15 @@ class Report:
 
 def together(reports: Sequence[Report]) -> Report:
     """Return the rows of several sources or cases as one report, named in ``of``."""
-    first, *others = reports
-    if not others:
+    first, *rest = reports
+    if not rest:
         return first
     table, short = (
         pd.concat([getattr(one, name).assign(of=one.of) for one in reports])
         for name in ("table", "short")
     )
     shown = (Shown("of", "of"), *first.shown)
-    caption = first.note if {one.note for one in others} == {first.note} else ""
+    caption = first.note if {one.note for one in rest} == {first.note} else ""
     return replace(first, table=table, short=short, shown=shown, caption=caption, remarks=())
 
 
@@ -160,8 +160,8 @@ def windows_for(rows: Rows) -> pd.DataFrame:
 
 def baseline_of(strategies: Iterable[object]) -> str | None:
     """Return the baseline of tables and figures; None if there is none."""
-    known = set(strategies)
-    return next((name for name in AGAINST if name in known), None)
+    names = set(strategies)
+    return next((name for name in AGAINST if name in names), None)
 
 
 def summary(
@@ -195,41 +195,41 @@ def summary(
     Raises:
         ConfigError: if the column of a limit, or the baseline, is missing.
     """
-    every = {str(name): part for name, part in windows.groupby("strategy", sort=False)}
-    parts = {name: part for name, part in every.items() if ON_FRONT not in name}
-    against = task.against if task else against or baseline_of(parts)
-    require_known("strategy to compare against", () if against is None else against, parts)
+    every = {str(name): frame for name, frame in windows.groupby("strategy", sort=False)}
+    frames = {name: frame for name, frame in every.items() if ON_FRONT not in name}
+    against = task.against if task else against or baseline_of(frames)
+    require_known("strategy to compare against", () if against is None else against, frames)
     # Without automated vehicles the values of limits are missing.
     for column in task.limits if task and WAYS[0] in windows else ():
         require(column in windows, f"task.limits.{column}: episodes.parquet has no such column")
     column, *per = task.measure.columns if task else (PATH, DISTANCE)
     rows = []
-    for name, part in parts.items():
+    for name, frame in frames.items():
         row: dict[str, Any] = {"strategy": name, "against": against or ""}
         kinds = {"windows": "profile_id", "drives": DRIVE, "seeds": TRAINED}
-        row |= {key: part.get(of, part["profile_id"]).nunique() for key, of in kinds.items()}
-        row |= {"drivers": int(part["drivers"].max())} if "drivers" in part else {}
-        row["left_out"], kept = seeds_left_out(windows, name, against)
-        row["single"] = kept == 1
+        row |= {key: frame.get(of, frame["profile_id"]).nunique() for key, of in kinds.items()}
+        row |= {"drivers": int(frame["drivers"].max())} if "drivers" in frame else {}
+        row["left_out"], seeds = seeds_left_out(windows, name, against)
+        row["single"] = seeds == 1
         if task:
-            row |= {SCORE: score_of(task, part, energy)}
-        hit = bool(part.get("collisions", pd.Series(dtype=float)).sum())
+            row |= {SCORE: score_of(task, frame, energy)}
+        hit = bool(frame.get("collisions", pd.Series(dtype=float)).sum())
         row |= _savings(windows, name, (column, per), None if hit else against)
         row |= ratio(windows, "all_path_energy_kj", name, [DISTANCE]).columns(PATH_PER_KM, 1e3)
-        row |= {measure.key: measure.value(part) for measure in MEASURES}
+        row |= {measure.key: measure.value(frame) for measure in MEASURES}
         rows.append(row)
     table = pd.DataFrame(rows)
     table = table.astype({"collisions": int, "episodes": int})
     table["single"] &= table["seeds"].max() > 1
-    whole = table[table["strategy"] == against]
+    base = table[table["strategy"] == against]
     for key, lost in {"distance_lost": DISTANCE, FLOW_LOST: FLOW}.items():
-        table[key] = 1.0 - table[lost] / (whole[lost].iloc[0] if len(whole) else np.nan)
+        table[key] = 1.0 - table[lost] / (base[lost].iloc[0] if len(base) else np.nan)
     table.loc[crashed(table), ["distance_lost", FLOW_LOST, FLOW]] = np.nan
     if task:
         table["kept"] = table["collisions"] == 0
-        for one, bound in task.bounds.items():
-            table[f"limit_{one.key}"] = bound
-            table["kept"] &= pd.Series([one.keeps(x, bound) for x in table[one.key]])
+        for limit, bound in task.bounds.items():
+            table[f"limit_{limit.key}"] = bound
+            table["kept"] &= pd.Series([limit.keeps(x, bound) for x in table[limit.key]])
     return table
 
 
@@ -237,19 +237,19 @@ def _savings(
     windows: pd.DataFrame, name: str, of: tuple[str, Sequence[str]], against: str | None
 ) -> dict[str, float]:
     """Return the savings of a strategy, see :func:`summary`; ``of``: energy and distances."""
-    found: dict[str, float] = {}
+    row: dict[str, float] = {}
     second = f"total_{SECOND}"
     for key, energy, per in (
         ("saving", *of),
         ("second_saving", second, [DISTANCE]),
         ("drawn_saving", "total_energy_kj", []),
     ):
-        known = against not in (None, name) and energy in windows
-        share = savings(windows, energy, name, str(against), per) if known else NOTHING
-        found |= share.columns(key)
+        comparable = against not in (None, name) and energy in windows
+        share = savings(windows, energy, name, str(against), per) if comparable else NOTHING
+        row |= share.columns(key)
         if key == "saving":
-            found |= dict(zip(FEW_DRIVES, share.over_drives or (np.nan, np.nan), strict=True))
-    found["end_saving"] = found["drawn_saving"] - found["saving"]
+            row |= dict(zip(FEW_DRIVES, share.over_drives or (np.nan, np.nan), strict=True))
+    row["end_saving"] = row["drawn_saving"] - row["saving"]
     names = windows["strategy"].unique()
     fronts = {x: [y for y in names if y.partition(ON_FRONT)[0] == x] for x in (*RULE_ROWS, name)}
     rule = next((x for x in RULE_ROWS if len(fronts[x]) > 1), "")
@@ -258,9 +258,9 @@ def _savings(
         ("second_flow_saving", [RECORDED], second),
         ("rule_saving", fronts.get(rule, []) if name != rule else [], of[0]),
     ):
-        own = fronts[name] if len(fronts[name]) > 1 and against is not None else []
-        found |= at_equal_flow(windows, own, other, energy, RECORDED).columns(key)
-    return found
+        front = fronts[name] if len(fronts[name]) > 1 and against is not None else []
+        row |= at_equal_flow(windows, front, other, energy, RECORDED).columns(key)
+    return row
 
 
 def score_of(task: Task, part: pd.DataFrame, energy: Fleet | None) -> float:
@@ -306,14 +306,14 @@ def report(
     }
     percent["distance_pct"] = -100.0 * table["distance_lost"]
     every = pd.concat([table, pd.DataFrame(percent)], axis=1)  # in few blocks, for more columns
-    made = _of_task(every, task) if task else _of_energy(every, energy, filtered, second)
-    short, shown = made.pop("short")
+    fields = _of_task(every, task) if task else _of_energy(every, energy, filtered, second)
+    short, shown = fields.pop("short")
     rows = _rows(task, table["against"].iloc[0])
-    words = "" if task else verdict(windows, table, few)
-    words = "\n".join(filter(None, [words, few_drives(table)]))
+    text = "" if task else verdict(windows, table, few)
+    text = "\n".join(filter(None, [text, few_drives(table)]))
     notes += [*crashes(table), *filter(None, [flow_note(table), by_ends(table), seeds_note(table)])]
-    made |= {"full_caption": FULL, "verdict": words, "remarks": notes}
-    return Report(of, table, short, shown, rows, **made)
+    fields |= {"full_caption": FULL, "verdict": text, "remarks": notes}
+    return Report(of, table, short, shown, rows, **fields)
 
 
 def _rows(task: Task | None, against: str | None) -> list[Measure]:
@@ -334,15 +334,15 @@ def _rows(task: Task | None, against: str | None) -> list[Measure]:
         Measure("end_saving", "    of it by start and end of episodes", form="{:+.1%}"),
         Measure("distance_lost", "distance lost", form="{:+.2%}"),
         Measure(FLOW_LOST, "flow lost", form="{:+.2%}"),
-        *(one for one in MEASURES if one.label),
+        *(measure for measure in MEASURES if measure.label),
         *(
             replace(
-                one,
-                label=f"limit: {' '.join(one.bounded(bounds[one]).split())}",
+                measure,
+                label=f"limit: {' '.join(measure.bounded(bounds[measure]).split())}",
                 unit="",
-                form=one.number,
+                form=measure.number,
             )
-            for one in sorted(bounds, key=lambda one: one.unit == SHARE)
+            for measure in sorted(bounds, key=lambda measure: measure.unit == SHARE)
         ),
         *kept,
         *(Measure(key, label, form="{:.0f}") for key, label in COUNTS.items()),
@@ -362,7 +362,7 @@ def _of_energy(
     against = (cars["against"].iloc[0] or None) if len(cars) > 1 else None
     ends = ("", "_low", "_high") if against is None and len(cars) > 1 else ("",)
     source, flow = flow_against(cars)
-    way, basis = (WAY, "distance against theirs") if flow.isna().all() else (FLOW_SHARE, source)
+    loss, basis = (WAY, "distance against theirs") if flow.isna().all() else (FLOW_SHARE, source)
     note = "" if against is None else f"{saved_against(cars, against)}; {basis}; "
     note += f"{with_interval(cars, 'energy')}; " * (len(ends) > 1)
     short = [one for one in MEASURES if one.short]
@@ -375,10 +375,10 @@ def _of_energy(
         shown.append(Shown("fuel_g_per_km", "fuel\n[g/km]"))
     fronts = [one for one in AT_FLOW if cars[one.key].notna().any()]
     seconds = [SECOND_SAVED] * bool(cars[SECOND_SAVED.key].notna().any() and not fronts)
-    shown += [] if against is None else [SAVED, *seconds, way]
+    shown += [] if against is None else [SAVED, *seconds, loss]
     shown += fronts or [one.shown for one in short]
     of = "fuel" if second is not None and burns_one_fuel(second) else "second model"
-    shown = [Shown(key, words.format(of)) for key, words in [*shown, COLLISIONS]]
+    shown = [Shown(key, heading.format(of)) for key, heading in [*shown, COLLISIONS]]
     note += SHARES * (not fronts)
     return {
         "short": shortened(cars.assign(**columns), shown),
@@ -391,22 +391,22 @@ def _of_energy(
 
 def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
     """Return the parts of a report that are specific to a task: score and limits."""
-    way = Shown(FLOW, "flow\n[1/h]") if table[FLOW].notna().any() else WAY
-    limits = [Shown(one.key, one.bounded(bound)) for one, bound in task.bounds.items()]
+    distance = Shown(FLOW, "flow\n[1/h]") if table[FLOW].notna().any() else WAY
+    limits = [Shown(limit.key, limit.bounded(bound)) for limit, bound in task.bounds.items()]
     shown = [
         Shown(SCORE, task.label.replace(" ", "\n")),
         SAVED,
-        *(() if way.key in {one.key for one in limits} else [way]),
+        *(() if distance.key in {limit.key for limit in limits} else [distance]),
         *limits,
         COLLISIONS,
         KEEPS,
     ]
-    columns = {one.key: one.scale * table[one.key] for one in task.bounds}
-    words, least = saved_against(table, task.against, always=True), task.measure.least
+    columns = {limit.key: limit.scale * table[limit.key] for limit in task.bounds}
+    note, least = saved_against(table, task.against, always=True), task.measure.least
     if (table.loc[table["strategy"] == task.against, SCORE] < least).any():
-        words = f"no saving: the baseline, {in_words(task.against)}, is below {least:g} "
-        words += task.measure.unit
-    saved = f"{words}; " * (len(table) > 1)
+        note = f"no saving: the baseline, {in_words(task.against)}, is below {least:g} "
+        note += task.measure.unit
+    saved = f"{note}; " * (len(table) > 1)
     caption = f"{saved}kept: all limits, without a collision; {ALL}"
     short = shortened(table.assign(**columns), shown)
     return {"short": short, "caption": caption, "against": task.against, "label": task.label}
@@ -427,9 +427,9 @@ def shortened(
     counts = [key for key in ("windows", "drivers") if key in table and table[key].nunique() > 1]
     shown = [*shown, *(Shown(key, key) for key in counts)]
     lost = table.get(FLOW_LOST, pd.Series(np.nan, table.index)) > FLOW_NAMED
-    words = [in_words(str(name)) for name in table["strategy"]]
+    labels = [in_words(str(name)) for name in table["strategy"]]
     single = table.get("single", lost & False)
-    rows = zip(words, lost, single, strict=True)
+    rows = zip(labels, lost, single, strict=True)
     table = table.assign(driver=[x + MARK * y + ONE * z for x, y, z in rows])
     shown = (Shown("driver", "driven by"), *shown)
     names = [f"{one.key}{end}" for one in shown for end in ("", "_low", "_high")]
@@ -445,10 +445,10 @@ def saved_against(found: pd.DataFrame, against: str, always: bool = False) -> st
         against: the baseline.
         always: mention intervals even if there are none.
     """
-    words = f"saved: against {in_words(against)}"
+    caption = f"saved: against {in_words(against)}"
     if not always and found["saving_low"].isna().all():
-        return words
-    return with_interval(found, words)
+        return caption
+    return with_interval(found, caption)
 
 
 def with_interval(found: pd.DataFrame, words: str) -> str:
@@ -470,8 +470,8 @@ def flow_against(table: pd.DataFrame) -> tuple[str, pd.Series]:
 
     The baseline is the recorded drivers, else that of the savings.
     """
-    known = set(table["strategy"])
-    name = RECORDED if RECORDED in known else table["against"].iloc[0]
-    whole = table.loc[table["strategy"] == name, FLOW]
-    share = table[FLOW] / (whole.iloc[0] if len(whole) else np.nan) - 1.0
+    names = set(table["strategy"])
+    name = RECORDED if RECORDED in names else table["against"].iloc[0]
+    base = table.loc[table["strategy"] == name, FLOW]
+    share = table[FLOW] / (base.iloc[0] if len(base) else np.nan) - 1.0
     return f"flow against {in_words(str(name))}", 100.0 * share

@@ -53,8 +53,8 @@ def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:
     stored = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else {}
     if stored and not {"seed", "data"} <= stored.keys():
         raise ResultsError(f"{folder} holds a {CONFIG} of something else; choose another folder")
-    kept = [name for name in RUN_FILES if (folder / name).exists()]
-    if not kept:
+    files = [name for name in RUN_FILES if (folder / name).exists()]
+    if not files:
         return
     with suppress(ResultsError):  # complete a file of an older version by defaults
         stored = as_plain(trusted(stored, str(folder / CONFIG), own_modules(cfg))[0], places=False)
@@ -63,7 +63,7 @@ def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:
     if keys:
         names = ", ".join(keys[:3]) + (", …" if len(keys) > 3 else "")
         raise ResultsError(
-            f"{folder} already holds {kept[0]} of other settings ({names}); choose another "
+            f"{folder} already holds {files[0]} of other settings ({names}); choose another "
             "hydra.run.dir, or remove the folder"
         )
 
@@ -76,8 +76,8 @@ def resumed_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:
     """
     cfg = load_config(folder, trust)
     now = inputs_of(as_plain(cfg))
-    for section, known in cfg.inputs.items():
-        for file in differing(known, now.get(section, {})):
+    for section, hashes in cfg.inputs.items():
+        for file in differing(hashes, now.get(section, {})):
             raise ResultsError(
                 f"{folder}: {file} ({section}) has changed since the run began; restore it, or "
                 "begin a new run"
@@ -100,8 +100,8 @@ def load_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:
     if not path.is_file():
         raise no_run(Path(folder))
     cfg, places = trusted(read_settings(path), str(path), trust)
-    for place in places:
-        log.warning("%s: %s names a path to write to and is left out", path, place)
+    for key in places:
+        log.warning("%s: %s names a path to write to and is left out", path, key)
     return cfg
 
 

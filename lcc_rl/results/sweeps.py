@@ -43,29 +43,29 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
     loaded = load(root, settings=())
     rows = loaded.assign(run=loaded["run"].astype(str), strategy=loaded["strategy"].astype(str))
     runs = {name: _own(_settings(root / name)) for name in rows["run"].unique()}
-    for strategy, part in rows.groupby("strategy"):
-        first, *others = (one.drop(columns="run") for _, one in part.groupby("run"))
-        equal = (first.reset_index(drop=True).equals(x.reset_index(drop=True)) for x in others)
-        if part["training_seed"].isna().any() and all(equal):
-            rows = rows.drop(index=part.index.difference(first.index))
+    for strategy, group in rows.groupby("strategy"):
+        first, *rest = (one.drop(columns="run") for _, one in group.groupby("run"))
+        equal = (first.reset_index(drop=True).equals(x.reset_index(drop=True)) for x in rest)
+        if group["training_seed"].isna().any() and all(equal):
+            rows = rows.drop(index=group.index.difference(first.index))
         else:
-            names = list(dict.fromkeys(part["run"]))
-            words = labels([runs[name] for name in names], [root / name for name in names])
+            names = list(dict.fromkeys(group["run"]))
+            choices = labels([runs[name] for name in names], [root / name for name in names])
             plain, mark, limit = str(strategy).partition(ON_FRONT)
             named = {
                 name: f"{plain} {', '.join(word.values())}".strip() + mark + limit
-                for name, word in zip(names, words, strict=True)
+                for name, word in zip(names, choices, strict=True)
             }
-            rows.loc[part.index, "strategy"] = part["run"].map(named)
+            rows.loc[group.index, "strategy"] = group["run"].map(named)
     rows = rows.drop_duplicates([name for name in rows if name != "run"])
     _check_one_study(root, rows)
-    found = rows.drop(columns="run").reset_index(drop=True)
+    table = rows.drop(columns="run").reset_index(drop=True)
     missing = dict(loaded.attrs.get("unfinished", {}))
     for name, why in loaded.attrs.get("damaged", {}).items():
         missing[name] = f"damaged: {why.removeprefix(f'{root / name}{os.sep}')}"
     remarks = [f"Without rows: {listed(missing)}."] * bool(missing) + without_effect(root)
-    found.attrs |= {"remarks": remarks, "first": str(root / next(iter(runs)))}
-    return found
+    table.attrs |= {"remarks": remarks, "first": str(root / next(iter(runs)))}
+    return table
 
 
 def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str, str]]:
@@ -95,20 +95,20 @@ def without_effect(root: Path) -> list[str]:
     """Return sentences on settings with which trainings of one seed have the same weights."""
     folders = [folder for folder in run_folders(root) if (folder / POLICY).is_file()]
     stored = [_settings(folder) for folder in folders]
-    words, equal = labels(list(map(_own, stored)), folders), defaultdict(list)
-    for folder, settings, word in zip(folders, stored, words, strict=True):
+    named, equal = labels(list(map(_own, stored)), folders), defaultdict(list)
+    for folder, settings, word in zip(folders, stored, named, strict=True):
         weights = checksums(folder / POLICY) or folder  # those of a damaged file equal no others
         equal[settings.get("seed"), weights].append(word)
-    found: dict[str, set[str]] = {}
-    for first, *others in equal.values():
-        if keys := [key for key in first if any(one.get(key) != first[key] for one in others)]:
-            names = " and ".join(", ".join(one.values()) for one in (first, *others))
-            found.setdefault(", ".join(keys), set()).add(names)
+    cases: dict[str, set[str]] = {}
+    for first, *rest in equal.values():
+        if keys := [key for key in first if any(one.get(key) != first[key] for one in rest)]:
+            names = " and ".join(", ".join(one.values()) for one in (first, *rest))
+            cases.setdefault(", ".join(keys), set()).add(names)
     return [
         f"{keys} had no effect: the networks of equal seeds are the same with {one}"
         + f" (and in {len(names) - 1} more cases)" * bool(names)
         + "."
-        for keys, (one, *names) in sorted((keys, sorted(names)) for keys, names in found.items())
+        for keys, (one, *names) in sorted((keys, sorted(names)) for keys, names in cases.items())
     ]
 
 

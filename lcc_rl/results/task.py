@@ -21,11 +21,11 @@ PERCENT = re.compile(r"\d+(\.\d+)? ?%")
 
 
 def _bound(value: Any) -> Any:
-    known = value == RECORDED or (isinstance(value, str) and PERCENT.fullmatch(value))
-    if known or (isinstance(value, (int, float)) and value >= 0.0):
+    relative = value == RECORDED or (isinstance(value, str) and PERCENT.fullmatch(value))
+    if relative or (isinstance(value, (int, float)) and value >= 0.0):
         return value
-    what = f"a number, {RECORDED}, or a share of the value of task.against such as 98 %"
-    raise ValueError(f"must be {what}, got {value!r}; ~task.limits.<name> removes a limit")
+    expected = f"a number, {RECORDED}, or a share of the value of task.against such as 98 %"
+    raise ValueError(f"must be {expected}, got {value!r}; ~task.limits.<name> removes a limit")
 
 
 Bound = Annotated[float | str, BeforeValidator(_bound)]
@@ -64,14 +64,14 @@ class Task(Settings):
 
     def resolved(self, windows: pd.DataFrame) -> Task:
         """Return the task with numbers for limits that refer to other strategies."""
-        known, found = measures.limit_measures(), dict(self.limits)
+        measure_of, limits = measures.limit_measures(), dict(self.limits)
         for key, bound in self.limits.items():
             if isinstance(bound, str):
                 name = RECORDED if bound == RECORDED else self.against
                 share = 1.0 if bound == RECORDED else 0.01 * float(bound.rstrip(" %"))
-                part = windows[windows["strategy"] == name]
-                found[key] = share * known[key].value(part) if len(part) else bound
-        return replace(self, limits=found)
+                rows = windows[windows["strategy"] == name]
+                limits[key] = share * measure_of[key].value(rows) if len(rows) else bound
+        return replace(self, limits=limits)
 
     @property
     def bounds(self) -> dict[Measure, float]:

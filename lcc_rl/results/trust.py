@@ -74,12 +74,12 @@ def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] =
         if module in trust:
             continue
         try:
-            found = find_target(value, where) if _within_registry(module) else None
+            target = find_target(value, where) if _within_registry(module) else None
         except ConfigError as error:
             raise ResultsError(f"{error}; of another release, or damaged") from error
         # A module also contains its imports, such as import_module.
-        home = str(getattr(found, "__module__", ""))
-        if not _within_registry(home) or not (inspect.isclass(found) or home == FUNCTIONS):
+        home = str(getattr(target, "__module__", ""))
+        if not _within_registry(home) or not (inspect.isclass(target) or home == FUNCTIONS):
             raise ResultsError(
                 f"{where}: {key} names {value!r}, which is no class of lcc_rl that may be stored; "
                 f"if you trust it, add trust=[{module}], or --trust {module} to commands with flags"
@@ -108,8 +108,8 @@ def own_modules(cfg: Any) -> list[str]:
 
 def trust_option(cfg: Any) -> str:
     """Return the option with the modules outside the registry for a command that resumes a run."""
-    own = own_modules(cfg)
-    return f" trust=[{','.join(own)}]" if own else ""
+    modules = own_modules(cfg)
+    return f" trust=[{','.join(modules)}]" if modules else ""
 
 
 def _within_registry(module: str) -> bool:

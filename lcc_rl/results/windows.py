@@ -57,19 +57,19 @@ def fold(rows: Rows, by: Sequence[str], columns: Sequence[str] = ()) -> pd.DataF
 
     Memory grows with the number of groups, not of rows.
     """
-    parts: list[pd.DataFrame] = []
+    sums: list[pd.DataFrame] = []
     for frame in _frames(rows, [*by, *columns] if columns else []):
-        parts.append(_sums(_derived(frame), by, columns))
-        if sum(map(len, parts)) > FOLDED + 2 * len(parts[0]):
-            parts = [_added(parts)]
-    total = _added(parts)
-    found = {}
+        sums.append(_sums(_derived(frame), by, columns))
+        if sum(map(len, sums)) > FOLDED + 2 * len(sums[0]):
+            sums = [_added(sums)]
+    total = _added(sums)
+    means = {}
     for kind, name in zip(*map(total.columns.get_level_values, (0, 1)), strict=True):
         if kind != "count":
             count = total.get(("count", name))
             values = total[kind, name]
-            found[name] = values if count is None else values / count.replace(0, np.nan)
-    return pd.DataFrame(found).reset_index()
+            means[name] = values if count is None else values / count.replace(0, np.nan)
+    return pd.DataFrame(means).reset_index()
 
 
 def _frames(rows: Rows, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
@@ -77,36 +77,36 @@ def _frames(rows: Rows, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
     if isinstance(rows, pd.DataFrame):
         yield rows
         return
-    wanted = set(columns) or set(rows.schema.names)
-    wanted |= {"collided", DAMPING, REPEAT, *WAYS}
-    wanted |= {f"{group}_{name}" for group in ("total", "hdv") for name in ENERGIES}
-    known = [name for name in rows.schema.names if name in wanted]
+    needed = set(columns) or set(rows.schema.names)
+    needed |= {"collided", DAMPING, REPEAT, *WAYS}
+    needed |= {f"{group}_{name}" for group in ("total", "hdv") for name in ENERGIES}
+    present = [name for name in rows.schema.names if name in needed]
     for file in rows.get_fragments():
         for group in file.split_by_row_group():
-            table = group.to_table(schema=rows.schema, columns=known)
-            for place, field in enumerate(table.schema):
+            table = group.to_table(schema=rows.schema, columns=present)
+            for index, field in enumerate(table.schema):
                 if pa.types.is_dictionary(field.type):
-                    text = table.column(place).cast(pa.string())
-                    table = table.set_column(place, field.name, text)
+                    text = table.column(index).cast(pa.string())
+                    table = table.set_column(index, field.name, text)
             yield table.to_pandas()
 
 
 def _derived(rows: pd.DataFrame) -> pd.DataFrame:
     """Add numbers, distances and energies of all vehicles, and whether an episode is damped."""
     seed = pd.to_numeric(rows.get(TRAINED, pd.Series(np.nan, rows.index))).astype("Int64")
-    found: dict[str, Any] = {TRAINED: seed, "episodes": 1.0}
-    found["drivers"] = (rows[REPEAT] == 0).astype(float) if REPEAT in rows else 1.0
+    added: dict[str, Any] = {TRAINED: seed, "episodes": 1.0}
+    added["drivers"] = (rows[REPEAT] == 0).astype(float) if REPEAT in rows else 1.0
     if "collided" in rows:
-        found |= dict.fromkeys(("collisions", "collided"), rows["collided"].astype(float))
-    if ways := [name for name in WAYS if name in rows]:
-        found[DISTANCE] = rows[ways].sum(axis=1)
+        added |= dict.fromkeys(("collisions", "collided"), rows["collided"].astype(float))
+    if distances := [name for name in WAYS if name in rows]:
+        added[DISTANCE] = rows[distances].sum(axis=1)
     for name in ENERGIES:  # without automated vehicles, those of the others
-        parts = [rows[f"{x}_{name}"] for x in ("total", "hdv") if f"{x}_{name}" in rows]
-        if parts:
-            found[f"all_{name}"] = parts[0].fillna(parts[-1])
+        energies = [rows[f"{x}_{name}"] for x in ("total", "hdv") if f"{x}_{name}" in rows]
+        if energies:
+            added[f"all_{name}"] = energies[0].fillna(energies[-1])
     if DAMPING in rows:
-        found |= {"damped": rows[DAMPING].notna(), "damped_s": rows[DAMPING].fillna(0.0)}
-    return rows.assign(**found)
+        added |= {"damped": rows[DAMPING].notna(), "damped_s": rows[DAMPING].fillna(0.0)}
+    return rows.assign(**added)
 
 
 def _sums(frame: pd.DataFrame, by: Sequence[str], columns: Sequence[str]) -> pd.DataFrame:
@@ -124,19 +124,19 @@ def _sums(frame: pd.DataFrame, by: Sequence[str], columns: Sequence[str]) -> pd.
     values = frame[names].astype(np.float64)
     groups = values.groupby(keys, sort=False, dropna=False, observed=True)
     kinds: dict[str, list[str]] = {kind: [] for kind in ("sum", "count", "min", "max")}
-    known = aggregates()
+    statistics = aggregates()
     for name in names:
-        kind = "max" if name.startswith(WORST) else known.get(name, "mean")
-        for part in ("sum", "count") if kind == "mean" else (kind,):
-            kinds[part].append(name)
+        kind = "max" if name.startswith(WORST) else statistics.get(name, "mean")
+        for statistic in ("sum", "count") if kind == "mean" else (kind,):
+            kinds[statistic].append(name)
     return pd.concat({x: getattr(groups[y], x)() for x, y in kinds.items() if y}, axis=1)
 
 
-def _added(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
+def _added(sums: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Add partial sums of the same groups."""
-    if len(parts) == 1:
-        return parts[0]
-    total = pd.concat(parts)
+    if len(sums) == 1:
+        return sums[0]
+    total = pd.concat(sums)
     kinds = {column: "sum" if column[0] == "count" else column[0] for column in total.columns}
     levels = list(range(total.index.nlevels))
     return total.groupby(level=levels, sort=False, dropna=False).agg(kinds)
@@ -173,9 +173,9 @@ class Means:
         """Return the means with energies and savings per vehicle and km."""
         drivers = self.drivers.copy()
         for group, names in DRIVEN.items():
-            way = drivers[[name for name in names if name in drivers]].sum(axis=1) / 1e3
+            km = drivers[[name for name in names if name in drivers]].sum(axis=1) / 1e3
             energies = drivers.columns[drivers.columns.str.fullmatch(f"{group}_.*energy_kj")]
-            drivers[energies] = drivers[energies].div(way, axis=0)
+            drivers[energies] = drivers[energies].div(km, axis=0)
         return replace(self, drivers=drivers, per=PER_KM)
 
     def saving(self, column: str, strategy: str, baseline: str) -> Estimate:
@@ -205,10 +205,10 @@ def savings(
         (:func:`lcc_rl.results.bootstrap.estimate`), for the windows of both; NaN if one of them is
         missing, or the baseline is below the measure's ``least``.
     """
-    energy, way, drives = _by_window(with_equal_seeds(rows, strategy, baseline), column, per)
+    energy, distance, drives = _by_window(with_equal_seeds(rows, strategy, baseline), column, per)
     if energy.empty or not {strategy, baseline} <= set(energy.columns.get_level_values(0)):
         return NOTHING
-    ours, theirs = ((energy[x].to_numpy(), way[x].to_numpy()) for x in (strategy, baseline))
+    ours, theirs = ((energy[x].to_numpy(), distance[x].to_numpy()) for x in (strategy, baseline))
     if theirs[0].mean() < next((x.least for x in MEASURES if x.key == column), -np.inf):
         return NOTHING
     paired = equal_seeds(energy[strategy].columns, energy[baseline].columns)
@@ -219,9 +219,9 @@ def ratio(rows: pd.DataFrame, column: str, strategy: str, per: Sequence[str]) ->
     """Return a strategy's mean energy per distance with its interval, as :func:`savings`."""
     if column not in rows:
         return NOTHING
-    energy, way, drives = _by_window(rows[rows[STRATEGY] == strategy], column, per)
-    side = {"energy": energy.to_numpy(), "way": way.to_numpy()}
-    return estimate(lambda x: per_distance(**x), side, drives=drives) if way.size else NOTHING
+    energy, distance, drives = _by_window(rows[rows[STRATEGY] == strategy], column, per)
+    side = {"energy": energy.to_numpy(), "way": distance.to_numpy()}
+    return estimate(lambda x: per_distance(**x), side, drives=drives) if distance.size else NOTHING
 
 
 def with_equal_seeds(rows: pd.DataFrame, strategy: str, baseline: str) -> pd.DataFrame:
@@ -241,22 +241,22 @@ def seeds_left_out(rows: pd.DataFrame, strategy: str, baseline: str | None) -> t
     """
     every = rows[rows[STRATEGY].isin([strategy, baseline])].dropna(subset=TRAINED)
     every = every.drop_duplicates(WINDOW_KEYS[:2]).sort_values(TRAINED)
-    kept = with_equal_seeds(every, strategy, str(baseline))
-    left = every.drop(kept.index).groupby(STRATEGY, sort=False)[TRAINED]
-    words = (f"seed {', '.join(map(str, seeds))} of {in_words(str(of))}" for of, seeds in left)
-    return " and ".join(words), int((kept[STRATEGY] == strategy).sum())
+    compared = with_equal_seeds(every, strategy, str(baseline))
+    rest = every.drop(compared.index).groupby(STRATEGY, sort=False)[TRAINED]
+    phrases = (f"seed {', '.join(map(str, seeds))} of {in_words(str(of))}" for of, seeds in rest)
+    return " and ".join(phrases), int((compared[STRATEGY] == strategy).sum())
 
 
 def _by_window(
     chosen: pd.DataFrame, column: str, per: Sequence[str]
 ) -> tuple[pd.DataFrame, pd.DataFrame, list[object] | None]:
     """Return energy and distance by window, strategy and seed, and the drives of the windows."""
-    ways = [name for name in per if name in chosen]
+    distances = [name for name in per if name in chosen]
     groups = chosen.groupby([*WINDOW_KEYS[:2], "profile_id"], dropna=False, sort=False)
-    means = groups[list(dict.fromkeys([column, *ways]))].mean().reset_index()
+    means = groups[list(dict.fromkeys([column, *distances]))].mean().reset_index()
     means[TRAINED] = means[TRAINED].astype(object).fillna(-1)
-    means["way"] = means[ways].sum(axis=1) if ways else 1.0
-    energy, way = (
+    means["way"] = means[distances].sum(axis=1) if distances else 1.0
+    energy, distance = (
         means.pivot(index="profile_id", columns=[STRATEGY, TRAINED], values=name)
         for name in (column, "way")
     )
@@ -264,7 +264,7 @@ def _by_window(
     drives = None
     if DRIVE in chosen:
         drives = chosen.groupby("profile_id")[DRIVE].first().reindex(energy.index).tolist()
-    return energy, way.loc[energy.index, energy.columns], drives
+    return energy, distance.loc[energy.index, energy.columns], drives
 
 
 def by_driver(drivers: pd.DataFrame, column: str) -> pd.DataFrame:
@@ -280,11 +280,11 @@ def driver_savings(drivers: pd.DataFrame, column: str, strategy: str, baseline: 
 
 def per_seed(windows: pd.DataFrame, column: str) -> dict[str, pd.Series]:
     """Return for each strategy the mean of a column over windows by training seed."""
-    found = {
+    means = {
         str(strategy): rows.groupby(TRAINED, dropna=False)[column].mean()
         for strategy, rows in windows.groupby(STRATEGY, sort=False)
     }
-    return {strategy: values for strategy, values in found.items() if values.notna().any()}
+    return {strategy: values for strategy, values in means.items() if values.notna().any()}
 
 
 def by_source(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -292,5 +292,5 @@ def by_source(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     if SOURCE not in rows:
         yield "", rows
         return
-    for source, part in rows.groupby(SOURCE, sort=False):
-        yield str(source), part
+    for source, group in rows.groupby(SOURCE, sort=False):
+        yield str(source), group

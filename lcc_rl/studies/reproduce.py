@@ -82,10 +82,10 @@ def parser() -> ArgumentParser:
     """Return the command line: a subcommand per study."""
     top = Arguments(description=__doc__)
     commands = top.add_subparsers(required=True, dest="study")
-    one = _trained(commands, "alcc", "Adaptive Leading Cruise Control (arXiv 2210.02147)")
-    _listing(one, "--parts", alcc.STUDY_PARTS, "parts to run: " + ",".join(alcc.STUDY_PARTS))
+    paper = _trained(commands, "alcc", "Adaptive Leading Cruise Control (arXiv 2210.02147)")
+    _listing(paper, "--parts", alcc.STUDY_PARTS, "parts to run: " + ",".join(alcc.STUDY_PARTS))
     names = f"all by default: {','.join(alcc.ABLATIONS)}; or your own as name:override"
-    _listing(one, "--ablations", (), f"ablations; {names}")
+    _listing(paper, "--ablations", (), f"ablations; {names}")
     _trained(commands, "hcfs", "Hybrid Car-Following Strategy (IEEE T-ASE 2021)")
     _subcommand(commands, "ring", "field experiment on a ring (Stern et al. 2018)")
     two = _subcommand(commands, "road", "effect of automated cars on a recorded road")
@@ -94,21 +94,21 @@ def parser() -> ArgumentParser:
 
 
 def _subcommand(commands: Any, name: str, text: str) -> ArgumentParser:
-    one: ArgumentParser = commands.add_parser(name, help=text)
+    command: ArgumentParser = commands.add_parser(name, help=text)
     folder = Path("outputs") / name
-    one.add_argument("--out", type=Path, default=folder, help="the study's folder")
-    _listing(one, "--formats", (), "further formats of figures: " + ",".join(FORMATS[1:]))
-    return one
+    command.add_argument("--out", type=Path, default=folder, help="the study's folder")
+    _listing(command, "--formats", (), "further formats of figures: " + ",".join(FORMATS[1:]))
+    return command
 
 
 def _trained(commands: Any, name: str, text: str) -> ArgumentParser:
     """Add the subcommand of a study with trainings."""
-    one = _subcommand(commands, name, text)
-    one.add_argument("--seeds", type=int, default=8, help="trainings of every learned variant")
-    one.add_argument("--jobs", type=int, default=2, help="parallel trainings")
+    command = _subcommand(commands, name, text)
+    command.add_argument("--seeds", type=int, default=8, help="trainings of every learned variant")
+    command.add_argument("--jobs", type=int, default=2, help="parallel trainings")
     text = f"experiment: paper_{name}, quickstart …; for alcc with agent=…: the agent's length"
-    one.add_argument("--recipe", help=text)
-    return one
+    command.add_argument("--recipe", help=text)
+    return command
 
 
 def _listing(target: ArgumentParser, name: str, default: tuple[str, ...], text: str) -> None:
@@ -120,7 +120,7 @@ def main(words: list[str]) -> int:
     """Run a command; further words are overrides of all runs."""
     top = parser()
     arguments, overrides = top.parse_known_args(words)
-    if wrong := [item for item in overrides if item.startswith("-")]:
+    if wrong := [option for option in overrides if option.startswith("-")]:
         top.error(f"unknown: {' '.join(wrong)}")
     check_overrides(overrides, SET_BY_STUDY, OWN_FOLDER_WORDS)
     arguments.overrides = overrides

@@ -57,19 +57,19 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     Raises:
         ResultsError: if a table is missing or cannot be read.
     """
-    place = folder / RING_EVALUATION
-    rows, steps = (read_parquet(place / name) for name in (EPISODES, STEPS))
-    cfg, found = stored_config(place), StudyResults(folder, formats)
+    source = folder / RING_EVALUATION
+    rows, steps = (read_parquet(source / name) for name in (EPISODES, STEPS))
+    cfg, study = stored_config(source), StudyResults(folder, formats)
     first = cfg["evaluation"]["humans_first"]
     lasting = cfg["scenario"]["horizon"] * cfg["scenario"]["time_step"]
     caption = f"{lasting:g} s after {first:g} s in which humans drive all cars: means over episodes"
-    found.table("ring", caption, table(rows))
+    study.table("ring", caption, table(rows))
     for name in dict.fromkeys(rows["strategy"]):
         figure = space_time(steps, [name], cfg)
         if figure is not None:
-            found.figure(name.replace("/", "_"), in_words(name), figure)
-    found.write(RING_TITLE)
-    return found
+            study.figure(name.replace("/", "_"), in_words(name), figure)
+    study.write(RING_TITLE)
+    return study
 
 
 def table(rows: pd.DataFrame) -> pd.DataFrame:
@@ -82,22 +82,22 @@ def table(rows: pd.DataFrame) -> pd.DataFrame:
         fuel=rows["total_net_energy_kj"] / (rows["cav_distance_m"] + rows["hdv_distance_m"])
     )
     means = rows.groupby("strategy", sort=False).mean(numeric_only=True)
-    humans, found = means.loc[HUMAN], []
-    for name, part in rows.groupby("strategy", sort=False):
-        own, times = means.loc[name], part["damping_time_s"]
+    humans, entries = means.loc[HUMAN], []
+    for name, group in rows.groupby("strategy", sort=False):
+        mean, times = means.loc[name], group["damping_time_s"]
         damped = (
             f"{times.mean():.0f} s" if times.notna().all() else f"{times.count()} of {len(times)}"
         )
-        ratios = (own / humans).to_dict()
+        ratios = (mean / humans).to_dict()
         changes = (f"{signed(100 * (ratios[x] - 1))} %" for x in ("speed_std_mps", "fuel"))
-        found.append(
+        entries.append(
             {
                 "driven by": in_words(str(name)),
                 "damped after": damped,
-                "speeds vary [m/s]": own["speed_std_mps"],
+                "speeds vary [m/s]": mean["speed_std_mps"],
                 **dict(zip(("speeds against humans", "fuel"), changes, strict=True)),
-                "mean speed [m/s]": own["mean_speed_mps"],
-                "smallest gap [m]": part["min_gap_m"].min(),
+                "mean speed [m/s]": mean["mean_speed_mps"],
+                "smallest gap [m]": group["min_gap_m"].min(),
             }
         )
-    return pd.DataFrame([*found, FIELD])
+    return pd.DataFrame([*entries, FIELD])

@@ -70,25 +70,25 @@ def run(folder: Path, overrides: Sequence[str], shares: Sequence[str] = ROAD_SHA
     Raises:
         LccError: one clear error for wrong settings or files.
     """
-    of_data = [item for item in overrides if top_key(item) in ("data", "calibration")]
-    driven = [item for item in overrides if item not in of_data]
-    given, found = {top_key(item) for item in driven}, []
+    of_data = [override for override in overrides if top_key(override) in ("data", "calibration")]
+    driven = [override for override in overrides if override not in of_data]
+    keys, extra = {top_key(override) for override in driven}, []
     cfg = load("pipeline", ["~experiment", *_beside(FITTED, of_data)])
     first = _evaluation(driven, "50")  # checked before data are read
     check_shares(shares, first.scenario.string["size"])
     read_once(cfg, folder, learns=False)
-    if "leader" not in given:
+    if "leader" not in keys:
         drives = leader_drives(read_parquet(folder / TRAJECTORIES), cfg.scenario.time_step)
         write_parquet(drives, folder / LEADERS_FILE)
-        begun = round(first.evaluation.warm_up / cfg.scenario.time_step)
-        steps = window_steps(drives.groupby("drive").size().to_numpy(), begun)
-        found += ["leader=drives", f"leader.path={quoted(folder / LEADERS_FILE)}"]
-        found += ["leader.evaluation_share=1", "leader.least_variation=0"]
-        found += [f"leader.together='.*(?={OF_DRIVE})'", f"scenario.horizon={steps}"]
-    if "drivers" not in given:
-        found += ["drivers=calibrated", f"drivers.path={quoted(calibrate_once(cfg, folder))}"]
+        skipped = round(first.evaluation.warm_up / cfg.scenario.time_step)
+        steps = window_steps(drives.groupby("drive").size().to_numpy(), skipped)
+        extra += ["leader=drives", f"leader.path={quoted(folder / LEADERS_FILE)}"]
+        extra += ["leader.evaluation_share=1", "leader.least_variation=0"]
+        extra += [f"leader.together='.*(?={OF_DRIVE})'", f"scenario.horizon={steps}"]
+    if "drivers" not in keys:
+        extra += ["drivers=calibrated", f"drivers.path={quoted(calibrate_once(cfg, folder))}"]
     for share in shares:
-        complete(with_inputs(_evaluation([*found, *driven], share)), folder / SHARES_FOLDER / share)
+        complete(with_inputs(_evaluation([*extra, *driven], share)), folder / SHARES_FOLDER / share)
 
 
 def check_shares(shares: Sequence[str], size: int) -> None:
@@ -102,21 +102,21 @@ def check_shares(shares: Sequence[str], size: int) -> None:
             number = float(share)
         except ValueError:
             number = math.nan
-        words = f"--shares takes per cent above 0 and at most 100, got {share!r} (0 is in "
-        require(0.0 < number <= 100.0, words + "every table)")
+        message = f"--shares takes per cent above 0 and at most 100, got {share!r} (0 is in "
+        require(0.0 < number <= 100.0, message + "every table)")
         sizes = (n for n in range(size, 100 * size) if (number * n / 100.0 + 1e-9) % 1.0 < 1e-6)
         if (enough := next(sizes, size)) != size:
-            words = f"{size} vehicles have no {share} %; use scenario.string.size={enough}"
-            raise ConfigError(f"--shares {','.join(shares)}: {words}")
+            message = f"{size} vehicles have no {share} %; use scenario.string.size={enough}"
+            raise ConfigError(f"--shares {','.join(shares)}: {message}")
 
 
-def _evaluation(words: Sequence[str], share: str) -> Any:
-    part = f"scenario.string.penetration={share}e-2"
-    return load("evaluate", [*_beside(DRIVEN, words), part])
+def _evaluation(overrides: Sequence[str], share: str) -> Any:
+    option = f"scenario.string.penetration={share}e-2"
+    return load("evaluate", [*_beside(DRIVEN, overrides), option])
 
 
-def _beside(defaults: Sequence[str], words: Sequence[str]) -> list[str]:
-    return [*(item for item in defaults if key_of(item) not in map(key_of, words)), *words]
+def _beside(defaults: Sequence[str], overrides: Sequence[str]) -> list[str]:
+    return [*(item for item in defaults if key_of(item) not in map(key_of, overrides)), *overrides]
 
 
 def leader_drives(episodes: pd.DataFrame, time_step: float) -> pd.DataFrame:
@@ -151,15 +151,15 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     Raises:
         ResultsError: if a table is missing or cannot be read.
     """
-    found = StudyResults(folder, formats)
-    places = sorted((folder / SHARES_FOLDER).iterdir(), key=lambda place: float(place.name))
-    parts = {place.name: windows_for(read_parquet(place / EPISODES)) for place in places}
-    table = pd.DataFrame(row for share, part in parts.items() for row in rows_of(share, part))
+    study = StudyResults(folder, formats)
+    places = sorted((folder / SHARES_FOLDER).iterdir(), key=lambda path: float(path.name))
+    by_share = {path.name: windows_for(read_parquet(path / EPISODES)) for path in places}
+    table = pd.DataFrame(row for share, group in by_share.items() for row in rows_of(share, group))
     table = table.astype(dict.fromkeys(COUNTED[:2], int))
-    windows, cfg = parts[places[0].name], stored_config(places[0])
+    windows, cfg = by_share[places[0].name], stored_config(places[0])
     drives, scenario, settings = windows[DRIVE].nunique(), cfg["scenario"], cfg["evaluation"]
     few = ", by t since these are few (of one recording over its windows)" * (drives < LEAST_DRIVES)
-    found.table(
+    study.table(
         "road",
         f"{scenario['string']['size']} vehicles, {settings['drivers']} times behind each of "
         f"{several(len(windows['profile_id'].unique()), 'window')} of "
@@ -169,19 +169,19 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
         table,
     )
     for share, rows in table.groupby("automated_pct"):
-        found.blocks += [f"{share:g} % automated: {words}" for words in crashes(rows)]
+        study.blocks += [f"{share:g} % automated: {remark}" for remark in crashes(rows)]
     shown = [Shown(x.shown.key, fill(x.title, 18)) for x in MEASURES if x.key in DRAWN]
     of = [f"{x:g} %" for x in table["automated_pct"]]
     named = table.assign(of=of, driver=[in_words(str(name)) for name in table["strategy"]])
-    one = Report("", table, named, tuple(shown), (), "", "")
-    found.figure("road", "The same values and intervals; shares of time in %", measures_of(one))
+    report = Report("", table, named, tuple(shown), (), "", "")
+    study.figure("road", "The same values and intervals; shares of time in %", measures_of(report))
     for name, file in (("Data", folder / TRAJECTORIES), ("Drivers", folder / DRIVERS_FILE)):
         if file.is_file():
             lines = [f"* {line}" for line in parquet_metadata(file)["report"].splitlines()]
-            new = [line for line in lines if line not in "\n".join(found.blocks)]
-            found.blocks.append("\n".join([f"## {name}\n", *new]))
-    found.write("Automated cars on this road")
-    return found
+            new = [line for line in lines if line not in "\n".join(study.blocks)]
+            study.blocks.append("\n".join([f"## {name}\n", *new]))
+    study.write("Automated cars on this road")
+    return study
 
 
 def rows_of(share: str, windows: pd.DataFrame) -> Iterator[dict[str, Any]]:
@@ -193,19 +193,19 @@ def rows_of(share: str, windows: pd.DataFrame) -> Iterator[dict[str, Any]]:
         share: share of automated cars [%].
         windows: result of :func:`lcc_rl.results.report.windows_for`.
     """
-    parts = {str(name): part for name, part in windows.groupby("strategy", sort=False)}
-    for name, part in parts.items():
+    groups = {str(name): group for name, group in windows.groupby("strategy", sort=False)}
+    for name, group in groups.items():
         row: dict[str, Any] = {"automated_pct": float(share), "strategy": name}
-        crashed = name != HUMAN and bool(part["collisions"].sum())
+        crashed = name != HUMAN and bool(group["collisions"].sum())
         for one in (one for one in MEASURES if one.key in COMPARED):
             column, *per = one.columns
             nothing = crashed or name == HUMAN
-            found = NOTHING if nothing else savings(windows, column, name, HUMAN, per)
-            low, high = found.over_drives or (found.low, found.high)
-            humans = one.value(parts[HUMAN])
-            value = math.nan if crashed else one.value(part)
-            left = Estimate(value, humans * (1.0 - high), humans * (1.0 - low))
-            row |= left.columns(one.shown.key, one.scale)
+            saved = NOTHING if nothing else savings(windows, column, name, HUMAN, per)
+            low, high = saved.over_drives or (saved.low, saved.high)
+            humans = one.value(groups[HUMAN])
+            value = math.nan if crashed else one.value(group)
+            interval = Estimate(value, humans * (1.0 - high), humans * (1.0 - low))
+            row |= interval.columns(one.shown.key, one.scale)
             if one.key == FUEL:
-                row |= Estimate(found.value, low, high).columns("fuel_saved_pct", 100.0)
-        yield row | {one.key: one.value(part) for one in MEASURES if one.key in COUNTED}
+                row |= Estimate(saved.value, low, high).columns("fuel_saved_pct", 100.0)
+        yield row | {one.key: one.value(group) for one in MEASURES if one.key in COUNTED}

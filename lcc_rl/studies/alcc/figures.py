@@ -112,9 +112,9 @@ def distributions(drivers: pd.DataFrame) -> Figure:
     titles = {"cav": "controlled car (CAV)", "hdv": "human driver (HDV)"}
     for axis, (vehicle, title) in zip(axes, titles.items(), strict=True):
         energy = by_driver(drivers, f"{vehicle}_path_energy_kj")
-        for place, name in enumerate(names):
+        for row, name in enumerate(names):
             if name in energy:
-                _flat_box(axis, energy[name].to_numpy(float), place, colour(name))
+                _flat_box(axis, energy[name].to_numpy(float), row, colour(name))
         rows_of(axis, names if vehicle == "cav" else [""] * len(names))
         axis.use_sticky_edges = False  # a box may be at the edge
         axis.margins(x=0.12)
@@ -124,16 +124,16 @@ def distributions(drivers: pd.DataFrame) -> Figure:
     return figure
 
 
-def _flat_box(axis: Axes, values: np.ndarray, place: int, hue: str) -> None:
+def _flat_box(axis: Axes, values: np.ndarray, row: int, hue: str) -> None:
     """Draw a horizontal box with its mean beside it."""
     lowest, low, median, high, highest = np.percentile(values, [5, 25, 50, 75, 95])
-    axis.hlines(place, lowest, highest, color=hue)
-    axis.barh(place, high - low, 0.5, low, color=hue, alpha=0.35, edgecolor=hue)
-    axis.vlines(median, place - 0.25, place + 0.25, color=hue, lw=2.0)
+    axis.hlines(row, lowest, highest, color=hue)
+    axis.barh(row, high - low, 0.5, low, color=hue, alpha=0.35, edgecolor=hue)
+    axis.vlines(median, row - 0.25, row + 0.25, color=hue, lw=2.0)
     mean = values.mean()
     above: dict[str, Any] = {"xytext": (0, 8), "textcoords": "offset points"}
-    axis.plot(mean, place, marker="D", color=INK, markersize=3)
-    axis.annotate(f"{mean:.1f}", (mean, place), ha="center", fontsize=6, **above)
+    axis.plot(mean, row, marker="D", color=INK, markersize=3)
+    axis.annotate(f"{mean:.1f}", (mean, row), ha="center", fontsize=6, **above)
 
 
 @paper
@@ -157,9 +157,9 @@ def generalization_figure(windows: pd.DataFrame) -> Figure:
     below.axhline(together, color=colour(STRATEGY), lw=0.8, ls="--", label=line)
     _cut_outliers(below, places, values)
     below.set_xticks([])
-    words = f"held-out windows, sorted by the saving (n = {len(table)}); right: the paper's"
+    text = f"held-out windows, sorted by the saving (n = {len(table)}); right: the paper's"
     saved = f"saved by {in_words(STRATEGY)}\nagainst {in_words(BASELINE)} [%]"
-    below.set(xlabel=words, ylabel=saved)
+    below.set(xlabel=text, ylabel=saved)
     legend_above(below, 2)
     return figure
 
@@ -190,10 +190,10 @@ def _cut_outliers(axis: Axes, places: np.ndarray, values: np.ndarray) -> None:
         "ha": "right",
         "fontsize": 7,
     }
-    for place, value in zip(places, values, strict=True):
+    for x, value in zip(places, values, strict=True):
         if abs(value) > limit:
             mark, end, side = ("▲", limit, "top") if value > 0 else ("▼", -limit, "bottom")
-            axis.annotate(f"{signed(value, '{:+.0f}')} % {mark}", (place, end), va=side, **look)
+            axis.annotate(f"{signed(value, '{:+.0f}')} % {mark}", (x, end), va=side, **look)
 
 
 @paper
@@ -210,9 +210,9 @@ def comparison_figure(windows: pd.DataFrame) -> Figure:
     abreast = 0.18 * np.linspace(-1.0, 1.0, len(strategies)) * (len(strategies) > 1)
     for axis, (column, (label, line)) in zip(axes, PANELS.items(), strict=True):
         for strategy, offset in zip(strategies, abreast, strict=True):
-            part, hue = table[table["strategy"] == strategy], colour(strategy)
-            rows = [names.index(name) + offset for name in part["ablation"]]
-            dots(axis, rows, part, column, hue, label=in_words(strategy))
+            chosen, hue = table[table["strategy"] == strategy], colour(strategy)
+            rows = [names.index(name) + offset for name in chosen["ablation"]]
+            dots(axis, rows, chosen, column, hue, label=in_words(strategy))
         axis.axvline(line, color=SOFT, lw=0.8, ls="-" if line == 0.0 else "--")
         axis.axhline(0.5, color=SOFT, lw=0.6)
         axis.set_xlabel(label)

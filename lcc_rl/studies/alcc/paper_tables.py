@@ -58,12 +58,12 @@ def table_iv(drivers: pd.DataFrame) -> pd.DataFrame:
     chosen: dict[str, Any] = {"mean": None, "best": saved.idxmax(), "worst": saved.idxmin()}
     rows = []
     for label, driver in chosen.items():
-        own = {x: t.mean() if driver is None else t.loc[driver] for x, t in energies.items()}
+        of_driver = {x: t.mean() if driver is None else t.loc[driver] for x, t in energies.items()}
         for name in (BASELINE, STRATEGY):
             row: dict[str, object] = {"driver": label, "strategy": name, "from": STUDY_ROW}
-            row |= {column: energy[name] for column, energy in own.items()}
+            row |= {column: energy[name] for column, energy in of_driver.items()}
             for kind, column in ENERGY_KINDS.items():
-                energy = own[f"total_{column}"]
+                energy = of_driver[f"total_{column}"]
                 share = 100.0 * share_saved(energy[STRATEGY], energy[BASELINE])
                 row[f"{kind}saving_pct"] = share if name == STRATEGY else np.nan
             rows.append(row)
@@ -80,11 +80,11 @@ def holistic(means: Means) -> pd.DataFrame:
     """Return savings of the total energy per driver, for study and paper (Fig. 10)."""
     rows = []
     for kind, column in ENERGY_KINDS.items():
-        found = savings(means.windows, f"total_{column}", *PAIR)
+        share = savings(means.windows, f"total_{column}", *PAIR)
         saved = 100.0 * driver_savings(means.drivers, f"total_{column}", *PAIR)
         row = {
             "from": f"{STUDY_ROW}, {ENERGY_WORDS[kind]}",
-            **found.columns("mean_saving_pct", 100.0),
+            **share.columns("mean_saving_pct", 100.0),
         }
         row |= {"best_driver_pct": saved.max(), "worst_driver_pct": saved.min()}
         row |= {"drivers_worse_off": f"{int((saved < 0).sum())} of {len(saved)}"}
@@ -110,8 +110,8 @@ def generalization(windows: pd.DataFrame) -> pd.DataFrame:
         energy = per_seed(part, path)
         row |= {f"{name}_path_energy_kj": energy[name].mean() for name in (BASELINE, STRATEGY)}
         for kind, column in ENERGY_KINDS.items():
-            found = savings(part, f"total_{column}", *PAIR)
-            row |= found.columns(f"{kind}saving_pct", 100.0)
+            share = savings(part, f"total_{column}", *PAIR)
+            row |= share.columns(f"{kind}saving_pct", 100.0)
         against = savings(part, path, STRATEGY, "idm")
         rows.append(row | against.columns("path_saving_against_idm_pct", 100.0))
     return pd.DataFrame(rows)
@@ -152,7 +152,7 @@ def human_energy(means: Means) -> pd.DataFrame:
     rows: list[dict[str, object]] = []
     for strategy in per_seed(means.windows, "total_energy_kj"):
         for kind, column in ENERGY_KINDS.items():
-            found = savings(means.windows, f"hdv_{column}", strategy, "direct")
+            share = savings(means.windows, f"hdv_{column}", strategy, "direct")
             energy = by_driver(means.drivers, f"hdv_{column}")
             saved = 100.0 * share_saved(energy[strategy], energy["direct"])
             rows.append(
@@ -161,7 +161,7 @@ def human_energy(means: Means) -> pd.DataFrame:
                     "energy": ENERGY_WORDS[kind],
                     "scenario_A_kj": energy[strategy].mean(),
                     "scenario_B_kj": energy["direct"].mean(),
-                    **found.columns("saving_pct", 100.0),
+                    **share.columns("saving_pct", 100.0),
                     "least_driver_pct": saved.min(),
                     "most_driver_pct": saved.max(),
                     "drivers_better_off": f"{int((saved > 0).sum())} of {len(saved)}",

@@ -45,19 +45,19 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     Raises:
         ResultsError: if there is no evaluation in the folder, or a file cannot be read.
     """
-    found = StudyResults(folder, formats)
+    study = StudyResults(folder, formats)
     if not any(map(_finished, folder.glob(f"**/{EVALUATION_FOLDER}"))):
         raise ResultsError(
             f"{folder}: no {EVALUATION_FOLDER}/{EPISODES}; run lcc-rl reproduce alcc"
         )
     main = Means.read(folder / EVALUATION_FOLDER) if _finished(folder / EVALUATION_FOLDER) else None
     if main is not None:
-        add_main(found, main)
-    _learning(found)
-    _ablations(found, main)
-    _people(found)
-    found.write(ALCC_TITLE)
-    return found
+        add_main(study, main)
+    _learning(study)
+    _ablations(study, main)
+    _people(study)
+    study.write(ALCC_TITLE)
+    return study
 
 
 def narrow(shown: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
@@ -67,10 +67,10 @@ def narrow(shown: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
         for table in (shown["energies"], shown["human_energy"], shown["constraints"])
     )
     human = human[human["energy"] == paper_tables.ENERGY_WORDS[""]]
-    parts = ["strategy", "total_path_energy_kj", "total_path_energy_kj_low"]
-    parts += ["total_path_energy_kj_high", "total_energy_kj", *tables.ENERGY_PARTS]
+    columns = ["strategy", "total_path_energy_kj", "total_path_energy_kj_low"]
+    columns += ["total_path_energy_kj_high", "total_energy_kj", *tables.ENERGY_PARTS]
     return {
-        "parts": energies.loc[energies["strategy"] != "direct", parts],
+        "parts": energies.loc[energies["strategy"] != "direct", columns],
         "behind": human.drop(columns=["energy", "least_driver_pct", "most_driver_pct"]),
         "shares": shares[["strategy", "collisions", *SHARE_COLUMNS]],
     }
@@ -102,63 +102,63 @@ def add_main(found: StudyResults, means: Means) -> None:
         found.figure(f"human_energy_{name}", caption, run_figures.human_energy_figure(means, name))
 
 
-def _awareness(found: StudyResults, means: Means) -> None:
+def _awareness(study: StudyResults, means: Means) -> None:
     caption = f"Table IV and this study, {sample_of(means.windows, means.drivers)}"
-    found.table("table_iv", caption, paper_tables.table_iv(means.drivers))
-    found.table("holistic", "Saving per driver", paper_tables.holistic(means))
+    study.table("table_iv", caption, paper_tables.table_iv(means.drivers))
+    study.table("holistic", "Saving per driver", paper_tables.holistic(means))
     caption = "Path energy of both vehicles and its saving, by driver behind (Fig. 10)"
     figure = run_figures.paired_improvement(means, *PAIR)
-    found.figure("improvement", caption, figure)
+    study.figure("improvement", caption, figure)
 
 
-def _generalization(found: StudyResults, windows: pd.DataFrame) -> None:
+def _generalization(study: StudyResults, windows: pd.DataFrame) -> None:
     caption = "Saving of alcc against reference over profiles and on the 4 of the paper"
-    found.table("generalization_row", caption, paper_tables.generalization_row(windows))
-    found.table("generalization", "Every held-out window", paper_tables.generalization(windows))
+    study.table("generalization_row", caption, paper_tables.generalization_row(windows))
+    study.table("generalization", "Every held-out window", paper_tables.generalization(windows))
     caption = "Energies and saving on every held-out window (Fig. 12)"
-    found.figure("generalization", caption, figures.generalization_figure(windows))
+    study.figure("generalization", caption, figures.generalization_figure(windows))
 
 
-def _learning(found: StudyResults) -> None:
-    if (found.folder / CURVES).exists():
-        training = read_parquet(found.folder / CURVES)
-    elif any((found.folder / "train").rglob("training.parquet")):
-        training = results.load(found.folder / "train", "training", strict=True)
+def _learning(study: StudyResults) -> None:
+    if (study.folder / CURVES).exists():
+        training = read_parquet(study.folder / CURVES)
+    elif any((study.folder / "train").rglob("training.parquet")):
+        training = results.load(study.folder / "train", "training", strict=True)
     else:
         return
-    found.table("learning", "Learning curves, every seed", tables.learning(training))
-    found.figure("learning_curve", "Reward over training (Fig. 6)", learning_curve(training))
-    found.figure("reward_terms", "Every reward term", figures.reward_terms(training))
+    study.table("learning", "Learning curves, every seed", tables.learning(training))
+    study.figure("learning_curve", "Reward over training (Fig. 6)", learning_curve(training))
+    study.figure("reward_terms", "Every reward term", figures.reward_terms(training))
 
 
-def _ablations(found: StudyResults, main: Means | None) -> None:
+def _ablations(study: StudyResults, main: Means | None) -> None:
     means = {
         path.parent.name: Means.read(path)
-        for path in found.folder.glob(f"ablations/*/{EVALUATION_FOLDER}")
+        for path in study.folder.glob(f"ablations/*/{EVALUATION_FOLDER}")
         if _finished(path)
     }
     if not means:
         return
     order = [*(name for name in ABLATIONS if name in means), *sorted(means.keys() - ABLATIONS)]
-    parts = {ITSELF: main} if main is not None else {}
-    parts |= {name: means[name] for name in order}
+    series = {ITSELF: main} if main is not None else {}
+    series |= {name: means[name] for name in order}
     windows = pd.concat(
-        [one.windows.assign(ablation=name) for name, one in parts.items()], ignore_index=True
+        [one.windows.assign(ablation=name) for name, one in series.items()], ignore_index=True
     )
-    found.table("series", "Energy as drawn of both vehicles", tables.series(windows))
-    found.table("ablations", "Path energy, safety and efficiency", tables.comparison(windows))
+    study.table("series", "Energy as drawn of both vehicles", tables.series(windows))
+    study.table("ablations", "Path energy, safety and efficiency", tables.comparison(windows))
     caption = "Energy, safety and efficiency under each change"
-    found.figure("ablations", caption, figures.comparison_figure(windows))
+    study.figure("ablations", caption, figures.comparison_figure(windows))
 
 
-def _people(found: StudyResults) -> None:
+def _people(study: StudyResults) -> None:
     """Add the calibration and the power map."""
-    found.figure("power_map", "The motor's power map (A2; Fig. 2)", figures.power_map())
-    if (found.folder / DRIVERS_FILE).exists():
-        drivers = read_parquet(found.folder / DRIVERS_FILE)
-        found.figure("calibration", "Calibration (Fig. 4)", calibration_figure(drivers))
+    study.figure("power_map", "The motor's power map (A2; Fig. 2)", figures.power_map())
+    if (study.folder / DRIVERS_FILE).exists():
+        drivers = read_parquet(study.folder / DRIVERS_FILE)
+        study.figure("calibration", "Calibration (Fig. 4)", calibration_figure(drivers))
         caption = "Joint distribution of desired speed and time gap (Fig. 5)"
-        found.figure("joint_distribution", caption, joint_figure(drivers))
+        study.figure("joint_distribution", caption, joint_figure(drivers))
 
 
 def _finished(evaluation: Path) -> bool:

@@ -78,13 +78,13 @@ def chosen_ablation(item: str) -> tuple[str, Change]:
 
 def default_recipe(overrides: Iterable[str]) -> str | None:
     """Return the recipe of the study: the paper's windows, and its learner without another."""
-    own = any(key_of(item) == "agent" for item in overrides)
-    return WINDOWS if own else "paper_alcc"
+    agent = any(key_of(item) == "agent" for item in overrides)
+    return WINDOWS if agent else "paper_alcc"
 
 
 def settings_of_run(study: Study, entry: str, variant: str, change: Change, *own: str) -> Any:
     """Compose a run of recipe, inputs of the study, user's overrides, change and own overrides."""
-    given = {top_key(item) for item in study.overrides}
+    keys = {top_key(item) for item in study.overrides}
     shared = [
         item
         for item in study.overrides
@@ -96,17 +96,17 @@ def settings_of_run(study: Study, entry: str, variant: str, change: Change, *own
         users = [x for x in users if x not in moved]
         changed = (*changed, *(x.replace("split.", "split.held_out.", 1) for x in moved))
     drivers = ("drivers=calibrated", f"drivers.path={quoted(study.folder / DRIVERS_FILE)}")
-    words = [
+    options = [
         f"experiment=[{','.join([*filter(None, [study.recipe]), *change.recipes])}]",
         f"variant={variant}",
         "data=episodes",
         f"data.path={quoted(study.folder / TRAJECTORIES)}",
-        *(() if "drivers" in given else drivers),
+        *(() if "drivers" in keys else drivers),
         *users,
         *changed,
         *own,
     ]
-    return load(entry, words)
+    return load(entry, options)
 
 
 def alcc_trainings(study: Study, change: Change) -> dict[str, TrainConfig]:
@@ -140,14 +140,14 @@ def run(study: Study, parts: Sequence[str] = STUDY_PARTS, ablations: Sequence[st
     for folder, (change, runs) in series.items():
         train_all(runs, folder, study.jobs)
         cfg: EvaluateConfig = settings_of_run(study, "evaluate", "alcc", change)
-        place = study.folder if change is MAIN else folder
-        complete(with_inputs(cfg.with_(compare=[str(folder)])), place / EVALUATION_FOLDER)
+        target = study.folder if change is MAIN else folder
+        complete(with_inputs(cfg.with_(compare=[str(folder)])), target / EVALUATION_FOLDER)
 
 
 def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dict[Path, Change]:
     """Return the series of trainings of the parts by their folders."""
     require_known("part", parts, STUDY_PARTS)
-    found = {study.folder / TRAIN: MAIN} if "main" in parts else {}
+    series = {study.folder / TRAIN: MAIN} if "main" in parts else {}
     if "ablations" in parts:
         # Without ablations that change nothing, and in short runs without long trainings.
         gamma = settings_of_run(study, "train", "alcc", MAIN).agent.made().gamma
@@ -156,13 +156,13 @@ def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dic
             left_out |= set(OF_DDPG)
         chosen = ablations or tuple(name for name in ABLATIONS if name not in left_out)
         named = map(chosen_ablation, chosen)
-        found |= {study.folder / "ablations" / name: change for name, change in named}
-    return found
+        series |= {study.folder / "ablations" / name: change for name, change in named}
+    return series
 
 
 def _calibration(study: Study, runs: dict[str, TrainConfig]) -> PipelineConfig:
     """Return the settings of the calibration, with the data and division of a training."""
-    own = [item for item in study.overrides if top_key(item) not in OF_TRAINING]
-    cfg: PipelineConfig = load("pipeline", ["~experiment", "calibration=both", *own])
+    shared = [item for item in study.overrides if top_key(item) not in OF_TRAINING]
+    cfg: PipelineConfig = load("pipeline", ["~experiment", "calibration=both", *shared])
     first = next(iter(runs.values()))
     return cfg.with_(split=first.split, scenario=first.scenario)

@@ -81,7 +81,7 @@ def strata(windows: pd.DataFrame) -> pd.DataFrame:
         per source with its name in the column ``tercile`` and no range.
     """
     names = [name for name in per_seed(windows, PATH) if name not in UNTRAINED]
-    parts = list(_thirds(windows))
+    thirds = list(_thirds(windows))
     rows = [
         {
             "strategy": name,
@@ -96,7 +96,7 @@ def strata(windows: pd.DataFrame) -> pd.DataFrame:
         for name in (["alcc"] if "alcc" in names else names)
         for baseline in COMPARED
         if baseline != name and (windows["strategy"] == baseline).any()
-        for by, third, least, most, inside in parts
+        for by, third, least, most, inside in thirds
     ]
     return pd.DataFrame(rows)
 
@@ -108,11 +108,11 @@ def _thirds(windows: pd.DataFrame) -> Iterator[tuple[str, str, float, float, pd.
             yield SOURCE, source, np.nan, np.nan, rows
     for column in LEADER_COLUMNS:
         values = windows.groupby("profile_id")[column].first().sort_values()
-        parts = np.array_split(np.arange(len(values)), len(TERCILES))
-        for name, part in zip(TERCILES, (values.iloc[chosen] for chosen in parts), strict=True):
-            if len(part):
-                inside = windows[windows["profile_id"].isin(part.index)]
-                yield column, name, part.iloc[0], part.iloc[-1], inside
+        thirds = np.array_split(np.arange(len(values)), len(TERCILES))
+        for name, third in zip(TERCILES, (values.iloc[chosen] for chosen in thirds), strict=True):
+            if len(third):
+                inside = windows[windows["profile_id"].isin(third.index)]
+                yield column, name, third.iloc[0], third.iloc[-1], inside
 
 
 def _seeds(rows: pd.DataFrame) -> str:
@@ -132,14 +132,14 @@ def constraints(windows: pd.DataFrame) -> pd.DataFrame:
         part = windows[windows["strategy"] == strategy]
         row: dict[str, object] = {"strategy": strategy, "seeds": _seeds(part)}
         row |= {name: int(part[name].sum()) for name in ("episodes", "collisions")}
-        kept = not row["collisions"]
+        within = not row["collisions"]
         for name, column in SHARES.items():
             values = 100.0 * part.groupby("training_seed", dropna=False)[column].mean()
             row[f"mean_{name}"], row[f"worst_seed_{name}"] = values.mean(), values.max()
             row[f"worst_episode_{name}"] = 100.0 * part[f"worst_{column}"].max()
-            kept = kept and values.max() <= SHARE_LIMITS.get(name, np.inf)
+            within = within and values.max() <= SHARE_LIMITS.get(name, np.inf)
         row["least_ttc_s"], row["least_gap_m"] = part["min_ttc_s"].min(), part["min_gap_m"].min()
-        rows.append(row | {"within_limits": bool(kept)})
+        rows.append(row | {"within_limits": bool(within)})
     return pd.DataFrame(rows)
 
 
@@ -238,7 +238,7 @@ def series(windows: pd.DataFrame) -> pd.DataFrame:
         row: dict[str, object] = {"training": name, "seeds": seeds}
         compared = (("alcc", "reference"), ("alcc", "idm"), ("own_energy", "reference"))
         for strategy, baseline in compared:
-            found = savings(part, "total_energy_kj", strategy, baseline)
-            row |= found.columns(f"{strategy}_against_{baseline}_pct", 100.0)
+            share = savings(part, "total_energy_kj", strategy, baseline)
+            row |= share.columns(f"{strategy}_against_{baseline}_pct", 100.0)
         rows.append(row)
     return pd.DataFrame(rows)

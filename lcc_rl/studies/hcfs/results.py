@@ -46,46 +46,46 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     Raises:
         ResultsError: if a table is missing or cannot be read.
     """
-    found = StudyResults(folder, formats)
+    study = StudyResults(folder, formats)
     episodes, steps = (read_parquet(folder / name) for name in (EPISODES, STEPS))
-    _windows(found, episodes)
+    _windows(study, episodes)
     for case in CASES:
-        _case(found, episodes, steps, case)
-    found.table("table_iv", "Table IV as printed, on another record", tables.printed())
-    found.table("weights", "Σ reward from Σ|e_v| and Σ|jerk| of Table IV", tables.weight_table())
-    whole = tables.whole_records(episodes, WHOLE_ROWS)
-    found.table("whole", "Σ reward over whole records (range of the trainings)", whole)
+        _case(study, episodes, steps, case)
+    study.table("table_iv", "Table IV as printed, on another record", tables.printed())
+    study.table("weights", "Σ reward from Σ|e_v| and Σ|jerk| of Table IV", tables.weight_table())
+    totals = tables.whole_records(episodes, WHOLE_ROWS)
+    study.table("whole", "Σ reward over whole records (range of the trainings)", totals)
     gains = tables.whole_gains(episodes, PARENT_ROWS)
-    found.table("whole_gains", "HCFS against its parents over whole records", gains)
+    study.table("whole_gains", "HCFS against its parents over whole records", gains)
     if (folder / SOURCES_FILE).exists():  # only with evaluations on other leaders
         runs = read_parquet(folder / SOURCES_FILE)
         shown = tables.sources(runs, ("cacc tuned", "hcfs", "hcfs first"))
-        found.table("sources", "Windows of other sources of leaders", shown)
-        found.table("sources_in_full", "The same for all strategies", tables.sources(runs))
+        study.table("sources", "Windows of other sources of leaders", shown)
+        study.table("sources_in_full", "The same for all strategies", tables.sources(runs))
     if (folder / LENGTHS).exists():  # only with several studies
         lengths = tables.lengths(read_parquet(folder / LENGTHS))
-        found.table("lengths", "Σ reward per window by the length of the training", lengths)
+        study.table("lengths", "Σ reward per window by the length of the training", lengths)
     curve = learning_curve(read_parquet(folder / TRAINING))
-    found.figure("learning_curve", "Learning curve of the DDPG parent", curve)
-    found.write(HCFS_TITLE)
-    return found
+    study.figure("learning_curve", "Learning curve of the DDPG parent", curve)
+    study.write(HCFS_TITLE)
+    return study
 
 
-def _windows(found: StudyResults, episodes: pd.DataFrame) -> None:
-    others = [name for name in STRATEGIES if name != "hcfs"]
-    gained = tables.win_rates(episodes, "hcfs", [*others, "deadbeat oracle"])
+def _windows(study: StudyResults, episodes: pd.DataFrame) -> None:
+    rivals = [name for name in STRATEGIES if name != "hcfs"]
+    gained = tables.win_rates(episodes, "hcfs", [*rivals, "deadbeat oracle"])
     untuned = tables.win_rates(episodes, "hcfs untuned", ["cacc paper_like", LEARNED, "hcfs"])
     cases = tables.over_cases(episodes, tuple(CASES), IN_CASES)
-    found.table("windows", "Σ reward per window", tables.windows(episodes, STRATEGIES))
-    found.table("win_rates", "HCFS (rule: CACC tuned) against every other", gained)
-    found.table("win_rates_untuned", "HCFS with the CACC of Table IV", untuned)
-    found.table("windows_in_full", "Held-out windows: means", case_table(episodes, WINDOW_CASES))
-    found.table("cases", "Σ reward in the cases of the paper", cases)
+    study.table("windows", "Σ reward per window", tables.windows(episodes, STRATEGIES))
+    study.table("win_rates", "HCFS (rule: CACC tuned) against every other", gained)
+    study.table("win_rates_untuned", "HCFS with the CACC of Table IV", untuned)
+    study.table("windows_in_full", "Held-out windows: means", case_table(episodes, WINDOW_CASES))
+    study.table("cases", "Σ reward in the cases of the paper", cases)
 
 
-def _case(found: StudyResults, episodes: pd.DataFrame, steps: pd.DataFrame, case: str) -> None:
+def _case(study: StudyResults, episodes: pd.DataFrame, steps: pd.DataFrame, case: str) -> None:
     stem, (table, speeds, jerk, use) = case.replace(" ", "_"), CASES[case]
-    found.table(stem, f"{case} ({table} of the paper)", case_table(episodes, case))
+    study.table(stem, f"{case} ({table} of the paper)", case_table(episodes, case))
     pictures = {
         ("velocities", f"speeds (Fig. {speeds})"): platoon.velocities(steps, case),
         ("jerk", f"jerk and its bound (Fig. {jerk})"): platoon.jerks(steps, case, 30.0),
@@ -94,5 +94,5 @@ def _case(found: StudyResults, episodes: pd.DataFrame, steps: pd.DataFrame, case
             steps, case, "hcfs oracle"
         ),
     }
-    for (name, words), figure in pictures.items():
-        found.figure(f"{stem}_{name}", f"{case}: {words}", figure)
+    for (name, caption), figure in pictures.items():
+        study.figure(f"{stem}_{name}", f"{case}: {caption}", figure)

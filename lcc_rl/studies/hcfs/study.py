@@ -43,9 +43,9 @@ WLTC = "+leader.full_length.wltc={path: wltc_3b, scale: 0.5}"
 def trainings(study: Study) -> dict[str, TrainConfig]:
     """Return a training of the DDPG parent per seed, by folder."""
     # Only the study's evaluation uses the full-length record.
-    own = (f"experiment={study.recipe}", f"variant={LEARNED}", *study.overrides)
+    shared = (f"experiment={study.recipe}", f"variant={LEARNED}", *study.overrides)
     return {
-        f"seed_{seed}": load("train", [*own, "evaluation.full_length=false", f"seed={seed}"])
+        f"seed_{seed}": load("train", [*shared, "evaluation.full_length=false", f"seed={seed}"])
         for seed in range(study.seeds)
     }
 
@@ -53,9 +53,9 @@ def trainings(study: Study) -> dict[str, TrainConfig]:
 def evaluation(study: Study, *own: str) -> StudyConfig:
     """Return the configuration of an evaluation of the hybrid."""
     shared = known_settings(list(study.overrides), "evaluate")
-    more = () if any(top_key(item) == "leader" for item in study.overrides) else (WLTC,)
-    words = [f"experiment={study.recipe}", "variant=hcfs", *more, *shared, *own]
-    cfg: StudyConfig = load("evaluate", words)
+    leader = () if any(top_key(item) == "leader" for item in study.overrides) else (WLTC,)
+    options = [f"experiment={study.recipe}", "variant=hcfs", *leader, *shared, *own]
+    cfg: StudyConfig = load("evaluate", options)
     return cfg
 
 
@@ -68,20 +68,20 @@ def run(study: Study) -> None:
     Raises:
         LccError: for any error in settings or files, in one line.
     """
-    cfg, runs, place = evaluation(study), trainings(study), study.folder / LEARNED
-    train_all(runs, place, study.jobs)
+    cfg, runs, parents = evaluation(study), trainings(study), study.folder / LEARNED
+    train_all(runs, parents, study.jobs)
     prepare_torch(cfg)
     inputs = load_inputs(cfg)
     target = study.folder / "evaluation"
     _evaluate(baselines(cfg), cfg, inputs, target / BASELINES_FOLDER)
-    done = [place / name for name in runs]
+    done = [parents / name for name in runs]
     for folder in done:
-        own = evaluation(study, f"policy={quoted(folder)}")
+        hybrid = evaluation(study, f"policy={quoted(folder)}")
         weights, trained = load_policy(folder)
-        check_policy(own, trained)
-        own = own.with_(agent=trained.agent)
-        learned = with_weights(own, weights, trained.seed, str(folder), inputs.population)
-        _evaluate(hybrid_strategies(own, learned), own, inputs, target / folder.name)
+        check_policy(hybrid, trained)
+        hybrid = hybrid.with_(agent=trained.agent)
+        learned = with_weights(hybrid, weights, trained.seed, str(folder), inputs.population)
+        _evaluate(hybrid_strategies(hybrid, learned), hybrid, inputs, target / folder.name)
     keep(study.folder, done)
 
 
@@ -89,17 +89,17 @@ def keep(folder: Path, trainings: Sequence[Path]) -> None:
     """Write the tables of the page: a row per run, cases of the first training, and curves."""
     root = folder / "evaluation"
     seeds = [root / path.name for path in trainings]
-    found = [read_parquet(path / EPISODES) for path in (root / BASELINES_FOLDER, *seeds)]
-    write_parquet(per_run(pd.concat(found, ignore_index=True)), folder / EPISODES)
-    found = [read_parquet(path / STEPS) for path in (root / BASELINES_FOLDER, *seeds[:1])]
-    write_parquet(rounded(pd.concat(found, ignore_index=True)), folder / STEPS)
-    found = [
+    frames = [read_parquet(path / EPISODES) for path in (root / BASELINES_FOLDER, *seeds)]
+    write_parquet(per_run(pd.concat(frames, ignore_index=True)), folder / EPISODES)
+    frames = [read_parquet(path / STEPS) for path in (root / BASELINES_FOLDER, *seeds[:1])]
+    write_parquet(rounded(pd.concat(frames, ignore_index=True)), folder / STEPS)
+    frames = [
         read_parquet(path / TRAINING)[["episodes", "episode_reward"]].assign(
             variant=LEARNED, seed=int(path.name.removeprefix("seed_"))
         )
         for path in trainings
     ]
-    write_parquet(rounded(pd.concat(found, ignore_index=True)), folder / TRAINING)
+    write_parquet(rounded(pd.concat(frames, ignore_index=True)), folder / TRAINING)
 
 
 def hybrid_strategies(cfg: StudyConfig, learned: Strategy) -> list[Strategy]:

@@ -51,10 +51,10 @@ LEADERS = {  # names of sources of leaders in tables
 
 def per_run(episodes: pd.DataFrame) -> pd.DataFrame:
     """Sum the rows of each run's vehicles; :func:`case_table` also accepts the result."""
-    how = {**dict.fromkeys(SUMS, "sum"), **dict.fromkeys(LARGEST_COLUMNS, "max")}
-    how |= {"min_gap_m": "min", "learned_share": "mean", "energy_kj_per_km": "mean"}
-    how |= {DRIVE: "first"} if DRIVE in episodes else {}
-    return episodes.groupby(RUN, sort=False, dropna=False, as_index=False).agg(how)
+    kinds = {**dict.fromkeys(SUMS, "sum"), **dict.fromkeys(LARGEST_COLUMNS, "max")}
+    kinds |= {"min_gap_m": "min", "learned_share": "mean", "energy_kj_per_km": "mean"}
+    kinds |= {DRIVE: "first"} if DRIVE in episodes else {}
+    return episodes.groupby(RUN, sort=False, dropna=False, as_index=False).agg(kinds)
 
 
 def rounded(frame: pd.DataFrame) -> pd.DataFrame:
@@ -117,23 +117,23 @@ def win_rates(
         with 95 % intervals over drives and seeds. Trained strategies are compared by seed;
         ``seeds_ahead`` counts the seeds with a positive difference.
     """
-    own = reward_per_seed(episodes, of, case)
+    reward = reward_per_seed(episodes, of, case)
     names = [n for n in dict.fromkeys(episodes["strategy"]) if n != of]
     rows = []
     for name in names if against is None else against:
         other = reward_per_seed(episodes, name, case)
         if len(other.columns) == 1:
-            other = pd.concat([other.iloc[:, 0]] * len(own.columns), axis=1, keys=own.columns)
-        shared = own.columns.intersection(other.columns)
-        difference = own[shared] - other[shared]
+            other = pd.concat([other.iloc[:, 0]] * len(reward.columns), axis=1, keys=reward.columns)
+        shared = reward.columns.intersection(other.columns)
+        difference = reward[shared] - other[shared]
         wins = (difference > 1e-6) + 0.5 * (difference.abs() <= 1e-6)
         row: dict[str, object] = {"strategy": of, "against": name}
         row |= {"trainings": len(shared), "windows": len(difference)}
         row |= crossed_rewards(wins).columns("wins_pct", 100.0)
         row |= crossed_rewards(difference).columns("reward_gain")
         # Rewards are negative: the share of the cost that is saved.
-        both = -own[shared], -other[shared]
-        gain = bootstrap.saving(*both, paired=True, drives=_drives(own))
+        both = -reward[shared], -other[shared]
+        gain = bootstrap.saving(*both, paired=True, drives=_drives(reward))
         row |= gain.columns("gain_pct", 100.0)
         rows.append(row | {"seeds_ahead": int((difference.mean() > 0).sum())})
     return pd.DataFrame(rows)
@@ -234,13 +234,13 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
             if name in set(group["strategy"])
         }
         for name, energy in spent.items():
-            own = group[group["strategy"] == name]
+            driven = group[group["strategy"] == name]
             saved = bootstrap.saving(energy, spent[strategies[0]], drives=_drives(energy))
-            above = f"{(own['energy_ratio'] > 1.0).sum()} of {len(own)}"
+            above = f"{(driven['energy_ratio'] > 1.0).sum()} of {len(driven)}"
             row: dict[str, object] = {"leaders": source, "strategy": in_words(name)}
             row |= crossed_rewards(reward_per_seed(group, name, WINDOW_CASES)).columns("Σ reward")
-            row |= {"gap error_m": own["max_gap_error_m"].max()}
-            row |= {"string ratio, above 1": f"{own['energy_ratio'].max():.2f}, {above}"}
+            row |= {"gap error_m": driven["max_gap_error_m"].max()}
+            row |= {"string ratio, above 1": f"{driven['energy_ratio'].max():.2f}, {above}"}
             rows.append(row | saved.columns("energy saved_pct", 100.0))
     return pd.DataFrame(rows)
 
