@@ -72,6 +72,7 @@ def run(
             motion = _cut(motion_of(rows, scenario), start, duration)
             # Side by side, only a short title fits.
             name = in_words(strategy) + (f": {label}" if len(named) == 1 else "")
+            require((title or name) not in motions, f"--strategy {key}: a second {title or name!r}")
             motions[title or name] = motion
     default = folder / "figures" / f"animation_{in_file(named[0][0])}_{episode}.html"
     return animate(motions, out or default)

@@ -75,16 +75,22 @@ def compared(folder: Path, target: Path) -> Iterator[tuple[str, bool]]:
             yield f"{name}: {one.shape} against {other.shape} rows and columns", False
         else:
             named = [str(key) for key in one if not one[key].equals(other[key])]
-            size = max(_largest(one[key], other[key]) for key in named)
+            sizes = (_largest(one[key], other[key]) for key in named)
+            size = max(sizes, key=lambda x: -1.0 if np.isnan(x) else x)
             columns = ", ".join(named[:3]) + ", …" * (len(named) > 3)
             text = f"{len(named)} of {one.shape[1]} columns differ ({columns}), by up to {size:.2g}"
             yield f"{name}: {len(one):,} rows, {text}", False
 
 
 def _largest(one: pd.Series, other: pd.Series) -> float:
-    """Return the largest difference as a share of the numbers; nan for text."""
-    if not pd.api.types.is_numeric_dtype(one):
+    """Return the largest difference as a share of the numbers; inf if one of two is missing.
+
+    It is nan for text.
+    """
+    if not all(map(pd.api.types.is_numeric_dtype, (one, other))):
         return float("nan")
+    if (one.isna() != other.isna()).any():
+        return float("inf")
     first, second = one.to_numpy(float), other.to_numpy(float)
     scale = np.maximum(np.maximum(np.abs(first), np.abs(second)), 1e-12)
     return float(np.nanmax(np.abs(first - second) / scale, initial=0.0))

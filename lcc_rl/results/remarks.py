@@ -115,7 +115,7 @@ def few_drives(table: pd.DataFrame) -> str:
     few = table[table[FEW_DRIVES[0]].notna()]
     rows = zip(few["strategy"], *(100.0 * few[name] for name in FEW_DRIVES), strict=True)
     text = "; ".join(f"{in_words(str(name))} {between(*bounds)}" for name, *bounds in rows)
-    return f"Saved [%], t-interval over {table['drives'].max()} drives: {text}." if text else ""
+    return f"Saved [%], t-interval over {few['drives'].max()} drives: {text}." if text else ""
 
 
 def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:

@@ -211,6 +211,9 @@ def test_the_command_animates_what_is_named(run_folder, capsys) -> None:
     found = data_of(out.read_text())
     assert (found["title"], found["time"]) == ("one IDM driver: profile p, driver 1", [1.0, 1.5])
     assert found["speed"][0] == [9.0] * 2
+    twice = [str(run_folder), "--strategy=alcc: A", "--strategy=one IDM driver: A", "--out=x.svg"]
+    with pytest.raises(ConfigError, match="one IDM driver: a second 'A'"):
+        command.main(twice)
     job = run_folder.parent / "job"
     job.mkdir()
     run_folder.rename(job / "evaluation")

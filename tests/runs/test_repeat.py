@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commands import NO_AGENT, QUICK, TINY, assert_same_tables, run_command, tiny
 from helpers import check_refused
@@ -29,6 +30,9 @@ def test_rows_that_differ_are_named(trained, tmp_path) -> None:
     rows = read_parquet(one / "episodes.parquet")
     rows.loc[0, "total_energy_kj"] *= 1.25
     write_parquet(rows, other / "episodes.parquet")
+    missing = rows.assign(total_energy_kj=rows["total_energy_kj"].mask(rows.index == 0))
+    assert repeat._largest(rows["total_energy_kj"], missing["total_energy_kj"]) == np.inf
+    assert np.isnan(repeat._largest(rows["total_energy_kj"], rows["strategy"]))
     (other / "steps.parquet").unlink()
     found = dict(repeat.compared(one, other))
     assert [*found.values()] == [False, False, True]
