@@ -83,10 +83,7 @@ def compared(folder: Path, target: Path) -> Iterator[tuple[str, bool]]:
 
 
 def _largest(one: pd.Series, other: pd.Series) -> float:
-    """Return the largest difference as a share of the numbers; inf if one of two is missing.
-
-    It is nan for text.
-    """
+    """Return the largest difference as a share; inf if a number is missing, nan for text."""
     if not all(map(pd.api.types.is_numeric_dtype, (one, other))):
         return float("nan")
     if (one.isna() != other.isna()).any():
