@@ -352,7 +352,7 @@ def driving(
     pieces: Sequence[Piece],
     safety: CBFFilter | None,
     world: World,
-    limits: Mapping[str, float] | None,
+    limits: Mapping[str, float] | None = None,
 ) -> DrivingProgram:
     """Return the program of pieces and a filter in a world; the filter acts from the start.
 

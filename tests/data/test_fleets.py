@@ -102,7 +102,8 @@ def test_short_trips_and_those_of_another_rate_are_named(tmp_path) -> None:
         written(tmp_path, trip, f"trip{number}.csv")
     report = DriveLeaders(path=str(tmp_path), evaluation_share=1.0).load(0.1, 1500).report
     assert report.count("samples 1 s apart were interpolated to 0.1 s") == 1
-    assert "left out 1 of 3 record(s), shorter than an episode of 150 s: trip2 (59 s)" in report
+    short = "shorter than an episode of 150 s (scenario.horizon=1500): trip2 (59 s)"
+    assert f"left out 1 of 3 record(s), {short}" in report
 
 
 def test_many_files_have_one_line_progress_and_a_check_of_memory(

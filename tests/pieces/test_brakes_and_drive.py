@@ -9,6 +9,7 @@ import torch
 from helpers import POPULATION, check_refused, composed, play
 from torch import Tensor
 
+import lcc_rl
 from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.envs import build_env
@@ -108,8 +109,8 @@ def test_limits_without_effect_are_refused() -> None:
             "scenario.max_braking=6 has no effect: no vehicle of the string is automated",
         ),
         (
-            lambda: load("evaluate", [f"+{AUTO}.max_acceleration=6", "compare=[acc]"]),
-            "has no effect: compare names every controller",
+            lambda: lcc_rl.compare("acc", overrides=[f"+{AUTO}.max_acceleration=6"]),
+            "has no effect: every controller is named",
         ),
         (lambda: load("train", ["scenario.max_braking=-1"]), "max_braking must be greater than 0"),
     ]
