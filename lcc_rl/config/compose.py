@@ -329,8 +329,8 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
             f"{key}={value}: several values are runs of a sweep, -m; a list is {key}=[{value}]"
         )
     if found := re.match(r"(\w+)\S* appears more than once", str(error)):
-        group = found.group(1)
-        return ConfigError(f"+{group}=… is chosen already: leave it out, or write {group}=…")
+        twice = f"{found.group(1)} is chosen twice: leave one out, or write it without +"
+        return ConfigError(f"{' '.join(overrides)}: {twice}")
     cause = error.__cause__
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)
     tokens = [*overrides, *text.partition("See https://")[0].split()]

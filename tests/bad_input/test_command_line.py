@@ -38,7 +38,7 @@ REFUSED = {
     "train data=ngsim data.path='~nobody-here/x.csv'": "~nobody-here/x.csv: no such file",
     "train resume=nowhere": "nowhere",
     "run variant=idm": "variant=idm has no effect on lcc-rl run",
-    "train experiment=limits +filter=cbf": ".filter=… is chosen already: leave it out",
+    "train experiment=limits +filter=cbf": "filter is chosen twice: leave one out",
     f"train -m variant=idm {' '.join(LISTS)}": "at most 100000 runs",
     "train filter=cbf": r"write \+filter=",
     "evaluate compare=[acc] +filter=cbf": r"drives behind the filter \(acc\); .* _filtered",
