@@ -134,7 +134,7 @@ class Views:
 
     def _found(
         self,
-        index_: int,
+        own: int,
         lead: int,
         index: int,
         distance: int,
@@ -142,7 +142,7 @@ class Views:
         entries: Sequence[Tensor],
     ) -> Tensor:
         """Return an entry at a distance where not every vehicle or episode has a vehicle."""
-        entry = torch.ones_like(entries[index_]) if present else entries[index_]
+        entry = torch.ones_like(entries[own]) if present else entries[own]
         if distance < 0:
             entry = entries_ahead(entries[lead] if lead >= 0 else None, entry)
         elif distance > 0:
