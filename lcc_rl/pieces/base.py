@@ -197,11 +197,9 @@ class Piece(Part, TensorDictModuleBase, Transform):
 
     def _declared(self, entries: Sequence[Entry | NestedKey]) -> list[Key]:
         """Store entries of the piece; return their keys."""
-        declared = [
-            x.of(self.role, self.name) if isinstance(x, Entry) else Entry(x) for x in entries
-        ]
-        self.entries |= {as_key(entry.key): entry for entry in declared}
-        return [as_key(entry.key) for entry in declared]
+        new = [x.of(self.role, self.name) if isinstance(x, Entry) else Entry(x) for x in entries]
+        self.entries |= {as_key(entry.key): entry for entry in new}
+        return [as_key(entry.key) for entry in new]
 
     def shape_of(self, key: Key) -> tuple[int, ...]:
         """Return the shape of a declared entry after the batch dimensions."""
