@@ -191,7 +191,7 @@ class DifferentiableRollout:
             later: the gradient by the next moment.
             by_row, by_action: what does not come through the next moment.
             row, shift: as for :meth:`_drive`.
-            held: likewise, and the gradient by the learned tensors from later moments.
+            fixed: likewise, and the gradient by the learned tensors from later moments.
         """
         count = len(self.learned)
         first = len(fixed) - 2 * count
