@@ -157,7 +157,7 @@ class DifferentiableRollout:
         return entries
 
     def _advance(self, row: Tensor, action: Tensor, *constants: Tensor) -> Sequence[Tensor]:
-        """Return the next moment; what is held are the constants."""
+        """Return the next moment from an action and the constants."""
         before = dict(zip(self.constants, constants, strict=True)) | self._entries(row)
         return (self._packed(self.step({**before, ACTION: action})),)
 
@@ -167,7 +167,7 @@ class DifferentiableRollout:
         Args:
             row: a moment.
             shift: added to the policy's action.
-            held: the constants, the policy's fixed tensors, its learned ones.
+            fixed: the constants, the policy's fixed tensors, its learned ones.
         """
         constants, tensors = fixed[: len(self.constants)], fixed[len(self.constants) :]
         named = dict(zip((*self.fixed, *self.learned), tensors, strict=True))
