@@ -52,8 +52,8 @@ class Run:
         """Return the tables that commands print; ``full``: with all measures."""
         console = Console(width=render.WIDTH)
         with console.capture() as text:
-            for one in self.reports(against):
-                console.print(render.terminal(one, one.of, full))
+            for report in self.reports(against):
+                console.print(render.terminal(report, report.of, full))
         return text.get().rstrip()
 
     def reports(self, against: str | None = None) -> list[Report]:
@@ -146,23 +146,23 @@ def compare(
         >>> found = compare([run, "pretrained/alcc_limits", "idm_acc"])  # doctest: +SKIP
         >>> found = compare({"slow": PID(gain=0.1), "fast": PID(gain=0.4)})  # doctest: +SKIP
     """
-    target, words = _folder("evaluate", variant, folder), with_variant(variant, overrides)
-    cfg = load("evaluate", words)
+    target, typed = _folder("evaluate", variant, folder), with_variant(variant, overrides)
+    cfg = load("evaluate", typed)
     if isinstance(strategies, (str, PathLike)) or not isinstance(strategies, Iterable):
         strategies = [strategies]
     named = isinstance(strategies, Mapping)
-    items = strategies.items() if named else [(type(one).__name__, one) for one in strategies]
-    known = items and all(isinstance(name, str) for name, _ in items)
-    require(known, f"compare: expected strategies, or a mapping of them by name: {strategies!r}")
-    given = [(name, one, as_given(one, name)) for name, one in items]
-    policies = {name: policy for name, _, policy in given if policy is not None}
-    others = [(name, one) for name, one, policy in given if policy is None]
+    pairs = strategies.items() if named else [(type(x).__name__, x) for x in strategies]
+    valid = pairs and all(isinstance(name, str) for name, _ in pairs)
+    require(valid, f"compare: expected strategies, or a mapping of them by name: {strategies!r}")
+    resolved = [(name, x, as_given(x, name)) for name, x in pairs]
+    policies = {name: policy for name, _, policy in resolved if policy is not None}
+    rules = [(name, x) for name, x, policy in resolved if policy is None]
     if named:
-        spec: Any = {name: setting_of(one, f"compare.{name}") for name, one in others}
+        spec: Any = {name: setting_of(x, f"compare.{name}") for name, x in rules}
     else:
-        spec = [setting_of(one) for _, one in others]
+        spec = [setting_of(x) for _, x in rules]
     cfg = cfg.with_(compare=spec)
-    rows = evaluation.run(cfg, target, own=False, quiet=True, policies=policies, typed=words)
+    rows = evaluation.run(cfg, target, own=False, quiet=True, policies=policies, typed=typed)
     if folder is not None:
         evaluation.draw(rows, cfg, target)
     return Run(target, rows, cfg)

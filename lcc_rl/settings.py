@@ -88,17 +88,17 @@ R = TypeVar("R")
 class Settings:
     """Base of classes with annotated fields as settings; see the module."""
 
-    def __init_subclass__(cls, **more: Any) -> None:
-        super().__init_subclass__(**more)
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
         if "__init__" in vars(cls):
             raise TypeError(f"{cls.__name__}: settings are annotated fields, without __init__")
         dataclass(cls, kw_only=True, eq=False, config=STRICT)
         construct = cls.__init__
 
         @wraps(construct)
-        def checked(self: Any, **given: Any) -> None:
+        def checked(self: Any, **settings: Any) -> None:
             try:
-                construct(self, **_converted(cls, given, cls.__name__))
+                construct(self, **_converted(cls, settings, cls.__name__))
                 self.validate()
             except LccError:
                 raise
@@ -127,9 +127,9 @@ def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
     Raises:
         ConfigError: naming the first unknown or wrong setting.
     """
-    own = {key: value for key, value in given.items() if value != "???"}
+    settings = {key: value for key, value in given.items() if value != "???"}
     try:
-        return kind(**_converted(kind, own, where))
+        return kind(**_converted(kind, settings, where))
     except RefusedSetting as error:
         if error.__cause__ is None:  # it contains its place already
             raise
@@ -138,8 +138,8 @@ def parse(kind: type[S], given: Mapping[str, Any], where: str) -> S:
 
 def _converted(kind: type[Settings], given: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Return settings as their annotations declare them."""
-    wanted = {name: field.annotation for name, field in kind.__pydantic_fields__.items()}  # type: ignore[attr-defined]
-    return {name: _as_declared(wanted.get(name), x, f"{where}.{name}") for name, x in given.items()}
+    types = {name: field.annotation for name, field in kind.__pydantic_fields__.items()}  # type: ignore[attr-defined]
+    return {name: _as_declared(types.get(name), x, f"{where}.{name}") for name, x in given.items()}
 
 
 def _as_declared(annotation: Any, value: Any, where: str) -> Any:
@@ -148,12 +148,12 @@ def _as_declared(annotation: Any, value: Any, where: str) -> Any:
     if kind is Annotated:
         return _as_declared(inner[0], value, where)
     if kind in (Union, UnionType):
-        made = (_as_declared(one, value, where) for one in inner)
-        return next((x for x in made if type(x) is not type(value) or x != value), value)
+        choices = (_as_declared(arg, value, where) for arg in inner)
+        return next((x for x in choices if type(x) is not type(value) or x != value), value)
     if isinstance(value, list) and inner:
-        each = inner if len(inner) == len(value) and ... not in inner else inner[:1] * len(value)
-        found = [_as_declared(one, x, where) for one, x in zip(each, value, strict=True)]
-        return tuple(found) if kind is tuple else found
+        args = inner if len(inner) == len(value) and ... not in inner else inner[:1] * len(value)
+        items = [_as_declared(arg, x, where) for arg, x in zip(args, value, strict=True)]
+        return tuple(items) if kind is tuple else items
     if not isinstance(value, Mapping) or not inspect.isclass(kind):
         return value
     if issubclass(kind, Mapping):
@@ -183,17 +183,17 @@ def _reason(error: Any, kind: Any, where: str) -> str:
         return f"{where}: {error}".removeprefix(": ")
     first = error.errors()[0]
     if first["type"] in ("unexpected_keyword_argument", "unexpected_positional_argument"):
-        known = [field.name for field in dataclasses.fields(kind)]
+        names = [field.name for field in dataclasses.fields(kind)]
         what = f"setting of {where} ({kind.__name__})" if where else "option"
-        return str(unknown_name(what, str(first["loc"][-1]), known))
-    parts = "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in first["loc"])
-    key = (where + parts).removeprefix(".")
+        return str(unknown_name(what, str(first["loc"][-1]), names))
+    path = "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in first["loc"])
+    key = (where + path).removeprefix(".")
     if first["type"] == "missing" and len(first["loc"]) == 1:
         return f"{key} is required: use {key}=…"
     if first["type"] == "value_error":
         return f"{key}: {first['ctx']['error']}"
-    wanted = re.sub(r"^\w+ should", "must", first["msg"])
-    return f"{key} {wanted}, got {in_short(first['input'], 200)}"
+    rule = re.sub(r"^\w+ should", "must", first["msg"])
+    return f"{key} {rule}, got {in_short(first['input'], 200)}"
 
 
 def checked(function: Callable[..., R]) -> Callable[..., R]:
@@ -202,9 +202,9 @@ def checked(function: Callable[..., R]) -> Callable[..., R]:
     names = inspect.signature(function)
 
     @wraps(function)
-    def checking(*args: Any, **given: Any) -> R:
+    def checking(*args: Any, **kwargs: Any) -> R:
         try:
-            return call(**names.bind(*args, **given).arguments)
+            return call(**names.bind(*args, **kwargs).arguments)
         except ValidationError as error:
             raise refused(error, function, function.__name__) from error
 
@@ -219,16 +219,16 @@ def values(settings: Any) -> dict[str, Any]:
 
 def defaults(kind: type[Settings]) -> dict[str, Any]:
     """Return the defaults of a class's settings by name, as plain containers."""
-    found = {}
+    plain = {}
     for field in dataclasses.fields(kind):  # type: ignore[arg-type]
         if isinstance(field.default, FieldInfo):
             if not field.default.is_required():
-                found[field.name] = as_plain(field.default.get_default(call_default_factory=True))
+                plain[field.name] = as_plain(field.default.get_default(call_default_factory=True))
         elif field.default is not dataclasses.MISSING:
-            found[field.name] = as_plain(field.default)
+            plain[field.name] = as_plain(field.default)
         elif field.default_factory is not dataclasses.MISSING:
-            found[field.name] = as_plain(field.default_factory())
-    return found
+            plain[field.name] = as_plain(field.default_factory())
+    return plain
 
 
 def as_plain(value: Any, places: bool = True) -> Any:
@@ -270,11 +270,11 @@ def find_target(target: str, where: str) -> Any:
     """
     module, _, name = target.rpartition(".")
     where = f"{where}.{TARGET}"
-    found = getattr(load_module(module, where, target), name, None)
-    if not callable(found):
-        what = f"{module} has no {name!r}" if found is None else "it is no class or function"
-        raise ConfigError(f"{where}: cannot find {target!r}: {what}")
-    return found
+    member = getattr(load_module(module, where, target), name, None)
+    if not callable(member):
+        reason = f"{module} has no {name!r}" if member is None else "it is no class or function"
+        raise ConfigError(f"{where}: cannot find {target!r}: {reason}")
+    return member
 
 
 def load_module(module: str, where: str, target: str = "") -> Any:

@@ -85,11 +85,11 @@ class ArrayEpisodes:
     def _advance(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return state and observation after a step, and the result of :meth:`step`."""
         reached = self.one_step(self.rows.entries(state) | {ACTION: action.unsqueeze(1)})
-        seen = reached[OBSERVATION].flatten(1)
-        results = [reached[key].flatten(1).to(seen.dtype) for key in self.written]
-        total = seen.sum(1, keepdim=True) + results[0]
-        finite = (total - total == 0.0).to(seen.dtype)  # False for NaN and infinity
-        return self.rows.packed(reached), seen, torch.cat([*results, finite], 1)
+        observation = reached[OBSERVATION].flatten(1)
+        results = [reached[key].flatten(1).to(observation.dtype) for key in self.written]
+        total = observation.sum(1, keepdim=True) + results[0]
+        finite = (total - total == 0.0).to(observation.dtype)  # False for NaN and infinity
+        return self.rows.packed(reached), observation, torch.cat([*results, finite], 1)
 
     def _begin(self, seeds: Tensor) -> tuple[Tensor, Tensor]:
         """Return state and observation at the start of episodes."""
@@ -120,25 +120,25 @@ class ArrayEpisodes:
         for place, generator in zip(places, generators, strict=True):
             if seeds is not None and (seed := seeds[place]) is not None:
                 generator.manual_seed(seed)
-        drawn = [torch.randint(2**31, (1, 1), generator=each) for each in generators]
+        drawn = [torch.randint(2**31, (1, 1), generator=x) for x in generators]
         if options:
             every = torch.zeros(self.count, 1, dtype=torch.int64)
             every[places] = torch.cat(drawn)
             moment = entries_of(self.env.reset(options=self._given(every, options)))
             state = self.rows.packed(moment)[places].numpy()
-            seen = moment[OBSERVATION[1:]][places].numpy()
+            observation = moment[OBSERVATION[1:]][places].numpy()
         else:
-            state, seen = self.begin(torch.cat(drawn).numpy())
+            state, observation = self.begin(torch.cat(drawn).numpy())
         for place, generator in zip(places, generators, strict=True):
             self.generators[place] = generator
         self.state, self.observation = self.state.copy(), self.observation.copy()
-        self.state[places], self.observation[places] = state, seen
+        self.state[places], self.observation[places] = state, observation
         self._expose(places, begins=True)
         return self.observation
 
     def _given(self, seeds: Tensor, options: Mapping[str, Any]) -> TensorDict:
         """Return seeds and reset options as an argument of the TorchRL environment's reset."""
-        given = TensorDict({SEED: seeds}, [self.count])
+        td = TensorDict({SEED: seeds}, [self.count])
         specs = {".".join(key): spec for key, spec in option_specs(self.env).items()}
         for name, value in options.items():
             if (spec := specs.get(name)) is None:
@@ -146,9 +146,9 @@ class ArrayEpisodes:
             array, size = np.asarray(value, np.object_), spec.shape.numel()
             if array.size not in (1, size) or not all(map(is_whole, array.flat)):
                 raise ConfigError(f"reset: {name} must be 1 or {size} whole numbers, got {value!r}")
-            whole = torch.as_tensor(array.astype(np.int64)).flatten()
-            given.set(as_key(name), whole.expand(size).reshape(spec.shape).clone())
-        return given
+            integers = torch.as_tensor(array.astype(np.int64)).flatten()
+            td.set(as_key(name), integers.expand(size).reshape(spec.shape).clone())
+        return td
 
     def step(self, actions: Any) -> Array:
         """Advance every episode by a step, including episodes that have ended.
@@ -164,17 +164,17 @@ class ArrayEpisodes:
             Diverged: if an action, an observation or a reward is not a finite number.
         """
         try:
-            given = np.asarray(actions)
+            array = np.asarray(actions)
         except ValueError:  # rows of different lengths
-            given = np.empty(0, np.object_)
-        if given.shape != (self.count, 1) or given.dtype.kind not in "fiu":
-            wanted = f"actions must be real numbers {[self.count, 1]}"
-            raise ConfigError(f"{wanted}, got {list(given.shape)} {given.dtype}")
-        given = np.ascontiguousarray(given, np.float32)
+            array = np.empty(0, np.object_)
+        if array.shape != (self.count, 1) or array.dtype.kind not in "fiu":
+            message = f"actions must be real numbers {[self.count, 1]}"
+            raise ConfigError(f"{message}, got {list(array.shape)} {array.dtype}")
+        array = np.ascontiguousarray(array, np.float32)
         step = int(self.state[:, self.step_column].max()) + 1
-        if not np.isfinite(given).all():
-            self._check({ACTION: given}, step)
-        self.state, self.observation, results = self.advance(self.state, given)
+        if not np.isfinite(array).all():
+            self._check({ACTION: array}, step)
+        self.state, self.observation, results = self.advance(self.state, array)
         if not results[:, -1].all():
             self._check({OBSERVATION: self.observation, REWARD: results[:, :1]}, step)
         self._expose(range(self.count), begins=False)

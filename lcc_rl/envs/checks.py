@@ -40,8 +40,8 @@ def check_pieces(
     # Values that the first step computed and stored may be kept.
     before = [_kept(piece) for piece in pieces]
     _play(pieces, horizon, actions, episodes + BATCH)
-    for piece, held in zip(pieces, before, strict=True):
-        _check_forgets(piece, held)
+    for piece, attributes in zip(pieces, before, strict=True):
+        _check_forgets(piece, attributes)
 
 
 def _play(
@@ -52,12 +52,12 @@ def _play(
 ) -> None:
     """Reset episodes by their seeds, take a step, and compare written entries with the specs."""
     moment = TensorDict(tick(episodes, torch.zeros_like(episodes), horizon), [BATCH])
-    given = TensorDict(batch_size=[BATCH])
+    options = TensorDict(batch_size=[BATCH])
     for piece in pieces:
-        _attempt(piece, lambda piece=piece: piece._reset(given, moment))
+        _attempt(piece, lambda piece=piece: piece._reset(options, moment))
         if isinstance(piece, StepTransform):
-            found = {key: moment.get(key) for key in piece.targets}
-            _compare(piece, found, "at reset")
+            entries = {key: moment.get(key) for key in piece.targets}
+            _compare(piece, entries, "at reset")
     state = entries_of(moment)
     for key, shape in actions.items():
         state[as_key(key)] = torch.zeros(BATCH, *shape)
@@ -78,9 +78,9 @@ def check_step(piece: Piece, before: State, reached: State) -> None:
         ConfigError: naming the piece, and the number of entries, shape or type at fault.
     """
     read = {key: (reached if late else before)[key] for late, key in piece.needs}
-    kept = {key: value.clone() for key, value in read.items()}
+    copies = {key: value.clone() for key, value in read.items()}
     _attempt(piece, lambda: piece.derive(before, reached))
-    for key, value in kept.items():  # torch does not count changes by .data or NumPy
+    for key, value in copies.items():  # torch does not count changes by .data or NumPy
         if not torch.equal(read[key].nan_to_num(), value.nan_to_num()):
             raise changed(type(piece).__name__, ".".join(key))
     _compare(piece, {key: reached[key] for key in piece.targets}, "after a step")
@@ -91,19 +91,19 @@ def _kept(piece: Piece) -> dict[str, list[Any]]:
 
     A tensor is accompanied by the number of its changes in place, a list or mapping by its items.
     """
-    held = {}
+    attributes = {}
     for path, module in piece.named_modules():
         for name, value in {**vars(module), **dict(module.named_buffers(recurse=False))}.items():
             if name == "_buffers":
                 continue
-            parts = [value]
+            values = [value]
             if isinstance(value, Mapping):
-                parts += value.values()
+                values += value.values()
             elif isinstance(value, (list, set, deque)):
-                parts += value
-            parts += changes([part for part in parts if isinstance(part, Tensor)])
-            held[f"{path}.{name}" if path else name] = parts
-    return held
+                values += value
+            values += changes([x for x in values if isinstance(x, Tensor)])
+            attributes[f"{path}.{name}" if path else name] = values
+    return attributes
 
 
 def _check_forgets(piece: Piece, before: Mapping[str, list[Any]]) -> None:
@@ -113,11 +113,11 @@ def _check_forgets(piece: Piece, before: Mapping[str, list[Any]]) -> None:
         ConfigError: naming the attribute and the place for state.
     """
     after = _kept(piece)
-    for name, parts in after.items():
+    for name, values in after.items():
         old = before.get(name, [])
-        if len(parts) != len(old) or not all(
-            new is kept or (isinstance(new, int) and new == kept)
-            for new, kept in zip(parts, old, strict=True)
+        if len(values) != len(old) or not all(
+            new is stored or (isinstance(new, int) and new == stored)
+            for new, stored in zip(values, old, strict=True)
         ):
             raise ConfigError(
                 f"{type(piece).__name__} remembers in its attribute {name!r}, which all episodes "
@@ -142,10 +142,10 @@ def _attempt(piece: Piece, action: object) -> None:
         ) from error
 
 
-def _compare(piece: Piece, found: Mapping[Key, Tensor], when: str) -> None:
+def _compare(piece: Piece, entries: Mapping[Key, Tensor], when: str) -> None:
     """Compare the written entries of a piece with its specs."""
     layouts = piece.layouts(torch.Size([BATCH]))
-    for key, value in found.items():
+    for key, value in entries.items():
         if key not in layouts or key in (DONE, TERMINATED):
             continue
         shape, dtype = layouts[key]
@@ -176,17 +176,17 @@ def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
             where = f"{piece.title} writes {'.'.join(key)}, but {key[-1]!r} is a group of entries"
             # tensordict confuses the two where a TensorDict lacks the group
             require(len(key) == 1 or key[-1] not in groups, f"{where}: use another name")
-    known = {SEED, STEP, DONE, TERMINATED, TRUNCATED, *actions, *written(pieces)}
+    keys = {SEED, STEP, DONE, TERMINATED, TRUNCATED, *actions, *written(pieces)}
     for piece in pieces:
         for _, key in piece.needs:
-            if key in known:
+            if key in keys:
                 continue
             if key[-1] == "action":
                 raise ConfigError(
                     f"{piece.title} reads {'.'.join(key)}, but only automated vehicles "
                     "have an action"
                 )
-            near = sorted(".".join(other) for other in known if other[0] == key[0])
+            near = sorted(".".join(other) for other in keys if other[0] == key[0])
             close = get_close_matches(".".join(key), near, n=1)
             hint = f" Did you mean {close[0]}?" if close else ""
             where = ", only " + ", ".join(near) if near else "; vehicles' are self.x and ahead.x"

@@ -37,8 +37,8 @@ def batch_shape(batch_size: Sequence[int] | int) -> torch.Size:
 
 def is_whole(value: Any) -> bool:
     """Whether a value is a whole number of 64 bits and no truth value."""
-    whole = isinstance(value, Integral) and not isinstance(value, bool)
-    return whole and -(2**63) <= value < 2**63
+    integral = isinstance(value, Integral) and not isinstance(value, bool)
+    return integral and -(2**63) <= value < 2**63
 
 
 def checked_seed(seed: Any) -> int | None:
@@ -134,8 +134,8 @@ class Clock(EnvBase):
         return seeds.to(self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
-        given = {} if tensordict is None else tensordict
-        seeds, step = given.get(SEED, None), given.get(STEP, None)
+        options = {} if tensordict is None else tensordict
+        seeds, step = options.get(SEED, None), options.get(STEP, None)
         if seeds is None:
             seeds = self.draw_seeds()
         else:
@@ -188,10 +188,10 @@ class Traffic(TransformedEnv):
         set_state: bool = False,
         **settings: Any,
     ) -> TensorDictBase:
-        begun = TensorDict(batch_size=self.batch_size) if tensordict is None else tensordict
+        start = TensorDict(batch_size=self.batch_size) if tensordict is None else tensordict
         moving = written(piece for piece in pieces_of(self) if isinstance(piece, StepTransform))
         state = sorted({SEED, STEP, *moving})
-        missing = [".".join(key) for key in state if begun.get(key, None) is None]
+        missing = [".".join(key) for key in state if start.get(key, None) is None]
         if set_state or len(missing) < len(state):
             require(
                 not missing,
@@ -199,10 +199,10 @@ class Traffic(TransformedEnv):
                 f"it lacks {', '.join(missing)}; a seed or a profile is given by reset(options=…)",
             )
         if not set_state:
-            begun = begun.exclude(*state)
+            start = start.exclude(*state)
             for key, value in self._checked({} if options is None else options).items():
-                begun.set(key, value)
-        return super()._reset(begun, set_state=set_state, **settings)
+                start.set(key, value)
+        return super()._reset(start, set_state=set_state, **settings)
 
     def compile(self, *, warmup: int | None = None, **given: Any) -> Traffic:
         """Compile ``step_and_maybe_reset``, see TorchRL's ``EnvBase.compile``.
@@ -237,15 +237,15 @@ class Traffic(TransformedEnv):
         for key in self.action_keys:
             # Other shapes may broadcast: one action would drive every vehicle. Other types would
             # change the type of observations.
-            found, wanted = tensordict.get(key, None), self.full_action_spec[key]
-            if found is None:
+            action, spec = tensordict.get(key, None), self.full_action_spec[key]
+            if action is None:
                 continue
             # −1 stands for any size: a transform may take several actions in a row.
-            sizes = zip(found.shape, wanted.shape, strict=False)
-            fits = found.ndim == wanted.ndim and all(x == y or y < 0 for x, y in sizes)
-            if fits and found.dtype == wanted.dtype:
+            sizes = zip(action.shape, spec.shape, strict=False)
+            fits = action.ndim == spec.ndim and all(x == y or y < 0 for x, y in sizes)
+            if fits and action.dtype == spec.dtype:
                 continue
-            expected, got = (f"{list(x.shape)} {x.dtype}" for x in (wanted, found))
+            expected, got = (f"{list(x.shape)} {x.dtype}" for x in (spec, action))
             raise ConfigError(f"{'.'.join(as_key(key))} must be {expected}, got {got}")
 
     def _checked(self, options: Any) -> dict[Key, torch.Tensor]:
@@ -255,23 +255,23 @@ class Traffic(TransformedEnv):
             ConfigError: naming the key, what was expected and the valid options.
         """
         leaves = options.items(True, True) if is_tensor_collection(options) else options.items()
-        given, specs = {as_key(key): value for key, value in leaves}, option_specs(self)
-        for key, value in given.items():
-            name, known = ".".join(key), ", ".join(".".join(key) for key in specs)
-            require(key in specs, f"reset: {name} is no reset option; those that exist: {known}")
+        entries, specs = {as_key(key): value for key, value in leaves}, option_specs(self)
+        for key, value in entries.items():
+            name, names = ".".join(key), ", ".join(".".join(key) for key in specs)
+            require(key in specs, f"reset: {name} is no reset option; those that exist: {names}")
             spec = specs[key]
-            wanted = f"reset: {name} must be {list(spec.shape)} {spec.dtype}"
+            message = f"reset: {name} must be {list(spec.shape)} {spec.dtype}"
             if not isinstance(value, torch.Tensor):
-                raise ConfigError(f"{wanted}, got {value!r}")
+                raise ConfigError(f"{message}, got {value!r}")
             if value.shape != spec.shape or value.dtype != spec.dtype:
-                raise ConfigError(f"{wanted}, got {list(value.shape)} {value.dtype}")
-        return given
+                raise ConfigError(f"{message}, got {list(value.shape)} {value.dtype}")
+        return entries
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         # TorchRL looks up the shape of every reward here, a twentieth of the time of a step. The
         # shapes of pieces' rewards were checked when the environment was built.
-        own = all(isinstance(x, Piece | VIEWS) for x in self.transform)
-        return next_tensordict_out if own else super()._step_proc_data(next_tensordict_out)
+        ours = all(isinstance(x, Piece | VIEWS) for x in self.transform)
+        return next_tensordict_out if ours else super()._step_proc_data(next_tensordict_out)
 
     def double(self) -> Traffic:
         """Refuse: data would have another type than the specs."""

@@ -78,10 +78,10 @@ class StringCollector(BaseCollector):
         self.reads = [key for key in reads if key != self.action]
         state = self._entries(env.reset())
         self.keys = self._asked(keys, list(state))
-        wanted = {*(self._inner(root_key(key)) for key in self.keys), DONE}
-        wanted |= {self._inner(key) for key in self.reads}
+        entries = {*(self._inner(root_key(key)) for key in self.keys), DONE}
+        entries |= {self._inner(key) for key in self.reads}
         # Pieces on which none of these entries depend are left out.
-        self.step = Step(closure(pieces_of(env), wanted), env.base_env.horizon)
+        self.step = Step(closure(pieces_of(env), entries), env.base_env.horizon)
         self.first = Step(pieces_of(env), env.base_env.horizon)  # a reset may read more
         # What the next step reads or a batch contains.
         self.carried = read_before(piece for piece, _ in self.step.pieces)
@@ -96,10 +96,10 @@ class StringCollector(BaseCollector):
     def _asked(self, keys: Sequence[NestedKey] | None, state: list[Key]) -> list[Key]:
         """Return the leaves of a batch; by default all entries before and after a step."""
         rewards = [as_key(key) for key in self.env.full_reward_spec.keys(True, True)]
-        known = [self._shown(key) for key in [*state, self._inner(self.action)]]
+        before = [self._shown(key) for key in [*state, self._inner(self.action)]]
         after = [(NEXT, *self._shown(key)) for key in [*state, *rewards]]
-        asked = keys if keys is not None else [*known, *after]
-        every = [*known, *rewards]
+        asked = keys if keys is not None else [*before, *after]
+        every = [*before, *rewards]
         return list(dict.fromkeys(leaf for key in asked for leaf in leaf_keys(key, every)))
 
     def _inner(self, key: Key) -> Key:
@@ -113,8 +113,8 @@ class StringCollector(BaseCollector):
 
     def reset(self) -> None:
         """Begin new episodes in all places."""
-        begun = self._entries(self.env.reset())
-        self.state = {key: value for key, value in begun.items() if key in self.carried}
+        entries = self._entries(self.env.reset())
+        self.state = {key: value for key, value in entries.items() if key in self.carried}
 
     def _entries(self, td: TensorDictBase) -> State:
         shown = entries_of(td.exclude(*MultiAgent.keys))
@@ -133,8 +133,8 @@ class StringCollector(BaseCollector):
         """Return the next batch, ``[*batch, steps]``."""
         record = []
         for _ in range(self.steps):
-            self.state, kept, over = self.advance(self.state)
-            record.append(kept)
+            self.state, entries, over = self.advance(self.state)
+            record.append(entries)
             if over:
                 self.state = self._renew(self.state, self.renew, self.rows)
         self._frames += self.requested_frames_per_batch
@@ -150,10 +150,10 @@ class StringCollector(BaseCollector):
 
     def _act(self, state: State) -> State:
         """Return a state with the policy's action."""
-        seen = TensorDict(batch_size=self.env.batch_size)
+        td = TensorDict(batch_size=self.env.batch_size)
         for key in self.reads:
-            seen.set(key, self._look(state, key))
-        action = self.policy(seen).get(self.action)
+            td.set(key, self._look(state, key))
+        action = self.policy(td).get(self.action)
         inner = self._inner(self.action)
         return {**state, inner: action if inner == self.action else action.unsqueeze(-2)}
 
@@ -161,12 +161,12 @@ class StringCollector(BaseCollector):
         """Return the next state, the entries to keep and whether any episode is over."""
         before = self._act(state)
         reached = self.step(before)
-        kept = [
+        values = [
             self._look(reached, key[1:]) if key[0] == NEXT else self._look(before, key)
             for key in self.keys
         ]
         after = {key: reached.get(key, value) for key, value in state.items()}
-        return after, kept, reached[DONE].any()
+        return after, values, reached[DONE].any()
 
     def _look(self, state: State, key: Key) -> Tensor:
         """Return an entry in the form that the environment shows."""
@@ -192,13 +192,13 @@ class StringCollector(BaseCollector):
 
     def _renewed(self, state: State, rows: Tensor, seeds: Tensor) -> State:
         """Return the state with the first states of new episodes, by their seeds, in some rows."""
-        begun = self.first.begin(seeds)
+        fresh = self.first.begin(seeds)
 
         def put(value: Tensor, new: Tensor) -> Tensor:
             flat = value.reshape(-1, *new.shape[1:])
             return flat.index_put((rows,), new).view(value.shape)
 
-        return {key: put(value, begun[key]) for key, value in state.items()}
+        return {key: put(value, fresh[key]) for key, value in state.items()}
 
     def update_policy_weights_(self, *_: Any, **__: Any) -> None:
         """Do nothing: the policy is the caller's own object, in this process."""
@@ -233,11 +233,11 @@ def _view(env: TransformedEnv) -> Any:
     Raises:
         ConfigError: if it has other transforms, which a collector of pieces would not apply.
     """
-    others = [t for t in env.transform if t not in pieces_of(env)]
-    strange = [type(t).__name__ for t in others if not isinstance(t, VIEWS)]
+    foreign = [t for t in env.transform if t not in pieces_of(env)]
+    strange = [type(t).__name__ for t in foreign if not isinstance(t, VIEWS)]
     if strange:
         raise ConfigError(
             f"the environment has the transforms {', '.join(strange)}, which StringCollector does "
             "not apply; use torchrl.collectors.Collector (training.collector=torchrl)"
         )
-    return others[0] if others else None
+    return foreign[0] if foreign else None

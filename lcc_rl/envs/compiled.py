@@ -114,10 +114,10 @@ class Traced(Compiled):
                 if node.target is torch.ops.aten.view.default:
                     node.target = torch.ops.aten.reshape.default
             graph.recompile()
-            made = torch._inductor.compile(graph, list(tensors), options(tensors[0].device))
-        found: Sequence[Tensor] = made(*tensors)
-        self.function, self.errors = made, tuple  # errors of later calls are no compiler's
-        return found
+            compiled = torch._inductor.compile(graph, list(tensors), options(tensors[0].device))
+        results: Sequence[Tensor] = compiled(*tensors)
+        self.function, self.errors = compiled, tuple  # errors of later calls are no compiler's
+        return results
 
 
 def _checked(guards: Sequence[Any]) -> list[bool]:

@@ -123,13 +123,13 @@ def after_humans(cfg: StudyConfig, seconds: float) -> StudyConfig:
         return cfg
     require(cfg.scenario.road == RING, "humans_first needs a ring: a leader's record would end")
     steps = World(time_step=cfg.scenario.time_step).steps(seconds, "humans_first")
-    drivers, held = cfg.scenario.controllers, cfg.scenario.filters.get(AUTOMATED)
+    drivers, safety = cfg.scenario.controllers, cfg.scenario.filters.get(AUTOMATED)
     changes: dict[str, Any] = {"horizon": cfg.scenario.horizon + steps}
     if drivers[AUTOMATED] != drivers[HUMAN]:
         both = {"before": drivers[HUMAN], "after": drivers[AUTOMATED], "from_s": seconds}
         changes["controllers"] = {AUTOMATED: Node.of({TARGET: path_of(Handover), **both}, AUTO)}
-    if held is not None:
-        changes["filters"] = {AUTOMATED: held.changed(from_s=seconds)}
+    if safety is not None:
+        changes["filters"] = {AUTOMATED: safety.changed(from_s=seconds)}
     return cfg.with_(scenario=changes)
 
 
@@ -164,7 +164,7 @@ def _by_role(scenario: ScenarioConfig, group: str) -> list[tuple[str, Node]]:
 def moment_bytes(pieces: Sequence[Piece]) -> int:
     """Return the size of all entries of an episode at one time [bytes]."""
     size = torch.Size([1])
-    layouts = [one for piece in pieces for one in piece.layouts(size, piece.targets).values()]
+    layouts = [layout for piece in pieces for layout in piece.layouts(size, piece.targets).values()]
     return sum(shape.numel() * dtype.itemsize for shape, dtype in layouts)
 
 
@@ -185,13 +185,13 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
     named = {name: node for name, node in scenario.pieces.items() if node is not None}
     pieces = _leader(scenario, named.pop("leader", None), world)
     drivers = _drivers(scenario, world)
-    for name, one in energy.classes.items():
-        roles = one.roles if one.share else ()
+    for name, kind in energy.classes.items():
+        roles = kind.roles if kind.share else ()
         require_known(f"role (scenario.fleet.{name}.roles)", roles, scenario.controllers)
     require_known("role (energy.roles)", energy.roles, scenario.controllers)
     classes = [EnergyClasses().bind(world)] if len(energy.models) > 1 else []
     actuators, sensors = (
-        [own.bind(world, role) for role, own in group.items()]
+        [piece.bind(world, role) for role, piece in group.items()]
         for group in (world.actuators, world.sensors)
     )
     pieces += [RolePlaces().bind(world), *classes, *drivers, *actuators]
@@ -233,10 +233,10 @@ def _drivers(scenario: ScenarioConfig, world: World) -> list[Any]:
     """Build the controllers of the roles in the string, and their safety filters."""
     for role in world.string.names:
         if scenario.controllers.get(role) is None:
-            known = ", ".join(name for name, node in scenario.controllers.items() if node)
+            roles = ", ".join(name for name, node in scenario.controllers.items() if node)
             raise ConfigError(
                 f"scenario.string has the role {role!r}, but scenario.controllers names only "
-                f"{known}; use +controller@scenario.controllers.{role}=… for another"
+                f"{roles}; use +controller@scenario.controllers.{role}=… for another"
             )
     nodes = [*_by_role(scenario, "controllers"), *_by_role(scenario, "filters")]
     return [node.made(Piece).bind(world, role) for role, node in nodes]

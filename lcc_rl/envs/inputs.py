@@ -112,8 +112,8 @@ def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
         names = [f"ring {number}" for number in range(cfg.evaluation.profiles or 1)]
         empty = constant_profiles(0.0, scenario.horizon, scenario.time_step, names)
         return Inputs(empty, empty, population, (described(population, cfg),))
-    wanted = len(cfg.scenario.vehicles) if cfg.evaluation.rows == "vehicles" else None
-    leaders = _source_of_leaders(cfg, episodes).load(scenario.time_step, scenario.horizon, wanted)
+    cars = len(cfg.scenario.vehicles) if cfg.evaluation.rows == "vehicles" else None
+    leaders = _source_of_leaders(cfg, episodes).load(scenario.time_step, scenario.horizon, cars)
     windows, training = leaders.windows, leaders.training
     if len(training):
         training = training.at_least(scenario.horizon)
@@ -144,13 +144,13 @@ def _source_of_leaders(cfg: StudyConfig, episodes: Any) -> Any:
 def described(population: Population, cfg: StudyConfig) -> str:
     """Return a line on the human drivers and their leaders."""
     speed, gap = population.desired_speed, population.time_gap
-    own = cfg.leader is not None and "source" not in cfg.leader.settings
-    leaders = cfg.leader if own else cfg.data
+    separate = cfg.leader is not None and "source" not in cfg.leader.settings
+    leaders = cfg.leader if separate else cfg.data
     source = leaders.settings.get("path") or "synthetic or shipped traffic"
     behind = "on a ring" if cfg.scenario.road == RING else f"behind leaders of {source}"
     mode = getattr(population, "mode", None)
-    taken = f", drivers.mode={mode}" if mode else ""
-    drivers = f"{len(gap)} human drivers ({origin_of(cfg.drivers)}{taken})"
+    suffix = f", drivers.mode={mode}" if mode else ""
+    drivers = f"{len(gap)} human drivers ({origin_of(cfg.drivers)}{suffix})"
     line = f"{drivers} {behind}: mean v0 {speed.mean():.1f} m/s, mean T {gap.mean():.2f} s"
     reaction = getattr(population, "reaction", None)
     if reaction is None or reaction == Reaction():
@@ -185,10 +185,10 @@ def _once(what: str, settings: Any, make: Callable[[], Any]) -> tuple[Any, bool]
     plain = as_plain(settings)
     key, kinds = json.dumps([plain, inputs_of(plain)], default=str), nodes_in(settings)
     of = key, [node.kind for node in kinds]  # a notebook may define a class anew
-    known = what in _last and _last[what][:2] == of
-    if not known:
+    cached = what in _last and _last[what][:2] == of
+    if not cached:
         _last[what] = *of, make()
-    return _last[what][2], known
+    return _last[what][2], cached
 
 
 def shared_inputs(cfg: StudyConfig) -> Inputs:
@@ -212,8 +212,8 @@ def load_episodes(node: Node) -> LoadedEpisodes:
     """
     if not is_sweep():
         return cast(LoadedEpisodes, node.made(LOADS).load())
-    loaded, known = _once("episodes", {"data": node}, lambda: node.made(LOADS).load())
-    return replace(loaded, report=[SHARED, *loaded.report]) if known else loaded
+    loaded, cached = _once("episodes", {"data": node}, lambda: node.made(LOADS).load())
+    return replace(loaded, report=[SHARED, *loaded.report]) if cached else loaded
 
 
 def shortfalls(cfg: StudyConfig, available: Mapping[str, int]) -> list[str]:
@@ -224,10 +224,10 @@ def shortfalls(cfg: StudyConfig, available: Mapping[str, int]) -> list[str]:
         available: available numbers by ``"<setting>"`` or ``"<setting> <source>"``.
     """
     lines = []
-    for what, count in available.items():
-        name, _, source = what.partition(" ")
-        wanted = getattr(cfg.evaluation, name)
-        if wanted is not None and wanted > count:
+    for label, count in available.items():
+        name, _, source = label.partition(" ")
+        asked = getattr(cfg.evaluation, name)
+        if asked is not None and asked > count:
             only = f"only {count} {f'of {source} ' if source else ''}are available; taking all"
-            lines.append(f"evaluation.{name}={wanted}: {only}")
+            lines.append(f"evaluation.{name}={asked}: {only}")
     return lines

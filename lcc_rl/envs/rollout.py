@@ -63,14 +63,14 @@ class DifferentiableRollout:
         inside = closure(needed, {OBSERVATION}, recurrent)
         self.after = [piece for piece in needed if piece not in inside]
         self.step = Step(inside, self.horizon, self.graded)
-        known = {SEED, STEP, ACTION, *written(inside)}
-        kept = known & (
+        entries = {SEED, STEP, ACTION, *written(inside)}
+        recorded = entries & (
             {key for piece in self.after for _, key in piece.needs} | every | {STEP, ACTION}
         )
         self.constants = sorted({SEED}.union(*(piece.constants for piece in inside)))
-        read = read_before(inside) & known
-        self.moving = sorted((kept | read | {STEP}) - {ACTION, *self.constants})
-        self.recorded = sorted(kept)
+        read = read_before(inside) & entries
+        self.moving = sorted((recorded | read | {STEP}) - {ACTION, *self.constants})
+        self.recorded = sorted(recorded)
         self.policy = policy
         self.learned = {name: x for name, x in policy.named_parameters() if x.requires_grad}
         tensors = dict(policy.named_parameters()) | dict(policy.named_buffers())
@@ -90,9 +90,9 @@ class DifferentiableRollout:
     def skip(self, state: State, steps: int) -> State:
         """Return the moment some steps later; the action is zero, and no gradient is kept."""
         action = self.env.full_action_spec[ACTION].zero()
-        row, held = self._packed(state), [state[key] for key in self.constants]
+        row, constants = self._packed(state), [state[key] for key in self.constants]
         for _ in range(steps):
-            (row,) = self.advance(row, action, *held)
+            (row,) = self.advance(row, action, *constants)
         return state | self._entries(row)
 
     def play(self, state: State, steps: int, shifts: Tensor | None = None) -> tuple[State, State]:
@@ -109,20 +109,20 @@ class DifferentiableRollout:
         """
         if shifts is None:
             shifts = self.env.full_action_spec[ACTION].zero().expand(steps, -1, -1, -1)
-        held = [state[key] for key in self.constants] + list(self.fixed.values())
-        passed, taken = [self._packed(state)], []
+        fixed = [state[key] for key in self.constants] + list(self.fixed.values())
+        states, driven = [self._packed(state)], []
         with torch.no_grad():
             for step in range(steps):
-                given = passed[-1], shifts[step], *held, *self.learned.values()
-                row, action = self.drive(*given)
-                passed.append(row)
-                taken.append(action)
-            rows, actions = torch.stack(passed), torch.stack(taken)
+                inputs = states[-1], shifts[step], *fixed, *self.learned.values()
+                row, action = self.drive(*inputs)
+                states.append(row)
+                driven.append(action)
+            rows, actions = torch.stack(states), torch.stack(driven)
         if torch.is_grad_enabled():
             if self.drive.function is self.drive.plain:  # nor can its gradient be compiled
                 self.pull.function = self.pull.plain
             weights = self.learned.values()
-            rows, actions = _Motion.apply(self.pull, rows, actions, held, shifts, *weights)
+            rows, actions = _Motion.apply(self.pull, rows, actions, fixed, shifts, *weights)
         moments = self._entries(rows)
         last = state | {key: value[-1] for key, value in moments.items()}
         moments |= {key: state[key].expand(steps + 1, *state[key].shape) for key in self.constants}
@@ -150,29 +150,29 @@ class DifferentiableRollout:
     def _entries(self, rows: Tensor) -> State:
         """Return the moving entries of packed moments, ``[*moments, numbers, batch]``."""
         entries, lead = {}, rows.ndim - 2
-        parts = zip(self.moving, self.types, rows.split(self.sizes, -2), strict=True)
-        for key, (shape, dtype), part in parts:
-            entry = part.unflatten(-2, tuple(shape)[::-1]).to(dtype)
+        columns = zip(self.moving, self.types, rows.split(self.sizes, -2), strict=True)
+        for key, (shape, dtype), column in columns:
+            entry = column.unflatten(-2, tuple(shape)[::-1]).to(dtype)
             entries[key] = entry.permute(*range(lead), *reversed(range(lead, entry.ndim)))
         return entries
 
-    def _advance(self, row: Tensor, action: Tensor, *held: Tensor) -> Sequence[Tensor]:
-        """Return the next moment; what is held are the constants."""
-        before = dict(zip(self.constants, held, strict=True)) | self._entries(row)
+    def _advance(self, row: Tensor, action: Tensor, *constants: Tensor) -> Sequence[Tensor]:
+        """Return the next moment from an action and the constants."""
+        before = dict(zip(self.constants, constants, strict=True)) | self._entries(row)
         return (self._packed(self.step({**before, ACTION: action})),)
 
-    def _drive(self, row: Tensor, shift: Tensor, *held: Tensor) -> Sequence[Tensor]:
+    def _drive(self, row: Tensor, shift: Tensor, *fixed: Tensor) -> Sequence[Tensor]:
         """Return the next moment and the action before it.
 
         Args:
             row: a moment.
             shift: added to the policy's action.
-            held: the constants, the policy's fixed tensors, its learned ones.
+            fixed: the constants, the policy's fixed tensors, its learned ones.
         """
-        constants, tensors = held[: len(self.constants)], held[len(self.constants) :]
+        constants, tensors = fixed[: len(self.constants)], fixed[len(self.constants) :]
         named = dict(zip((*self.fixed, *self.learned), tensors, strict=True))
-        seen = self._entries(row)[OBSERVATION].contiguous()
-        action = torch.func.functional_call(self.policy, named, (seen,))
+        observed = self._entries(row)[OBSERVATION].contiguous()
+        action = torch.func.functional_call(self.policy, named, (observed,))
         action = (action + shift).clamp(-1.0, 1.0)
         return *self._advance(row, action, *constants), action
 
@@ -183,7 +183,7 @@ class DifferentiableRollout:
         by_action: Tensor,
         row: Tensor,
         shift: Tensor,
-        *held: Tensor,
+        *fixed: Tensor,
     ) -> Sequence[Tensor]:
         """Return the gradient by a moment, by its shift, and by the learned tensors so far.
 
@@ -191,18 +191,18 @@ class DifferentiableRollout:
             later: the gradient by the next moment.
             by_row, by_action: what does not come through the next moment.
             row, shift: as for :meth:`_drive`.
-            held: likewise, and the gradient by the learned tensors from later moments.
+            fixed: likewise, and the gradient by the learned tensors from later moments.
         """
         count = len(self.learned)
-        first = len(held) - 2 * count
+        first = len(fixed) - 2 * count
         with torch.enable_grad():
-            given = [x.detach().requires_grad_() for x in (row, shift, *held[first:][:count])]
-            reached = self._drive(*given[:2], *held[:first], *given[2:])
-            found = torch.autograd.grad(
-                reached, given, [later, by_action], allow_unused=True, materialize_grads=True
+            inputs = [x.detach().requires_grad_() for x in (row, shift, *fixed[first:][:count])]
+            reached = self._drive(*inputs[:2], *fixed[:first], *inputs[2:])
+            gradients = torch.autograd.grad(
+                reached, inputs, [later, by_action], allow_unused=True, materialize_grads=True
             )
-        sums = (x + y for x, y in zip(held[first + count :], found[2:], strict=True))
-        return found[0] + by_row, found[1], *sums
+        sums = (x + y for x, y in zip(fixed[first + count :], gradients[2:], strict=True))
+        return gradients[0] + by_row, gradients[1], *sums
 
 
 class _Motion(torch.autograd.Function):
@@ -214,21 +214,21 @@ class _Motion(torch.autograd.Function):
         pull: Traced,
         rows: Tensor,
         actions: Tensor,
-        held: Sequence[Tensor],
+        fixed: Sequence[Tensor],
         shifts: Tensor,
         *learned: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        ctx.save_for_backward(rows, shifts, *held, *learned)
+        ctx.save_for_backward(rows, shifts, *fixed, *learned)
         ctx.pull, ctx.learned = pull, len(learned)
         return rows.clone(), actions.clone()
 
     @staticmethod
     def backward(ctx: Any, by_rows: Tensor, by_actions: Tensor) -> tuple[Tensor | None, ...]:
-        rows, shifts, *held = ctx.saved_tensors
+        rows, shifts, *fixed = ctx.saved_tensors
         columns = by_rows.contiguous(), by_actions.contiguous(), rows, shifts
         later, by_shifts = columns[0][-1], torch.empty_like(shifts)
-        sums = [torch.zeros_like(x) for x in held[len(held) - ctx.learned :]]
+        sums = [torch.zeros_like(x) for x in fixed[len(fixed) - ctx.learned :]]
         for step in reversed(range(len(shifts))):
-            given = (column[step] for column in columns)
-            later, by_shifts[step], *sums = ctx.pull(later, *given, *held, *sums)
+            inputs = (column[step] for column in columns)
+            later, by_shifts[step], *sums = ctx.pull(later, *inputs, *fixed, *sums)
         return None, None, None, None, by_shifts, *sums

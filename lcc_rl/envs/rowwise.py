@@ -112,9 +112,9 @@ def recorded(
     """
     recorder = Recorder()
     examples = [example.clone() for example in examples]
-    for place, example in enumerate(examples):
+    for index, example in enumerate(examples):
         columns = range(example.shape[-1])
-        variables = [recorder.variable(f"x{place}[row, {column}]", ()) for column in columns]
+        variables = [recorder.variable(f"x{index}[row, {column}]", ()) for column in columns]
         recorder.add(example, torch.tensor(variables).reshape(1, -1))
     with torch.no_grad(), recorder, TensorsOnly():
         results = function(*examples)
@@ -128,18 +128,18 @@ def translated(function: TensorFunction, examples: Sequence[Tensor]) -> tuple[st
     for i in recorder.needed(variable for output in outputs for variable in output):
         expression, reads = recorder.statements[i]
         # One source, compiled once, for functions that differ in their settings.
-        if found := FRACTION.fullmatch(expression):
-            expression = f"{found[1]}(c0[{len(constants)}])"
-            constants.append(float(found[2]))
+        if match := FRACTION.fullmatch(expression):
+            expression = f"{match[1]}(c0[{len(constants)}])"
+            constants.append(float(match[2]))
         lines.append(f"v{i} = " + expression.format(*(f"v{x}" for x in reads)))
     lines += [
-        f"y{place}[row, {column}] = v{variable}"
-        for place, output in enumerate(outputs)
+        f"y{index}[row, {column}] = v{variable}"
+        for index, output in enumerate(outputs)
         for column, variable in enumerate(output)
     ]
     tables = [*(table.detach().numpy() for table in recorder.tables), np.array(constants)]
     counts = (("x", examples), ("y", outputs), ("t", recorder.tables), ("c", [constants]))
-    names = ", ".join(f"{name}{i}" for name, each in counts for i in range(len(each)))
+    names = ", ".join(f"{name}{i}" for name, rows in counts for i in range(len(rows)))
     body = "".join(f"        {line}\n" for line in lines)
     source = f"def kernel({names}):\n    for row in range(len(x0)):\n{body}"
     return source, tables

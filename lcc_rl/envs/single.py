@@ -56,12 +56,12 @@ class SingleAgent(Transform):
         return self._shown(input_spec.clone(), "full_action_spec", ("action",))
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        seen = ("observation", "reward_terms")
-        output_spec = self._shown(output_spec.clone(), "full_observation_spec", seen)
+        observed = ("observation", "reward_terms")
+        output_spec = self._shown(output_spec.clone(), "full_observation_spec", observed)
         return self._shown(output_spec, "full_reward_spec", ("reward",))
 
-    def _shown(self, specs: Composite, part: str, names: tuple[str, ...]) -> Composite:
-        spec = specs[part]
+    def _shown(self, specs: Composite, space: str, names: tuple[str, ...]) -> Composite:
+        spec = specs[space]
         if AUTOMATED not in spec.keys():  # noqa: SIM118  a rule has no action
             return specs
         group = spec[AUTOMATED]
@@ -73,7 +73,7 @@ class SingleAgent(Transform):
                 del group[name]
         if not len(list(group.keys())):
             del spec[AUTOMATED]
-        specs[part] = spec
+        specs[space] = spec
         return specs
 
 

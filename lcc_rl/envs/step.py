@@ -87,9 +87,9 @@ class Step:
         start = TensorDict(batch_size=seeds.shape[:-1], device=seeds.device)
         for key, value in clock.items():
             start.set(key, value)
-        given = TensorDict(batch_size=start.batch_size)
+        options = TensorDict(batch_size=start.batch_size)
         for piece, _ in self.pieces:
-            start = piece._reset(given, start)
+            start = piece._reset(options, start)
         return _read(start)
 
 
@@ -100,22 +100,22 @@ def written(pieces: Iterable[Piece]) -> set[Key]:
 
 def read_before(pieces: Iterable[Piece]) -> set[Key]:
     """Return the entries of a state that the next step reads, including constants."""
-    found: set[Key] = {SEED, STEP}
+    keys: set[Key] = {SEED, STEP}
     for piece in pieces:
-        found |= {key for late, key in piece.needs if not late} | set(piece.constants)
-    return found
+        keys |= {key for late, key in piece.needs if not late} | set(piece.constants)
+    return keys
 
 
 def closure(pieces: Sequence[Piece], wanted: set[Key], chosen: Sequence[Piece] = ()) -> list[Piece]:
     """Return the chosen pieces and all on which they or the wanted entries depend, in order."""
-    kept = list(chosen)
-    keys = set(wanted) | {key for piece in kept for _, key in piece.needs}
+    closed = list(chosen)
+    keys = set(wanted) | {key for piece in closed for _, key in piece.needs}
     grown = True
     while grown:
-        more = [piece for piece in pieces if piece not in kept and written([piece]) & keys]
-        keys |= {key for piece in more for _, key in piece.needs}
-        kept, grown = kept + more, bool(more)
-    return [piece for piece in pieces if piece in kept]
+        added = [piece for piece in pieces if piece not in closed and written([piece]) & keys]
+        keys |= {key for piece in added for _, key in piece.needs}
+        closed, grown = closed + added, bool(added)
+    return [piece for piece in pieces if piece in closed]
 
 
 def entries_of(td: TensorDictBase) -> State:
@@ -126,8 +126,8 @@ def entries_of(td: TensorDictBase) -> State:
 
 def leaf_keys(key: NestedKey, known: Iterable[Key]) -> list[Key]:
     """Return the keys of an entry, or of all entries below it, among those known."""
-    name, place = root_key(key), as_key(key)
-    prefix = place[: len(place) - len(name)]
+    name, path = root_key(key), as_key(key)
+    prefix = path[: len(path) - len(name)]
     return [prefix + entry for entry in known if entry[: len(name)] == name]
 
 
@@ -165,13 +165,13 @@ class Pieces(Compose):
 
     def pop(self, index: int | None = None) -> Transform:
         """Remove and return a transform; the sum of all terms no longer holds a reward term."""
-        found = self.transforms[-1 if index is None else index]
-        self._leave_out([found])
+        removed = self.transforms[-1 if index is None else index]
+        self._leave_out([removed])
         return super().pop(index)
 
     def __delitem__(self, index: Any) -> None:
-        found = self.transforms[index]
-        self._leave_out(found if isinstance(index, slice) else [found])
+        removed = self.transforms[index]
+        self._leave_out(removed if isinstance(index, slice) else [removed])
         super().__delitem__(index)
 
     def __setitem__(self, index: Any, value: Any) -> None:
@@ -196,11 +196,11 @@ class Pieces(Compose):
     def _count(self, terms: Sequence[str]) -> None:
         """Let the sum of all terms hold these."""
         total = self._total()
-        place = list(self.transforms).index(total)
+        index = list(self.transforms).index(total)
         renewed = TotalReward(terms=terms).bind(World(total.string))
         renewed = renewed.to(total.parent.device) if total.parent else renewed
-        super().pop(place)
-        super().insert(place, renewed)
+        super().pop(index)
+        super().insert(index, renewed)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Return the specs of action and state: what steps change, and features that they read."""
@@ -221,26 +221,26 @@ class Pieces(Compose):
     def _run(self, count: int, td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
         """Apply the first transforms to a step, consecutive pieces as one function."""
         waiting: list[Piece] = []
-        for place, transform in enumerate(self.transforms[:count]):
+        for index, transform in enumerate(self.transforms[:count]):
             if isinstance(transform, Piece):
                 waiting.append(transform)
                 continue
             next_td, waiting = _apply(waiting, td, next_td), []
             again = isinstance(transform, FrameSkipTransform)
-            next_td = self._repeat(place, td, next_td) if again else transform._step(td, next_td)
+            next_td = self._repeat(index, td, next_td) if again else transform._step(td, next_td)
         return _apply(waiting, td, next_td)
 
-    def _repeat(self, place: int, td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
+    def _repeat(self, index: int, td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
         """Repeat the action, adding up rewards, until an episode ends.
 
         TorchRL's own transform would step from the same TensorDict again, which holds the state.
         """
-        skip: Any = self.transforms[place]
+        skip: Any = self.transforms[index]
         rewards = skip.parent.reward_keys
         for _ in range(skip.frame_skip - 1):
             now = td.copy().update(next_td.exclude(*rewards))
             now.set(PARTIAL, ~next_td.get(DONE).flatten(len(td.batch_size) - 1))
-            reached = self._run(place, now, self.container.base_env._step(now))
+            reached = self._run(index, now, self.container.base_env._step(now))
             for key in rewards:
                 reached.set(key, reached.get(key) + next_td.get(key))
             next_td = reached
@@ -294,15 +294,15 @@ class Pieces(Compose):
         return [transform for transform in self.transforms if not isinstance(transform, Piece)]
 
 
-def _read(td: TensorDictBase, place: Key = ()) -> State:
+def _read(td: TensorDictBase, prefix: Key = ()) -> State:
     """Return the entries of a TensorDict by their full keys, without copies."""
-    found: State = {}
+    entries: State = {}
     for name, value in td.items():
         if isinstance(value, Tensor):
-            found[(*place, name)] = value
+            entries[(*prefix, name)] = value
         else:
-            found |= _read(value, (*place, name))
-    return found
+            entries |= _read(value, (*prefix, name))
+    return entries
 
 
 def _hold(moves: Tensor, before: State, reached: State, keys: Iterable[Key]) -> None:
@@ -348,8 +348,8 @@ def _tensordict(entries_of: dict[str, Any], batch: BatchSize, device: device | N
     TensorDict's check of every shape costs as much as the physics. The shapes were checked when the
     environment was built (:mod:`lcc_rl.envs.checks`).
     """
-    made = {
+    entries = {
         name: _tensordict(value, batch, device) if isinstance(value, dict) else value
         for name, value in entries_of.items()
     }
-    return TensorDict._new_unsafe(made, batch_size=batch, device=device)
+    return TensorDict._new_unsafe(entries, batch_size=batch, device=device)

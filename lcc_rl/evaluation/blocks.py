@@ -57,10 +57,10 @@ class Store:
         if len(self.blocks) == 1:
             return (strategy, block) in self.kept
         try:  # the rows are written last
-            found = parquet_metadata(self._paths(strategy, block)[0])
+            metadata = parquet_metadata(self._paths(strategy, block)[0])
         except ResultsError:
             return False
-        return found.get(BLOCK_MARK) == self.marks[strategy]
+        return metadata.get(BLOCK_MARK) == self.marks[strategy]
 
     def put(self, strategy: int, block: int, tables: Tables) -> None:
         """Store a block of a strategy."""
@@ -77,12 +77,12 @@ class Store:
     def rows(self) -> Iterator[pd.DataFrame]:
         """Yield the rows of each block, strategy by strategy."""
         for block in self.blocks:
-            parts = [self._read(place, block, 0) for place in range(len(self.marks))]
-            yield pd.concat(parts, ignore_index=True)
+            frames = [self._read(index, block, 0) for index in range(len(self.marks))]
+            yield pd.concat(frames, ignore_index=True)
 
     def steps(self) -> pd.DataFrame:
         """Return the time series of all sample episodes, strategy by strategy."""
-        every = [(place, block) for place in range(len(self.marks)) for block in self.blocks]
+        every = [(index, block) for index in range(len(self.marks)) for block in self.blocks]
         return pd.concat([self._read(*key, 1) for key in every], ignore_index=True)
 
     def _read(self, strategy: int, block: int, which: int) -> pd.DataFrame:

@@ -48,8 +48,8 @@ class Cases:
     def __init__(self, strategy: Strategy, cfg: StudyConfig, inputs: Inputs) -> None:
         self.strategy, self.cfg, self.inputs = strategy, cfg, inputs
         windows = Case(WINDOW_CASES, inputs.evaluation, len(cfg.scenario.vehicles))
-        whole = inputs.full_length if cfg.evaluation.full_length else ()
-        cases = (*inputs.cases, windows, *whole)
+        full = inputs.full_length if cfg.evaluation.full_length else ()
+        cases = (*inputs.cases, windows, *full)
         self.drives = [CaseRuns(strategy, case, inputs, cfg.device) for case in cases]
         self.largest = max((drive.size for drive in self.drives), key=math.prod)
         # Size of the time series of the cases in a file, which hardly compress [bytes].
@@ -90,8 +90,8 @@ class Cases:
         }
         frame = pd.concat([pd.DataFrame(labels), frame], axis=1)
         if self.inputs.evaluation.sources:
-            own = case.profile.sources or [""] * len(case.profile)
-            frame[SOURCE] = [own[i] for i in frame["run_id"]]
+            sources = case.profile.sources or [""] * len(case.profile)
+            frame[SOURCE] = [sources[i] for i in frame["run_id"]]
         return frame
 
 
@@ -131,8 +131,8 @@ class CaseRuns:
         """
         env, vehicles = self.player.env, len(self.cfg.scenario.vehicles)
         ids = torch.arange(self.runs, device=env.device)
-        given = reset_options(env, ids, ids % self.drivers, seed, self.drivers)
-        record = dict(self.player.play(given)[0])
+        options = reset_options(env, ids, ids % self.drivers, seed, self.drivers)
+        record = dict(self.player.play(options)[0])
         index = record.pop(INDEX, None)
         series = {"leader": record.pop(("leader", "speed"))}
         for (space, name), entry in record.items():
@@ -176,9 +176,9 @@ def measured_series(series: CaseSeries, time_step: float = 0.1) -> pd.DataFrame:
     if "winner" in series:
         columns["learned_share"] = series["winner"].double().mean(0)
         columns |= {name: series[name][-1] for _, name in COUNTERS}
-    each = {name: value[..., None, None] for name, value in series.items()}  # a vehicle a batch
-    alive = torch.ones_like(each["jerk"], dtype=torch.bool)
-    columns |= safety_measures(each, alive, time_step, registered())
+    entries = {name: value[..., None, None] for name, value in series.items()}  # a vehicle a batch
+    alive = torch.ones_like(entries["jerk"], dtype=torch.bool)
+    columns |= safety_measures(entries, alive, time_step, registered())
     runs, vehicles = energy.shape
     frame = pd.DataFrame({name: value.flatten().cpu().numpy() for name, value in columns.items()})
     frame.insert(0, "run_id", np.repeat(np.arange(runs), vehicles))
@@ -195,8 +195,8 @@ def trace(series: CaseSeries, time_step: float) -> pd.DataFrame:
     columns = {"speed_mps": torch.cat([leader, series["speed"][1:, 0]], dim=-1)}
     for name, label in TRACED.items():
         if name in series:
-            own = series[name][:, 0].to(leader.dtype)
-            columns[label] = torch.cat([torch.full_like(leader, torch.nan), own], dim=-1)
+            values = series[name][:, 0].to(leader.dtype)
+            columns[label] = torch.cat([torch.full_like(leader, torch.nan), values], dim=-1)
     frame = pd.DataFrame({name: value.flatten().cpu().numpy() for name, value in columns.items()})
     frame.insert(0, "time_s", np.repeat(np.arange(1, steps + 1) * time_step, vehicles + 1))
     frame.insert(1, "follower", np.tile(np.arange(vehicles + 1), steps))

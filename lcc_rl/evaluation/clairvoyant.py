@@ -85,7 +85,7 @@ def clairvoyant(
         Diverged: if an action or an entry of objective or limits is not finite.
     """
     require(iterations >= 1, f"iterations must be at least 1, got {iterations}")
-    env, given = _episodes(strategy, inputs, drivers, seed)
+    env, options = _episodes(strategy, inputs, drivers, seed)
     policy: Any = strategy.policy
     network, steps = policy.module.requires_grad_(False), env.base_env.horizon
     keys = [(VEHICLES, name) for name in CONSTRAINED]
@@ -93,22 +93,22 @@ def clairvoyant(
     # Plans minimise the smooth energy; the best one is chosen by the measured energy.
     goal, measured = Goal(strategy.cfg, own), Goal(strategy.cfg, own, exact=True)
     cars = strategy.cfg.automated
-    held = (math.ceil(steps / hold), env.batch_size[0], cars, 1)
-    shifts, found = torch.zeros(held, requires_grad=True), Best(env.batch_size[0])
+    shape = (math.ceil(steps / hold), env.batch_size[0], cars, 1)
+    shifts, best = torch.zeros(shape, requires_grad=True), Best(env.batch_size[0])
     optimizer = torch.optim.Adam([shifts], betas=(0.9, 0.95))
     for iteration in range(iterations):
         share = iteration / iterations
         every = shifts.repeat_interleave(hold, 0)[:steps]
-        _, record = source.play(source.start(given), steps, every)
+        _, record = source.play(source.start(options), steps, every)
         data = source.assemble(record)
         check_batch(data, label=strategy.title)
         price, missed = goal(data)
-        found.take(torch.stack(measured(data)).sum(0), every)
+        best.take(torch.stack(measured(data)).sum(0), every)
         total = price + min(1.0, 0.1 + 1.8 * share) * missed
         _descend(optimizer, total, share, math.sqrt(hold))
         means = {"kJ": float(price.detach().mean()), "missed": float(missed.detach().mean())}
         report(iteration + 1, means)
-    planned = Planned(strategy.policy, found.shifts)
+    planned = Planned(strategy.policy, best.shifts)
     return replace(strategy, name=BOUND_OWN if own else BOUND_BOTH, policy=planned, seed=None)
 
 
@@ -206,8 +206,8 @@ class Goal:
         speed, gap = (data.get(next_key((VEHICLES, x))).flatten(1) for x in ("speed", "gap"))
         distance = speed.sum(1) * self.time_step
         kinds = data.get(CLASS, None)
-        own = self.length if kinds is None else self.fleet.lengths(kinds).flatten(1).mean(1)
-        flow = speed.mean(1) / (gap.mean(1) + own)
+        length = self.length if kinds is None else self.fleet.lengths(kinds).flatten(1).mean(1)
+        flow = speed.mean(1) / (gap.mean(1) + length)
         if self.first is None:
             self.first = (energy / distance).detach(), flow.detach()
         per_metre, least = self.first

@@ -50,8 +50,8 @@ class Comparison:
         else:
             plan = plan_of(cfg, inputs)
             self.blocks = plan.own
-            how = (settings.seed, settings.sample_episodes, cfg.device, settings.compiled)
-            self.players = [Episodes(strategy, inputs, plan, *how) for strategy in strategies]
+            args = (settings.seed, settings.sample_episodes, cfg.device, settings.compiled)
+            self.players = [Episodes(strategy, inputs, plan, *args) for strategy in strategies]
         count, steps, moment = max((x.largest for x in self.players), key=math.prod)
         size = f"an evaluation of {count} episodes of {steps} steps side by side"
         require_memory({size: count * steps * moment}, cfg.device)
@@ -75,8 +75,8 @@ class Comparison:
         """
         metadata = {IDENTITY: identity(self.cfg)}
         store = Store(folder, self.strategies, self.blocks)
-        for place in range(len(self.strategies)):
-            self._play_missing(place, self.players.pop(0), store, folder)
+        for index in range(len(self.strategies)):
+            self._play_missing(index, self.players.pop(0), store, folder)
         check_present(folder)
         write_parquet(store.steps(), folder / STEPS, metadata)
         # Last, because it marks a finished run.
@@ -85,10 +85,10 @@ class Comparison:
         return next(store.rows()) if len(self.blocks) == 1 else as_rows(folder / EPISODES)
 
     def _play_missing(
-        self, place: int, player: Episodes | Cases, store: Store, folder: Path
+        self, index: int, player: Episodes | Cases, store: Store, folder: Path
     ) -> None:
         """Play the blocks of a strategy that are not stored yet."""
-        name, missing = self.strategies[place].name, store.missing(place)
+        name, missing = self.strategies[index].name, store.missing(index)
         if not missing:
             return
         counts = {block: player.count(block) for block in self.blocks}
@@ -97,14 +97,14 @@ class Comparison:
             there = len(counts) - len(missing)
             log.info("%s: %d of %d blocks exist already", name, there, len(counts))
         where = folder if len(self.blocks) > 1 else None
-        title = f"evaluate {in_words(name)} ({place + 1} of {len(self.strategies)})"
+        title = f"evaluate {in_words(name)} ({index + 1} of {len(self.strategies)})"
         with ProgressReporter(title, sum(counts.values()), "episode", done, where) as progress:
             for block in missing:
                 rows, steps = player.play(block)
                 if self.every > 1 and len(steps):
                     number = (steps["time_s"] / self.cfg.scenario.time_step).round() - 1
                     steps = steps[number % self.every == 0]
-                store.put(place, block, (rows, steps))
+                store.put(index, block, (rows, steps))
                 done += counts[block]
                 if where is not None:
                     progress.update(done)

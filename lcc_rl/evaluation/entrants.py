@@ -85,9 +85,9 @@ class Entrants:
         nothing is compared.
         """
         cfg, named = self.cfg, _by_label(self.cfg.compare)
-        given = isinstance(cfg.compare, Mapping)
+        by_name = isinstance(cfg.compare, Mapping)
         policies = [
-            (label if given else "", self._of_task(run))
+            (label if by_name else "", self._of_task(run))
             for label, spec in named.items()
             if is_policy(spec)
             for run in _runs_of(Path(spec))
@@ -98,12 +98,12 @@ class Entrants:
             if spec != DIRECT:
                 controller_of(spec)
         if not cfg.automated:
-            if left := [*named, *filter(None, [cfg.policy])]:
-                log.warning("no vehicle is automated; left out: %s", ", ".join(left))
+            if ignored := [*named, *filter(None, [cfg.policy])]:
+                log.warning("no vehicle is automated; left out: %s", ", ".join(ignored))
             return {}, []
         for label in rivals:
-            words = f"compare={label}: it has no vehicle to drive in this string"
-            require(applies(cfg, label), words)
+            message = f"compare={label}: it has no vehicle to drive in this string"
+            require(applies(cfg, label), message)
         return rivals, policies
 
     def _check_used(self, typed: Sequence[str]) -> None:
@@ -114,9 +114,9 @@ class Entrants:
         unused = {AUTO: "every controller is named and has its own settings"}
         named = any(str(x).endswith(FILTERED) for x in (*rows, *self.rivals.values()))
         if not self.paths and not named:
-            words = f"nothing drives behind the filter ({', '.join(self.rivals or rows)}); "
-            words += f"it needs a name that ends in {FILTERED}"
-            unused |= dict.fromkeys(("filter", "scenario.filters"), words)
+            reason = f"nothing drives behind the filter ({', '.join(self.rivals or rows)}); "
+            reason += f"it needs a name that ends in {FILTERED}"
+            unused |= dict.fromkeys(("filter", "scenario.filters"), reason)
         for word in typed:
             for key in filter(key_of(word).startswith, unused):
                 raise ConfigError(f"{word.removeprefix('++')} has no effect: {unused[key]}")
@@ -129,17 +129,17 @@ class Entrants:
         cfg, policy = self.cfg, None
 
         def read(path: str) -> TrainedPolicy:
-            weights, own = load_policy(path, cfg.variant, tuple(cfg.trust))
-            if words := other_traffic(path, own, cfg):
-                log.warning(words)
-            return weights, own
+            weights, training = load_policy(path, cfg.variant, tuple(cfg.trust))
+            if warning := other_traffic(path, training, cfg):
+                log.warning(warning)
+            return weights, training
 
         if cfg.policy is not None and cfg.learns:
             policy = read(self._of_task(str(cfg.policy)))
             check_policy(cfg, policy[1])
         policies = [read(path) for _, path in self.paths]
-        for (name, path), (_, own) in zip(self.paths, policies, strict=True):
-            _check_label(name, path, own.variant)
+        for (name, path), (_, training) in zip(self.paths, policies, strict=True):
+            _check_label(name, path, training.variant)
         return policy, policies
 
     def strategies(self, inputs: Inputs) -> list[Strategy]:
@@ -148,19 +148,19 @@ class Entrants:
         Raises:
             LccError: if a policy or controller does not fit the inputs.
         """
-        cfg, found = self.cfg, self._rules(inputs)
+        cfg, rows = self.cfg, self._rules(inputs)
         for (name, path), file in zip(self.paths, self.policies, strict=True):
-            one = trained(cfg, path, file, inputs.population)
-            found.append(replace(one, name=name or one.name))
+            learned = trained(cfg, path, file, inputs.population)
+            rows.append(replace(learned, name=name or learned.name))
         if self.own:
-            found += studied(cfg, self.policy, inputs.population)
-        found += [self._given(name, policy, inputs) for name, policy in self.further.items()]
-        found = named_apart(beside_filtered(cfg, found) + found)
-        check_distinct(found)
-        found += front_of(found, cfg.evaluation.front)
-        for strategy in (s for s in found if s.source):
+            rows += studied(cfg, self.policy, inputs.population)
+        rows += [self._given(name, policy, inputs) for name, policy in self.further.items()]
+        rows = named_apart(beside_filtered(cfg, rows) + rows)
+        check_distinct(rows)
+        rows += front_of(rows, cfg.evaluation.front)
+        for strategy in (s for s in rows if s.source):
             log.info("%s: the policy of %s", in_words(strategy.name), strategy.source)
-        return found
+        return rows
 
     def _given(self, name: str, policy: GivenPolicy, inputs: Inputs) -> Strategy:
         """Return the strategy of a policy of another library, after a trial."""
@@ -184,7 +184,7 @@ class Entrants:
         if lacking and RECORDED in self.cfg.evaluation.baselines:
             log.warning("%s is left out: %s", RECORDED, lacking)
         every = baselines(self.cfg, self.rivals)
-        return [one for one in every if not lacking or one.name != RECORDED]
+        return [s for s in every if not lacking or s.name != RECORDED]
 
     def _limits_of_record(self) -> list[str]:
         """Return the limits of the task that refer to the recorded drivers."""
@@ -204,8 +204,8 @@ def _by_label(named: Sequence[Any] | Mapping[str, Any]) -> Mapping[str, Any]:
         return named
     labels = [spec if is_policy(spec) else label_of(spec) for spec in named]
     for label, count in Counter(labels).items():
-        words = f"compare names two {label}: give each a name, 'compare={{first: …, second: …}}'"
-        require(count == 1, words)
+        message = f"compare names two {label}: give each a name, 'compare={{first: …, second: …}}'"
+        require(count == 1, message)
     return dict(zip(labels, named, strict=True))
 
 
@@ -233,7 +233,7 @@ def check_installed(cfg: StudyConfig, compared: Sequence[Any] = ()) -> None:
         cfg: configuration of a study, including its baselines.
         compared: further controllers, see :func:`lcc_rl.evaluation.named.controller_of`.
     """
-    own = [name for name in cfg.evaluation.baselines if applies(cfg, name)]
-    others = [controller_of(spec) for spec in (*own, *compared) if spec not in (DIRECT, PEOPLE)]
-    for node in nodes_in([cfg.scenario.controllers, *others]):
+    names = [name for name in cfg.evaluation.baselines if applies(cfg, name)]
+    further = [controller_of(spec) for spec in (*names, *compared) if spec not in (DIRECT, PEOPLE)]
+    for node in nodes_in([cfg.scenario.controllers, *further]):
         getattr(node.kind, "check_installed", lambda: None)()

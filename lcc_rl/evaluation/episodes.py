@@ -107,7 +107,7 @@ class Plan:
     @property
     def own(self) -> range:
         """The blocks of this shard."""
-        first, end = (self.blocks * part // self.shards for part in (self.shard, self.shard + 1))
+        first, end = (self.blocks * shard // self.shards for shard in (self.shard, self.shard + 1))
         return range(first, end)
 
     def count(self, block: int) -> int:
@@ -170,8 +170,8 @@ class Episodes:
         compiled: bool | None = None,
     ) -> None:
         self.strategy, self.inputs, self.plan, self.seed = strategy, inputs, plan, seed
-        self.cfg, begun, self.warm_up = after_uncounted(strategy.cfg.for_any_leader())
-        self.begun = begun + self.warm_up
+        self.cfg, start, self.warm_up = after_uncounted(strategy.cfg.for_any_leader())
+        self.begun = start + self.warm_up
         steps, rowwise = len(plan) * self.cfg.scenario.horizon, False
         if compiled is None:
             compiled = steps >= COMPILED_STEPS

@@ -47,27 +47,27 @@ def check_variant(cfg: StudyConfig) -> None:
     Variant and configuration must both have an agent or none, and connected vehicles need messages.
     """
     try:
-        own = load("train", [f"variant={cfg.variant}"])
+        variant = load("train", [f"variant={cfg.variant}"])
     except ConfigError:  # a user's variant that only this command line defines
         return
-    talks, heard = (MESSAGES in part.scenario.pieces for part in (own, cfg))
+    talks, heard = (MESSAGES in x.scenario.pieces for x in (variant, cfg))
     if talks and not heard:
         raise ConfigError(
             f"variant={cfg.variant} is of connected vehicles, and scenario {cfg.scenario.name} has "
             "no messages: use task=platoon-us06, task=platoon-highway or scenario=platoon"
         )
-    if cfg.learns and not own.learns:  # the variant has no automated vehicle, the task has
+    if cfg.learns and not variant.learns:  # the variant has no automated vehicle, the task has
         raise ConfigError(f"variant={cfg.variant} has no agent: use compare=[{cfg.variant}]")
-    if own.learns and not cfg.learns and _is_driven_as(cfg, own):
+    if variant.learns and not cfg.learns and _is_driven_as(cfg, variant):
         raise ConfigError(
             f"variant={cfg.variant} is a learned controller, but there is no agent; for a human "
             "driver use variant=idm"
         )
 
 
-def _is_driven_as(cfg: StudyConfig, own: StudyConfig) -> bool:
+def _is_driven_as(cfg: StudyConfig, other: StudyConfig) -> bool:
     """Whether automated vehicles have the same kind of controller in two configurations."""
-    kinds = [part.scenario.controllers[AUTOMATED].kind for part in (cfg, own)]
+    kinds = [x.scenario.controllers[AUTOMATED].kind for x in (cfg, other)]
     return cfg.automated > 0 and kinds[0] is kinds[1]
 
 
@@ -82,9 +82,9 @@ def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
         ConfigError: naming the difference.
     """
     path = f"policy={cfg.policy}"
-    wanted = (own.task or {}).get("name")
-    if wanted is not None and cfg.task is None:
-        raise ConfigError(f"{path} was trained for a task: add task={wanted}")
+    task = (own.task or {}).get("name")
+    if task is not None and cfg.task is None:
+        raise ConfigError(f"{path} was trained for a task: add task={task}")
     check_scenario(path, own, cfg)
     hybrid = cfg.deployed is not None or own.deployed is not None
     if own.variant != cfg.variant and not hybrid:
@@ -97,12 +97,12 @@ def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
 def _check_entries(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
     """Check that an observation has the entries of the training."""
     scales = (x.observation.settings.get("scales", {}) for x in (own, cfg))
-    one, other = ({key for key, _ in flatten(found)} for found in scales)
-    parts = (("with", one - other), ("without", other - one))
-    words = [f"{how} {', '.join(sorted(keys))}" for how, keys in parts if keys]
+    trained, studied = ({key for key, _ in flatten(nested)} for nested in scales)
+    groups = (("with", trained - studied), ("without", studied - trained))
+    extra = [f"{word} {', '.join(sorted(keys))}" for word, keys in groups if keys]
     require(
-        not words,
-        f"{path} was trained {' and '.join(words)} in its observation: give the options of its "
+        not extra,
+        f"{path} was trained {' and '.join(extra)} in its observation: give the options of its "
         f"training, or 'compare=[{path.removeprefix('policy=')}]', which observes as in training",
     )
 
@@ -111,8 +111,8 @@ def _observed(cfg: StudyConfig) -> dict[str, Any]:
     """Return the settings of an observation, the order of its entries and the memory."""
     node = as_plain(cfg.observation)
     order = [key for key, _ in flatten(node) if key.startswith("scales.")]
-    kept = {name: cfg.scenario.pieces.get(name) for name in ("memory", "spread")}
-    memory = {f"scenario.pieces.{name}": as_plain(x) for name, x in kept.items() if x is not None}
+    pieces = {name: cfg.scenario.pieces.get(name) for name in ("memory", "spread")}
+    memory = {f"scenario.pieces.{name}": as_plain(x) for name, x in pieces.items() if x is not None}
     return {"observation": {**node, "order of scales": order}, **memory}
 
 
@@ -140,19 +140,19 @@ def check_action(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
     Raises:
         ConfigError: naming the difference.
     """
-    one, other = (
+    trained, studied = (
         {
             "scenario.time_step": node.scenario.time_step,
             AUTO: as_plain(node.scenario.controllers[AUTOMATED]),
         }
         for node in (own, cfg)
     )
-    _check_same(path, one, other)
+    _check_same(path, trained, studied)
 
 
 def _check_same(path: str, own: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
-    one, other = dict(flatten(own)), dict(flatten(asked))
-    changes = [f"{key}={one.get(key)}, got {other.get(key)}" for key in differing(one, other)]
+    old, new = dict(flatten(own)), dict(flatten(asked))
+    changes = [f"{key}={old.get(key)}, got {new.get(key)}" for key in differing(old, new)]
     require(not changes, f"{path} was trained with {'; '.join(changes)}")
 
 
@@ -172,11 +172,11 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     if not changed:
         return ""
     nodes = {name: getattr(own, name) for name in changed}
-    places = {name: node and node.settings.get("path") for name, node in nodes.items()}
-    others = ", ".join(name + (f" (path={at})" if at else "") for name, at in places.items())
+    paths = {name: node and node.settings.get("path") for name, node in nodes.items()}
+    sources = ", ".join(name + (f" (path={at})" if at else "") for name, at in paths.items())
     options = " ".join(f"{name}=…" for name in changed)
     return (
-        f"{path} was trained with other {others}: use {options} as in the config.yaml of its "
+        f"{path} was trained with other {sources}: use {options} as in the config.yaml of its "
         "training to evaluate on the windows that were held out there"
     )
 
@@ -187,23 +187,23 @@ def other_drivers(cfg: StudyConfig) -> str:
         return ""
     name = cfg.task["name"]
     try:
-        own = load("evaluate", [f"task={name}"])
+        task = load("evaluate", [f"task={name}"])
     except ConfigError:  # a task without a file
         return ""
-    if own.drivers == cfg.drivers:
+    if task.drivers == cfg.drivers:
         return ""
     return (
         f"Human drivers: {origin_of(cfg.drivers)} instead of those of task={name} "
-        f"({origin_of(own.drivers)}); published scores do not apply."
+        f"({origin_of(task.drivers)}); published scores do not apply."
     )
 
 
 def classes(cfg: StudyConfig) -> str:
     """Return a sentence on the classes of ``scenario.fleet`` and their shares; else nothing."""
     nodes = {name: node for name, node in cfg.scenario.fleet.items() if node is not None}
-    found = {name: node.made(VehicleClass) for name, node in nodes.items()}
-    each = (f"{x.share:.0%} of {' and '.join(x.roles)}: {name}" for name, x in found.items())
-    return f"Classes of vehicles (scenario.fleet): {', '.join(each)}." if nodes else ""
+    fleet = {name: node.made(VehicleClass) for name, node in nodes.items()}
+    shares = (f"{x.share:.0%} of {' and '.join(x.roles)}: {name}" for name, x in fleet.items())
+    return f"Classes of vehicles (scenario.fleet): {', '.join(shares)}." if nodes else ""
 
 
 def check_width(policy: TensorDictModule, weights: Mapping[str, Any], path: str) -> None:
@@ -212,10 +212,10 @@ def check_width(policy: TensorDictModule, weights: Mapping[str, Any], path: str)
     Raises:
         ConfigError: naming both numbers.
     """
-    one, other = (state.get(FIRST_LAYER) for state in (weights, policy.state_dict()))
-    if one is not None and other is not None and one.shape[1] != other.shape[1]:
+    trained, built = (state.get(FIRST_LAYER) for state in (weights, policy.state_dict()))
+    if trained is not None and built is not None and trained.shape[1] != built.shape[1]:
         raise ConfigError(
-            f"policy={path} was trained with {one.shape[1]} observed entries; in this "
-            f"scenario.string an automated vehicle has {other.shape[1]}: train one for it, with "
+            f"policy={path} was trained with {trained.shape[1]} observed entries; in this "
+            f"scenario.string an automated vehicle has {built.shape[1]}: train one for it, with "
             "the same scenario.string and observation"
         )

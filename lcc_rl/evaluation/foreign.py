@@ -50,16 +50,16 @@ class GivenPolicy(TensorDictModuleBase):
         while isinstance(self.module, TensorDictSequential) and _is_head(self.module[0]):
             self.heads.append(_still(self.module[0], name))
             self.module = self.module[1:]
-        moving = [type(part).__name__ for part in self.module.modules() if _normalizes(part)]
-        words = f"{name}: {', '.join(moving)} must be the first module of the sequence"
-        require(not moving, words)
+        moving = [type(layer).__name__ for layer in self.module.modules() if _normalizes(layer)]
+        message = f"{name}: {', '.join(moving)} must be the first module of the sequence"
+        require(not moving, message)
         reads, writes = (list(map(unravel_key, x)) for x in (module.in_keys, module.out_keys))
         self.grouped = OBSERVATION in reads
         self.action = ACTION if self.grouped else ACTION[-1]
         self.memory = {key: (NEXT, key) for key in reads if unravel_key((NEXT, key)) in writes}
-        seen = [OBSERVATION if self.grouped else OBSERVATION[-1], INITIAL, *self.memory]
+        entries = [OBSERVATION if self.grouped else OBSERVATION[-1], INITIAL, *self.memory]
         require(
-            set(reads) <= set(seen) and seen[0] in reads and self.action in writes,
+            set(reads) <= set(entries) and entries[0] in reads and self.action in writes,
             f"{name} reads {reads} and writes {writes}: expected 'observation' and 'action', maybe "
             "of the group 'automated', 'is_init', and entries that it writes to ('next', key)",
         )
@@ -71,22 +71,22 @@ class GivenPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``("automated", "action")``, ``[*batch, vehicles, 1]``."""
         observed, first = tensordict.get(OBSERVATION), tensordict.get(STEP) == 0
-        seen = TensorDict({OBSERVATION: observed}, observed.shape[:-2])
+        td = TensorDict({OBSERVATION: observed}, observed.shape[:-2])
         if not self.grouped:
             first = first.unsqueeze(-2).expand(*observed.shape[:-1], 1).reshape(-1, 1)
-            seen = TensorDict({OBSERVATION[-1]: observed.flatten(0, -2)}, [len(first)])
+            td = TensorDict({OBSERVATION[-1]: observed.flatten(0, -2)}, [len(first)])
         if first.any():  # all episodes begin at once
             self.kept, self.heads = {}, [_anew(head) for head in self.heads]
-        seen.update({INITIAL: first, **self.kept})
+        td.update({INITIAL: first, **self.kept})
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             for head in self.heads:
-                begun = {"_reset": first} if isinstance(head, CatFrames) and first.any() else {}
-                seen = head._call(seen, **begun)
+                reset = {"_reset": first} if isinstance(head, CatFrames) and first.any() else {}
+                td = head._call(td, **reset)
             training = self.module.training
-            seen = self.module.eval()(seen)
+            td = self.module.eval()(td)
             self.module.train(training)
-        self.kept = {key: seen.get(after) for key, after in self.memory.items()}
-        action = seen.get(self.action).reshape(*observed.shape[:-1], 1)
+        self.kept = {key: td.get(after) for key, after in self.memory.items()}
+        action = td.get(self.action).reshape(*observed.shape[:-1], 1)
         size = action.detach().abs().cpu()
         self.steps += 1
         self.beyond = self.beyond + (size > 1.0 + 1e-5).float().mean()
@@ -111,8 +111,8 @@ class GivenPolicy(TensorDictModuleBase):
             ConfigError: with the error in one line.
         """
         width = moment.get(OBSERVATION).shape[-1]
-        words = f"{self.name} fails for observations of {width} numbers"
-        with raised_as(ConfigError, words, Exception):  # any error of the user's module
+        message = f"{self.name} fails for observations of {width} numbers"
+        with raised_as(ConfigError, message, Exception):  # any error of the user's module
             self(moment)
 
 
@@ -125,8 +125,8 @@ def _anew(head: Transform) -> Transform:
     return CatFrames(N=head.N, dim=head.dim, **keys, **padding)
 
 
-def _normalizes(part: nn.Module) -> bool:
-    return hasattr(part, "to_observation_norm")
+def _normalizes(module: nn.Module) -> bool:
+    return hasattr(module, "to_observation_norm")
 
 
 def _still(head: Any, name: str) -> Transform:
@@ -136,10 +136,10 @@ def _still(head: Any, name: str) -> Transform:
         ConfigError: if it has none yet, or separate ones for each environment.
     """
     kind = type(head).__name__
-    words = f"{name}: {kind} has no statistics yet; pass the one of the training"
-    with raised_as(ConfigError, words, Exception):  # torchrl has no check
+    message = f"{name}: {kind} has no statistics yet; pass the one of the training"
+    with raised_as(ConfigError, message, Exception):  # torchrl has no check
         still = head.to_observation_norm() if _normalizes(head) else head
-    norms = [part for part in still.modules() if isinstance(part, ObservationNorm)]
+    norms = [module for module in still.modules() if isinstance(module, ObservationNorm)]
     require(
         all(norm.loc.ndim < 2 + (OBSERVATION in norm.in_keys) for norm in norms),
         f"{name}: {kind} has statistics of its own for each environment: train with "
@@ -148,8 +148,8 @@ def _still(head: Any, name: str) -> Transform:
     return still
 
 
-def _is_head(part: Any) -> bool:
-    return isinstance(part, Transform) and not isinstance(part, StepTransform)
+def _is_head(module: Any) -> bool:
+    return isinstance(module, Transform) and not isinstance(module, StepTransform)
 
 
 def as_given(policy: Any, name: str) -> GivenPolicy | None:

@@ -70,7 +70,7 @@ def energy_measures(
     last = speed.gather(0, steps).squeeze(0)
     stored = (energy.stored_energy(last, kind) - energy.stored_energy(speed[0], kind)) * KILO
     lost = energy.acceleration_loss(*motion, kind)
-    found = {
+    measures = {
         "energy_kj": drawn,
         "net_energy_kj": drawn - stored,
         "steady_energy_kj": steady,
@@ -78,14 +78,14 @@ def energy_measures(
         "distance_m": total(0.5 * (speed[:-1] + speed[1:])),
     }
     if lost is not None:
-        found["acceleration_loss_kj"] = total(lost) * KILO
-        found["path_energy_kj"] = steady + found["acceleration_loss_kj"]
-    found |= energy.burnt(found["path_energy_kj"] / KILO, kind)
+        measures["acceleration_loss_kj"] = total(lost) * KILO
+        measures["path_energy_kj"] = steady + measures["acceleration_loss_kj"]
+    measures |= energy.burnt(measures["path_energy_kj"] / KILO, kind)
     strange = energy.infeasible(*motion, kind)
     if strange is not None:
         count = steps.squeeze(0).clamp(min=1)
-        found["share_infeasible"] = (strange * alive).sum(0) / count
-    return found
+        measures["share_infeasible"] = (strange * alive).sum(0) / count
+    return measures
 
 
 def averaged_energies(
@@ -107,20 +107,20 @@ def averaged_energies(
         Energies by name of :data:`lcc_rl.energy.AVERAGED`, each ``[*batch, n, 1]`` [kJ]; NaN if no
         average is whole.
     """
-    energy, found = as_fleet(energy), {}
-    way = (0.5 * (speed[:-1] + speed[1:]) * alive).sum(0) * time_step
+    energy, energies = as_fleet(energy), {}
+    distance = (0.5 * (speed[:-1] + speed[1:]) * alive).sum(0) * time_step
     for name, seconds in zip(AVERAGED, AVERAGES, strict=True):
         width = round(seconds / time_step)
         if width >= len(speed):
-            found[name] = torch.full_like(way, torch.nan)
+            energies[name] = torch.full_like(distance, torch.nan)
             continue
         # In single precision, sums would lose the difference of consecutive averages.
         sums = torch.cat([torch.zeros_like(speed[:1]), speed]).cumsum(0, dtype=torch.float64)
         mean = ((sums[width:] - sums[:-width]) / width).to(speed)
         power = energy.power(mean[:-1], mean.diff(dim=0) / time_step, kind)
-        own = energy_measures(power, mean, alive[width - 1 :], time_step, energy, kind)
-        found[name] = own["path_energy_kj"] * way / own["distance_m"]
-    return found
+        values = energy_measures(power, mean, alive[width - 1 :], time_step, energy, kind)
+        energies[name] = values["path_energy_kj"] * distance / values["distance_m"]
+    return energies
 
 
 def measured_ttc(ttc: Tensor) -> Tensor:
@@ -173,8 +173,8 @@ class Reductions:
     def highest(self, entry: Tensor) -> Tensor:
         """Maximum over time and vehicles; an entry may lack the first times."""
         alive = self.alive[len(self.alive) - len(entry) :]
-        found = torch.where(alive, entry, -torch.inf)
-        return found.amax(0).amax(-2) if len(entry) else found.sum(0).sum(-2) * torch.nan
+        values = torch.where(alive, entry, -torch.inf)
+        return values.amax(0).amax(-2) if len(entry) else values.sum(0).sum(-2) * torch.nan
 
     def slope(self, entry: Tensor) -> Tensor:
         """Change of an entry per second over each :data:`SPAN`; the first times are missing."""
@@ -273,13 +273,13 @@ def register(measure: Measure, metric: Metric, every: bool = False) -> None:
         ConfigError: if the key is no word, is one of the package or of another ``register``, an
             entry is unknown, or a trial of the metric fails.
     """
-    key, known = measure.key, registered().get(measure.key, metric)
-    words = "expected letters, digits and _, as in the name of a column"
-    require(key.isidentifier(), f"measure {key!r}: {words}")
+    key, previous = measure.key, registered().get(measure.key, metric)
+    message = "expected letters, digits and _, as in the name of a column"
+    require(key.isidentifier(), f"measure {key!r}: {message}")
     require(key not in OURS, f"measure {key}: the package has one of this key; expected another")
-    again = metric.__module__ == "__main__" or _place(known) == _place(metric)
-    words = f"{known.__module__} has registered one of this key; expected another"
-    require(again, f"measure {key}: {words}")
+    again = metric.__module__ == "__main__" or _place(previous) == _place(metric)
+    message = f"{previous.__module__} has registered one of this key; expected another"
+    require(again, f"measure {key}: {message}")
     _, *entries = signature(metric).parameters
     valid = (*SERIES, *(("free",) if every else OF_FILTER))
     require_known(f"entry of the measure {key}", entries, valid)
@@ -291,7 +291,7 @@ def register(measure: Measure, metric: Metric, every: bool = False) -> None:
     except Exception as error:
         raise ConfigError(f"measure {key}: {in_short(error)}") from error
     for table in (MEASURES, PLATOON):
-        table[:] = [one for one in table if one.key != key] + [measure]
+        table[:] = [row for row in table if row.key != key] + [measure]
     for metrics in (METRICS, ROAD_METRICS):
         metrics.pop(key, None)
     (ROAD_METRICS if every else METRICS)[key] = metric
@@ -330,15 +330,15 @@ def safety_measures(
         Minima and maxima over the vehicles, shares of time and root mean squares averaged over
         them, each ``[*batch, 1]``; the least time-to-collision is NaN if no gap closed.
     """
-    over, found = Reductions(alive, time_step), {}
+    over, measures = Reductions(alive, time_step), {}
     for name, metric in metrics.items():
         _, *entries = signature(metric).parameters
         if all(entry in series for entry in entries):
-            value = found[name] = metric(over, *(series[entry] for entry in entries))
-            shape, wanted = list(torch.as_tensor(value).shape), list(alive.shape[1:-1])
-            words = f"measure {name}: expected a number of each episode {wanted}, got {shape}"
-            require(shape == wanted, f"{words}; over reduces entries: over.mean, over.highest …")
-    return found
+            value = measures[name] = metric(over, *(series[entry] for entry in entries))
+            shape, expected = list(torch.as_tensor(value).shape), list(alive.shape[1:-1])
+            text = f"measure {name}: expected a number of each episode {expected}, got {shape}"
+            require(shape == expected, f"{text}; over reduces entries: over.mean, over.highest …")
+    return measures
 
 
 def string_measures(
@@ -367,11 +367,11 @@ def string_measures(
         and, behind a leader, the deviation in time of the last vehicle divided by the leader's
         (``string_ratio``).
     """
-    here, steps = alive.unsqueeze(-2), alive.sum(0).clamp(min=1)
+    by_vehicle, steps = alive.unsqueeze(-2), alive.sum(0).clamp(min=1)
 
     def average(entry: Tensor) -> Tensor:
         """Mean over time of ``[time, *batch, …, 1]``."""
-        running = here if entry.ndim == here.ndim else alive
+        running = by_vehicle if entry.ndim == by_vehicle.ndim else alive
         count = running.sum(0).clamp(min=1)
         return torch.where(running, entry, 0.0).sum(0) / count
 
@@ -381,17 +381,17 @@ def string_measures(
     spread = _spread(speed)
     late = torch.arange(len(alive), device=alive.device).view(-1, *[1] * (alive.ndim - 1))
     last = alive & (late >= (0.9 * steps).floor())
-    found = {
+    measures = {
         "mean_speed_mps": average(speed).mean(-2),
         "speed_std_mps": deviation(speed).mean(-2),
         "speed_spread_mps": average(spread),
         "final_speed_spread_mps": torch.where(last, spread, 0.0).sum(0) / last.sum(0).clamp(min=1),
     }
-    found["flow_vph"] = 3600.0 * found["mean_speed_mps"] / (average(gap).mean(-2) + length)
+    measures["flow_vph"] = 3600.0 * measures["mean_speed_mps"] / (average(gap).mean(-2) + length)
     if leader is not None:
-        own = deviation(speed[..., -1, :])
-        found["string_ratio"] = own / deviation(leader).clamp(min=1e-3)
-    return found
+        std = deviation(speed[..., -1, :])
+        measures["string_ratio"] = std / deviation(leader).clamp(min=1e-3)
+    return measures
 
 
 def damping_time(speed: Tensor, alive: Tensor, time_step: float) -> Tensor:
@@ -403,8 +403,8 @@ def damping_time(speed: Tensor, alive: Tensor, time_step: float) -> Tensor:
     Returns:
         ``[*batch, 1]`` [s]; NaN if it does not stay below.
     """
-    passed = torch.arange(1, len(alive) + 1, device=alive.device).view(-1, *[1] * (alive.ndim - 1))
-    time = (passed * (alive & (_spread(speed) > CALM))).amax(0)
+    steps = torch.arange(1, len(alive) + 1, device=alive.device).view(-1, *[1] * (alive.ndim - 1))
+    time = (steps * (alive & (_spread(speed) > CALM))).amax(0)
     return torch.where(time < alive.sum(0).clamp(min=1), time * time_step, torch.nan)
 
 

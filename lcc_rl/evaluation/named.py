@@ -51,8 +51,8 @@ OTHER_WORDS = (
 
 def rules() -> tuple[str, ...]:
     """Return the names of all baselines and of the files of ``controller``."""
-    found = [name for name in choices("controller") if name not in NEEDY]
-    return tuple(dict.fromkeys([DIRECT, PEOPLE, "idm", *OF_CACC, *BASELINES, "deadbeat", *found]))
+    names = [name for name in choices("controller") if name not in NEEDY]
+    return tuple(dict.fromkeys([DIRECT, PEOPLE, "idm", *OF_CACC, *BASELINES, "deadbeat", *names]))
 
 
 def is_shipped(name: str) -> bool:
@@ -107,8 +107,8 @@ def controller_of(spec: Any, behind: bool = False) -> Node:
     """
     if isinstance(spec, str):
         plain = spec.removesuffix(FILTERED)
-        own = _named(spec) if behind or plain not in TUNED else None
-        if node := own or _named(plain):
+        filtered = _named(spec) if behind or plain not in TUNED else None
+        if node := filtered or _named(plain):
             return node
         spec = plain
     node = spec if isinstance(spec, Node) else Node.of(_described(spec), f"compare={spec}")
@@ -123,11 +123,11 @@ def label_of(spec: Any) -> str:
     """
     if isinstance(spec, Node):
         spec = str(spec.settings.get("law") or spec.settings[TARGET])
-    known, plain = {*rules(), *choices("variant")}, spec.removesuffix(FILTERED)
+    names, plain = {*rules(), *choices("variant")}, spec.removesuffix(FILTERED)
     file = Path(plain)
     if file.suffix in (*YAML, ONNX):
-        return (file.name if file.stem in known else file.stem) + spec[len(plain) :]
-    return spec if spec in known else str(spec).rpartition(".")[2]
+        return (file.name if file.stem in names else file.stem) + spec[len(plain) :]
+    return spec if spec in names else str(spec).rpartition(".")[2]
 
 
 def _named(spec: str) -> Node | None:
@@ -135,19 +135,19 @@ def _named(spec: str) -> Node | None:
     if spec in (shipped := _shipped()):
         return shipped[spec]
     if spec in choices("controller"):
-        words = ["variant=idm", f"controller@{AUTO}={spec}"]
+        overrides = ["variant=idm", f"controller@{AUTO}={spec}"]
     elif spec in choices("variant"):
-        words = [f"variant={spec}"]
+        overrides = [f"variant={spec}"]
     else:
         return None
-    cfg = load("evaluate", words)
+    cfg = load("evaluate", overrides)
     if cfg.agent is not None:
         raise ConfigError(
             f"variant {spec} is learned: compare the run folder or policy.pt of "
             f"lcc-rl train variant={spec}"
         )
-    found: Node = cfg.scenario.controllers[AUTOMATED]
-    return found
+    controller: Node = cfg.scenario.controllers[AUTOMATED]
+    return controller
 
 
 @cache
@@ -165,9 +165,9 @@ def _shipped() -> dict[str, Node]:
     gains = ["+gains=tuned", *(f"+gains@gains.{name}={name}" for name in GAINS)]
     plain: Any = OmegaConf.to_container(composed(None, [*gains, *drivers]), resolve=True)
     settings = plain["scenario"]["controllers"]
-    found = {x: Node.of(settings[x], f"controller {x}") for x in names if x != PEOPLE}
-    found |= {name: found[file].changed(**own) for name, (file, own) in BASELINES.items()}
-    return found | {f"cacc {x}": found["cacc"].changed(**plain["gains"][x]) for x in GAINS}
+    nodes = {x: Node.of(settings[x], f"controller {x}") for x in names if x != PEOPLE}
+    nodes |= {name: nodes[file].changed(**changes) for name, (file, changes) in BASELINES.items()}
+    return nodes | {f"cacc {x}": nodes["cacc"].changed(**plain["gains"][x]) for x in GAINS}
 
 
 def _described(spec: Any) -> Any:

@@ -31,10 +31,10 @@ def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
     seeds of one training share a name, that of their folder. If one folder holds several trainings,
     the settings that differ are added.
     """
-    kinds = [one.cfg.agent.name if one.policy else "" for one in strategies]
-    found = _where_several(strategies, kinds, kinds)
-    marks = _trainings(found)
-    return _where_several(found, marks, _labels(found, marks))
+    kinds = [s.cfg.agent.name if s.policy else "" for s in strategies]
+    by_agent = _where_several(strategies, kinds, kinds)
+    marks = _trainings(by_agent)
+    return _where_several(by_agent, marks, _labels(by_agent, marks))
 
 
 def _where_several(
@@ -51,42 +51,42 @@ def _where_several(
 
 def _trainings(strategies: Sequence[Strategy]) -> list[tuple[str, int]]:
     """Return settings, and number among equal seeds, by which policies of a name differ."""
-    found: list[tuple[str, int]] = []
+    marks: list[tuple[str, int]] = []
     of_seed: Counter[Hashable] = Counter()
-    for one in strategies:
-        settings = dict(flatten(as_plain(one.own or one.cfg))) if one.policy else {}
+    for s in strategies:
+        settings = dict(flatten(as_plain(s.own or s.cfg))) if s.policy else {}
         kept = {key: x for key, x in settings.items() if not f"{key}.".startswith(OF_NO_TRAINING)}
         text = json.dumps(kept, sort_keys=True, default=str)
-        of_seed[one.name, text, one.seed] += 1
-        found.append((text, of_seed[one.name, text, one.seed] if one.policy else 0))
-    return found
+        of_seed[s.name, text, s.seed] += 1
+        marks.append((text, of_seed[s.name, text, s.seed] if s.policy else 0))
+    return marks
 
 
 def _labels(strategies: Sequence[Strategy], marks: Sequence[tuple[str, int]]) -> list[str]:
     """Return the addition to the name of each policy, the same for the seeds of a training."""
-    groups = [(one.name, mark) for one, mark in zip(strategies, marks, strict=True)]
-    places: dict[tuple[str, tuple[str, int]], str] = {}
-    for one, group in zip(strategies, groups, strict=True):
-        places.setdefault(group, _place(one, groups.count(group) > 1))
-    apart = Counter((name, place) for (name, _), place in places.items())
+    groups = [(s.name, mark) for s, mark in zip(strategies, marks, strict=True)]
+    titles: dict[tuple[str, tuple[str, int]], str] = {}
+    for s, group in zip(strategies, groups, strict=True):
+        titles.setdefault(group, _place(s, groups.count(group) > 1))
+    apart = Counter((name, title) for (name, _), title in titles.items())
     differences: dict[tuple[str, str], str] = {}
     for name in {name for name, _ in groups}:
         texts = {
-            text: Path(one.source)
-            for one, (own, (text, _)) in zip(strategies, groups, strict=True)
-            if own == name
+            text: Path(s.source)
+            for s, (other, (text, _)) in zip(strategies, groups, strict=True)
+            if other == name
         }
         every = labels([json.loads(text) for text in texts], list(texts.values()))
-        for text, words in zip(texts, every, strict=True):
-            differences[name, text] = ", ".join(words.values())
-    found = []
-    for one, (name, (text, which)) in zip(strategies, groups, strict=True):
-        place = places[name, (text, which)]
-        if apart[name, place] > 1:  # one folder holds several trainings, or one twice
-            twice = (name, (text, 2)) in places or not differences[name, text]
-            place = _place(one, False) if twice else differences[name, text]
-        found.append(place)
-    return found
+        for text, changes in zip(texts, every, strict=True):
+            differences[name, text] = ", ".join(changes.values())
+    additions = []
+    for s, (name, (text, which)) in zip(strategies, groups, strict=True):
+        title = titles[name, (text, which)]
+        if apart[name, title] > 1:  # one folder holds several trainings, or one twice
+            twice = (name, (text, 2)) in titles or not differences[name, text]
+            title = _place(s, False) if twice else differences[name, text]
+        additions.append(title)
+    return additions
 
 
 def _place(strategy: Strategy, of_sweep: bool) -> str:

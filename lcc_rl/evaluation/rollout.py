@@ -71,8 +71,8 @@ class Player:
         self.env, self.policy, self.label, self.horizon = env, policy, label, env.base_env.horizon
         self.pieces = pieces_of(env)
         _check_driven(policy, self.pieces)
-        known = written(self.pieces)
-        self.kept = [key for key in keys if key in known]
+        outputs = written(self.pieces)
+        self.kept = [key for key in keys if key in outputs]
         self.reads = [as_key(key) for key in getattr(policy, "in_keys", [])]
         needed = closure(self.pieces, {*self.kept, *self.reads, TERMINATED})
         self.step = Step(needed, self.horizon)
@@ -120,8 +120,8 @@ class Player:
         running, alive = torch.ones_like(state[TERMINATED]), []
         for step in range(self.horizon):
             alive.append(running)
-            before, (state, kept, running) = state, self._advance(state, running)
-            for key, value in zip(self.checked, kept, strict=True):
+            before, (state, entries, running) = state, self._advance(state, running)
+            for key, value in zip(self.checked, entries, strict=True):
                 first = int(key[-1] == "speed")
                 if key not in record:  # written in place: a stack would need twice the memory
                     record[key] = value.new_empty((self.horizon + first, *value.shape))
@@ -150,15 +150,15 @@ class Player:
         for step in range(self.horizon):
             row, record[step] = kernel(row)
         columns = torch.from_numpy(record).split([x[0].numel() for x in kinds.values()], -1)
-        found = {}
+        series = {}
         for (key, kind), column in zip(kinds.items(), columns, strict=True):
             value = column.reshape(*column.shape[:2], *kind.shape[1:]).to(kind.dtype)
             speeds = key[-1] == "speed"  # also before the first step
-            found[key] = torch.cat([state[key].unsqueeze(0), value]) if speeds else value
-        ended = found.pop(TERMINATED)
+            series[key] = torch.cat([state[key].unsqueeze(0), value]) if speeds else value
+        ended = series.pop(TERMINATED)
         alive = torch.ones_like(ended)
         alive[1:] = ended[:-1].cumsum(0) == 0
-        return found, alive
+        return series, alive
 
     def _translated(self, state: State) -> tuple[Rows, Rowwise, State]:
         """Return the rows of a state, the step of them, and an example of each entry to keep."""
@@ -174,17 +174,17 @@ class Player:
 
         def advance(packed: Tensor) -> tuple[Tensor, Tensor]:
             after, dtype = moments(packed), torch.get_default_dtype()
-            kept = torch.cat([after[key].flatten(1).to(dtype) for key in names], 1)
-            return rows.packed(after), kept
+            entries = torch.cat([after[key].flatten(1).to(dtype) for key in names], 1)
+            return rows.packed(after), entries
 
         example = rows.packed(state)[:1]
         reached = moments(example)
         kernel = Rowwise(advance, (example,), "the evaluation")
         return rows, kernel, {key: reached[key] for key in names}
 
-    def _begin(self, given: TensorDictBase) -> State:
+    def _begin(self, options: TensorDictBase) -> State:
         """Return the first state of the episodes."""
-        state = entries_of(self.env.reset(options=given))
+        state = entries_of(self.env.reset(options=options))
         if self.policy is not None and not self.reads:
             return state  # it may read anything
         carried = {SEED, STEP, TERMINATED, *written(piece for piece, _ in self.step.pieces)}
@@ -193,9 +193,9 @@ class Player:
     def _advance(self, state: State, running: Tensor) -> Advanced:
         """Return the next state, the entries to keep, and which episodes still run."""
         action = self._action(state, self.env.batch_size).values()
-        *found, running = self.move(*state.values(), *map(self.arranged, action), running)
+        *tensors, running = self.move(*state.values(), *map(self.arranged, action), running)
         count = len(self.names)
-        return dict(zip(self.names, found[:count], strict=True)), found[count:], running
+        return dict(zip(self.names, tensors[:count], strict=True)), tensors[count:], running
 
     def _move(self, *tensors: Tensor) -> Sequence[Tensor]:
         """Return the next state, the entries to keep, and which episodes still run.
@@ -205,18 +205,18 @@ class Player:
         """
         before = dict(zip((*self.names, ACTION), tensors[:-1], strict=False))
         shown = {**before, **self.step(before)}
-        kept = [self.arranged(shown[key]) for key in (*self.names, *self.checked)]
-        return *kept, tensors[-1] & ~shown[TERMINATED]
+        entries = [self.arranged(shown[key]) for key in (*self.names, *self.checked)]
+        return *entries, tensors[-1] & ~shown[TERMINATED]
 
     def _action(self, state: State, batch: torch.Size) -> State:
         """Return the action of the policy for a batch; none without a policy."""
         if self.policy is None:
             return {}
-        seen = TensorDict(batch_size=batch, device=self.env.device)
+        td = TensorDict(batch_size=batch, device=self.env.device)
         for key in self.reads or state:
             if key in state:
-                seen.set(key, state[key])
-        return {ACTION: self.policy(seen).get(ACTION)}
+                td.set(key, state[key])
+        return {ACTION: self.policy(td).get(ACTION)}
 
 
 def _check_driven(policy: Policy | None, pieces: Sequence[Piece]) -> None:
@@ -249,13 +249,13 @@ def reset_options(
     # Every episode has its own stream. The drivers of a string have consecutive ids, so every
     # driver is used equally often in every place.
     number = profile * drivers + driver + repeat * STREAM_INCREMENT
-    given = TensorDict(batch_size=batch, device=env.device)
-    given.set(SEED, (hash_bits(number + (seed * 0x9E3779B1 & LOW_BITS)) >> 1).unsqueeze(-1))
-    known = option_specs(env)
-    if PROFILE in known:
-        given.set(PROFILE, profile.unsqueeze(-1))
-        given.set(PROFILE_START, torch.zeros_like(profile).unsqueeze(-1))
-    if DRIVER in known:
-        place = torch.arange(known[DRIVER].shape[-2]).unsqueeze(-1)
-        given.set(DRIVER, (driver.view(-1, 1, 1) + place) % drivers)
-    return given
+    options = TensorDict(batch_size=batch, device=env.device)
+    options.set(SEED, (hash_bits(number + (seed * 0x9E3779B1 & LOW_BITS)) >> 1).unsqueeze(-1))
+    specs = option_specs(env)
+    if PROFILE in specs:
+        options.set(PROFILE, profile.unsqueeze(-1))
+        options.set(PROFILE_START, torch.zeros_like(profile).unsqueeze(-1))
+    if DRIVER in specs:
+        place = torch.arange(specs[DRIVER].shape[-2]).unsqueeze(-1)
+        options.set(DRIVER, (driver.view(-1, 1, 1) + place) % drivers)
+    return options

@@ -72,25 +72,25 @@ def grouped(record: Record, string: VehicleString) -> Groups:
     The record of automated vehicles includes their places in the string, 0 at the front.
     """
     groups: Groups = {"leader": {}, "cav": {}, "hdv": {}}
-    own = list(string.places(AUTOMATED))
-    others = [place for place in range(len(string)) if place not in own]
+    cav = list(string.places(AUTOMATED))
+    hdv = [place for place in range(len(string)) if place not in cav]
     for (space, name), entry in record.items():
         if (space, name) in FILTER_ENTRIES:
             groups["cav"][name] = entry
         elif space == "leader":
             groups["leader"][name] = entry.unsqueeze(-2)
         elif space == "vehicles" and not string.drawn:
-            for group, places in (("cav", own), ("hdv", others)):
+            for group, places in (("cav", cav), ("hdv", hdv)):
                 if places:
                     groups[group][name] = entry[..., _slice(places), :]
-            if own:
-                groups["cav"]["place"] = torch.tensor(own).expand(*entry.shape[:2], len(own))
+            if cav:
+                groups["cav"]["place"] = torch.tensor(cav).expand(*entry.shape[:2], len(cav))
         elif space == "vehicles":
             index = record[INDEX][0]
             place = torch.arange(len(string), device=index.device)
-            taken = (place == index.unsqueeze(-1)).any(-2)
-            order = taken.int().argsort(stable=True, dim=-1)
-            rest = order[..., : len(others)].sort(-1).values
+            automated = (place == index.unsqueeze(-1)).any(-2)
+            order = automated.int().argsort(stable=True, dim=-1)
+            rest = order[..., : len(hdv)].sort(-1).values
             groups["cav"]["place"] = record[INDEX]
             for group, chosen in (("cav", index), ("hdv", rest)):
                 at = chosen.expand(entry.shape[0], *chosen.shape)
@@ -128,25 +128,25 @@ def measures(
         if "power" not in series:
             continue
         kinds = series.get(CLASS[1])
-        how = alive.unsqueeze(-2), time_step, energy, None if kinds is None else kinds[0]
-        found = energy_measures(series["power"], series["speed"], *how)
+        args = alive.unsqueeze(-2), time_step, energy, None if kinds is None else kinds[0]
+        energies = energy_measures(series["power"], series["speed"], *args)
         if second is not None:
             speed = series["speed"]
             power = second.power(speed[:-1], speed.diff(dim=0) / time_step)
-            found[SECOND] = energy_measures(power, speed, *how[:2], second)["path_energy_kj"]
-        found |= averaged_energies(series["speed"], *how) if averaged else {}
-        for name, value in found.items():
+            energies[SECOND] = energy_measures(power, speed, *args[:2], second)["path_energy_kj"]
+        energies |= averaged_energies(series["speed"], *args) if averaged else {}
+        for name, value in energies.items():
             added = value.mean(-2) if name.startswith("share_") else value.sum(-2)
             columns[f"{group}_{name}"] = added
-    own = groups["cav"]
-    if "gap" in own:
+    cav = groups["cav"]
+    if "gap" in cav:
         ahead = {f"leader_{name}": x for name, x in groups["leader"].items()}
-        columns |= safety_measures({**own, **ahead}, alive.unsqueeze(-2), time_step)
+        columns |= safety_measures({**cav, **ahead}, alive.unsqueeze(-2), time_step)
         for name in SUMMED:
             keys = [f"{group}_{name}" for group in ("cav", "hdv")]
-            parts = [columns[key] for key in keys if key in columns]
-            if parts:
-                columns[f"total_{name}"] = torch.stack(parts).sum(0)
+            terms = [columns[key] for key in keys if key in columns]
+            if terms:
+                columns[f"total_{name}"] = torch.stack(terms).sum(0)
     if "gap" in groups["hdv"]:
         gap = groups["hdv"]["gap"].amin(-2)
         columns["hdv_min_gap_m"] = torch.where(alive, gap, torch.inf).amin(0)
@@ -170,12 +170,12 @@ def brakings(record: Record, alive: Tensor, string: VehicleString) -> pd.DataFra
 
     The uncounted time is included, since collisions count there, too.
     """
-    groups, found = grouped(record, string), {}
+    groups, columns = grouped(record, string), {}
     for name, group in (("max_leader_braking_mps2", "leader"), ("max_braking_mps2", "cav")):
         if (motion := groups[group].get("acceleration")) is not None:
             hardest = torch.where(alive.unsqueeze(-2), -motion[-len(alive) :], -torch.inf)
-            found[name] = hardest.amax((0, -2)).squeeze(-1).clamp(min=0.0).cpu().numpy()
-    return pd.DataFrame(found)
+            columns[name] = hardest.amax((0, -2)).squeeze(-1).clamp(min=0.0).cpu().numpy()
+    return pd.DataFrame(columns)
 
 
 def traffic(
@@ -194,8 +194,8 @@ def traffic(
         kinds = record[CLASS][0]
         series["free"] = torch.minimum(series["free"], fleet.speed_limits(kinds))
         mean = length + (fleet.lengths(kinds) - length).mean(-2)
-    found = safety_measures(series, alive.unsqueeze(-2), time_step, ROAD_METRICS)
-    return found | string_measures(
+    columns = safety_measures(series, alive.unsqueeze(-2), time_step, ROAD_METRICS)
+    return columns | string_measures(
         record["vehicles", "speed"][-steps:],
         record["vehicles", "gap"],
         alive,
@@ -233,12 +233,12 @@ def describe(
 def desired_speeds(strategy: Strategy, episodes: pd.DataFrame) -> np.ndarray:
     """Return v0 [m/s] by episode: the strategy's or the driver's; NaN for recorded drivers."""
     controllers = strategy.cfg.scenario.controllers
-    own = controllers.get(AUTOMATED) if strategy.cfg.automated else None
-    given = None if own is None else own.settings.get("desired_speed")
+    controller = controllers.get(AUTOMATED) if strategy.cfg.automated else None
+    speed = None if controller is None else controller.settings.get("desired_speed")
     if strategy.name == RECORDED:
-        given = np.nan
+        speed = np.nan
     drivers = episodes["desired_speed_mps"].to_numpy()
-    return drivers if given is None else np.full_like(drivers, given)
+    return drivers if speed is None else np.full_like(drivers, speed)
 
 
 def leader_faster(
@@ -262,13 +262,13 @@ def leader_measures(
 
     The leader has the first energy model. The first step that counts is ``first``.
     """
-    fleet, found = as_fleet(energy), {}
+    fleet, values = as_fleet(energy), {}
     for index in profile.unique().tolist():
         speed = profiles.record(index)[first:]
         power = fleet.path_power(speed[:-1], speed.diff() / profiles.time_step)
         drawn = power.sum() * profiles.time_step * KILO
-        found[index] = (float(drawn), float(speed.mean()))
-    return pd.DataFrame([found[index] for index in profile.tolist()], columns=list(LEADER_COLUMNS))
+        values[index] = (float(drawn), float(speed.mean()))
+    return pd.DataFrame([values[index] for index in profile.tolist()], columns=list(LEADER_COLUMNS))
 
 
 def sample(

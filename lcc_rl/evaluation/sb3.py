@@ -45,16 +45,16 @@ class StableBaselinesPolicy(nn.Module):
         vectors, names = self._wrappers(model.get_env() if normalize is None else normalize)
         # Only models trained with VecNormalize have it; those with a replay buffer always do.
         raw = getattr(model, "_last_original_obs", None) is not None
-        known = NORMALIZED in names or (vectors and hasattr(model, "replay_buffer"))
-        words = f"{self.title} lacks the {NORMALIZED} of its training, or the vector without one: "
-        require(known or not raw, f"{words}load it by {self.title}.load(path, env=…)")
+        normalized = NORMALIZED in names or (vectors and hasattr(model, "replay_buffer"))
+        text = f"{self.title} lacks the {NORMALIZED} of its training, or the vector without one: "
+        require(normalized or not raw, f"{text}load it by {self.title}.load(path, env=…)")
         acts, sees = model.action_space, model.observation_space
         ends = [np.unique(getattr(x, at, np.nan)) for x in (acts, sees) for at in ("low", "high")]
-        own, first = [-1.0, 1.0, -LARGEST_SCALED, LARGEST_SCALED], 2 * (RESCALED in names)
-        usable = all(map(np.array_equal, ends[first:], [[x] for x in own[first:]]))
+        bounds, first = [-1.0, 1.0, -LARGEST_SCALED, LARGEST_SCALED], 2 * (RESCALED in names)
+        usable = all(map(np.array_equal, ends[first:], [[x] for x in bounds[first:]]))
         usable = usable and acts.shape == (1,)
-        words = f"{self.title}: its spaces {acts} and {sees} are not those of this package's"
-        require(usable, f"{words} environment, and no wrapper of the training explains them")
+        text = f"{self.title}: its spaces {acts} and {sees} are not those of this package's"
+        require(usable, f"{text} environment, and no wrapper of the training explains them")
         low, high = float(ends[0][0]), float(ends[1][0])
         self.middle, self.reach = (low + high) / 2.0, (high - low) / 2.0
         self.squashed, self.limit, mean, scale = policy.squash_output, torch.inf, 0.0, 1.0
@@ -67,9 +67,9 @@ class StableBaselinesPolicy(nn.Module):
         with raised_as(ConfigError, kind, Exception), torch.no_grad():  # any of a user's class
             self.network = deepcopy(nn.Sequential(*_layers(policy))).cpu().eval()
             sizes = np.geomspace(0.01, 3.0, 64)[:, None]
-            seen = np.random.default_rng(0).normal(0.0, sizes, (64, *sees.shape)).astype("float32")
-            found = self._action(torch.as_tensor(seen)) * self.reach + self.middle
-            off = np.abs(model.predict(seen, deterministic=True)[0] - found.numpy()).max()
+            batch = np.random.default_rng(0).normal(0.0, sizes, (64, *sees.shape)).astype("float32")
+            actions = self._action(torch.as_tensor(batch)) * self.reach + self.middle
+            off = np.abs(model.predict(batch, deterministic=True)[0] - actions.numpy()).max()
             require(off < 1e-4 * self.reach, f"predict() differs from its layers by {off:.2g}")
 
     def _wrappers(self, env: Any) -> tuple[list[Any], list[str]]:
@@ -79,10 +79,10 @@ class StableBaselinesPolicy(nn.Module):
         vectors = [env]
         while hasattr(vectors[-1], "venv"):
             vectors.append(vectors[-1].venv)
-        words = f"{self.title}: the wrappers of its environment cannot be read; is it closed?"
-        with raised_as(ConfigError, words, Exception):  # of a process that has ended
+        message = f"{self.title}: the wrappers of its environment cannot be read; is it closed?"
+        with raised_as(ConfigError, message, Exception):  # of a process that has ended
             texts = {*vectors[-1].env_method("__str__")}  # <Monitor<CarFollowing<lcc_rl/alcc-v0>>>
-        names = [type(one).__name__ for one in vectors]
+        names = [type(x).__name__ for x in vectors]
         names += [name for text in texts for name in re.findall(r"<(\w+)(?=[< ])", text)]
         strange = ", ".join({*names} - CARRIED) or "wrappers"
         require(
@@ -93,15 +93,15 @@ class StableBaselinesPolicy(nn.Module):
         )
         return vectors, names
 
-    def _action(self, seen: Tensor) -> Tensor:
+    def _action(self, inputs: Tensor) -> Tensor:
         """Return the actions for normalised observations."""
-        found = self.network(seen)
-        return found if self.squashed else ((found - self.middle) / self.reach).clamp(-1.0, 1.0)
+        outputs = self.network(inputs)
+        return outputs if self.squashed else ((outputs - self.middle) / self.reach).clamp(-1.0, 1.0)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the actions in [−1, 1], ``[rows, 1]``."""
-        seen = (observation - self.mean) / self.scale
-        return self._action(seen.clamp(-self.limit, self.limit))
+        inputs = (observation - self.mean) / self.scale
+        return self._action(inputs.clamp(-self.limit, self.limit))
 
 
 def _layers(policy: Any) -> list[nn.Module]:

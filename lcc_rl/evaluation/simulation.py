@@ -115,16 +115,16 @@ def simulate(
     fixed = OF_ARGUMENTS | {"reward"} | ({"drivers"} if drivers is not None else set())
     check_overrides(overrides, fixed, "has no effect in simulate: see the arguments")
     profiles = _profiles(leader, time_step, seconds)
-    given, spec = _given(controller)
+    compared, spec = _given(controller)
     rule = None if spec is None or is_policy(spec) else controller_of(spec).kind
-    words = (
+    settings = (
         *("evaluation.baselines=[]", "evaluation.behind_filter=[]", "evaluation.warm_up=0"),
         f"variant={'alcc' if is_policy(spec) else 'idm'}",
         *(["scenario=platoon"] * (rule in (CACC, DeadBeat)) + list(overrides)),
         *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
     )
-    cfg = load("evaluate", words).with_(compare=given, reward=UNREAD)
+    cfg = load("evaluate", settings).with_(compare=compared, reward=UNREAD)
     require(
         (cfg.scenario.road == RING) == (leader is None),
         "simulate: a ring (scenario=ring in overrides) has leader=None, an open road has a leader",
@@ -143,10 +143,10 @@ def simulate(
 def _given(controller: Any) -> tuple[Any, Any]:
     """Return the value of ``compare`` for a controller, and its setting; None without one."""
     named = isinstance(controller, Mapping) and TARGET not in controller
-    words = f"controller: expected one, such as {{'name': MyACC()}}, got {in_short(controller)}"
-    require(not named or len(controller) == 1, words)
-    name, one = next(iter(controller.items())) if named else ("", controller)
-    spec = None if one is None else setting_of(one, "controller")
+    message = f"controller: expected one, such as {{'name': MyACC()}}, got {in_short(controller)}"
+    require(not named or len(controller) == 1, message)
+    name, value = next(iter(controller.items())) if named else ("", controller)
+    spec = None if value is None else setting_of(value, "controller")
     return {name: spec} if named else [spec] * (spec is not None), spec
 
 
@@ -160,20 +160,20 @@ def _words(string: str | Mapping[str, Any]) -> str:
 def _profiles(leader: Any, time_step: float, seconds: float | None) -> Profiles:
     """Return the leaders' records, of one length; for a ring one of zeros."""
     steps = (seconds or 0.0) / time_step
-    whole = abs(steps - round(steps)) < 1e-6
-    require(whole, f"simulate: seconds={seconds or 0.0:g} is no multiple of time_step={time_step}")
+    fits = abs(steps - round(steps)) < 1e-6
+    require(fits, f"simulate: seconds={seconds or 0.0:g} is no multiple of time_step={time_step}")
     if leader is None:
         require(seconds is not None, "simulate: leader=None needs scenario=ring and seconds=…")
         return constant_profiles(0.0, round(steps), time_step, ["ring"])
     listed = isinstance(leader, (list, tuple)) and len(leader) > 0
     several = listed and not all(isinstance(x, (int, float, np.number)) for x in leader)
-    records = [_record(one, time_step) for one in (leader if several else [leader])]
+    records = [_record(speeds, time_step) for speeds in (leader if several else [leader])]
     most = min((len(record) for record in records), default=0) - 1
     require(most > 0, "simulate: leader needs at least two speeds [m/s]")
-    words = (
+    message = (
         f"simulate: seconds={seconds or 0.0:g}, and the leader drives for {most * time_step:g} s"
     )
-    require(round(steps) <= most, words)
+    require(round(steps) <= most, message)
     steps = round(steps) or most
     names = [f"leader {number}" for number in range(len(records))]
     return from_records([x[: steps + 1] for x in records], names, names, time_step)
@@ -184,8 +184,8 @@ def _record(leader: Any, time_step: float) -> Tensor:
     if isinstance(leader, (str, PathLike)):
         hard = Plausible(max_hard=1.0)  # tests of brakes; the column names the unit
         return resample(*read_speed_record(fspath(leader), hard), time_step)
-    words = "simulate: leader must be speeds [m/s], a shipped cycle or a file"
-    with raised_as(ConfigError, words, ValueError, TypeError):
+    message = "simulate: leader must be speeds [m/s], a shipped cycle or a file"
+    with raised_as(ConfigError, message, ValueError, TypeError):
         speeds = np.asarray(np.ma.filled(leader, np.nan), dtype=np.float32)
         if speeds.ndim != 1:
             raise ValueError(f"got an array of shape {list(speeds.shape)}")
@@ -202,15 +202,15 @@ def _simulated(strategy: Strategy, inputs: Inputs, repeats: int, seed: int) -> S
     desired = inputs.population.desired_speed
     slow = int((desired < inputs.evaluation.speeds.max()).sum())
     if slow and len(cfg.scenario.vehicles) > cfg.automated:
-        words = "the leader exceeds the desired speed of %d of %d human drivers, who fall behind; "
-        log.warning(words + "drivers=highway in overrides has faster ones", slow, people)
+        text = "the leader exceeds the desired speed of %d of %d human drivers, who fall behind; "
+        log.warning(text + "drivers=highway in overrides has faster ones", slow, people)
     env = build_env(cfg, inputs.evaluation, inputs.population, batch, 0, cfg.device, nominal=True)
     long, short = cfg.scenario.horizon >= LONG, len(cfg.scenario.vehicles) <= SHORT_STRING
     rows = long and short and not isinstance(strategy.policy, GivenPolicy)  # has its own memory
     keys = [LEADER, OF_LEADER, CLASS, INDEX, *(("vehicles", name) for name in MOTION)]
     player = Player(env, strategy.policy, keys, strategy.title, long and not rows, rows)
-    given = reset_options(env, profile, repeat % people, seed, people, repeat // people)
-    record, alive = player.play(given)
+    options = reset_options(env, profile, repeat % people, seed, people, repeat // people)
+    record, alive = player.play(options)
     start = player.start["vehicles", "gap"].unsqueeze(0)
     return _Motion(cfg, record, start, alive).tables()
 
@@ -228,8 +228,8 @@ class _Motion:
     def __init__(self, cfg: StudyConfig, record: Record, start: Tensor, alive: Tensor) -> None:
         self.cfg, self.record, self.alive = cfg, record, alive
         self.energy, self.time_step = build_energy(cfg), cfg.scenario.time_step
-        own = {name: record["vehicles", name] for name in MOTION}
-        self.groups = [own | {"gap": torch.cat([start, own["gap"]])}]
+        vehicles = {name: record["vehicles", name] for name in MOTION}
+        self.groups = [vehicles | {"gap": torch.cat([start, vehicles["gap"]])}]
         self.kinds = [record[CLASS][0] if CLASS in record else None]
         if LEADER in record:
             speed, change = (record[key].unsqueeze(-2) for key in (LEADER, OF_LEADER))
@@ -253,22 +253,22 @@ class _Motion:
             columns[column] = self._whole(name)[time, episode].flatten()
         steps = pd.DataFrame(columns)
         by_vehicle = steps.groupby(["episode", "vehicle"], sort=False)
-        found = by_vehicle.agg(
+        summary = by_vehicle.agg(
             role=("role", "first"),
             mean_speed_mps=("speed_mps", "mean"),
             min_gap_m=("gap_m", "min"),
             mean_gap_m=("gap_m", "mean"),
         ).reset_index()
-        found["collided"] = found["min_gap_m"] <= 0.0
-        return Simulation(steps, found.assign(**self._energies()))
+        summary["collided"] = summary["min_gap_m"] <= 0.0
+        return Simulation(steps, summary.assign(**self._energies()))
 
     def _whole(self, name: str) -> np.ndarray:
         """Return a quantity of all vehicles, ``[steps + 1, episodes, n]``; NaN where unknown."""
-        parts = [group[name].squeeze(-1) for group in self.groups]
-        found = torch.cat(parts, -1).numpy()
-        if len(found) == len(self.alive):  # of a step: none before the first one
-            found = np.concatenate([np.full_like(found[:1], np.nan), found])
-        return found
+        groups = [group[name].squeeze(-1) for group in self.groups]
+        values = torch.cat(groups, -1).numpy()
+        if len(values) == len(self.alive):  # of a step: none before the first one
+            values = np.concatenate([np.full_like(values[:1], np.nan), values])
+        return values
 
     def _roles(self) -> np.ndarray:
         """Return the role of each vehicle in each episode, ``[episodes, n]``."""
@@ -282,11 +282,11 @@ class _Motion:
 
     def _energies(self) -> dict[str, np.ndarray]:
         """Return distance and energies of all vehicles, episode by episode."""
-        here, found = self.alive.unsqueeze(-2), []
+        running, energies = self.alive.unsqueeze(-2), []
         for group, kind in zip(self.groups, self.kinds, strict=True):
-            how = (here, self.time_step, self.energy, kind)
-            found.append(energy_measures(group["power"], group["speed"], *how))
-        names = [name for name in found[-1] if all(name in part for part in found)]
+            args = (running, self.time_step, self.energy, kind)
+            energies.append(energy_measures(group["power"], group["speed"], *args))
+        names = [name for name in energies[-1] if all(name in x for x in energies)]
         return {
-            name: torch.cat([part[name] for part in found], -2).flatten().numpy() for name in names
+            name: torch.cat([x[name] for x in energies], -2).flatten().numpy() for name in names
         }

@@ -101,12 +101,12 @@ def baseline(cfg: StudyConfig, name: str, spec: Any = None) -> Strategy:
         cfg = cfg.driven_by(controller_of(name)).without_equipment()
         start = Node.of({TARGET: path_of(TimeGapStart)}, f"scenario.start.{AUTOMATED}")
         return Strategy(name, cfg.with_(scenario={"start": {AUTOMATED: start}}))
-    kept = cfg.scenario.filters.get(AUTOMATED)
+    safety = cfg.scenario.filters.get(AUTOMATED)
     named = any(str(word).endswith(FILTERED) for word in (name, spec))
-    words = f"{name} needs the safety filter, but there is none (+filter=cbf adds one)"
-    require(kept is not None or not named, words)
-    held = kept is not None and kept.settings.get("time_gap", True) is not None
-    controller = controller_of(spec or name, held)
+    message = f"{name} needs the safety filter, but there is none (+filter=cbf adds one)"
+    require(safety is not None or not named, message)
+    behind = safety is not None and safety.settings.get("time_gap", True) is not None
+    controller = controller_of(spec or name, behind)
     if named:
         return Strategy(name, cfg.driven_by(controller))
     if cfg.variant == name and _kind(cfg) is controller.kind:
@@ -117,12 +117,12 @@ def baseline(cfg: StudyConfig, name: str, spec: Any = None) -> Strategy:
 
 def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[Strategy]:
     """Build the baselines with which a filtered policy is compared, behind its filter."""
-    filters = (one.cfg.scenario.filters.get(AUTOMATED) for one in strategies if one.policy)
-    own = next((node for node in filters if node is not None), None)
-    if own is None:
+    filters = (s.cfg.scenario.filters.get(AUTOMATED) for s in strategies if s.policy)
+    safety = next((node for node in filters if node is not None), None)
+    if safety is None:
         return []
-    names = {one.name for one in strategies}
-    cfg = cfg.with_(scenario={"filters": {AUTOMATED: own}})
+    names = {s.name for s in strategies}
+    cfg = cfg.with_(scenario={"filters": {AUTOMATED: safety}})
     return [baseline(cfg, name) for name in cfg.evaluation.behind_filter if name not in names]
 
 
@@ -134,18 +134,18 @@ def front_of(strategies: Sequence[Strategy], time_gaps: Sequence[float]) -> list
     Raises:
         ConfigError: if there is no safety filter.
     """
-    behind = [one for one in strategies if one.cfg.scenario.filters.get(AUTOMATED) is not None]
+    behind = [s for s in strategies if s.cfg.scenario.filters.get(AUTOMATED) is not None]
     require(
         behind or not time_gaps, "evaluation.front needs the safety filter (+filter=cbf adds one)"
     )
-    rule = next((name for name in RULE_ROWS if name in {one.name for one in behind}), None)
-    found = []
-    for one in behind:
-        for time_gap in time_gaps if one.policy is not None or one.name == rule else ():
-            other = one.cfg.scenario.filters[AUTOMATED].changed(time_gap=time_gap)
-            cfg = one.cfg.with_(scenario={"filters": {AUTOMATED: other}})
-            found.append(replace(one, name=f"{one.name}{ON_FRONT}{time_gap:g}", cfg=cfg))
-    return found
+    rule = next((name for name in RULE_ROWS if name in {s.name for s in behind}), None)
+    front = []
+    for s in behind:
+        for time_gap in time_gaps if s.policy is not None or s.name == rule else ():
+            other = s.cfg.scenario.filters[AUTOMATED].changed(time_gap=time_gap)
+            cfg = s.cfg.with_(scenario={"filters": {AUTOMATED: other}})
+            front.append(replace(s, name=f"{s.name}{ON_FRONT}{time_gap:g}", cfg=cfg))
+    return front
 
 
 def rule(cfg: StudyConfig) -> Strategy:
@@ -156,10 +156,10 @@ def rule(cfg: StudyConfig) -> Strategy:
     if not cfg.automated:
         return Strategy(DIRECT, cfg)
     try:
-        own = _kind(load("evaluate", [f"variant={cfg.variant}"]))
+        kind = _kind(load("evaluate", [f"variant={cfg.variant}"]))
     except ConfigError:  # a user's variant that only this command line defines
-        own = _kind(cfg)
-    name = cfg.variant if _kind(cfg) is own else label_of(cfg.scenario.controllers[AUTOMATED])
+        kind = _kind(cfg)
+    name = cfg.variant if _kind(cfg) is kind else label_of(cfg.scenario.controllers[AUTOMATED])
     return Strategy(name, cfg.after_training())
 
 
@@ -168,8 +168,8 @@ def _kind(cfg: StudyConfig) -> Any:
 
 
 def _baseline_controllers(cfg: StudyConfig) -> list[Any]:
-    automated = (one for one in baselines(cfg) if one.name != DIRECT)
-    return [one.cfg.scenario.controllers[AUTOMATED] for one in automated]
+    automated = (s for s in baselines(cfg) if s.name != DIRECT)
+    return [s.cfg.scenario.controllers[AUTOMATED] for s in automated]
 
 
 def no_policy(cfg: StudyConfig) -> ConfigError:
@@ -196,10 +196,10 @@ def studied(
     """
     if not cfg.learns:
         strategy = rule(cfg)
-        known = cfg.scenario.controllers[AUTOMATED] in _baseline_controllers(cfg)
-        same = known and cfg.scenario.filters.get(AUTOMATED) is None and strategy.name != DIRECT
+        listed = cfg.scenario.controllers[AUTOMATED] in _baseline_controllers(cfg)
+        repeats = listed and cfg.scenario.filters.get(AUTOMATED) is None and strategy.name != DIRECT
         named = strategy.name in cfg.evaluation.baselines
-        return [] if same or named else [strategy]
+        return [] if repeats or named else [strategy]
     if policy is None:
         raise no_policy(cfg)
     weights, own_cfg = policy
@@ -212,8 +212,8 @@ def studied(
 def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
     """Return the scenario under study with the agent of ``own``, and its filter if it has none."""
     changes: dict[str, Any] = {"agent": own.agent}
-    seen = own.observation.made(Piece)
-    if isinstance(seen, Observation) and seen.shows_presence(own.scenario.vehicles):
+    piece = own.observation.made(Piece)
+    if isinstance(piece, Observation) and piece.shows_presence(own.scenario.vehicles):
         changes["observation"] = cfg.observation.changed(presence=True)
     if cfg.scenario.filters.get(AUTOMATED) is None and own.scenario.filters.get(AUTOMATED):
         log.info("the policy of variant %s keeps the filter of its training", own.variant)
@@ -225,15 +225,15 @@ def hybrids(strategy: Strategy) -> list[Strategy]:
     """Build a hybrid strategy, its parents and its oracle."""
     cfg = strategy.cfg
     parent = cfg.driven_by(cfg.scenario.controllers[AUTOMATED])
-    found = [replace(strategy, name=cfg.agent.name, cfg=parent)]
+    strategies = [replace(strategy, name=cfg.agent.name, cfg=parent)]
     parent_rule = cfg.deployed.settings.get("rule")
     if parent_rule is not None and parent_rule not in _baseline_controllers(cfg):
-        found.insert(0, Strategy("cacc", cfg.driven_by(parent_rule)))
-    found.append(replace(strategy, cfg=cfg.after_training()))
+        strategies.insert(0, Strategy("cacc", cfg.driven_by(parent_rule)))
+    strategies.append(replace(strategy, cfg=cfg.after_training()))
     if set(cfg.scenario.vehicles.names) == {AUTOMATED}:
         knowing = cfg.driven_by(cfg.deployed.changed(lookahead="oracle"))
-        found.append(replace(strategy, name=f"{strategy.name} oracle", cfg=knowing))
-    return found
+        strategies.append(replace(strategy, name=f"{strategy.name} oracle", cfg=knowing))
+    return strategies
 
 
 def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Population) -> Strategy:
@@ -248,23 +248,23 @@ def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Popu
     Raises:
         LccError: if the policy does not fit the scenario or its own network.
     """
-    weights, own = policy
-    check_scenario(path, own, cfg)
-    other = _of_training(cfg.with_(observation=own.observation), own)
+    weights, training = policy
+    check_scenario(path, training, cfg)
+    other = _of_training(cfg.with_(observation=training.observation), training)
     pieces = {
         name: node
-        for name, node in own.scenario.pieces.items()
+        for name, node in training.scenario.pieces.items()
         if name in KNOWLEDGE or name not in other.scenario.pieces
     }
-    driver = {AUTOMATED: own.scenario.controllers[AUTOMATED]}
+    driver = {AUTOMATED: training.scenario.controllers[AUTOMATED]}
     other = other.with_(
-        variant=own.variant,
-        deployed=own.deployed,
+        variant=training.variant,
+        deployed=training.deployed,
         scenario={"controllers": driver, "pieces": pieces},
     )
-    check_action(path, own, other)
-    strategy = with_weights(other, weights, own.seed, path, population)
-    return replace(strategy, cfg=other.after_training(), own=own)
+    check_action(path, training, other)
+    strategy = with_weights(other, weights, training.seed, path, population)
+    return replace(strategy, cfg=other.after_training(), own=training)
 
 
 def with_weights(
@@ -278,7 +278,7 @@ def with_weights(
     with raised_as(ResultsError, f"{path}: its agent cannot be built", ConfigError):
         agent = build_agent(cfg, population, cfg.device)
     check_width(agent.policy, weights, path)
-    words = f"{path}: the weights do not fit the policy network"
-    with raised_as(ResultsError, words, RuntimeError):
+    message = f"{path}: the weights do not fit the policy network"
+    with raised_as(ResultsError, message, RuntimeError):
         agent.policy.load_state_dict(dict(weights))
     return Strategy(cfg.variant, cfg, shared_policy(agent.policy), seed, path)

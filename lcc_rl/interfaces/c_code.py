@@ -59,7 +59,7 @@ def c_code(module: DrivingProgram, about: str) -> str:
             body += _statement(i, *recorder.statements[i], types)
     except Untranslatable as error:
         raise ConfigError(f"C code of this policy or rule: {error} is not supported") from error
-    body += [f"memory[{place}] = v{i};" for place, i in enumerate((*outputs, ())[1])]
+    body += [f"memory[{index}] = v{i};" for index, i in enumerate((*outputs, ())[1])]
     lines = "".join(f"    {line}\n" for line in [*body, f"return v{outputs[0][0]};"])
     inputs = [described_input(name) for name in module.names]
     columns = "".join(f" * state[{k}]: {x.name} [{x.unit}]\n" for k, x in enumerate(inputs))
@@ -79,21 +79,21 @@ def _table(name: str, table: Array) -> str:
 
 def _statement(i: int, formula: str, reads: tuple[int, ...], types: dict[int, str]) -> list[str]:
     """Return a recorded statement in C, and keep the type of its variable."""
-    given = [f"v{x}" for x in reads]
+    args = [f"v{x}" for x in reads]
     if formula.startswith("layer("):
         weights, bias = re.findall(r"t\d+", formula)
         units, types[i] = f"sizeof {bias} / sizeof *{bias}", "layer"
-        before, inputs, count = "", given[0], f"sizeof {given[0]} / sizeof *{given[0]}"
+        before, inputs, count = "", args[0], f"sizeof {args[0]} / sizeof *{args[0]}"
         if types[reads[0]] != "layer":
-            before, inputs, count = f", in{i}[] = {{{', '.join(given)}}}", f"in{i}", f"{len(given)}"
+            before, inputs, count = f", in{i}[] = {{{', '.join(args)}}}", f"in{i}", f"{len(args)}"
         call = f"layer({weights}, {bias}, {inputs}, {count}, v{i}, {units});"
         return [f"float v{i}[{units}]{before};", call]
     if formula.startswith("rectified("):
-        units, types[i] = f"sizeof {given[0]} / sizeof *{given[0]}", "layer"
-        each = f"v{i}[unit] = {given[0]}[unit] < 0 ? 0 : {given[0]}[unit];"
+        units, types[i] = f"sizeof {args[0]} / sizeof *{args[0]}", "layer"
+        line = f"v{i}[unit] = {args[0]}[unit] < 0 ? 0 : {args[0]}[unit];"
         return [
             f"float v{i}[{units}];",
-            f"for (int unit = 0; unit < (int)({units}); unit++) {each}",
+            f"for (int unit = 0; unit < (int)({units}); unit++) {line}",
         ]
     if "**" in formula:
         formula = "powf({0}, {1})"
@@ -101,8 +101,8 @@ def _statement(i: int, formula: str, reads: tuple[int, ...], types: dict[int, st
         raise Untranslatable(formula.split("(")[0])
     formula = re.sub(r"x0\[row, (\d+)\]", r"state[\1]", formula)
     formula = re.sub(r"x1\[row, (\d+)\]", r"memory[\1]", formula)
-    text = WORD.sub(lambda found: FUNCTIONS[found[0]], formula)
+    text = WORD.sub(lambda match: FUNCTIONS[match[0]], formula)
     kind = next((kind for word, kind in TYPES.items() if formula.startswith(word)), None)
     operands = [types[x] for x in reads if types[x] != "layer"]
     types[i] = "int" if formula in TRUTHS else kind or ["float", *operands][-1]
-    return [f"const {types[i]} v{i} = {text.format(*given)};"]
+    return [f"const {types[i]} v{i} = {text.format(*args)};"]

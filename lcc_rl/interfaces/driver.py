@@ -107,28 +107,28 @@ class Driver:
                     f"{time_step!r} s (in SUMO, --step-length {trained:g} sets it)"
                 )
         else:
-            own = bootstrap(drivers) if isinstance(drivers, (str, Path)) else drivers
-            self.program = self._rule(spec, safety, measuring(time_step, True, own), limits)
+            population = bootstrap(drivers) if isinstance(drivers, (str, Path)) else drivers
+            self.program = self._rule(spec, safety, measuring(time_step, True, population), limits)
         self.names = self.program.names
         self.behind = {x for x in self.names if x.startswith("behind.")} - {BEHIND_PRESENT}
         self._check()
         self.reset()
 
     def _rule(self, spec: Any, safety: Safety, world: World, limits: Any) -> DrivingProgram:
-        own = None
+        active = None
         if isinstance(spec, str) and spec.endswith(FILTERED):
             filters = load("evaluate", ["variant=idm", "+filter=cbf"]).scenario.filters
-            own = filters[AUTOMATED].made(CBFFilter)
-        own = filter_of(safety, own, self.name)
-        node = controller_of(spec, own is not None and own.time_gap is not None)
-        return driving([node.made(Controller)], own, world, limits)
+            active = filters[AUTOMATED].made(CBFFilter)
+        active = filter_of(safety, active, self.name)
+        node = controller_of(spec, active is not None and active.time_gap is not None)
+        return driving([node.made(Controller)], active, world, limits)
 
     def _check(self) -> None:
         for name in self.names:
             if name not in MEASURED:
-                known = ", ".join(MEASURED)
+                measurable = ", ".join(MEASURED)
                 raise ConfigError(
-                    f"{self.name} reads {name}, which is not measured here, only {known}"
+                    f"{self.name} reads {name}, which is not measured here, only {measurable}"
                 )
         self.program.step(*self._examples(BATCH), apply=check_step)  # type: ignore[misc]
 
@@ -149,8 +149,8 @@ class Driver:
             self.numbers: dict[Hashable, int] = {}  # seeds of all cars, in order of appearance
             return
         gone = _ids(cars)
-        stay = [place for place, car in enumerate(self.cars) if car not in gone]
-        self.cars, self.memory = [self.cars[place] for place in stay], self.memory[stay]
+        stay = [row for row, car in enumerate(self.cars) if car not in gone]
+        self.cars, self.memory = [self.cars[row] for row in stay], self.memory[stay]
 
     def step(self, measured: Mapping[str, Any], cars: Sequence[Hashable] | None = None) -> Any:
         """Return the acceleration of each car for the next step [m/s²].
@@ -180,40 +180,40 @@ class Driver:
             row = int(np.isfinite(command).argmin())
             lost = [x for x, value in zip(self.names, state[row], strict=True) if np.isnan(value)]
             lost = [x for x in lost if x not in self.program.stand_ins]
-            what = f"the command of {self.cars[row]} is {command[row, 0]}"
-            what = f"{lost[0]} is nan in row {row} of the cars" if lost else what
+            fault = f"the command of {self.cars[row]} is {command[row, 0]}"
+            fault = f"{lost[0]} is nan in row {row} of the cars" if lost else fault
             self.cars, self.memory = before
-            raise Diverged(f"{self.name}: {what}")
+            raise Diverged(f"{self.name}: {fault}")
         if memory:
             (self.memory,) = memory
             if not self.memory[:, 0].all():
-                held = zip(self.cars, self.memory, strict=True)
-                self.reset([car for car, row in held if not row[0]])
+                pairs = zip(self.cars, self.memory, strict=True)
+                self.reset([car for car, row in pairs if not row[0]])
         return float(command[0, 0]) if alone else command[:, 0]
 
     def _admit(self, cars: Sequence[Hashable], state: Array) -> None:
         """Sort the memories by the cars of a step."""
         if cars == self.cars:
             return
-        words = f"cars must be {len(state)} different ids, as many as measured, got {cars}"
-        require(len(cars) == len(set(cars)) == len(state), words)
-        places = {car: place for place, car in enumerate(self.cars)}
+        message = f"cars must be {len(state)} different ids, as many as measured, got {cars}"
+        require(len(cars) == len(set(cars)) == len(state), message)
+        places = {car: index for index, car in enumerate(self.cars)}
         stay = [row for row, car in enumerate(cars) if car in places]
         new = [row for row, car in enumerate(cars) if car not in places]
         if self.program.width:
             memory = np.zeros((len(state), self.program.width))
             memory[stay] = self.memory[[places[cars[row]] for row in stay]]
-            given = torch.from_numpy(state[new]).double()
-            own = [self.numbers.setdefault(cars[row], len(self.numbers)) for row in new]
-            seeds = self.seed + torch.tensor(own, dtype=torch.long).unsqueeze(-1)
-            memory[new] = self.program.begin(given, seeds).numpy()
+            inputs = torch.from_numpy(state[new]).double()
+            numbers = [self.numbers.setdefault(cars[row], len(self.numbers)) for row in new]
+            seeds = self.seed + torch.tensor(numbers, dtype=torch.long).unsqueeze(-1)
+            memory[new] = self.program.begin(inputs, seeds).numpy()
             self.memory = memory
         self.cars = cars
 
     def _state(self, measured: Mapping[str, Any]) -> tuple[Array, bool]:
         """Return the inputs of the program, ``[cars, names]``, and whether numbers were given."""
-        words = f"measured must name measurements, such as self.gap, got {type(measured).__name__}"
-        require(isinstance(measured, Mapping), words)
+        text = f"measured must name measurements, such as self.gap, got {type(measured).__name__}"
+        require(isinstance(measured, Mapping), text)
         if unknown := measured.keys() - KNOWN:
             raise unknown_name("measurement", str(min(unknown, key=str)), MEASURED)
         try:
@@ -222,28 +222,28 @@ class Driver:
             for name, column in zip(self.names, columns, strict=True):
                 if column.dtype.kind not in "biuf":
                     raise ValueError(f"{name} is {measured[name]!r}"[:100])
-            shape, *others = {column.shape for column in columns} - {()} or [()]
-            if others:
-                raise ValueError(f"their shapes are {sorted([shape, *others])}")
+            shape, *rest = {column.shape for column in columns} - {()} or [()]
+            if rest:
+                raise ValueError(f"their shapes are {sorted([shape, *rest])}")
             state = np.empty((math.prod(shape), len(columns)), np.float32)
-            for place, column in enumerate(columns):
-                state[:, place] = column
+            for index, column in enumerate(columns):
+                state[:, index] = column
         except KeyError as error:
             name, unit, meaning = described_input(error.args[0])
-            words = f"{self.name} reads {name}, which is not given: {meaning} [{unit}]"
-            raise ConfigError(words) from error
+            text = f"{self.name} reads {name}, which is not given: {meaning} [{unit}]"
+            raise ConfigError(text) from error
         except (ValueError, TypeError, RuntimeError) as error:  # torch's, of a gradient
-            words = f"measured must hold numbers, or arrays of one length: {error}"
-            raise ConfigError(words) from error
+            text = f"measured must hold numbers, or arrays of one length: {error}"
+            raise ConfigError(text) from error
         return state, not shape
 
     def _completed(self, measured: Mapping[str, Any]) -> dict[str, Any]:
         """Return measurements with NaN, which get stand-ins, where there is no vehicle behind."""
-        found, absent = dict(measured), measured.keys().isdisjoint(self.behind)
-        present = found.setdefault(BEHIND_PRESENT, float(not absent))
+        completed, absent = dict(measured), measured.keys().isdisjoint(self.behind)
+        present = completed.setdefault(BEHIND_PRESENT, float(not absent))
         for name in () if np.all(present) else self.behind:
-            found[name] = np.nan if absent else np.where(present, found[name], np.nan)
-        return found
+            completed[name] = np.nan if absent else np.where(present, completed[name], np.nan)
+        return completed
 
     @cached_property
     def _rows(self) -> Rowwise:
@@ -260,9 +260,9 @@ def _ids(cars: Iterable[Hashable]) -> list[Hashable]:
     """
     require(not isinstance(cars, str), f"cars must be a list of ids, got {cars!r}")
     with raised_as(ConfigError, "cars must be a list of ids", TypeError):
-        found = list(cars)
-        hash(tuple(found))
-    return found
+        ids = list(cars)
+        hash(tuple(ids))
+    return ids
 
 
 def _by_tensors(source: str) -> Any:

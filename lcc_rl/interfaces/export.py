@@ -99,29 +99,29 @@ def _written(
     require_known("ending", path.suffix, [*EXPORTERS, PAGE])
     cfg, page = None, path.suffix == PAGE
     if not isinstance(policy, (str, PathLike)):
-        given = policy
-        if (policy := network_of(given, normalize)) is None:
-            kind = type(given).__name__
+        source = policy
+        if (policy := network_of(source, normalize)) is None:
+            kind = type(source).__name__
             raise ConfigError(f"expected a run, a file, a torch module or a model, got {kind}")
         cfg = load("train", with_variant(variant, overrides))
     rule = cfg is None and not is_policy(str(policy))
-    words = f"{policy}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
-    require(not page or (cfg is None and not (safety or limits or rule)), words)
+    text = f"{policy}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
+    require(not page or (cfg is None and not (safety or limits or rule)), text)
     if cfg is None and not page and overrides:
-        words = (
+        text = (
             f"{' '.join(overrides)}: a program ({path.suffix}) takes safety.… and limits.…, no road"
         )
-        known = ("safety.", "limits.")
-        require(all(key_of(item).startswith(known) for item in overrides), words)
+        prefixes = ("safety.", "limits.")
+        require(all(key_of(override).startswith(prefixes) for override in overrides), text)
         changed: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)))
         safety, limits = changed.get("safety", safety), changed.get("limits", limits)
     names: list[str] = []
     if page:
         content = ring_page(policy, trust, overrides).encode()
     else:
-        how = (safety, limits)
-        own = _rule(policy, trust, *how) if rule else program(policy, trust, cfg, *how)
-        content, names = EXPORTERS[path.suffix](own, _name(policy)), own.names
+        changes = (safety, limits)
+        module = _rule(policy, trust, *changes) if rule else program(policy, trust, cfg, *changes)
+        content, names = EXPORTERS[path.suffix](module, _name(policy)), module.names
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path, names
@@ -129,9 +129,9 @@ def _written(
 
 def _rule(name: Any, trust: Sequence[str], safety: Safety, limits: Any) -> DrivingProgram:
     """Return the program of a rule with steps of 0.1 s."""
-    found = Driver(str(name), 0.1, trust, safety, limits=limits).program
-    require(SEED not in found.kept, f"{name} draws noise from seeds: it cannot be exported")
-    return found
+    module = Driver(str(name), 0.1, trust, safety, limits=limits).program
+    require(SEED not in module.kept, f"{name} draws noise from seeds: it cannot be exported")
+    return module
 
 
 def _name(policy: Any) -> str:
@@ -141,9 +141,9 @@ def _name(policy: Any) -> str:
 def described(module: DrivingProgram, name: str) -> str:
     """Return the description of a program as JSON: names, units and stand-ins of its inputs."""
     inputs = [described_input(name)._asdict() for name in module.names]
-    for one in inputs:
-        if one["name"] in module.stand_ins:
-            one["stand_in"] = str(module.stand_ins[one["name"]])
+    for column in inputs:
+        if column["name"] in module.stand_ins:
+            column["stand_in"] = str(module.stand_ins[column["name"]])
     about: dict[str, Any] = {"policy": name, "lcc_rl": __version__, "inputs": inputs}
     about["time_step_s"] = module.controller.time_step
     about |= {"output": "acceleration [m/s²]", "filter": module.safety is not None}
@@ -174,7 +174,7 @@ def _as_onnx(module: DrivingProgram, name: str) -> bytes:
     registry.setLevel(logging.ERROR)  # warnings about the missing torchvision
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # raised by torch about itself
-        made = torch.onnx.export(
+        converted = torch.onnx.export(
             exported,
             (),
             dynamo=True,
@@ -182,8 +182,8 @@ def _as_onnx(module: DrivingProgram, name: str) -> bytes:
             input_names=TAKES[:count],
             output_names=MAKES[:count],
         )
-    assert made is not None
-    proto = made.model_proto
+    assert converted is not None
+    proto = converted.model_proto
     onnx.helper.set_model_props(proto, {"lcc_rl": described(module, name)})
     content: bytes = proto.SerializeToString()
     return content
@@ -203,15 +203,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("policy", help="run folder, policy.pt, pretrained/<name> or a rule")
     parser.add_argument("path", help="file: a program (.onnx, .pt2, .c) or a page (.html)")
     parser.add_argument("--trust", action="append", default=[], help="module that it may name")
-    words = "of a page's ring (drivers=i80), of a program (safety.margin=2 limits.max_braking=6)"
-    parser.add_argument("settings", nargs="*", default=[], help=words)
+    text = "of a page's ring (drivers=i80), of a program (safety.margin=2 limits.max_braking=6)"
+    parser.add_argument("settings", nargs="*", default=[], help=text)
     options = parser.parse_args(arguments)
-    given = options.policy, options.path, options.trust
-    path, names = _written(*given, overrides=options.settings)
+    args = options.policy, options.path, options.trust
+    path, names = _written(*args, overrides=options.settings)
     if path.suffix == PAGE:
         print(f"{path}: the ring road in the browser, with {options.policy}")
         return 0
-    for item in map(described_input, names):
-        print(f"  {item.name} [{item.unit}]: {item.meaning}")
+    for column in map(described_input, names):
+        print(f"  {column.name} [{column.unit}]: {column.meaning}")
     print(f"{path}: maps these inputs, in this order, to the acceleration [m/s²]")
     return 0

@@ -130,8 +130,8 @@ class DrivingProgram(nn.Module):
         before, clock = read_before(pieces), [key for key in (SEED, STEP) if key in needs]
         self.kept: dict[Key, Any] = dict.fromkeys(clock, (torch.Size([1]), torch.int64))
         for piece in pieces:
-            own = [key for key in piece.entries if key in before]
-            self.kept |= piece.layouts(torch.Size([]), own)
+            keys = [key for key in piece.entries if key in before]
+            self.kept |= piece.layouts(torch.Size([]), keys)
         self.sizes = [shape.numel() for shape, _ in self.kept.values()]
         written = {SEED, STEP}.union(*(piece.entries for piece in pieces))
         self.inputs = {key: self._inputs(".".join(key)) for key in needs if key not in written}
@@ -149,22 +149,22 @@ class DrivingProgram(nn.Module):
 
     def _stand_ins(self) -> dict[str, str | float]:
         """Return zeros for a policy that observes presence, else a vehicle like the own one."""
-        found: dict[str, str | float] = {}
+        stand_ins: dict[str, str | float] = {}
         for name in (name for name in self.names if name.startswith(f"{BEHIND}.")):
             own = name.replace(BEHIND, SELF)
             if BEHIND_PRESENT in self.names or name.endswith(".acceleration"):
-                found[name] = 0.0
+                stand_ins[name] = 0.0
             elif own in self.names:
-                found[name] = own
-        return found
+                stand_ins[name] = own
+        return stand_ins
 
     def forward(self, state: Tensor, memory: Tensor | None = None) -> Any:
         """Return the commanded accelerations and, if there is one, the memory after the step."""
         if memory is None:
             return self.step(state)[0]
-        begun = memory[:, :1]
-        seeds = torch.zeros_like(begun, dtype=torch.int64)
-        return self.step(state, torch.where(begun > 0.0, memory, self.begin(state, seeds)))
+        started = memory[:, :1]
+        seeds = torch.zeros_like(started, dtype=torch.int64)
+        return self.step(state, torch.where(started > 0.0, memory, self.begin(state, seeds)))
 
     def begin(self, state: Tensor, seeds: Tensor) -> Tensor:
         """Return the initial memories of vehicles from seeds ``[batch, 1]``, int64."""
@@ -187,10 +187,10 @@ class DrivingProgram(nn.Module):
         ``apply(piece, before, reached)`` applies each piece, by default ``piece.derive``.
         """
         state = self._with_stand_ins(state)
-        held: Sequence[Tensor] = ()
+        last: Sequence[Tensor] = ()
         values = () if memory is None else memory[:, 1:].split(self.sizes, -1)
         if self.safety is not None:
-            state, *held = self._held(state, *values[-2:])
+            state, *last = self._held(state, *values[-2:])
         reached = self.measured(state)
         before = dict(reached)
         if memory is not None:
@@ -202,7 +202,7 @@ class DrivingProgram(nn.Module):
         command = reached[COMMAND_KEY].flatten(1)
         if memory is None:
             return (command,)
-        after = self._packed(reached, memory, held)
+        after = self._packed(reached, memory, last)
         if self.safety is not None:  # without measurements the vehicle starts anew
             after = torch.where(after.isfinite().all(-1, keepdim=True), after, 0.0)
         return command, after
@@ -213,50 +213,50 @@ class DrivingProgram(nn.Module):
             return state
         columns = dict(zip(self.names, state.split(1, -1), strict=True))
         rear = [columns[name] for name in self.stand_ins]
-        known = torch.cat(rear, -1).isfinite().all(-1, keepdim=True)
+        measured = torch.cat(rear, -1).isfinite().all(-1, keepdim=True)
         if BEHIND_PRESENT in columns:
-            known = known & (columns[BEHIND_PRESENT] > 0.0)
+            measured = measured & (columns[BEHIND_PRESENT] > 0.0)
         for name, other in self.stand_ins.items():
             value = columns[other] if isinstance(other, str) else other
-            columns[name] = torch.where(known, columns[name], value)
+            columns[name] = torch.where(measured, columns[name], value)
         return torch.cat([columns[name] for name in self.names], -1)
 
     def _held(self, state: Tensor, last: Tensor, missed: Tensor) -> tuple[Tensor, ...]:
         """Return the inputs of a step, those to keep, and whether there was no measurement."""
         gap = state[:, self.names.index("self.gap")].unsqueeze(-1)
-        known = state.isfinite().all(-1, keepdim=True) & (gap > 0.0)
+        measured = state.isfinite().all(-1, keepdim=True) & (gap > 0.0)
         lost = torch.where(missed > 0.0, torch.nan, last.to(state.dtype))
-        found = torch.where(known, state, lost)
-        return found, found, (~known).to(state.dtype)
+        inputs = torch.where(measured, state, lost)
+        return inputs, inputs, (~measured).to(state.dtype)
 
-    def _packed(self, entries: State, like: Tensor, held: Sequence[Tensor]) -> Tensor:
+    def _packed(self, entries: State, like: Tensor, last: Sequence[Tensor]) -> Tensor:
         rows = [torch.ones_like(like[:, :1])]
         for key, (shape, _) in self.kept.items():
             rows.append(entries[key].expand(like.shape[0], *shape).flatten(1).to(like.dtype))
-        return torch.cat([*rows, *(value.to(like.dtype) for value in held)], 1)
+        return torch.cat([*rows, *(value.to(like.dtype) for value in last)], 1)
 
     def measured(self, state: Tensor) -> State:
         """Return the measured entries, ``[batch, 1, width]``."""
         columns = dict(zip(self.names, state.unsqueeze(1).split(1, -1), strict=True))
-        found = {}
+        entries = {}
         for key, names in self.inputs.items():
             value = torch.cat([columns[name] for name in names], -1)
             if names == DERIVED_INPUTS.get(".".join(key)):
                 value = columns[names[0]] - columns[names[1]]
                 if key[0] == BEHIND and BEHIND_PRESENT in columns:  # zero without a vehicle behind
                     value = value * columns[BEHIND_PRESENT]
-            found[key] = value
-        return found
+            entries[key] = value
+        return entries
 
 
 def described_input(name: str) -> Input:
     """Return name, unit and meaning of a measurement such as ``"ahead.speed"``."""
     view, entry = name.split(".")[:2]
     owners = {"self": "own", "ahead": "of the vehicle ahead", "behind": "of the vehicle behind"}
-    known = declared(Piece)
+    shown = declared(Piece)
     for key in ((VEHICLES, entry), (view, entry), (ROLE, entry)):
-        if key in known:
-            return Input(name, known[key].unit, f"{known[key].meaning} ({owners.get(view, view)})")
+        if key in shown:
+            return Input(name, shown[key].unit, f"{shown[key].meaning} ({owners.get(view, view)})")
     return Input(name, "–", f"{entry} ({owners.get(view, view)})")
 
 
@@ -299,11 +299,11 @@ def program(
     scenario = cfg.scenario
     leader = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["constant"])
     env = build_env(cfg, leader, population)
-    if isinstance(policy, nn.Module) and (given := as_given(policy, type(policy).__name__)):
-        given.tried(env.reset())
+    if isinstance(policy, nn.Module) and (foreign := as_given(policy, type(policy).__name__)):
+        foreign.tried(env.reset())
     pieces = pieces_of(env)
-    found = {kind: [p for p in pieces if isinstance(p, kind)] for kind in (Observation, Action)}
-    require(all(found.values()), f"{policy}: no network drives its vehicles; nothing to export")
+    by_kind = {kind: [p for p in pieces if isinstance(p, kind)] for kind in (Observation, Action)}
+    require(all(by_kind.values()), f"{policy}: no network drives its vehicles; nothing to export")
     for name, node in scenario.fleet.items():
         if node is not None and AUTOMATED in node.settings["roles"]:
             raise ConfigError(
@@ -323,16 +323,16 @@ def program(
         learned = with_weights(cfg, weights or {}, cfg.seed, str(policy), population).policy
         assert isinstance(learned, TensorDictModule)
         network = learned.module
-    (observation,), (action,) = found.values()
-    held = f"{policy}: scenario.controllers.automated.hold, an action that is held, has no program"
-    require(action.every == 1, held)
+    (observation,), (action,) = by_kind.values()
+    text = f"{policy}: scenario.controllers.automated.hold, an action that is held, has no program"
+    require(action.every == 1, text)
     world = replace(
         measuring(scenario.time_step, BEHIND_PRESENT not in observation.names),
         max_braking=scenario.max_braking,
         max_acceleration=scenario.max_acceleration,
     )
-    seen = {name.partition(".")[0] for name in observation.seen}
-    memory = [p for p in pieces if isinstance(p, ObservationMemory) and p.view in seen]
+    views = {name.partition(".")[0] for name in observation.seen}
+    memory = [p for p in pieces if isinstance(p, ObservationMemory) and p.view in views]
     largest = action.max_acceleration
     network = NetworkController(network=network, max_acceleration=largest)
     return driving([*memory, observation, network], safety, world, limits)
@@ -343,8 +343,8 @@ def filter_of(safety: Safety, own: CBFFilter | None, name: str) -> CBFFilter | N
     if not isinstance(safety, Mapping):
         return safety or own
     if own is None:
-        words = f"; a rule whose name ends in {FILTERED} has one"
-        raise ConfigError(f"{name} has no safety filter whose settings safety could change{words}")
+        hint = f"; a rule whose name ends in {FILTERED} has one"
+        raise ConfigError(f"{name} has no safety filter whose settings safety could change{hint}")
     return parse(type(own), values(own) | dict(safety), "safety")
 
 

@@ -57,14 +57,14 @@ class Film:
         roles = string.roles
         if self.drawn:
             own = set(self._look(AUTOMATED, "index"))
-            others = iter(sorted(roles, key=AUTOMATED.__eq__))
-            roles = tuple(AUTOMATED if i in own else next(others) for i in range(len(string)))
+            rest = iter(sorted(roles, key=AUTOMATED.__eq__))
+            roles = tuple(AUTOMATED if i in own else next(rest) for i in range(len(string)))
         leader = None if string.ring else ahead
         return road_picture(SampleMotion(time, roles, speed, gap, front, leader, lengths, around))
 
     def _look(self, *key: str) -> Any:
         """Return an entry of the present state."""
         rows = self.episodes.rows
-        place = rows.keys.index(key)
-        first = sum(rows.sizes[:place])
-        return self.episodes.state[self.place, first : first + rows.sizes[place]].copy()
+        index = rows.keys.index(key)
+        first = sum(rows.sizes[:index])
+        return self.episodes.state[self.place, first : first + rows.sizes[index]].copy()

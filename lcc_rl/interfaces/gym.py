@@ -57,7 +57,7 @@ def _episodes(
     if render_mode is not None:
         from lcc_rl.interfaces.film import Film  # loads matplotlib
 
-        episodes.films = [Film(episodes, place) for place in range(count)]
+        episodes.films = [Film(episodes, index) for index in range(count)]
     return episodes
 
 
@@ -67,15 +67,15 @@ def _seeds(seed: Any, count: int) -> list[int | None]:
     Raises:
         ConfigError: naming a seed and its range, or the number of places.
     """
-    given = np.asarray(seed, np.object_)
-    if given.ndim == 0:
-        first = checked_seed(given.item())
+    seeds = np.asarray(seed, np.object_)
+    if seeds.ndim == 0:
+        first = checked_seed(seeds.item())
         return [None if first is None else checked_seed(first + i) for i in range(count)]
-    if given.shape != (count,):
+    if seeds.shape != (count,):
         raise ConfigError(
-            f"seed must be a number or a list of {count}, got one of {list(given.shape)}"
+            f"seed must be a number or a list of {count}, got one of {list(seeds.shape)}"
         )
-    return [checked_seed(each) for each in given]
+    return [checked_seed(x) for x in seeds]
 
 
 def _options(options: Any) -> dict[str, Any]:
@@ -198,9 +198,9 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
             f"max_episode_steps={max_episode_steps} is no setting of the vector: "
             f'use overrides=["scenario.horizon={max_episode_steps}"]',
         )
-        given = getattr(autoreset_mode, "value", autoreset_mode)
-        require_known("autoreset_mode", [given], [mode.value for mode in AutoresetMode])
-        self.mode = AutoresetMode(given)
+        choice = getattr(autoreset_mode, "value", autoreset_mode)
+        require_known("autoreset_mode", [choice], [mode.value for mode in AutoresetMode])
+        self.mode = AutoresetMode(choice)
         self.metadata = {**self.metadata, "autoreset_mode": self.mode}
         self.episodes = _episodes(variant, num_envs, overrides, held_out, render_mode)
         self.render_mode = render_mode
@@ -231,7 +231,7 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
         """
         options, count = _options(options), self.num_envs
         mask = np.asarray(options.pop(MASK_OPTION, [True] * count), np.object_)
-        truths = all(isinstance(each, bool | np.bool_) for each in mask.flat)
+        truths = all(isinstance(x, bool | np.bool_) for x in mask.flat)
         if mask.shape != (count,) or not truths or not mask.any():
             raise ConfigError(
                 f"{MASK_OPTION} must be {count} truth values, one true, got {mask.tolist()}"
@@ -247,23 +247,23 @@ class CarFollowingVector(VectorEnv[Array, Array, Array]):
         if not (self.running | self.ended).all():
             ended = np.flatnonzero(~self.running).tolist()
             raise ResetNeeded(f"call reset before step, by reset_mask in the places {ended}")
-        results, begun = self.episodes.step(actions), self.ended
-        if begun.any():
-            self.episodes.reset(np.flatnonzero(begun))
-            results[begun] = 0.0
+        results, finished = self.episodes.step(actions), self.ended
+        if finished.any():
+            self.episodes.reset(np.flatnonzero(finished))
+            results[finished] = 0.0
         observation = self.episodes.observation
         ends = results[:, 1:3] > 0.0
         done: Any = ends.any(1)
         info: dict[str, Any] = {
             TERMS_INFO: dict(zip(self.episodes.terms, results[:, 3:].T, strict=True))
         }
-        same = self.mode == AutoresetMode.SAME_STEP
-        if same and done.any():
+        same_step = self.mode == AutoresetMode.SAME_STEP
+        if same_step and done.any():
             final = {TERMS_INFO: info[TERMS_INFO], f"_{TERMS_INFO}": done}
             info |= {"final_obs": observation, "_final_obs": done}
             info |= {"final_info": final, "_final_info": done}
             observation = self.episodes.reset(np.flatnonzero(done))
-        self.running = ~done | same
+        self.running = ~done | same_step
         self.ended = done & (self.mode == AutoresetMode.NEXT_STEP)
         return observation, results[:, 0], ends[:, 0], ends[:, 1], info
 

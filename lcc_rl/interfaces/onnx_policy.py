@@ -93,8 +93,8 @@ class Program:
         with raised_as(ResultsError, path, Exception):  # onnxruntime's have no common class
             content = Path(path).read_bytes()
             self.session = ort.InferenceSession(content, options, ["CPUExecutionProvider"])
-        given = self.session.get_modelmeta().custom_metadata_map.get(ABOUT, "{}")
-        self.names = tuple(one.name for one in _facts(given, path).inputs)
+        about = self.session.get_modelmeta().custom_metadata_map.get(ABOUT, "{}")
+        self.names = tuple(column.name for column in _facts(about, path).inputs)
         self.memory = self._check_shapes()
 
     def __reduce__(self) -> Any:
@@ -103,14 +103,14 @@ class Program:
     def _check_shapes(self) -> int:
         """Check names, types and widths of inputs and outputs; return the width of the memory."""
         takes, makes = self.session.get_inputs(), self.session.get_outputs()
-        names = [[one.name for one in side] for side in (takes, makes)]
+        names = [[x.name for x in side] for side in (takes, makes)]
         count = 1 + (MEMORY_INPUT in names[0])
-        wanted = [list(TAKES[:count]), list(MAKES[:count])]
-        shapes = {one.name: one.shape for one in takes}
+        expected = [list(TAKES[:count]), list(MAKES[:count])]
+        shapes = {x.name: x.shape for x in takes}
         state, memory = shapes.get(STATE_INPUT, []), shapes.get(MEMORY_INPUT, ["batch", 0])
-        right = names == wanted and len(memory) == 2 and isinstance(memory[1], int)
+        right = names == expected and len(memory) == 2 and isinstance(memory[1], int)
         right = right and len(state) == 2 and state[1] == len(self.names)
-        if not right or any(one.type != "tensor(float)" for one in (*takes, *makes)):
+        if not right or any(x.type != "tensor(float)" for x in (*takes, *makes)):
             raise ResultsError(
                 f"{self.path}: expected the input {STATE_INPUT} [batch, {len(self.names)}], maybe "
                 f"{MEMORY_INPUT} [batch, n], and the outputs {' and '.join(MAKES[:count])}, in "
@@ -118,23 +118,23 @@ class Program:
             )
         return int(memory[1])
 
-    def __call__(self, *given: Tensor) -> list[Tensor]:
+    def __call__(self, *inputs: Tensor) -> list[Tensor]:
         """Return the accelerations, ``[batch, 1]``, and the memory if there is one.
 
         Args:
             *given: the state, ``[batch, inputs]``, and the memory, ``[batch, n]``.
         """
-        named = zip(TAKES, given, strict=False)
+        named = zip(TAKES, inputs, strict=False)
         feed = {name: value.detach().cpu().float().numpy() for name, value in named}
         with raised_as(ResultsError, self.path, Exception):
-            found = self.session.run(None, feed)
-        widths = [1, self.memory][: len(found)]
-        for value, width in zip(found, widths, strict=True):
+            outputs = self.session.run(None, feed)
+        widths = [1, self.memory][: len(outputs)]
+        for value, width in zip(outputs, widths, strict=True):
             require(
-                value.shape == (len(given[0]), width),
+                value.shape == (len(inputs[0]), width),
                 f"{self.path}: it returned {list(value.shape)}, expected [batch, {width}]",
             )
-        return [torch.as_tensor(value).to(given[0]) for value in found]
+        return [torch.as_tensor(value).to(inputs[0]) for value in outputs]
 
 
 def _facts(text: str, path: str) -> ProgramFacts:
@@ -147,8 +147,8 @@ def _facts(text: str, path: str) -> ProgramFacts:
         "(Policies made elsewhere) shows how to write them",
     )
     require(isinstance(about, dict), f"{path}: its metadata {ABOUT} must be a JSON object")
-    own = {key: about[key] for key in ("inputs", "output") if key in about}
-    return parse(ProgramFacts, own, f"{path}, metadata {ABOUT}")
+    facts = {key: about[key] for key in ("inputs", "output") if key in about}
+    return parse(ProgramFacts, facts, f"{path}, metadata {ABOUT}")
 
 
 class OnnxPolicy(Controller):
@@ -174,6 +174,6 @@ class OnnxPolicy(Controller):
     def command(self, *entries: Tensor) -> tuple[Tensor, ...]:
         """Return the commands, and the memory if there is one."""
         count, rows = len(self.program.names), entries[0].shape[:-1]
-        given = [torch.cat(entries[:count], -1), *entries[count:]]
-        found = self.program(*(value.reshape(rows.numel(), -1) for value in given))
-        return tuple(value.view(*rows, -1) for value in found)
+        inputs = [torch.cat(entries[:count], -1), *entries[count:]]
+        results = self.program(*(value.reshape(rows.numel(), -1) for value in inputs))
+        return tuple(value.view(*rows, -1) for value in results)

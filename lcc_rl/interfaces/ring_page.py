@@ -81,9 +81,9 @@ def page_data(policy: Any, trust: Sequence[str], overrides: Sequence[str]) -> di
         strange.append("drivers (only IDM drivers that share a, b and s0, without gap_noise)")
     if strange or car is None:
         raise ConfigError(f"{policy}: a page of the ring does not support {', '.join(strange)}")
-    for item in overrides:
-        key = key_of(item).removeprefix("controller@")
-        require(key.startswith(SHOWN), f"{item} has no effect: a page shows {', '.join(SHOWN)}")
+    for override in overrides:
+        key = key_of(override).removeprefix("controller@")
+        require(key.startswith(SHOWN), f"{override} has no effect: a page shows {', '.join(SHOWN)}")
     rules = {name: Driver(name, scenario.time_step).program.controller for name in RING_RULES}
     count, some = len(vehicles), vehicles.count(AUTOMATED)
     spread = [k * count // some for k in range(some)]
@@ -111,21 +111,21 @@ def page_data(policy: Any, trust: Sequence[str], overrides: Sequence[str]) -> di
 def ring_of(policy: str | Path, trust: Sequence[str], overrides: Sequence[str]) -> StudyConfig:
     """Return the ring of a policy's training, or else of the task, with overrides."""
     cfg: StudyConfig = load("evaluate", [*RING_TASK, *overrides])
-    own, given = load_policy(policy, trust=trust)[1], [key_of(item) for item in overrides]
-    if own.scenario.road != RING:
+    trained, keys = load_policy(policy, trust=trust)[1], [key_of(x) for x in overrides]
+    if trained.scenario.road != RING:
         return cfg
     ring = {
-        name: getattr(own.scenario, name)
+        name: getattr(trained.scenario, name)
         for name in OF_RING
-        if getattr(own.scenario, name) != {}
-        and not any(key.startswith(f"scenario.{name}") for key in given)
+        if getattr(trained.scenario, name) != {}
+        and not any(key.startswith(f"scenario.{name}") for key in keys)
     }
     changes: dict[str, Any] = {}
-    if own.drivers is not None and not any(x in key for x in OF_DRIVERS for key in given):
-        changes["drivers"] = own.drivers
-        ring["controllers"] = {HUMAN: own.scenario.controllers[HUMAN]}
-    if own.energy is not None and "energy" not in map(top_key, given):
-        changes["energy"] = own.energy
+    if trained.drivers is not None and not any(x in key for x in OF_DRIVERS for key in keys):
+        changes["drivers"] = trained.drivers
+        ring["controllers"] = {HUMAN: trained.scenario.controllers[HUMAN]}
+    if trained.energy is not None and "energy" not in map(top_key, keys):
+        changes["energy"] = trained.energy
     return cfg.with_(scenario=ring, **changes)
 
 
@@ -151,11 +151,11 @@ def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict
     observation: Any = program.observation
     memory = [piece for piece in program.pieces if isinstance(piece, ObservationMemory)]
     layers = [x for x in controller.layers.modules() if not list(x.children())]
-    kept = [(name, time) for x in memory for name in x.sources for time in x.seconds]
+    past = [(name, time) for x in memory for name in x.sources for time in x.seconds]
     columns = observation.columns()
-    seen = [*(name for column in columns for name in column), *(name for name, _ in kept)]
+    names = [*(name for column in columns for name in column), *(name for name, _ in past)]
     strange = [type(x).__name__ for x in layers if not isinstance(x, LAYERS)]
-    strange += [name for name in seen if name.partition(".")[0] not in VIEWS]
+    strange += [name for name in names if name.partition(".")[0] not in VIEWS]
     strange += ["stacked memory"] if any(x.stacked for x in memory) else []
     strange += ["late filter"] if program.safety is not None and program.safety.late else []
     require(not strange, f"{policy}: the page does not support its {', '.join(strange)}")
@@ -165,7 +165,7 @@ def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict
         "scales": observation.factors.tolist(),
         "max_acceleration": controller.max_acceleration,
         "filter": None if program.safety is None else filter_data(program.safety),
-        "memory": [{"source": name, "seconds": time} for name, time in kept],
+        "memory": [{"source": name, "seconds": time} for name, time in past],
     }
 
 

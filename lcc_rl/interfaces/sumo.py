@@ -79,8 +79,8 @@ class Bridge:
         kinds = self.sumo.vehicletype
         slow = [kind for kind in kinds.getIDList() if kinds.getActionStepLength(kind) > delta]
         if slow and self.sumo.simulation.getOption("step-method.ballistic") != "true":
-            words = "actionStepLength of %s exceeds the step of %g s: SUMO then moves all vehicles "
-            log.warning(words + "by ballistic steps, not by Euler's", ", ".join(slow), delta)
+            text = "actionStepLength of %s exceeds the step of %g s: SUMO then moves all vehicles "
+            log.warning(text + "by ballistic steps, not by Euler's", ", ".join(slow), delta)
         self.modes: dict[str, int] = {}  # original speed modes of commanded vehicles
 
     def command(self, execute: bool = True) -> dict[str, float]:
@@ -97,16 +97,16 @@ class Bridge:
         """
         cars = self.sumo.vehicle
         present = cars.getIDList()
-        seen = {car: self._measured(car) for car in present if self.chosen(car)}
-        measured = {car: row for car, row in seen.items() if row is not None}
+        rows = {car: self._measured(car) for car in present if self.chosen(car)}
+        measured = {car: row for car, row in rows.items() if row is not None}
         for car in [car for car in self.modes if car not in measured]:
             self._release(car, car in present)
         columns = zip(*measured.values(), strict=True) if measured else [()] * len(MEASURED)
         try:
-            wanted = self.driver.step(dict(zip(MEASURED, columns, strict=True)), list(measured))
+            result = self.driver.step(dict(zip(MEASURED, columns, strict=True)), list(measured))
         except Diverged as error:
             raise Diverged(f"{error} at {self.sumo.simulation.getTime():g} s") from error
-        commands = dict(zip(measured, wanted.tolist(), strict=True))
+        commands = dict(zip(measured, result.tolist(), strict=True))
         for car, acceleration in commands.items() if execute else ():
             self._set(car, cars.getSpeed(car) + acceleration * self.driver.time_step)
         return commands
@@ -137,10 +137,10 @@ class Bridge:
         gap = free + cars.getMinGap(car)  # SUMO's gaps exclude the minimum gap
         if not ahead or gap > self.sight:
             return None
-        own = (cars.getSpeed(car), gap, cars.getAcceleration(car))
+        motion = (cars.getSpeed(car), gap, cars.getAcceleration(car))
         lead = (cars.getSpeed(ahead), cars.getAcceleration(ahead))
         behind, free = cars.getFollower(car, self.sight) or ("", 0.0)
         room = free + cars.getMinGap(behind) if behind else 0.0
         if not behind or room > self.sight:
-            return (*own, *lead, 0.0, 0.0, 0.0, 0.0)
-        return (*own, *lead, cars.getSpeed(behind), room, cars.getAcceleration(behind), 1.0)
+            return (*motion, *lead, 0.0, 0.0, 0.0, 0.0)
+        return (*motion, *lead, cars.getSpeed(behind), room, cars.getAcceleration(behind), 1.0)

@@ -51,7 +51,7 @@ class Actuation(RoleTransform):
         braking = min(self.braking or hardest, hardest)
         return Response.of(late, self.lag, braking, world.time_step)
 
-    def compute(self, command: Tensor, kept: Tensor) -> tuple[Tensor, Tensor]:
-        line = join([kept[..., 1:], command], -1)
-        acceleration = self.response.next(kept[..., :1], line[..., :1])
+    def compute(self, command: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        line = join([memory[..., 1:], command], -1)
+        acceleration = self.response.next(memory[..., :1], line[..., :1])
         return acceleration, join([acceleration, line[..., 1:]], -1)

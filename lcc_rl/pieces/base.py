@@ -68,8 +68,8 @@ class Entry:
 
     def of(self, role: str, name: str = "") -> Entry:
         """Return the entry of a role or of a name."""
-        held = {ROLE: role, TERM: name}
-        return replace(self, key=tuple(held.get(part) or part for part in as_key(self.key)))
+        names = {ROLE: role, TERM: name}
+        return replace(self, key=tuple(names.get(x) or x for x in as_key(self.key)))
 
     def wide(self, width: int | tuple[int, ...]) -> Entry:
         """Return the entry with another width."""
@@ -78,13 +78,13 @@ class Entry:
 
 def declared(*kinds: type) -> dict[Key, Entry]:
     """Return the entries in the bodies of classes and of those derived from them, by key."""
-    found: dict[Key, Entry] = {}
+    entries: dict[Key, Entry] = {}
     for kind in kinds:
         for value in vars(kind).values():
             several = value if isinstance(value, tuple) else (value,)
-            found |= {as_key(one.key): one for one in several if isinstance(one, Entry)}
-        found |= declared(*kind.__subclasses__())
-    return found
+            entries |= {as_key(entry.key): entry for entry in several if isinstance(entry, Entry)}
+        entries |= declared(*kind.__subclasses__())
+    return entries
 
 
 def next_key(key: NestedKey) -> Key:
@@ -197,9 +197,9 @@ class Piece(Part, TensorDictModuleBase, Transform):
 
     def _declared(self, entries: Sequence[Entry | NestedKey]) -> list[Key]:
         """Store entries of the piece; return their keys."""
-        own = [x.of(self.role, self.name) if isinstance(x, Entry) else Entry(x) for x in entries]
-        self.entries |= {as_key(entry.key): entry for entry in own}
-        return [as_key(entry.key) for entry in own]
+        new = [x.of(self.role, self.name) if isinstance(x, Entry) else Entry(x) for x in entries]
+        self.entries |= {as_key(entry.key): entry for entry in new}
+        return [as_key(entry.key) for entry in new]
 
     def shape_of(self, key: Key) -> tuple[int, ...]:
         """Return the shape of a declared entry after the batch dimensions."""
@@ -210,12 +210,12 @@ class Piece(Part, TensorDictModuleBase, Transform):
         self, batch: torch.Size, keys: Sequence[Key] | None = None
     ) -> dict[Key, tuple[torch.Size, torch.dtype]]:
         """Return shape and type of declared entries, by default of all."""
-        found = {}
+        result = {}
         for key in self.entries if keys is None else keys:
-            whole = self.entries[key].whole or self.entries[key].option
-            dtype = torch.int64 if whole else torch.get_default_dtype()
-            found[key] = torch.Size((*batch, *self.shape_of(key))), dtype
-        return found
+            integral = self.entries[key].whole or self.entries[key].option
+            dtype = torch.int64 if integral else torch.get_default_dtype()
+            result[key] = torch.Size((*batch, *self.shape_of(key))), dtype
+        return result
 
     def derive(self, before: State, reached: State, detached: bool = False) -> None:
         """Compute the written entries from plain mappings of entries.
@@ -260,8 +260,8 @@ class Piece(Part, TensorDictModuleBase, Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Apply the piece to any TensorDict that holds its ``in_keys``."""
         reads = self.in_keys if self.needs else ()  # an unbound piece raises here
-        given = self._present([tensordict.get(key, None) for key in reads])
-        values = self.computed(given)
+        inputs = self._present([tensordict.get(key, None) for key in reads])
+        values = self.computed(inputs)
         values = (values,) if isinstance(values, Tensor) else values
         for key, value in zip(self.out_keys, values, strict=True):
             tensordict.set(key, value)
@@ -277,8 +277,8 @@ class Piece(Part, TensorDictModuleBase, Transform):
         # TorchRL's own version requires the out_keys in the specs, where keys under "next" are
         # missing. TransformedEnv passes a copy; one per piece would be slow.
         for part in parts:
-            whole = f"full_{part}_spec"
-            spec[whole] = getattr(self, f"transform_{part}_spec")(spec[whole])
+            name = f"full_{part}_spec"
+            spec[name] = getattr(self, f"transform_{part}_spec")(spec[name])
         return spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

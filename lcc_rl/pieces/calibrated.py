@@ -53,11 +53,11 @@ class CalibratedDrivers(Drivers):
         return self._each(driver, lambda law: law.equilibrium_gap(*steady))
 
     def _each(self, driver: Tensor, quantity: Callable[[DriverConstants], Tensor]) -> Tensor:
-        kind, found = self.kinds[driver], None
+        kind, result = self.kinds[driver], None
         for number, name in enumerate(self.models):
             law = LAWS[name]
-            own = {part: getattr(self, f"own_{part}")[driver] for part in law.shared()}
-            values = quantity(law(**own))
-            found = values if found is None else torch.where(kind == number, values, found)
-        assert found is not None  # a population holds drivers
-        return found
+            constants = {x: getattr(self, f"own_{x}")[driver] for x in law.shared()}
+            values = quantity(law(**constants))
+            result = values if result is None else torch.where(kind == number, values, result)
+        assert result is not None  # a population holds drivers
+        return result

@@ -135,11 +135,11 @@ class CBFFilter(RoleTransform):
         self.memories = [f"{self.role}.{name}" for name, needed in self.remembers.items() if needed]
         self.from_step = world.steps(self.from_s, "from_s")
         self.agreement = Agreement(self.sensing, world.time_step)
-        kept = [f"{self.role}.agreement", *self.memories]
-        seen = [f"next.{self.role}.{WANTED}", *FILTER_READS, *kept]
+        memory = [f"{self.role}.agreement", *self.memories]
+        reads = [f"next.{self.role}.{WANTED}", *FILTER_READS, *memory]
         self.replaced = world.replaced
-        seen += ["self.followed"] * self.replaced
-        self.declare(world, [*seen, *["episode.step"] * (self.from_step > 0)])
+        reads += ["self.followed"] * self.replaced
+        self.declare(world, [*reads, *["episode.step"] * (self.from_step > 0)])
         self.limits = Braking(self.response.braking, self.braking_ahead, self.time_to_collision)
 
     def watch(self) -> CBFGuarantee:
@@ -149,20 +149,20 @@ class CBFFilter(RoleTransform):
 
     def compute(self, wanted: Tensor, *state: Tensor) -> tuple[Tensor, Tensor]:
         """Return the filtered commands and the memory of gaps."""
-        given = list(state)
-        step = given.pop() if self.from_step else None
+        inputs = list(state)
+        step = inputs.pop() if self.from_step else None
         if self.replaced:  # gaps to another vehicle are not compared
-            same = given.pop() > self.sensing.oldest
-            given[len(FILTER_READS)] = torch.where(same, given[len(FILTER_READS)], 0.0)
-        command, agreed = self.filtered(wanted, *given)
+            same_leader = inputs.pop() > self.sensing.oldest
+            inputs[len(FILTER_READS)] = torch.where(same_leader, inputs[len(FILTER_READS)], 0.0)
+        command, agreed = self.filtered(wanted, *inputs)
         if step is not None:
             command = torch.where(step < self.from_step, wanted, command)
         return command, agreed
 
     def kept(self, memories: Sequence[Tensor], nothing: Tensor) -> list[Tensor]:
         """Return the memories of actuation and sensors; ``nothing``, one column, for none."""
-        given = iter(memories)
-        return [next(given) if needed else nothing for needed in self.remembers.values()]
+        rest = iter(memories)
+        return [next(rest) if needed else nothing for needed in self.remembers.values()]
 
     def _when_it_acts(
         self, motion: PairState, acceleration: Tensor | float, actuation: Tensor, sensors: Tensor
@@ -191,22 +191,22 @@ class CBFFilter(RoleTransform):
             *memories: the entries that :attr:`memories` names.
         """
         # A NaN or an infinity in any of them makes the sum non-finite.
-        known = (wanted + speed + gap + ahead + ahead_acceleration).isfinite()
-        kept, relative = self.kept(memories, wanted), ahead - speed
+        finite = (wanted + speed + gap + ahead + ahead_acceleration).isfinite()
+        memory, relative = self.kept(memories, wanted), ahead - speed
         with torch.no_grad():  # no slope: simulated measurements agree
             agreed = self.agreement.next(agreed, gap, relative)
-            agreed = batch_innermost(torch.where(known, agreed, 0.0))
+            agreed = batch_innermost(torch.where(finite, agreed, 0.0))
             differs = self.agreement.difference(agreed, relative)
         nearer = (ahead + differs.clamp(max=0.0)).clamp(min=0.0)
-        measured = PairState(speed, gap, nearer, kept[0][..., :1])
-        worst = self._when_it_acts(self.sensing.worst(measured), -self.braking_ahead, *kept)
+        measured = PairState(speed, gap, nearer, memory[0][..., :1])
+        worst = self._when_it_acts(self.sensing.worst(measured), -self.braking_ahead, *memory)
         safe = self._safe(replace(worst, gap=worst.gap - self.margin))
-        now = self._when_it_acts(measured, ahead_acceleration, *kept)
+        now = self._when_it_acts(measured, ahead_acceleration, *memory)
         command = self._comfortable(wanted, now, ahead_acceleration, differs.abs(), safe)
         stays = (gap < self.margin) & (relative + differs <= 0.0)
         command = torch.where(stays, command.clamp(max=0.0), command)
         command = command.clamp(self.least, self.largest)
-        return torch.where(known, command, self.least), agreed
+        return torch.where(finite, command, self.least), agreed
 
     def _safe(self, worst: PairState) -> Tensor:
         """Return the largest command after which full braking suffices."""
@@ -247,8 +247,8 @@ class CBFFilter(RoleTransform):
         if self.shortest_time_gap is not None:
             room = gap - self.shortest_time_gap * speed
             grows = half * ahead_acceleration - closing
-            held = (self.time_gap_rate * room + grows) / (self.shortest_time_gap + half)
-            command = torch.minimum(command, held)
+            bound = (self.time_gap_rate * room + grows) / (self.shortest_time_gap + half)
+            command = torch.minimum(command, bound)
         return command
 
     def _allowed(self, speed: Tensor, time_gap: float) -> tuple[Tensor, Tensor]:
@@ -295,10 +295,10 @@ class CBFGuarantee(RoleTransform):
     )
 
     def setup(self, world: World) -> None:
-        seen = ["self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration"]
+        reads = ["self.speed", "self.gap", "ahead.speed", "next.ahead.acceleration"]
         self.replaced = world.replaced
-        seen += [*self.safety.memories, "episode.step", *["next.self.followed"] * self.replaced]
-        self.declare(world, seen)
+        reads += [*self.safety.memories, "episode.step", *["next.self.followed"] * self.replaced]
+        self.declare(world, reads)
 
     def compute(
         self, speed: Tensor, gap: Tensor, ahead: Tensor, acceleration: Tensor, *more: Tensor

@@ -65,8 +65,8 @@ class Communication(Feature):
         string = world.string
         leader = [] if string.ring else [(LEADER, "speed"), (LEADER, "acceleration")]
         roles = [role for role in string.names if role in self.connected and string.drawn]
-        own = [(VEHICLES, name) for name in ("speed", "gap", "acceleration")]
-        self.declare(world, [*own, *leader, *((role, "index") for role in roles)])
+        motion = [(VEHICLES, name) for name in ("speed", "gap", "acceleration")]
+        self.declare(world, [*motion, *leader, *((role, "index") for role in roles)])
         if string.ring and (string.drawn or string.roles[0] in self.connected):
             raise ConfigError(
                 "communication: on a ring road the first vehicle of scenario.string must not be "

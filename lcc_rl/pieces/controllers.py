@@ -103,22 +103,22 @@ class Controller(RoleTransform):
         # Limits of the commands [m/s²]; None: not clamped.
         self.limits: tuple[float, float] | None = world.limits(self.role, *most)
         memory = self.remembers if remembers is None else remembers
-        own = [Entry((ROLE, x)) if isinstance(x, str) else x for x in memory]
-        kept = [".".join(as_key(entry.of(self.role).key)) for entry in own]
-        self.names = (*(self.reads if reads is None else reads), *kept)
+        entries = [Entry((ROLE, x)) if isinstance(x, str) else x for x in memory]
+        names = [".".join(as_key(entry.of(self.role).key)) for entry in entries]
+        self.names = (*(self.reads if reads is None else reads), *names)
         order = self.orders[self.role in world.filtered]
-        more = self.writes if writes is None else writes
-        super().declare(world, self.names, [order, *own, *more], keeps)
+        outputs = self.writes if writes is None else writes
+        super().declare(world, self.names, [order, *entries, *outputs], keeps)
 
     def compute(self, *entries: Tensor) -> Any:
         """Return the results of :meth:`command` with clamped commands."""
-        found = self.command(*entries)
+        results = self.command(*entries)
         if self.limits is None:
-            return found
-        if isinstance(found, Tensor):
-            return found.clamp(*self.limits)
-        command, *kept = found
-        return (command.clamp(*self.limits), *kept)
+            return results
+        if isinstance(results, Tensor):
+            return results.clamp(*self.limits)
+        command, *rest = results
+        return (command.clamp(*self.limits), *rest)
 
 
 class Action(Controller):
@@ -137,8 +137,8 @@ class Action(Controller):
 
     def setup(self, world: World) -> None:
         self.every = max(world.steps(self.hold, f"scenario.controllers.{self.name}.hold"), 1)
-        reads, kept = [f"{self.name}.action"], self.every > 1
-        self.declare(world, reads + ["episode.step"] * kept, remembers=[self.held] * kept)
+        reads, holds = [f"{self.name}.action"], self.every > 1
+        self.declare(world, reads + ["episode.step"] * holds, remembers=[self.held] * holds)
         assert self.limits is not None
         if max(self.limits[0], -self.limits[1]) <= -self.max_acceleration:
             self.limits = None  # the action is clamped when it is read
@@ -147,8 +147,8 @@ class Action(Controller):
         """Return the commands, and the action if it is held; the memory is step and action."""
         if not memory:
             return action * self.max_acceleration
-        step, held = memory
-        action = torch.where(step % self.every == 0, action, held)
+        step, last = memory
+        action = torch.where(step % self.every == 0, action, last)
         return action * self.max_acceleration, action
 
 
@@ -181,7 +181,7 @@ class Law(Controller):
         """Find the function and the entries that its parameters name."""
         self.function = find_target(self.law, "law")
         parameters = inspect.signature(self.function).parameters.values()
-        names = [one.name for one in parameters if one.default is one.empty]
+        names = [x.name for x in parameters if x.default is x.empty]
         self.declare(world, [_entry(name) for name in names])
 
     def command(self, *entries: Tensor) -> Tensor:

@@ -156,24 +156,24 @@ class Drivers(Controller):
     ) -> Any:
         """Return the commands, then the history and the noise if they are kept."""
         motion = (speed, gap, relative_speed)
-        kept: list[Tensor] = []
+        memories: list[Tensor] = []
         noise = sight = None
         if self.gap_spread:
             *more, before = more  # type: ignore[assignment]
-            how = self.gap_spread, self.gap_noise_step, self.gap_noise_streams
-            kept.insert(0, sight := self._noise_of(before, seed, step, *how))
+            args = self.gap_spread, self.gap_noise_step, self.gap_noise_streams
+            memories.insert(0, sight := self._noise_of(before, seed, step, *args))
         if self.noise_spread:
             *more, before = more  # type: ignore[assignment]
-            how = self.noise_spread, self.noise_step, self.noise_streams
-            kept.insert(0, noise := self._noise_of(before, seed, step, *how))
+            args = self.noise_spread, self.noise_step, self.noise_streams
+            memories.insert(0, noise := self._noise_of(before, seed, step, *args))
         if self.late:
             *more, history = more  # type: ignore[assignment]
             now = join(motion, -1)
             # In the first step the whole history is the present.
             past = torch.where(step == 0, now.repeat(*[1] * (now.ndim - 1), self.late), history)
-            seen = join([now, past], -1)
-            motion = self._then(seen, seed).split(1, -1)
-            kept.insert(0, seen[..., :-3])
+            frames = join([now, past], -1)
+            motion = self._then(frames, seed).split(1, -1)
+            memories.insert(0, frames[..., :-3])
         if sight is not None:
             motion = (motion[0], motion[1] * sight[..., :1].exp(), motion[2])
         command = self.acceleration(*motion, desired_speed, time_gap, *more)
@@ -187,17 +187,17 @@ class Drivers(Controller):
             least = self.noise_least / self.noise_spread
             factor = between((least, 1.0), seed, NOISE_STREAM)
             command = command + factor * noise[..., :1]
-        return (command, *kept) if kept else command
+        return (command, *memories) if memories else command
 
-    def _then(self, seen: Tensor, seed: Tensor) -> Tensor:
+    def _then(self, frames: Tensor, seed: Tensor) -> Tensor:
         """Return the motion that the drivers react to from the motion seen, latest first."""
         if self.soonest == self.late:
-            return seen[..., -3:]
+            return frames[..., -3:]
         span = self.late - self.soonest + 1
         late = self.soonest + (span * uniform(seed, 0, DELAY_STREAM)).long()
-        columns = 3 * late + torch.arange(3, device=seen.device)
-        columns = columns.expand(*seen.shape[:-1], 3)
-        return reverse(reverse(seen).gather(0, reverse(columns)))
+        columns = 3 * late + torch.arange(3, device=frames.device)
+        columns = columns.expand(*frames.shape[:-1], 3)
+        return reverse(reverse(frames).gather(0, reverse(columns)))
 
     def _noise_of(
         self,
@@ -289,21 +289,21 @@ class DriverModel(Drivers):
 
     def described(self, world: World, where: str) -> tuple[Tensor, Tensor, DriverConstants]:
         """Return the drivers, see :class:`Drivers`; drivers of other models are refused."""
-        one = self.desired_speed is not None
-        if one:
-            own = torch.tensor([[float(x)] for x in (self.desired_speed, self.time_gap)])  # type: ignore[arg-type]
-            known = self.law() if world.population is None else world.population.constants
-            found = (own[0], own[1], known)
+        single = self.desired_speed is not None
+        if single:
+            pair = torch.tensor([[float(x)] for x in (self.desired_speed, self.time_gap)])  # type: ignore[arg-type]
+            shared = self.law() if world.population is None else world.population.constants
+            drivers = (pair[0], pair[1], shared)
         else:
-            found = super().described(world, where)
+            drivers = super().described(world, where)
         models = getattr(world.population, "models", None)
-        if models and not one:
+        if models and not single:
             raise ConfigError(
                 f"{where}: the population holds drivers of the model(s) "
                 f"{', '.join(sorted(set(models)))}, expected IDM drivers; "
                 f"controller@{where}=calibrated drives each by its own model"
             )
-        constants = found[2] if self.parameters is None else self.parameters
+        constants = drivers[2] if self.parameters is None else self.parameters
         if not isinstance(constants, self.law):
             expected = self.law.__name__
             raise ConfigError(f"{where}.parameters: expected {expected}, got {constants!r}")
@@ -313,7 +313,7 @@ class DriverModel(Drivers):
                 "drivers.mode=local), got a population in which they differ by driver; "
                 f"controller@{where}=calibrated drives each by its own"
             )
-        return (*found[:2], constants)
+        return (*drivers[:2], constants)
 
 
 class IDM(DriverModel):

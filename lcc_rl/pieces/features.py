@@ -79,8 +79,8 @@ class EnergyClasses(StepTransform):
                     index = start.get((role, "index"))
                 else:
                     index = torch.tensor(self.string.places(role), device=seed.device)
-                own = (place == index.unsqueeze(-2)).any(-1, keepdim=True)
-                kinds = torch.where(own, _drawn(draw, shares), kinds)
+                mask = (place == index.unsqueeze(-2)).any(-1, keepdim=True)
+                kinds = torch.where(mask, _drawn(draw, shares), kinds)
         start.set(CLASS, kinds.expand(*start.batch_size, count, 1).clone())
 
 

@@ -99,15 +99,15 @@ class HCFS(Controller):
         check_leader(self.lookahead, self)
         if self.choice == "first":
             check_platoon(self, "choice=first", "needs a string that is one platoon", "between")
-        own = {field.name: getattr(self, field.name) for field in fields(PlatoonReward)}
-        self.reward = PlatoonReward(**own)
+        settings = {field.name: getattr(self, field.name) for field in fields(PlatoonReward)}
+        self.reward = PlatoonReward(**settings)
         self.both_brake = Braking(self.braking, self.braking, time_to_collision=0.0)
 
     def command(self, action: Tensor, *entries: Tensor) -> tuple[Tensor, ...]:
         """Return the commands, the winners and the counters."""
-        own, leader, rule = entries[:5], entries[5:8], entries[8:-4]
+        motion, leader, rule = entries[:5], entries[5:8], entries[8:-4]
         winner, *counts = entries[-4:]
-        decision = self.decide(action, own, leader, winner, self.rule.command(*rule))
+        decision = self.decide(action, motion, leader, winner, self.rule.command(*rule))
         flags = (decision.switched, decision.clamped, decision.capped)
         counted = [count + flag for count, flag in zip(counts, flags, strict=True)]
         return (decision.acceleration, decision.winner, *counted)
@@ -115,12 +115,12 @@ class HCFS(Controller):
     def decide(
         self,
         action: Tensor,
-        own: tuple[Tensor, ...],
+        motion: tuple[Tensor, ...],
         leader: tuple[Tensor, ...],
         last_winner: Tensor,
         rule: Tensor,
     ) -> Decision:
-        speed, last, gap, speed_error, leader_gap = own
+        speed, last, gap, speed_error, leader_gap = motion
         interval = jerk_interval(last, self.jerk_bound, self.time_step, self.max_acceleration)
         ahead, time_step = speed + speed_error, self.time_step
         cap = safe_acceleration(speed, gap - self.margin, ahead, self.both_brake, time_step)

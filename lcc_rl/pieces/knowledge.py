@@ -54,14 +54,14 @@ class LeaderPreview(Feature):
         steps = [world.steps(ahead, f"{where}.horizons") - late for ahead in self.horizons]
         self.register_buffer("speeds", profiles.speeds)
         self.register_buffer("offsets", profiles.offsets)
-        known = profiles.lengths if profiles.reach is None else profiles.reach
-        self.register_buffer("last", known - 1)
+        lengths = profiles.lengths if profiles.reach is None else profiles.reach
+        self.register_buffer("last", lengths - 1)
         self.register_buffer("shift", torch.tensor(steps))
         self.register_buffer("columns", torch.arange(len(steps)))
 
     def compute(self, profile: Tensor, start: Tensor, seed: Tensor, step: Tensor) -> Tensor:
-        place = torch.minimum(start + step + self.shift, self.last[profile]).clamp(min=0)
-        speed = self.speeds[self.offsets[profile] + place]
+        index = torch.minimum(start + step + self.shift, self.last[profile]).clamp(min=0)
+        speed = self.speeds[self.offsets[profile] + index]
         if self.noise:
             error = normal(seed, step, self.stream + self.columns)
             speed = (speed + self.noise * error).clamp(min=0.0)
@@ -116,37 +116,37 @@ class ObservationMemory(StepTransform):
             writes = [self.spread.wide(wide), self.averages.wide(wide)]
         elif self.stacked:
             writes.append(self.history.wide(self.counted * self.depth))
-        kept = [str(entry.key) for entry in writes[self.stacked :]]
+        history = [str(entry.key) for entry in writes[self.stacked :]]
         reached = [f"{NEXT}.{source}" for source in self.sources]
         self.replaced = world.replaced
         reached += [f"{NEXT}.self.followed"] * self.replaced
-        self.declare(world, [*kept, *reached], writes)
+        self.declare(world, [*history, *reached], writes)
         # The same entries at reset, which has no previous step.
         self.first = Views(world.string, AUTOMATED, world.sensed(AUTOMATED, self.sources))
         shares = 1.0 - torch.exp(-time_step / torch.tensor(list(self.seconds)))
         self.register_buffer("shares", shares.repeat(self.counted))
         self.register_buffer("places", torch.tensor(ages))
 
-    def compute(self, kept: Tensor, *measured: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+    def compute(self, memory: Tensor, *measured: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         """Return the entries, and the history or the averages if they are kept."""
-        given, spread = list(measured), self.kind == "spread"
-        same = given.pop() > 0.0 if self.replaced else None  # behind the same vehicle
-        average = given.pop(0) if spread else None
-        now = torch.cat(given, -1)
-        if same is not None:
-            fresh = now.repeat_interleave(kept.shape[-1] // self.counted, -1)
-            kept = torch.where(same, kept, 0.0 * fresh if spread else fresh)
-            average = None if average is None else torch.where(same, average, fresh)
+        inputs, spread = list(measured), self.kind == "spread"
+        same_leader = inputs.pop() > 0.0 if self.replaced else None  # behind the same vehicle
+        average = inputs.pop(0) if spread else None
+        now = torch.cat(inputs, -1)
+        if same_leader is not None:
+            fresh = now.repeat_interleave(memory.shape[-1] // self.counted, -1)
+            memory = torch.where(same_leader, memory, 0.0 * fresh if spread else fresh)
+            average = None if average is None else torch.where(same_leader, average, fresh)
         if average is not None:
             now = now.repeat_interleave(self.repeat, -1)
             away = (now - average).abs()
-            return torch.lerp(kept, away, self.shares), torch.lerp(average, now, self.shares)
+            return torch.lerp(memory, away, self.shares), torch.lerp(average, now, self.shares)
         if not self.stacked:
-            return torch.lerp(kept, now.repeat_interleave(self.repeat, -1), self.shares)
-        past = kept.unflatten(-1, (self.counted, self.depth))
+            return torch.lerp(memory, now.repeat_interleave(self.repeat, -1), self.shares)
+        past = memory.unflatten(-1, (self.counted, self.depth))
         past = torch.cat([now.unsqueeze(-1), past[..., :-1]], -1)
-        seen = past[..., self.places]
-        return batch_innermost(seen.flatten(-2)), batch_innermost(past.flatten(-2))
+        samples = past[..., self.places]
+        return batch_innermost(samples.flatten(-2)), batch_innermost(past.flatten(-2))
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         now = torch.cat(self.first.of(start), -1)

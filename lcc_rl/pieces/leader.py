@@ -70,7 +70,7 @@ class NGSIMLeader(StepTransform):
         self.time_step, self.names = world.time_step, profiles.names
         self.profile_stream = stream_id("leader.profile")
         self.start_stream = stream_id("leader.start")
-        self.streams = [stream_id(f"leader.perturbation.{part}") for part in "cAtp"]
+        self.streams = [stream_id(f"leader.perturbation.{letter}") for letter in "cAtp"]
         self.register_buffer("speeds", profiles.speeds)
         self.register_buffer("offsets", profiles.offsets)
         self.register_buffer("lengths", profiles.lengths)
@@ -119,8 +119,8 @@ class NGSIMLeader(StepTransform):
         """Draw a record by its weight, by counter."""
         if self.shares is None:
             return choose(seed, len(self.offsets), self.profile_stream)
-        place = uniform(seed, 0, self.profile_stream).double()
-        drawn = torch.searchsorted(self.shares, place, right=True)
+        draw = uniform(seed, 0, self.profile_stream).double()
+        drawn = torch.searchsorted(self.shares, draw, right=True)
         return drawn.clamp(max=len(self.offsets) - 1)  # rounding may leave the last share below 1
 
     def _window(self, given: TensorDictBase, seed: Tensor) -> tuple[Tensor, Tensor]:

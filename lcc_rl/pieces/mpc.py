@@ -78,8 +78,8 @@ class MPC(MPCSettings, Controller):
     def setup(self, world: World) -> None:
         self.check_installed()
         self.declare(world)
-        own = {field.name: getattr(self, field.name) for field in fields(MPCSettings)}
-        self.solver = Solver(MPCSettings(**own), self.limits)
+        settings = {field.name: getattr(self, field.name) for field in fields(MPCSettings)}
+        self.solver = Solver(MPCSettings(**settings), self.limits)
 
     @staticmethod
     def check_installed() -> None:
@@ -97,8 +97,8 @@ class MPC(MPCSettings, Controller):
         speed = entries[0]
         rows = torch.stack([x.detach().expand_as(speed).flatten() for x in entries], -1)
         first, unsolved = self.solver(rows.double().cpu().numpy())
-        made = (torch.as_tensor(x).to(speed).view_as(speed) for x in (first, unsolved))
-        return tuple(made)  # type: ignore[return-value]
+        results = (torch.as_tensor(x).to(speed).view_as(speed) for x in (first, unsolved))
+        return tuple(results)  # type: ignore[return-value]
 
 
 class Solver:
@@ -123,22 +123,22 @@ class Solver:
         Args:
             rows: speed, gap, acceleration, speed and acceleration ahead, ``[rows, 5]``.
         """
-        distinct, place = np.unique(rows, axis=0, return_inverse=True)
+        distinct, inverse = np.unique(rows, axis=0, return_inverse=True)
         first, unsolved = self._each(distinct)
-        return first[place.ravel()], unsolved[place.ravel()]
+        return first[inverse.ravel()], unsolved[inverse.ravel()]
 
     def _each(self, rows: Array) -> tuple[Array, Array]:
         first, unsolved = np.full(len(rows), np.nan), np.zeros(len(rows))
-        known = np.flatnonzero(np.isfinite(rows).all(1))
+        finite = np.flatnonzero(np.isfinite(rows).all(1))
         least, largest = self.program.limits
-        speed, gap, *others = rows[known].T
-        vectors = self.program.vectors(speed, gap.clip(-LONGEST_GAP, LONGEST_GAP), *others)
-        each = zip(known, vectors.linear, vectors.lower, vectors.upper, strict=True)
-        for row, linear, lower, upper in each:
+        speed, gap, *rest = rows[finite].T
+        vectors = self.program.vectors(speed, gap.clip(-LONGEST_GAP, LONGEST_GAP), *rest)
+        programs = zip(finite, vectors.linear, vectors.lower, vectors.upper, strict=True)
+        for row, linear, lower, upper in programs:
             self.osqp.update(q=linear, l=lower, u=upper)
-            found = self.osqp.solve(raise_error=False)
-            solved = found.info.status_val == 1
-            first[row] = np.clip(found.x[0], least, largest) if solved else least
+            result = self.osqp.solve(raise_error=False)
+            solved = result.info.status_val == 1
+            first[row] = np.clip(result.x[0], least, largest) if solved else least
             unsolved[row] = not solved
         return first, unsolved
 
@@ -208,10 +208,10 @@ class FollowingProgram:
         # The trapezoidal rule of the simulator (A18).
         self.ways = h * sums @ (self.speeds - 0.5 * h * np.eye(n))
         changes = (np.eye(n) - np.eye(n, k=-1)) / h
-        own = np.eye(n) + settings.jerk_price * changes.T @ changes
+        block = np.eye(n) + settings.jerk_price * changes.T @ changes
         prices = (settings.near_price, settings.far_price, settings.ttc_price)
         self.quadratic = 2.0 * np.diag(np.repeat([0.0, *prices], n))
-        self.quadratic[:n, :n] = 2.0 * own
+        self.quadratic[:n, :n] = 2.0 * block
         self.constraints = self._constraints()
 
     def _constraints(self) -> Array:
@@ -240,8 +240,8 @@ class FollowingProgram:
         """
         s, n = self.settings, self.steps
         speed = speed[:, None]
-        lead, way = self.predicted(ahead[:, None], ahead_change[:, None])
-        free = gap[:, None] + way - speed * self.times  # gaps without accelerating
+        lead, distance = self.predicted(ahead[:, None], ahead_change[:, None])
+        free = gap[:, None] + distance - speed * self.times  # gaps without accelerating
         # At equilibrium the limits leave a gap at any speed.
         narrowest = s.margin - (s.longest_time_gap - s.least_time_gap) * lead
         upper = [

@@ -72,17 +72,17 @@ class Observation(Feature):
         counts = [visible if view == BEHIND else wide.get(view, 1) for view, _ in flat]
         bases = _bases(self.relative_to or {}, flat, counts)
         values = [x for x, n in zip(flat.values(), counts, strict=True) for _ in range(n)]
-        seen = list(flat)
+        shown = list(flat)
         if self.shows_presence(string):
-            seen.append((BEHIND, PRESENT))
+            shown.append((BEHIND, PRESENT))
             values += [1.0] * visible
             bases.append([])
             counts.append(visible)
-        names = list(dict.fromkeys([*seen, *(key for keys in bases for key in keys)]))
-        known = world.sensed(AUTOMATED, [".".join(name) for name in names])
-        views = Views(string, AUTOMATED, known, visible)
+        names = list(dict.fromkeys([*shown, *(key for keys in bases for key in keys)]))
+        sensed = world.sensed(AUTOMATED, [".".join(name) for name in names])
+        views = Views(string, AUTOMATED, sensed, visible)
         self.declare(world, views, [self.gathered.wide(len(values))])
-        self.seen, self.names = [".".join(key) for key in seen], [".".join(key) for key in names]
+        self.seen, self.names = [".".join(key) for key in shown], [".".join(key) for key in names]
         self.bases = [[names.index(key) for key in keys] for keys in bases]
         self.repeats = [n // max(len(keys), 1) for n, keys in zip(counts, bases, strict=True)]
         factors = [1.0] * len(values) if self.raw else values
@@ -96,36 +96,36 @@ class Observation(Feature):
         """
         named = re.compile(re.escape(name) + r"(\.\d+)?")
         columns = enumerate(self.columns())
-        found = [i for i, (own, *of) in columns if named.fullmatch(own) and tuple(of) == base]
-        what = " relative to ".join((name, *base))
-        require(bool(found), f"a rule needs {what}, which observation.scales does not name")
-        return slice(found[0], found[-1] + 1)
+        indices = [i for i, (entry, *of) in columns if named.fullmatch(entry) and tuple(of) == base]
+        text = " relative to ".join((name, *base))
+        require(bool(indices), f"a rule needs {text}, which observation.scales does not name")
+        return slice(indices[0], indices[-1] + 1)
 
     def columns(self) -> list[list[str]]:
         """Return for each column the name of its entry, and that of the subtracted entry if any.
 
         The name of a view with several columns ends with a number: ``"memory.entries.0"``.
         """
-        found = []
+        result = []
         for name, bases, repeat in zip(self.seen, self.bases, self.repeats, strict=True):
             width = max(len(bases), 1) * repeat
             for column in range(width):
-                own = name if width == 1 else f"{name}.{column}"
-                found.append([own, *(self.names[i] for i in bases[column // repeat :][:1])])
-        return found
+                label = name if width == 1 else f"{name}.{column}"
+                result.append([label, *(self.names[i] for i in bases[column // repeat :][:1])])
+        return result
 
     def compute(self, *values: Tensor) -> Tensor:
         """Return the scaled observation, ``[*batch, A, entries]``."""
-        seen = list(values[: len(self.bases)])
-        for place, (bases, repeat) in enumerate(zip(self.bases, self.repeats, strict=True)):
+        entries = list(values[: len(self.bases)])
+        for index, (bases, repeat) in enumerate(zip(self.bases, self.repeats, strict=True)):
             if bases:
                 base = torch.cat([values[i] for i in bases], -1)
-                seen[place] = seen[place] - base.repeat_interleave(repeat, -1)
-        vehicles = max(entry.shape[-2] for entry in seen)
+                entries[index] = entries[index] - base.repeat_interleave(repeat, -1)
+        vehicles = max(entry.shape[-2] for entry in entries)
         # An entry that is the same for all, such as a preview of the leader, has one row.
         rows = [
             entry if entry.shape[-2] == vehicles else entry.expand(*entry.shape[:-2], vehicles, -1)
-            for entry in seen
+            for entry in entries
         ]
         return torch.cat(rows, dim=-1) * self.factors
 
@@ -140,13 +140,13 @@ def _bases(
         if view == BEHIND or view not in {name for name, _ in flat}:
             where = f"observation.relative_to.{view}"
             raise ConfigError(f"{where}: expected a view of observation.scales other than behind")
-    found = []
+    bases = []
     for (view, _), count in zip(flat, counts, strict=True):
-        given = relative_to.get(view) or ()
-        keys = [tuple(key.split(".")) for key in ([given] if isinstance(given, str) else given)]
+        base = relative_to.get(view) or ()
+        keys = [tuple(key.split(".")) for key in ([base] if isinstance(base, str) else base)]
         if keys and count % len(keys):
             raise ConfigError(
                 f"observation.relative_to.{view}: {len(keys)} entries do not divide its {count}"
             )
-        found.append(keys)
-    return found
+        bases.append(keys)
+    return bases

@@ -33,9 +33,9 @@ class RecordedDriver(Controller):
         Raises:
             ConfigError: if no driver was recorded behind the leaders.
         """
-        known = world.profiles is not None and world.profiles.followers is not None
+        recorded = world.profiles is not None and world.profiles.followers is not None
         require(
-            known,
+            recorded,
             f"scenario.controllers.{self.name}: no driver was recorded behind these leaders; use "
             "trajectories of several vehicles, such as data=ngsim, data=openacc, data=table or "
             "data=episodes",

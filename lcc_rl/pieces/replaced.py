@@ -83,8 +83,8 @@ class ReplacedLeader(NGSIMLeader):
         near, added = (distance, 0.0 * distance) if self.gap else (0.0 * distance + FAR, distance)
         numbers = (changed.to(speed.dtype), near, added)
         none = (torch.zeros_like(near), torch.full_like(near, FAR), torch.zeros_like(near))
-        each = [torch.where(changed, x, y) for x, y in zip(numbers, none, strict=True)]
-        return (reached, torch.where(changed, own, acceleration), *more, join(each, -1))
+        placement = [torch.where(changed, x, y) for x, y in zip(numbers, none, strict=True)]
+        return (reached, torch.where(changed, own, acceleration), *more, join(placement, -1))
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> Any:
         super().begin(given, start)

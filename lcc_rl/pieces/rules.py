@@ -52,9 +52,9 @@ class Averaging(Controller):
         past = join([speed, history[..., :-1]], -1)
         return total(past, -1) / (step + 1).clamp(max=self.samples), past
 
-    def towards(self, wanted: Tensor, speed: Tensor) -> Tensor:
+    def towards(self, target: Tensor, speed: Tensor) -> Tensor:
         """Return the acceleration [m/s²] to a speed."""
-        return (wanted - speed) / self.time_step
+        return (target - speed) / self.time_step
 
 
 class FollowerStopper(Averaging):
@@ -83,12 +83,12 @@ class FollowerStopper(Averaging):
         """Whether the speeds are kept: if there is no desired speed."""
         return self.desired_speed is None
 
-    def command(self, speed: Tensor, gap: Tensor, ahead: Tensor, *kept: Tensor) -> Any:
+    def command(self, speed: Tensor, gap: Tensor, ahead: Tensor, *history: Tensor) -> Any:
         """Return the commands, and the history if it is kept."""
         if self.desired_speed is not None:
             desired = torch.full_like(speed, self.desired_speed)
             return self.towards(self.wanted(speed, gap, ahead, desired), speed)
-        mean, past = self.mean(speed, *kept)
+        mean, past = self.mean(speed, *history)
         return self.towards(self.wanted(speed, gap, ahead, mean), speed), past
 
     def wanted(self, speed: Tensor, gap: Tensor, ahead: Tensor, desired: Tensor) -> Tensor:
@@ -186,8 +186,8 @@ class Calm(Averaging):
     @classmethod
     def constants_of_rule(cls) -> dict[str, float]:
         """Return the constants of the law with their defaults."""
-        own = ("gain", "gap", "standstill_gap", "time_gap", "braking", "response")
-        return {name: defaults(cls)[name] for name in own}
+        names = ("gain", "gap", "standstill_gap", "time_gap", "braking", "response")
+        return {name: defaults(cls)[name] for name in names}
 
     @staticmethod
     def law(speed: Tensor, gap: Tensor, relative: Tensor, lag: Tensor, *constants: Each) -> Tensor:
@@ -230,9 +230,9 @@ class Handover(Controller):
 
     def command(self, step: Tensor, *entries: Tensor) -> Any:
         """Return the commands of the active controller and the further entries of both."""
-        place = len(self.before.names)
-        first = self.before.compute(*entries[:place])
-        second = self.after.compute(*entries[place:])
+        count = len(self.before.names)
+        first = self.before.compute(*entries[:count])
+        second = self.after.compute(*entries[count:])
         first, second = (x if isinstance(x, tuple) else (x,) for x in (first, second))
         command = torch.where(step < self.from_step, first[0], second[0])
         return (command, *first[1:], *second[1:])

@@ -30,12 +30,12 @@ class Sections:
         self.keys: list[Key] = []
         if string.drawn:
             self.keys = [(role, "index") for role in (AUTOMATED, *({of} - {VEHICLES}))]
-        own = string.places(AUTOMATED)
-        ends = [*own[1:], len(string)]
-        self.first = [self._rank(place + 1) for place in own]
-        self.last = [self._rank(place) for place in ends] if own else []
+        automated = string.places(AUTOMATED)
+        ends = [*automated[1:], len(string)]
+        self.first = [self._rank(place + 1) for place in automated]
+        self.last = [self._rank(place) for place in ends] if automated else []
         # On a ring, vehicles ahead of the first automated vehicle are behind the last one.
-        self.wrapped = self._rank(own[0]) if own and string.ring else 0
+        self.wrapped = self._rank(automated[0]) if automated and string.ring else 0
 
     def _rank(self, place: int) -> int:
         """Return how many vehicles with the entry are ahead of a place."""
@@ -46,24 +46,24 @@ class Sections:
         """Return the sums, ``[*batch, A, 1]``, of an entry ``[*batch, n, 1]``."""
         if self.string.drawn:
             return self._sum_drawn(entry, *indices)
-        parts = [
+        sums = [
             _sum(entry[..., first:last, :])
             for first, last in zip(self.first, self.last, strict=True)
         ]
         if self.wrapped:
-            parts[-1] = parts[-1] + _sum(entry[..., : self.wrapped, :])
-        if not parts:
+            sums[-1] = sums[-1] + _sum(entry[..., : self.wrapped, :])
+        if not sums:
             return entry[..., :0, :]
-        return parts[0] if len(parts) == 1 else join(parts, -2)
+        return sums[0] if len(sums) == 1 else join(sums, -2)
 
-    def _sum_drawn(self, entry: Tensor, own: Tensor, *others: Tensor) -> Tensor:
-        first, last = own + 1, pad(own[..., 1:], (0, 1), value=len(self.string))
-        for index in others:
+    def _sum_drawn(self, entry: Tensor, places: Tensor, *indices: Tensor) -> Tensor:
+        first, last = places + 1, pad(places[..., 1:], (0, 1), value=len(self.string))
+        for index in indices:
             ahead = index.unsqueeze(-2)
-            first, last = ((ahead < place.unsqueeze(-1)).sum(-1) for place in (first, last))
+            first, last = ((ahead < end.unsqueeze(-1)).sum(-1) for end in (first, last))
         total = sum_ranges(entry, first, last)
         if self.string.ring:
-            start = first[..., :1] - (0 if others else 1)
+            start = first[..., :1] - (0 if indices else 1)
             front = sum_ranges(entry, start.new_zeros(start.shape), start)
             total = total + pad(front, (0, 0, total.shape[-2] - 1, 0))
         return total

@@ -71,9 +71,9 @@ class Sensors(RoleTransform):
         self.first_lost = world.steps(self.lost_from or 0.0, f"scenario.sensors.{role}.lost_from")
         self.apart = max(1, world.steps(self.error_time, f"scenario.sensors.{role}.error_time"))
         drawn = ["episode.seed", "next.episode.step"]
-        seen = [f"{role}.{SENSORS}", *(f"next.{name}" for name in TRUE_STATE), *drawn]
+        reads = [f"{role}.{SENSORS}", *(f"next.{name}" for name in TRUE_STATE), *drawn]
         width = 1 + len(TRUE_STATE) * (self.sensing.oldest + 1)
-        self.declare(world, seen, [*self.measured, self.kept.wide(width)])
+        self.declare(world, reads, [*self.measured, self.kept.wide(width)])
         # The same entries at reset, which has no previous step.
         self.first = Views(world.string, role, [*TRUE_STATE, "episode.seed", "episode.step"])
         self.streams = [stream_id(f"{role}.sensors.{name}") for name in ("gap", "speed", "ahead")]
@@ -94,8 +94,8 @@ class Sensors(RoleTransform):
         errors = (self.gap_error, self.speed_error, self.ahead_error, self.scale_error)
         return Sensing(*errors, late, longest)
 
-    def compute(self, memory: Tensor, *seen: Tensor) -> tuple[Tensor, ...]:
-        *now, seed, step = seen
+    def compute(self, memory: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+        *now, seed, step = inputs
         frames = join([*now, memory[..., 1 : -len(TRUE_STATE)]], -1)
         dropped = memory[..., :1] - self.sensing.late
         missing = uniform(seed, step, self.missing + self.index) < self.dropouts
@@ -125,15 +125,15 @@ class Sensors(RoleTransform):
         )
         speed = (own * speed + speed_error).clamp(min=0.0)
         ahead = (other * ahead + ahead_error).clamp(min=0.0)
-        kept = join([age, frames], -1)
-        return gap + gap_error, speed, ahead - speed, ahead, acceleration, kept
+        memory = join([age, frames], -1)
+        return gap + gap_error, speed, ahead - speed, ahead, acceleration, memory
 
     def _error(self, seed: Tensor, step: Tensor, stream: int) -> Tensor:
         """Return the error of a step's measurements as a share of its bound, in [−1, 1]."""
-        place = step / self.apart
-        first = place.floor()
+        phase = step / self.apart
+        first = phase.floor()
         start, end = (uniform(seed, first.long() + k, stream + self.index) for k in (0, 1))
-        return 2.0 * torch.lerp(start, end, place - first) - 1.0
+        return 2.0 * torch.lerp(start, end, phase - first) - 1.0
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         *now, seed, step = self.first.of(start)

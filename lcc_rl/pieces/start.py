@@ -50,9 +50,9 @@ class TimeGapStart(Part):
         self.lowest, self.highest = world.deviations(self.gap_range)
         self.given = DEFAULT_TIME_GAP if self.time_gap == "recorded" else float(self.time_gap)
         profiles, first = world.profiles, world.string.places(self.name)[:1] == (0,)
-        known = first and not world.string.drawn and profiles is not None
-        known = known and profiles.followers is not None and self.time_gap == "recorded"
-        self.records = (profiles.followers, profiles.offsets) if known else None
+        recorded = first and not world.string.drawn and profiles is not None
+        recorded = recorded and profiles.followers is not None and self.time_gap == "recorded"
+        self.records = (profiles.followers, profiles.offsets) if recorded else None
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""
@@ -61,8 +61,8 @@ class TimeGapStart(Part):
         gap = self.standstill_gap + self.given * speed
         if self.records is not None:
             followers, offsets = (x.to(speed.device) for x in self.records)
-            found = followers[offsets[start.get(PROFILE)] + start.get(PROFILE_START)]
-            pairs = zip(found.split(1, -1), (speed, gap), strict=True)
+            motion = followers[offsets[start.get(PROFILE)] + start.get(PROFILE_START)]
+            pairs = zip(motion.split(1, -1), (speed, gap), strict=True)
             speed, gap = (torch.cat([x.to(y), y[..., 1:, :]], -2) for x, y in pairs)
         return speed, factor * gap
 
@@ -90,11 +90,11 @@ class EquilibriumStart(Part):
                 f"{role}.desired_time_gap, which only driver models write; use for example "
                 f"'scenario.start.{role}=${{scenario.start.automated}}'"
             )
-        known = start.get((role, "equilibrium_gap"), None)
-        if known is not None:
-            return speed, self.drivers.capped(known, speed, self.cap_time_gap)
-        own = (desired_speed, time_gap, self.cap_time_gap)
-        return speed, self.drivers.equilibrium_gap(speed, *own)
+        gap = start.get((role, "equilibrium_gap"), None)
+        if gap is not None:
+            return speed, self.drivers.capped(gap, speed, self.cap_time_gap)
+        args = (desired_speed, time_gap, self.cap_time_gap)
+        return speed, self.drivers.equilibrium_gap(speed, *args)
 
 
 class HeadwayStart(Part):

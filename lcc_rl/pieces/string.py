@@ -59,11 +59,11 @@ class RolePlaces(StepTransform):
                 start.set((role, "index"), places.expand(*start.batch_size, len(places)).clone())
             return
         draw = uniform(start.get(SEED), 0, self.stream + self.index)
-        order, begun = draw.argsort(-1), 0
+        order, first = draw.argsort(-1), 0
         for role in self.roles:
             count = self.string.count(role)
-            start.set((role, "index"), order[..., begun : begun + count].sort(-1).values)
-            begun += count
+            start.set((role, "index"), order[..., first : first + count].sort(-1).values)
+            first += count
 
 
 class Start(Protocol):
@@ -115,14 +115,14 @@ class StringMotion(StepTransform):
             next_key((role, OBEYED if role in world.actuators else COMMAND))
             for role in string.names
         ]
-        own = [(VEHICLES, name) for name in ("speed", "gap", "acceleration")]
+        motion = [(VEHICLES, name) for name in ("speed", "gap", "acceleration")]
         leader = [] if string.ring else [LEADER_SPEED, next_key(LEADER_SPEED)]
         indices = [(role, "index") for role in string.names] if string.drawn else []
         self.fleet = world.energy
         self.limited = self.fleet is not None and self.fleet.limited
         self.replaced = world.replaced
         changes = [next_key(PLACEMENT), (VEHICLES, "followed")] * self.replaced
-        read = [*own, *leader, *commands, *indices, *changes, *[CLASS] * self.limited]
+        read = [*motion, *leader, *commands, *indices, *changes, *[CLASS] * self.limited]
         self.declare(world, read, [*self.writes, *[self.followed] * self.replaced])
         self.starts: dict[str, Any] = {
             role: start.bind(world, role) if isinstance(start, Part) else start
@@ -158,16 +158,16 @@ class StringMotion(StepTransform):
     def compute(self, speed: Tensor, gap: Tensor, acceleration: Tensor, *more: Tensor) -> Any:
         """Return the motion after the step and the executed commands."""
         leader, reached = (None, None) if self.string.ring else more[:2]
-        parts = more[0 if self.string.ring else 2 :]
+        inputs = more[0 if self.string.ring else 2 :]
         roles = len(self.string.names)
-        indices = parts[roles : 2 * roles] if self.string.drawn else ()
-        command = self._assemble(parts[:roles], indices)
+        indices = inputs[roles : 2 * roles] if self.string.drawn else ()
+        command = self._assemble(inputs[:roles], indices)
         if self.limited:
-            command = self.fleet.within(command, speed, self.time_step, parts[-1])
+            command = self.fleet.within(command, speed, self.time_step, inputs[-1])
         motion = advance_string(speed, gap, acceleration, command, leader, reached, self.time_step)
         if not self.replaced:
             return (*motion, command)
-        placement, followed = (x for x in parts[-2 - self.limited :][:2])
+        placement, followed = (x for x in inputs[-2 - self.limited :][:2])
         changed, near, added = placement.unsqueeze(-2).split(1, -1)
         gap = torch.minimum(motion.gap[..., :1, :], near) + added
         count = torch.where(changed > 0.0, 0.0, followed[..., :1, :] + 1.0)
@@ -177,9 +177,9 @@ class StringMotion(StepTransform):
         )
         return (*motion._replace(gap=gap), command, count)
 
-    def _assemble(self, parts: tuple[Tensor, ...], indices: tuple[Tensor, ...]) -> Tensor:
+    def _assemble(self, entries: tuple[Tensor, ...], indices: tuple[Tensor, ...]) -> Tensor:
         """Return an entry of all vehicles, front to back, from those of the roles."""
-        joined = parts[0] if len(parts) == 1 else join(parts, -2)
+        joined = entries[0] if len(entries) == 1 else join(entries, -2)
         if indices:
             order = join(indices, -1).unsqueeze(-1)
             places, values = reverse(order.expand_as(joined)), reverse(joined)
@@ -207,7 +207,7 @@ class StringMotion(StepTransform):
             ]
             indices = [start.get((role, "index")) for role in roles] if self.string.drawn else []
             speed, gap = (
-                self._assemble(tuple(part), tuple(indices)) for part in zip(*placed, strict=True)
+                self._assemble(tuple(x), tuple(indices)) for x in zip(*placed, strict=True)
             )
             speed = speed if limits is None else torch.minimum(speed, limits)
             relative = entries_ahead(leader, speed) - speed

@@ -142,8 +142,8 @@ class ExcessSpacing(RewardTerm):
 
     def missed(self, gap: Tensor, speed: Tensor) -> Tensor:
         """Return the share, ``[*batch, A, 1]``; negative for gaps shorter than a human driver's."""
-        own = self.standstill_gap + self.time_gap * speed
-        return (gap - own) / (own + self.vehicle_length)
+        desired = self.standstill_gap + self.time_gap * speed
+        return (gap - desired) / (desired + self.vehicle_length)
 
 
 class PathEnergy(RewardTerm):

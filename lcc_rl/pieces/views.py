@@ -94,17 +94,17 @@ class Views:
             self.keys.append(key)
         return self.keys.index(key)
 
-    def _resolver(self, given: NestedKey) -> Resolver:
+    def _resolver(self, requested: NestedKey) -> Resolver:
         """Return the function from the entries read to the view of a name or a key."""
-        name = as_key(given)
-        if not isinstance(given, str):
+        name = as_key(requested)
+        if not isinstance(requested, str):
             return partial(_as_it_is, self._place(name))
         if len(name) - (name[0] == NEXT) != 2:
-            raise ConfigError(f"expected a name such as self.gap, got {given!r}")
+            raise ConfigError(f"expected a name such as self.gap, got {requested!r}")
         prefix, (space, entry) = name[:-2], name[-2:]
         if self.string.measured and space in (SELF, AHEAD, BEHIND, LEADER):
-            seen = AHEAD if space == LEADER else space
-            return partial(_as_it_is, self._place((*prefix, seen, entry)))
+            group = AHEAD if space == LEADER else space
+            return partial(_as_it_is, self._place((*prefix, group, entry)))
         if space in (SELF, AHEAD):
             return self._at((*prefix, VEHICLES, entry), -1 if space == AHEAD else 0)
         if space == BEHIND:
@@ -164,24 +164,24 @@ class Views:
 
 
 def _selected(
-    place: int, select: Callable[[Tensor], Tensor], present: bool, entries: Sequence[Tensor]
+    index: int, select: Callable[[Tensor], Tensor], present: bool, entries: Sequence[Tensor]
 ) -> Tensor:
-    found = select(entries[place])
-    return torch.ones_like(found) if present else found
+    entry = select(entries[index])
+    return torch.ones_like(entry) if present else entry
 
 
-def _row(place: int, entries: Sequence[Tensor]) -> Tensor:
-    return entries[place].unsqueeze(-2)
+def _row(index: int, entries: Sequence[Tensor]) -> Tensor:
+    return entries[index].unsqueeze(-2)
 
 
-def _as_it_is(place: int, entries: Sequence[Tensor]) -> Tensor:
-    return entries[place]
+def _as_it_is(index: int, entries: Sequence[Tensor]) -> Tensor:
+    return entries[index]
 
 
-def _held(place: int, entries: Sequence[Tensor]) -> Tensor:
-    return entries[place].clamp(-1.0, 1.0)
+def _held(index: int, entries: Sequence[Tensor]) -> Tensor:
+    return entries[index].clamp(-1.0, 1.0)
 
 
-def _joined(parts: Sequence[Resolver], entries: Sequence[Tensor]) -> Tensor:
-    found = [part(entries) for part in parts]
-    return found[0] if len(found) == 1 else join(found, -1)
+def _joined(resolvers: Sequence[Resolver], entries: Sequence[Tensor]) -> Tensor:
+    views = [resolve(entries) for resolve in resolvers]
+    return views[0] if len(views) == 1 else join(views, -1)

@@ -63,9 +63,9 @@ class World:
         Raises:
             ConfigError: if the world has none.
         """
-        found = getattr(self, what)
-        require(found is not None, f"{where} needs a World({what}=…) to be bound to")
-        return found
+        value = getattr(self, what)
+        require(value is not None, f"{where} needs a World({what}=…) to be bound to")
+        return value
 
     def deviations(self, factors: tuple[float, float]) -> tuple[float, float]:
         """Return the range from which episodes draw a factor: 1 to 1 in an evaluation."""
@@ -108,11 +108,11 @@ class World:
         Raises:
             ConfigError: if a setting exceeds the limits of automated vehicles.
         """
-        own = {"max_deceleration": backward or forward, "max_acceleration": forward}
+        bounds = {"max_deceleration": backward or forward, "max_acceleration": forward}
         if role != AUTOMATED:
             return None if forward is None else (-(backward or forward), forward)
-        found, most = [], (self.max_braking, self.max_acceleration)
-        for (name, value), vehicle in zip(own.items(), most, strict=True):
+        ends, most = [], (self.max_braking, self.max_acceleration)
+        for (name, value), vehicle in zip(bounds.items(), most, strict=True):
             value = vehicle if value in (None, MAX_ACCELERATION) else value
             require(
                 value <= (vehicle if backward else max(most)),
@@ -121,8 +121,8 @@ class World:
                 f"(scenario.max_braking) and accelerate by at most {most[1]:g} m/s² "
                 "(scenario.max_acceleration)",
             )
-            found.append(min(value, vehicle))
-        return -found[0], found[1]
+            ends.append(min(value, vehicle))
+        return -ends[0], ends[1]
 
     def sensed(self, role: str, names: Sequence[NestedKey]) -> list[NestedKey]:
         """Return names of views of a role, with its measurements where it has sensors."""
