@@ -282,6 +282,8 @@ def test_bad_input_is_one_clear_error() -> None:
     people = Driver("human", 0.1)
     people.step(given, ["car1"])
     check_refused(people.reset, [("car12", "cars must be a list of ids, got 'car12'")], ConfigError)
+    more = {name: [x, x] for name, x in given.items()}  # with the ids of the step before
+    check_refused(people.step, [(more, ["car1"], "cars must be 2 different ids")], ConfigError)
     assert list(people.cars) == ["car1"]
     with pytest.raises(Diverged, match="nothing: the command of car7 is nan"):
         Driver(nothing, 0.1).step({"self.gap": [1.0]}, ["car7"])
