@@ -27,7 +27,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 43_600, "code": 28_750},
+    "lcc_rl + tools": {"lines": 43_610, "code": 28_750},
     "tests": {"lines": 25_600},
     "conf": {"yaml": 162},
 }

@@ -61,6 +61,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
         self.horizon -= burn_in
         self.rule = getattr(self.agent, "rule", None)
         self.objective: Objective | None = getattr(self.agent, "objective", None)
+        self.returns = getattr(self.agent, "returns", None)
         self.wanted: list[Key] = []
         if self.objective is not None and self.objective.differs:
             self.objective.replace([x for x in pieces_of(self.env) if isinstance(x, RewardTerm)])
@@ -112,7 +113,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
         collector.reset()
         segments = islice(collector, self.skipped, None)
         played, losses, missed, spent = [], [], [], [0.0, 0.0]
-        returns, last = getattr(self.agent, "returns", None), 0.0
+        last = 0.0
         for part in range(self.horizon // steps):
             begun = time.perf_counter()
             self.explore(share)
@@ -124,8 +125,10 @@ class CollectingLoop(TrainingLoop[AgentT]):
             if self.rule is not None:  # the policy's part of the action
                 own = batch.get(ACTION) - self.rule(batch.get(OBSERVATION))
                 batch.set(ACTION, own.clamp(-ONE, ONE))
-            if returns is not None:
-                last = returns.add(batch.get(("next", *REWARD)), batch.get(("next", "done")), last)
+            if self.returns is not None:
+                last = self.returns.add(
+                    batch.get(("next", *REWARD)), batch.get(("next", "done")), last
+                )
             collected, size = time.perf_counter(), batch.get(("next", *REWARD)).numel()
             before = self.iteration * (self.horizon // steps) + part
             losses.append(self.learn(batch, before * size))

@@ -65,7 +65,8 @@ class ReplayLoop(CollectingLoop[Any]):
         count = int((before + len(new)) * ratio) - int(before * ratio) if ready else 0
         sums = {"loss_actor": torch.zeros(()), "loss_value": torch.zeros(())}
         for drawn in islice(draws(self.buffer, self.sampler), count):
-            drawn.set_(("next", "reward"), settings.scaled(drawn.get(("next", "reward"))))
+            if settings.scale_rewards:
+                drawn.set_(("next", "reward"), settings.scaled(drawn.get(("next", "reward"))))
             losses = settings.update(drawn)
             sums = {name: total + losses[name] for name, total in sums.items()}
         self.updates += count

@@ -19,10 +19,8 @@ def main(cfg: EvaluateConfig) -> None:
     from lcc_rl.commands.evaluation import complete, run  # loads torch
 
     folder = resumed_folder(cfg, ("resume", "trust"))
-    if is_sweep():
-        complete(cfg, folder)
-    else:
-        run(cfg, folder, typed=HydraConfig.get().overrides.task)
+    work = complete if is_sweep() else run
+    work(cfg, folder, typed=HydraConfig.get().overrides.task)
     log.info("results in %s", folder)
 
 

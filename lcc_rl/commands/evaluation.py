@@ -86,14 +86,14 @@ def made_by(table: Path) -> str | None:
     return parquet_metadata(table).get(IDENTITY) if table.exists() else None
 
 
-def complete(cfg: EvaluateConfig, folder: Path) -> None:
+def complete(cfg: EvaluateConfig, folder: Path, typed: Sequence[str] = ()) -> None:
     """Complete a run of a sweep: skip a finished one, resume a stopped one."""
     table = folder / EPISODES
     if made_by(table) == identity(cfg):
         log.info("%s: finished before", folder.name)
         return
     check_folder(cfg, folder, "inputs")  # with other files it is repeated
-    run(cfg, folder, quiet=cfg.evaluation.shards > 1, replace=True)
+    run(cfg, folder, quiet=cfg.evaluation.shards > 1, replace=True, typed=typed)
     forget(folder)
 
 

@@ -32,7 +32,7 @@ from lcc_rl.evaluation.rows import INDEX
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.base import Key
-from lcc_rl.pieces.connected import CACC, DeadBeat
+from lcc_rl.pieces.connected import MESSAGES
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.rewards import CollisionPenalty
 from lcc_rl.settings import TARGET, Count, Positive, Seed, checked, path_of
@@ -116,11 +116,11 @@ def simulate(
     check_overrides(overrides, fixed, "has no effect in simulate: see the arguments")
     profiles = _profiles(leader, time_step, seconds)
     compared, spec = _given(controller)
-    rule = None if spec is None or is_policy(spec) else controller_of(spec).kind
+    reads = () if spec is None or is_policy(spec) else controller_of(spec).kind.reads
     settings = (
         *("evaluation.baselines=[]", "evaluation.behind_filter=[]", "evaluation.warm_up=0"),
         f"variant={'alcc' if is_policy(spec) else 'idm'}",
-        *(["scenario=platoon"] * (rule in (CACC, DeadBeat)) + list(overrides)),
+        *(["scenario=platoon"] * (not MESSAGES.isdisjoint(reads)) + list(overrides)),
         *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
     )

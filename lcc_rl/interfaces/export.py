@@ -113,8 +113,10 @@ def _written(
         )
         prefixes = ("safety.", "limits.")
         require(all(key_of(override).startswith(prefixes) for override in overrides), text)
+        text = "overrides: safety.… and limits.… are given as arguments, too"
+        require(safety is None and limits is None, text)
         changed: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)))
-        safety, limits = changed.get("safety", safety), changed.get("limits", limits)
+        safety, limits = changed.get("safety"), changed.get("limits")
     names: list[str] = []
     if page:
         content = ring_page(policy, trust, overrides).encode()

@@ -60,7 +60,7 @@ COMMAND_KEY = (AUTOMATED, "command")
 Safety = CBFFilter | Mapping[str, Any] | None  # a filter, or changed settings of a given one
 
 
-class Limits(Settings):
+class CarLimits(Settings):
     """Brakes and drive of the vehicle; None: those of the training, 3 m/s² for a rule."""
 
     max_braking: Positive | None = None  # [m/s²]
@@ -285,7 +285,7 @@ def program(
         trust: modules outside this package that the policy may name.
         cfg: the configuration in which a network was trained.
         safety: the safety filter, or changed settings of its own; None: its own.
-        limits: settings of :class:`Limits`.
+        limits: settings of :class:`CarLimits`.
 
     Raises:
         ConfigError: if no network drives, its filter depends on delays of a scenario, or its
@@ -356,9 +356,9 @@ def driving(
 ) -> DrivingProgram:
     """Return the program of pieces and a filter in a world; the filter acts from the start.
 
-    All are bound here, see :class:`DrivingProgram`, :func:`measuring` and :class:`Limits`.
+    All are bound here, see :class:`DrivingProgram`, :func:`measuring` and :class:`CarLimits`.
     """
-    world = parse(Limits, limits or {}, "limits").of(world)
+    world = parse(CarLimits, limits or {}, "limits").of(world)
     if safety is not None:
         world = replace(world, filtered=[AUTOMATED])
         pieces = [*pieces, type(safety)(**values(safety) | {"from_s": 0.0})]

@@ -19,7 +19,7 @@ from lcc_rl.functional.cacc import (
 )
 from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION
 from lcc_rl.functional.string import entries_ahead, gather
-from lcc_rl.pieces.base import Entry, Feature
+from lcc_rl.pieces.base import Entry, Feature, as_key
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import LEADER, VEHICLES
 from lcc_rl.pieces.world import World
@@ -103,6 +103,16 @@ class Communication(Feature):
         return find_chains(connected, self.leader_sends and not self.string.ring)
 
 
+# Names of the entries that only vehicles in a platoon have.
+MESSAGES = frozenset(f"self.{as_key(entry.key)[-1]}" for entry in Communication.writes)
+
+
+def leader_names(lookahead: str) -> list[str]:
+    """Return the entries from which a controller predicts its leader's next speed."""
+    true_next = "leader.next_speed" if lookahead == "oracle" else "self.leader_speed"
+    return ["self.leader_speed", "self.leader_acceleration", true_next]
+
+
 class CACC(Controller):
     """Cooperative adaptive cruise control (HCFS H11)."""
 
@@ -142,6 +152,8 @@ class DeadBeat(Controller):
     max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
     lookahead: Lookahead = "causal"
 
+    reads = ("self.speed", *leader_names("causal"))
+
     def setup(self, world: World) -> None:
         self.declare(world, ["self.speed", *leader_names(self.lookahead)])
         check_leader(self.lookahead, self)
@@ -149,12 +161,6 @@ class DeadBeat(Controller):
     def command(self, speed: Tensor, *leader: Tensor) -> Tensor:
         target = next_leader_speed(leader, self.lookahead, self.time_step)
         return (target - speed) / self.time_step
-
-
-def leader_names(lookahead: str) -> list[str]:
-    """Return the entries from which a controller predicts its leader's next speed."""
-    true_next = "leader.next_speed" if lookahead == "oracle" else "self.leader_speed"
-    return ["self.leader_speed", "self.leader_acceleration", true_next]
 
 
 def check_leader(lookahead: str, controller: Controller) -> None:

@@ -187,6 +187,8 @@ def test_bad_input_is_one_clear_error() -> None:
         (["human", "x.c"], "human draws noise from seeds: it cannot be exported"),
     ]
     check_refused(main, cases, ConfigError)
+    with pytest.raises(ConfigError, match=r"safety\.… and limits\.… are given as arguments, too"):
+        lcc_rl.export("idm_acc", "x.c", overrides=["limits.max_braking=6"], limits={})
     held = ["scenario.controllers.automated.hold=0.5"]
     with pytest.raises(ConfigError, match=r"controllers\.automated\.hold.* has no program"):
         lcc_rl.export(nn.Linear(7, 1), "x.onnx", overrides=held)

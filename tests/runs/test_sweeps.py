@@ -162,6 +162,12 @@ def test_cells_that_will_fail_are_named_before_the_first_run(caplog, capsys) -> 
     assert "unknown choice of agent 'nosuch'" in capsys.readouterr().err
 
 
+def test_a_run_of_a_sweep_is_refused_what_has_no_effect(tmp_path) -> None:
+    words = ("-m", "experiment=smoke", "compare=[acc]", "+filter=cbf", "seed=0", "sweep=s")
+    done = run_command("lcc_rl.cli.evaluate", *words, cwd=tmp_path)
+    assert "+filter=cbf has no effect: nothing drives behind the filter (acc)" in done.stdout
+
+
 def test_a_sweep_of_nothing_is_one_line(tmp_path) -> None:
     done = run_command("lcc_rl.cli.train", *SWEEP, "seed=range(0)", cwd=tmp_path)
     assert done.returncode == 2
