@@ -59,7 +59,8 @@ def configurations() -> Iterator[StudyConfig]:
     cfg = load("train", ["variant=alcc", SIZES, "+filter=cbf", "+faults=all", *knowledge])
     yield cfg
     held = "scenario.controllers.automated.hold=0.5"
-    yield load("train", ["variant=alcc", SIZES, "+event=cut_in", held])
+    hills = ["energy=electric", "+slope=hills", "+knowledge=terrain"]
+    yield load("train", ["variant=alcc", SIZES, "+event=cut_in", held, *hills])
     for drawn_or_single in ({"size": 6, "penetration": 0.34}, "automated human*4"):
         yield cfg.with_(scenario={"string": drawn_or_single})
     human = "scenario.controllers.human"

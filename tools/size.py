@@ -27,9 +27,9 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 43_610, "code": 28_750},
+    "lcc_rl + tools": {"lines": 43_875, "code": 28_920},
     "tests": {"lines": 25_600},
-    "conf": {"yaml": 162},
+    "conf": {"yaml": 164},
 }
 CASES = 1_243  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {

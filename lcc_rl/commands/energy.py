@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from copy import copy
 from os import PathLike, fspath
 from typing import Any
 
@@ -91,11 +90,7 @@ def _energies(records: Profiles, block: slice, model: Any) -> pd.DataFrame:
     rows, first, last = slice(first[0], last[-1] + 1), first - first[0], last - first[0]
     speed = records.speeds[rows]
     if records.grades is not None:
-        name = type(model).__name__
-        require(hasattr(model, "grade"), f"{name} has no grade; choose another energy=…")
-        model = copy(model)
-        model.grade = records.grades[rows][:-1]
-        model.validate()
+        model = model.at(records.grades[rows][:-1])
     power = model.power(speed[:-1], speed.diff() / step).numpy()
     power[last[:-1]] = 0.0  # from one record to the next
     drawn = KILO * step * np.add.reduceat(power, first, dtype=np.float64)

@@ -148,6 +148,11 @@ class ScenarioConfig(Section):
         leader = self.pieces.get("leader")
         return leader is not None and getattr(leader.kind, "replaces", False)
 
+    @property
+    def slope(self) -> Node | None:
+        """The node of the road's grade; None: the road is level."""
+        return self.pieces.get("slope")
+
 
 class RewardConfig(Section):
     """The reward: named terms."""

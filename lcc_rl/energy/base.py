@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Annotated
+from copy import copy
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
+from lcc_rl.errors import require
 from lcc_rl.settings import Settings
 
 # Widths of moving averages of speeds before their energy is computed [s]. Shorter ones keep the
@@ -19,6 +21,7 @@ AVERAGED = tuple(f"path_energy_{seconds:g}s_kj" for seconds in AVERAGES)  # thei
 SECOND = "second_path_energy_kj"  # path energy by evaluation.second_energy
 BURNT = ("fuel_l", "co2_g")  # fuel of an energy [L] and its carbon dioxide [g]
 
+GRAVITY = 9.81  # [m/s²]
 Grade = Annotated[float, Field(ge=-0.3, le=0.3)]  # grade of the road [rad]
 
 
@@ -44,6 +47,7 @@ class EnergyModel(Settings, ABC):
     heating_value = 0.0
     density = 0.0
     carbon_dioxide = math.nan
+    climb: ClassVar[Any] = None  # acceleration by gravity against the motion on a slope [m/s²]
 
     @property
     def inertia(self) -> float:
@@ -56,6 +60,20 @@ class EnergyModel(Settings, ABC):
             return torch.zeros_like(energy), torch.zeros_like(energy)
         grams = energy / self.heating_value
         return grams * 1e-3 / self.density, grams * self.carbon_dioxide
+
+    def at(self, grade: Tensor) -> Self:
+        """Return the model on a road with a grade at each sample, beside its own grade [rad].
+
+        Raises:
+            ConfigError: if the model has no grade.
+        """
+        kind = type(self).__name__
+        require(hasattr(self, "grade"), f"{kind} has no grade; choose another energy=…")
+        model = copy(self)
+        model.grade = self.grade + grade  # type: ignore[attr-defined]
+        model.climb = GRAVITY * grade.sin()  # type: ignore[misc]
+        model.validate()
+        return model
 
     @abstractmethod
     def power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
@@ -71,9 +89,14 @@ class EnergyModel(Settings, ABC):
         return self.power(speed, acceleration)
 
     def path_power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
-        """Return the smooth power [W] minus the change of kinetic energy."""
+        """Return the smooth power [W] minus the change of kinetic energy and of height."""
         stored = self.inertia / self.efficiency * speed * acceleration
-        return self.smooth_power(speed, acceleration) - stored
+        net = self.smooth_power(speed, acceleration) - stored
+        return net if self.climb is None else net - self.climbing(speed)
+
+    def climbing(self, speed: Tensor) -> Tensor:
+        """Return the power that becomes height on a slope, divided by efficiency [W]."""
+        return self.mass / self.efficiency * speed * (0.0 if self.climb is None else self.climb)
 
     def stored_energy(self, speed: Tensor) -> Tensor:
         """Return kinetic energy divided by efficiency [J], same shape."""

@@ -9,11 +9,11 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.energy.base import EnergyModel, Grade
+from lcc_rl.energy.base import GRAVITY, EnergyModel, Grade
 from lcc_rl.functional.power import acceleration_loss, motor_power, path_power
 from lcc_rl.settings import NonNegative, Positive
 
-GRAVITY, AIR = 9.81, 1.2  # [m/s²], [kg/m³]
+AIR = 1.2  # [kg/m³]
 
 
 class ElectricCar(EnergyModel):

@@ -42,6 +42,12 @@ class VehicleClass(Settings):
         kind, mass = type(self.energy).__name__, self.energy.mass
         require(mass > 0.0, f"{kind}: an energy model needs its mass [kg], got {mass!r}")
 
+    def at(self, grade: Tensor) -> Self:
+        """Return the class on a road with a grade at each sample [rad]."""
+        found = copy(self)
+        found.energy = self.energy.at(grade)
+        return found
+
     def within(self, command: Tensor, speed: Tensor, time_step: float) -> Tensor:
         """Return commands within the vehicle's power and its speed limit [m/s²].
 
@@ -128,6 +134,21 @@ class Fleet:
             found.roles[role] = [*(max(rest, 0.0) * share for share in own), *added]
         return found
 
+    def at(self, grade: Tensor | None) -> Self:
+        """Return the fleet on a road with a grade at each sample, of the shape of speeds [rad].
+
+        Args:
+            grade: None for the fleet itself.
+
+        Raises:
+            ConfigError: if an energy model has no grade.
+        """
+        if grade is None:
+            return self
+        found = copy(self)
+        found.classes = {name: one.at(grade) for name, one in self.classes.items()}
+        return found
+
     @property
     def limited(self) -> bool:
         """Whether a class has limits."""
@@ -176,6 +197,10 @@ class Fleet:
     def stored_energy(self, speed: Tensor, kind: Tensor | None = None) -> Tensor:
         """Return the kinetic energy [J], see :meth:`EnergyModel.stored_energy`."""
         return self._of(lambda model, v, _: model.stored_energy(v), speed, speed, kind)
+
+    def climbing(self, speed: Tensor, kind: Tensor | None = None) -> Tensor:
+        """Return the power that becomes height [W], see :meth:`EnergyModel.climbing`."""
+        return self._of(lambda model, v, _: model.climbing(v), speed, speed, kind)
 
     def acceleration_loss(
         self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None

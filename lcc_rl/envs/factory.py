@@ -34,12 +34,14 @@ from lcc_rl.pieces import (
     Piece,
     RolePlaces,
     Sensors,
+    Slope,
     StringMotion,
     TotalReward,
 )
 from lcc_rl.pieces.base import ACTION
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.hybrid import check_spacing
+from lcc_rl.pieces.views import LEADER, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import TARGET, parse, path_of
 
@@ -110,6 +112,7 @@ def world_of(
         scenario.max_braking,
         scenario.max_acceleration,
         scenario.replaced,
+        scenario.slope and scenario.slope.made(Slope),
     )
 
 
@@ -184,6 +187,8 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
     scenario, string, energy = cfg.scenario, world.string, world.energy
     named = {name: node for name, node in scenario.pieces.items() if node is not None}
     pieces = _leader(scenario, named.pop("leader", None), world)
+    named.pop("slope", None)
+    slopes = [world.slope.bind(world, x) for x in (LEADER, VEHICLES)] if world.slope else []
     drivers = _drivers(scenario, world)
     for name, kind in energy.classes.items():
         roles = kind.roles if kind.share else ()
@@ -195,7 +200,7 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
         for group in (world.actuators, world.sensors)
     )
     pieces += [RolePlaces().bind(world), *classes, *drivers, *actuators]
-    pieces += [_motion(scenario, world), *sensors]
+    pieces += [_motion(scenario, world), *slopes, *sensors]
     pieces += _watchers(drivers, world)
     pieces += [node.made(Piece).bind(world, name) for name, node in named.items()]
     check_spacing(pieces, world.profiles)

@@ -42,6 +42,7 @@ from lcc_rl.functional.pattern import AUTOMATED, RING
 from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.features import CLASS
 from lcc_rl.pieces.rewards import RewardTerm
+from lcc_rl.pieces.slope import Slope
 from lcc_rl.results.measures import FASTER
 
 # Steps of a strategy from which machine code saves more than the 2 to 4 s that it takes once, and
@@ -184,6 +185,7 @@ class Episodes:
         # Episodes side by side, their steps, and the size of the state of one [bytes].
         self.largest = plan.size, self.cfg.scenario.horizon, moment_bytes(pieces)
         self.energy, self.second = build_energy(self.cfg), second_energy(self.cfg)
+        self.slope = next((piece for piece in pieces if isinstance(piece, Slope)), None)
         filtered = self.cfg.scenario.filters.get(AUTOMATED) is not None
         self.keys = [*ROW_KEYS, INDEX, CLASS, *(FILTER_ENTRIES if filtered else ())]
         learned = strategy.policy is not None and self.cfg.evaluation.terms
@@ -239,7 +241,8 @@ class Episodes:
         desired = desired_speeds(self.strategy, described)
         described[FASTER] = leader_faster(inputs.evaluation, profile, desired, self.warm_up)
         time_step = self.cfg.scenario.time_step
-        leader = leader_measures(inputs.evaluation, profile, self.energy, self.warm_up)
+        args = inputs.evaluation, profile, self.energy, self.warm_up, self.slope
+        leader = leader_measures(*args)
         if self.cfg.scenario.road == RING:  # it has no leader
             leader[:] = np.nan
         # The noise of sensors adds energy to the motion of recorded drivers.

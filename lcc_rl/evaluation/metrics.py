@@ -38,6 +38,7 @@ def energy_measures(
     time_step: float,
     energy: Fleet | None = None,
     kind: Tensor | None = None,
+    grade: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Return energy (A20), gross and net of kinetic energy, and distance of every vehicle.
 
@@ -48,17 +49,18 @@ def energy_measures(
         time_step: duration of a step [s].
         energy: the energy models; None: that of the ALCC paper.
         kind: class of every vehicle, ``[*batch, n, 1]``; None: all have the first model.
+        grade: grade of the road after each step, as ``power`` [rad]; None: a level road.
 
     Returns:
-        ``energy_kj``; ``net_energy_kj``, net of the change of kinetic energy; ``steady_energy_kj``,
-        that of the driven speeds without acceleration; ``path_energy_kj``, the steady energy plus
-        the loss by accelerating, or the net energy for a model without these parts;
+        ``energy_kj``; ``net_energy_kj``, net of kinetic energy and height gained;
+        ``steady_energy_kj``, that of the driven speeds without acceleration; ``path_energy_kj``,
+        the steady energy plus the loss by accelerating, or the net energy for a model without them;
         ``distance_m``; fuel and carbon dioxide (:data:`lcc_rl.energy.BURNT`) if a model burns
         fuel; and, for models that define them, ``acceleration_loss_kj``, the loss by accelerating,
         and ``share_infeasible``, the share of time with an infeasible acceleration; each
         ``[*batch, n, 1]``.
     """
-    energy = as_fleet(energy)
+    energy = as_fleet(energy).at(grade)
     motion = speed[:-1], speed.diff(dim=0) / time_step
     still = torch.zeros_like(motion[0])
 
@@ -69,6 +71,8 @@ def energy_measures(
     steps = alive.sum(0, keepdim=True).long().expand(1, *speed.shape[1:])
     last = speed.gather(0, steps).squeeze(0)
     stored = (energy.stored_energy(last, kind) - energy.stored_energy(speed[0], kind)) * KILO
+    if grade is not None:
+        stored = stored + total(energy.climbing(speed[:-1], kind)) * KILO
     lost = energy.acceleration_loss(*motion, kind)
     measures = {
         "energy_kj": drawn,
@@ -94,6 +98,7 @@ def averaged_energies(
     time_step: float,
     energy: Fleet | None = None,
     kind: Tensor | None = None,
+    grade: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Return path energies of speeds averaged over :data:`lcc_rl.energy.AVERAGES`.
 
@@ -101,7 +106,7 @@ def averaged_energies(
     count like the rest.
 
     Args:
-        speed, alive, time_step, energy, kind: as for :func:`energy_measures`.
+        speed, alive, time_step, energy, kind, grade: as for :func:`energy_measures`.
 
     Returns:
         Energies by name of :data:`lcc_rl.energy.AVERAGED`, each ``[*batch, n, 1]`` [kJ]; NaN if no
@@ -114,13 +119,20 @@ def averaged_energies(
         if width >= len(speed):
             energies[name] = torch.full_like(distance, torch.nan)
             continue
-        # In single precision, sums would lose the difference of consecutive averages.
-        sums = torch.cat([torch.zeros_like(speed[:1]), speed]).cumsum(0, dtype=torch.float64)
-        mean = ((sums[width:] - sums[:-width]) / width).to(speed)
-        power = energy.power(mean[:-1], mean.diff(dim=0) / time_step, kind)
-        values = energy_measures(power, mean, alive[width - 1 :], time_step, energy, kind)
+        mean = _averaged(speed, width)
+        slope = None if grade is None else _averaged(grade, width)
+        power = energy.at(slope).power(mean[:-1], mean.diff(dim=0) / time_step, kind)
+        args = alive[width - 1 :], time_step, energy, kind, slope
+        values = energy_measures(power, mean, *args)
         energies[name] = values["path_energy_kj"] * distance / values["distance_m"]
     return energies
+
+
+def _averaged(entry: Tensor, width: int) -> Tensor:
+    """Return averages of consecutive values, ``[time - width + 1, …]``."""
+    # In single precision, sums would lose the difference of consecutive averages.
+    sums = torch.cat([torch.zeros_like(entry[:1]), entry]).cumsum(0, dtype=torch.float64)
+    return ((sums[width:] - sums[:-width]) / width).to(entry)
 
 
 def measured_ttc(ttc: Tensor) -> Tensor:

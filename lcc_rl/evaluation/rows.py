@@ -31,7 +31,8 @@ from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
 from lcc_rl.functional.string import gather
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.pieces.features import CLASS
+from lcc_rl.pieces.features import CLASS, GRADE
+from lcc_rl.pieces.slope import Slope
 from lcc_rl.pieces.string import COMMAND, WANTED
 from lcc_rl.results.windows import DRIVE, LEADER_COLUMNS, REPEAT, SOURCE
 
@@ -57,7 +58,7 @@ SAMPLED = (
 )
 VALUE_BYTES = 4  # of a value in a time series
 ROW_KEYS = [("leader", name) for name in ("speed", "acceleration")]
-ROW_KEYS += [("vehicles", name) for name in SERIES]
+ROW_KEYS += [("vehicles", name) for name in (*SERIES, GRADE)]
 INDEX = (AUTOMATED, "index")
 # Safety filter: steps covered by the guarantee, steps that begin safe, desired and commanded
 # acceleration.
@@ -128,12 +129,14 @@ def measures(
         if "power" not in series:
             continue
         kinds = series.get(CLASS[1])
-        args = alive.unsqueeze(-2), time_step, energy, None if kinds is None else kinds[0]
+        kind, grade = None if kinds is None else kinds[0], series.get(GRADE)
+        args = alive.unsqueeze(-2), time_step, energy, kind, grade
         energies = energy_measures(series["power"], series["speed"], *args)
         if second is not None:
             speed = series["speed"]
-            power = second.power(speed[:-1], speed.diff(dim=0) / time_step)
-            energies[SECOND] = energy_measures(power, speed, *args[:2], second)["path_energy_kj"]
+            power = second.at(grade).power(speed[:-1], speed.diff(dim=0) / time_step)
+            drawn = energy_measures(power, speed, *args[:2], second, grade=grade)
+            energies[SECOND] = drawn["path_energy_kj"]
         energies |= averaged_energies(series["speed"], *args) if averaged else {}
         for name, value in energies.items():
             added = value.mean(-2) if name.startswith("share_") else value.sum(-2)
@@ -256,7 +259,11 @@ def leader_faster(
 
 
 def leader_measures(
-    profiles: Profiles, profile: Tensor, energy: Fleet | None = None, first: int = 0
+    profiles: Profiles,
+    profile: Tensor,
+    energy: Fleet | None = None,
+    first: int = 0,
+    slope: Slope | None = None,
 ) -> pd.DataFrame:
     """Return the path energy [kJ] and the mean speed [m/s] of the leader of each episode.
 
@@ -264,8 +271,10 @@ def leader_measures(
     """
     fleet, values = as_fleet(energy), {}
     for index in profile.unique().tolist():
-        speed = profiles.record(index)[first:]
-        power = fleet.path_power(speed[:-1], speed.diff() / profiles.time_step)
+        speed = profiles.record(index)
+        grade = None if slope is None else slope.along(speed)[first:]
+        speed = speed[first:]
+        power = fleet.at(grade).path_power(speed[:-1], speed.diff() / profiles.time_step)
         drawn = power.sum() * profiles.time_step * KILO
         values[index] = (float(drawn), float(speed.mean()))
     return pd.DataFrame([values[index] for index in profile.tolist()], columns=list(LEADER_COLUMNS))

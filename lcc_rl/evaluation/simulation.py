@@ -31,10 +31,11 @@ from lcc_rl.evaluation.rollout import Player, Record, reset_options
 from lcc_rl.evaluation.rows import INDEX
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
-from lcc_rl.pieces.base import Key
+from lcc_rl.pieces.base import Key, State
 from lcc_rl.pieces.connected import MESSAGES
-from lcc_rl.pieces.features import CLASS
+from lcc_rl.pieces.features import CLASS, GRADE
 from lcc_rl.pieces.rewards import CollisionPenalty
+from lcc_rl.pieces.slope import PLACE
 from lcc_rl.settings import TARGET, Count, Positive, Seed, checked, path_of
 
 log = logging.getLogger("lcc_rl")
@@ -43,7 +44,6 @@ log = logging.getLogger("lcc_rl")
 # vehicles takes longer than their steps.
 LONG, SHORT_STRING = 2_000, 40
 LEADER: Key = ("leader", "speed")
-OF_LEADER: Key = ("leader", "acceleration")  # at a change of the leader, of the new vehicle
 SCENE = {f"scenario.{name}" for name in ("string", "time_step", "horizon")}
 OF_ARGUMENTS = SCENE | {"leader", "data", "split", "compare", "policy", "seed", "evaluation"}
 # Nothing reads the reward; this term fits any scenario.
@@ -53,7 +53,10 @@ MOTION = {
     "gap": "gap_m",
     "acceleration": "acceleration_mps2",
     "power": "power_w",
+    PLACE: "place_m",  # this and the next on a road with slopes
+    GRADE: "grade_rad",
 }
+AT_START = {"gap", PLACE, GRADE}  # also known before the first step
 
 
 @dataclass(frozen=True)
@@ -207,12 +210,12 @@ def _simulated(strategy: Strategy, inputs: Inputs, repeats: int, seed: int) -> S
     env = build_env(cfg, inputs.evaluation, inputs.population, batch, 0, cfg.device, nominal=True)
     long, short = cfg.scenario.horizon >= LONG, len(cfg.scenario.vehicles) <= SHORT_STRING
     rows = long and short and not isinstance(strategy.policy, GivenPolicy)  # has its own memory
-    keys = [LEADER, OF_LEADER, CLASS, INDEX, *(("vehicles", name) for name in MOTION)]
+    ahead = [("leader", name) for name in ("speed", "acceleration", PLACE, GRADE)]
+    keys = [*ahead, CLASS, INDEX, *(("vehicles", name) for name in MOTION)]
     player = Player(env, strategy.policy, keys, strategy.title, long and not rows, rows)
     options = reset_options(env, profile, repeat % people, seed, people, repeat // people)
     record, alive = player.play(options)
-    start = player.start["vehicles", "gap"].unsqueeze(0)
-    return _Motion(cfg, record, start, alive).tables()
+    return _Motion(cfg, record, player.start, alive).tables()
 
 
 class _Motion:
@@ -221,22 +224,32 @@ class _Motion:
     Args:
         cfg: configuration of the simulation.
         record: entries of a :class:`Player`.
-        start: gaps before the first step, ``[1, episodes, n, 1]`` [m].
+        start: the state before the first step.
         alive: whether each step belongs to a running episode, ``[steps, episodes, 1]``.
     """
 
-    def __init__(self, cfg: StudyConfig, record: Record, start: Tensor, alive: Tensor) -> None:
+    def __init__(self, cfg: StudyConfig, record: Record, start: State, alive: Tensor) -> None:
         self.cfg, self.record, self.alive = cfg, record, alive
         self.energy, self.time_step = build_energy(cfg), cfg.scenario.time_step
-        vehicles = {name: record["vehicles", name] for name in MOTION}
-        self.groups = [vehicles | {"gap": torch.cat([start, vehicles["gap"]])}]
-        self.kinds = [record[CLASS][0] if CLASS in record else None]
-        if LEADER in record:
-            speed, change = (record[key].unsqueeze(-2) for key in (LEADER, OF_LEADER))
-            ahead = {"speed": speed, "gap": torch.full_like(speed, torch.nan)}
-            ahead |= {"acceleration": change, "power": self.energy.power(speed[:-1], change)}
-            self.groups, self.kinds = [ahead, *self.groups], [None, *self.kinds]
+        self.names = [name for name in MOTION if ("vehicles", name) in record]
+        spaces = ["leader"] * (LEADER in record) + ["vehicles"]
+        self.groups = [self._group(space, start) for space in spaces]
+        kind = record[CLASS][0] if CLASS in record else None
+        self.kinds = [*[None] * (LEADER in record), kind]
         self.vehicles = np.arange(len(cfg.scenario.vehicles) + 1)[LEADER not in record :]
+
+    def _group(self, space: str, start: State) -> dict[str, Tensor]:
+        """Return the motion of the leader or of the vehicles, ``[time, episodes, n, 1]``."""
+        keys = {name: (space, name) for name in self.names if (space, name) in self.record}
+        group = {name: self.record[key] for name, key in keys.items()}
+        for name in AT_START & {*group}:
+            group[name] = torch.cat([start[space, name].unsqueeze(0), group[name]])
+        if space == "leader":
+            group = {name: entry.unsqueeze(-2) for name, entry in group.items()}
+            group["gap"] = torch.full_like(group["speed"], torch.nan)
+            energy = self.energy.at(_after(group.get(GRADE)))
+            group["power"] = energy.power(group["speed"][:-1], group["acceleration"])
+        return group
 
     def tables(self) -> Simulation:
         """Return a row per time and vehicle, and a row per vehicle."""
@@ -249,8 +262,8 @@ class _Motion:
             "vehicle": np.tile(self.vehicles, len(time)),
             "role": self._roles()[episode].flatten(),
         }
-        for name, column in MOTION.items():
-            columns[column] = self._whole(name)[time, episode].flatten()
+        for name in self.names:
+            columns[MOTION[name]] = self._whole(name)[time, episode].flatten()
         steps = pd.DataFrame(columns)
         by_vehicle = steps.groupby(["episode", "vehicle"], sort=False)
         summary = by_vehicle.agg(
@@ -284,9 +297,14 @@ class _Motion:
         """Return distance and energies of all vehicles, episode by episode."""
         running, energies = self.alive.unsqueeze(-2), []
         for group, kind in zip(self.groups, self.kinds, strict=True):
-            args = (running, self.time_step, self.energy, kind)
+            args = (running, self.time_step, self.energy, kind, _after(group.get(GRADE)))
             energies.append(energy_measures(group["power"], group["speed"], *args))
         names = [name for name in energies[-1] if all(name in x for x in energies)]
         return {
             name: torch.cat([x[name] for x in energies], -2).flatten().numpy() for name in names
         }
+
+
+def _after(entry: Tensor | None) -> Tensor | None:
+    """Return the values after each step of an entry that is known before the first one, too."""
+    return None if entry is None else entry[1:]

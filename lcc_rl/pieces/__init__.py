@@ -34,6 +34,7 @@ from lcc_rl.pieces.rewards import (
 )
 from lcc_rl.pieces.rules import Calm, FollowerStopper, Handover, PISaturation
 from lcc_rl.pieces.sensors import Sensors
+from lcc_rl.pieces.slope import Slope, SlopePreview
 from lcc_rl.pieces.start import EquilibriumStart, HeadwayStart, TimeGapStart
 from lcc_rl.pieces.string import RolePlaces, StringMotion
 from lcc_rl.pieces.surrogates import (

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from pydantic import Field
 from torch import Tensor
 
+from lcc_rl.energy.base import GRAVITY
 from lcc_rl.errors import require
 from lcc_rl.functional.actuation import Response
 from lcc_rl.functional.layout import join
@@ -25,13 +29,21 @@ class Actuation(RoleTransform):
     delay: NonNegative = 0.0  # between a command and its first effect, a number of steps [s]
     lag: NonNegative = 0.0  # time constant with which the acceleration follows the command [s]
     braking: Positive | None = None  # hardest braking possible; None: no limit [m/s²]
+    # Share of gravity along a slope that engine and brakes do not make up for.
+    slope: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
 
+    LATER = ("slope",)
     obeyed = Entry("role.obeyed", "m/s²", "acceleration of engine and brakes for the command")
     kept = Entry("role.actuation", "m/s²", "last acceleration, then commands that do not act yet")
 
     def setup(self, world: World) -> None:
         self.response = self.response_in(world, self.name, HARDEST)
         reads = [f"next.{self.name}.command", f"{self.name}.{ACTUATION}"]
+        if self.slope:
+            where = f"scenario.actuators.{self.name}.slope"
+            require(world.slope is not None, f"{where} needs a slope: +slope=hills")
+            require(self.name not in world.filtered, f"{where}: the safety filter knows no slopes")
+            reads.append("self.grade")
         self.declare(world, reads, [self.obeyed, self.kept.wide(1 + self.response.late)])
 
     def response_in(self, world: World, role: str, hardest: float) -> Response:
@@ -51,7 +63,10 @@ class Actuation(RoleTransform):
         braking = min(self.braking or hardest, hardest)
         return Response.of(late, self.lag, braking, world.time_step)
 
-    def compute(self, command: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+    def compute(self, command: Tensor, memory: Tensor, *grade: Tensor) -> tuple[Tensor, Tensor]:
         line = join([memory[..., 1:], command], -1)
         acceleration = self.response.next(memory[..., :1], line[..., :1])
-        return acceleration, join([acceleration, line[..., 1:]], -1)
+        kept = join([acceleration, line[..., 1:]], -1)
+        for angle in grade:
+            acceleration = acceleration - self.slope * GRAVITY * angle.sin()
+        return acceleration, kept

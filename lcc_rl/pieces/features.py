@@ -49,6 +49,7 @@ class TimeGap(Feature):
 
 
 CLASS = (VEHICLES, "energy_class")
+GRADE = "grade"  # entry of the vehicles on a slope, see lcc_rl.pieces.slope
 
 
 class EnergyClasses(StepTransform):
@@ -140,10 +141,13 @@ class MotorPower(StepTransform):
         names = [f"{space}.speed", f"{NEXT}.{self.vehicles}.{self.acceleration}"]
         if len(self.energy.models) > 1:
             names.append(f"{space}.{CLASS[-1]}")
+        self.sloped = world.slope is not None
+        names += [f"{NEXT}.{space}.{GRADE}"] * self.sloped
         written = self.kinds[0] if every else self.kinds[1]
         self.declare(world, names, [replace(written, key=(self.vehicles, self.power))])
 
     def compute(self, *motion: Tensor) -> Tensor:
         """Return the power, ``[*batch, n, 1]``."""
-        power = self.energy.power(*motion)
+        grade = motion[-1] if self.sloped else None
+        power = self.energy.at(grade).power(*motion[: len(motion) - self.sloped])
         return power if self.recuperation else power.clamp(min=0.0)

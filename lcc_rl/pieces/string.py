@@ -122,7 +122,11 @@ class StringMotion(StepTransform):
         self.limited = self.fleet is not None and self.fleet.limited
         self.replaced = world.replaced
         changes = [next_key(PLACEMENT), (VEHICLES, "followed")] * self.replaced
-        read = [*motion, *leader, *commands, *indices, *changes, *[CLASS] * self.limited]
+        sloped = self.limited and world.slope is not None
+        self.slope = world.slope.bind(world, VEHICLES) if sloped else None
+        place = [(VEHICLES, "place")] * sloped
+        of_class = [CLASS] * self.limited
+        read = [*motion, *leader, *commands, *indices, *place, *changes, *of_class]
         self.declare(world, read, [*self.writes, *[self.followed] * self.replaced])
         self.starts: dict[str, Any] = {
             role: start.bind(world, role) if isinstance(start, Part) else start
@@ -163,7 +167,11 @@ class StringMotion(StepTransform):
         indices = inputs[roles : 2 * roles] if self.string.drawn else ()
         command = self._assemble(inputs[:roles], indices)
         if self.limited:
-            command = self.fleet.within(command, speed, self.time_step, inputs[-1])
+            grade = None
+            if self.slope is not None:  # of the place that it reaches, as in its energy
+                place = inputs[roles + len(indices)]
+                grade = self.slope.grade_at(place + self.time_step * speed)
+            command = self.fleet.at(grade).within(command, speed, self.time_step, inputs[-1])
         motion = advance_string(speed, gap, acceleration, command, leader, reached, self.time_step)
         if not self.replaced:
             return (*motion, command)

@@ -13,7 +13,7 @@ from typing import ClassVar, Literal
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from lcc_rl.pieces.features import CLASS
+from lcc_rl.pieces.features import CLASS, GRADE
 from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.pieces.sections import Sections
 from lcc_rl.pieces.views import VEHICLES
@@ -169,13 +169,19 @@ class PathEnergy(RewardTerm):
         space = VEHICLES if behind else "self"
         kind = [f"{space}.{CLASS[-1]}"] * self.mixed
         indices = self.sections.keys if behind else []
+        self.sloped = world.slope is not None
+        kind = [f"{space}.{GRADE}"] * self.sloped + kind
         self.time_step, self.factor = world.time_step, world.time_step / self.scale
         self.declare(world, [f"{space}.speed", f"{space}.acceleration", *kind, *indices])
 
     def reward(self, speed: Tensor, acceleration: Tensor, *more: Tensor) -> Tensor:
         before = speed - acceleration * self.time_step
+        grade, more = (more[0], more[1:]) if self.sloped else (None, more)
         kind, indices = (more[0], more[1:]) if self.mixed else (None, more)
-        power = self.energy.path_power(before, acceleration, kind) - self.distance_price * before
+        power = (
+            self.energy.at(grade).path_power(before, acceleration, kind)
+            - self.distance_price * before
+        )
         if self.of == "behind":
             power = self.sections.sum(power, *indices)
         return power * -self.factor

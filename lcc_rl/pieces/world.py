@@ -41,6 +41,7 @@ class World:
         max_braking: hardest braking of automated vehicles [m/s²].
         max_acceleration: largest acceleration of automated vehicles [m/s²].
         replaced: whether the leader is replaced during episodes.
+        slope: the grade of the road, :class:`lcc_rl.pieces.Slope`; None: a level road.
     """
 
     string: VehicleString = field(default_factory=VehicleString)
@@ -56,6 +57,7 @@ class World:
     max_braking: float = MAX_ACCELERATION
     max_acceleration: float = MAX_ACCELERATION
     replaced: bool = False
+    slope: Any = None
 
     def given(self, what: str, where: str) -> Any:
         """Return profiles, population or energy.

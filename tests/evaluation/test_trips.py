@@ -156,16 +156,20 @@ def test_refused_trips(path) -> None:
 def test_a_simulated_drive_on_hills_is_priced_as_the_pages_show(tmp_path, monkeypatch) -> None:
     pages = Path(__file__).parents[2] / "docs"
     (car,) = (x.text for x in blocks(pages / "your_car.md") if "class MyCar" in x.text)
-    (drive,) = (x.text for x in blocks(pages / "energy.md") if "hills.parquet" in x.text)
+    (hills,) = (x.text for x in blocks(pages / "energy.md") if "slope.points" in x.text)
     (tmp_path / "my_car.py").write_text(car)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     names: dict = {}
-    exec(drive, names)
-    words = ["energy._target_=my_car.MyCar", "leader.columns.grade=grade"]
+    exec(hills, names)
+    words = ["energy._target_=my_car.MyCar", *names["hills"][1:]]
+    driven = lcc_rl.simulate("udds", "automated", "idm_acc", overrides=words, seconds=300)
+    drive = driven.steps.query("vehicle == 1").assign(drive="car 1")
+    drive.to_parquet("hills.parquet")
+    words = [words[0], "leader.columns.grade=grade_rad"]
     found = lcc_rl.trip_energies("hills.parquet", words)["energy_kj"].item()
     flat = lcc_rl.trip_energies("hills.parquet", words[:1])["energy_kj"].item()
-    speed, grade = names["drive"]["speed_mps"].to_numpy(float), names["grade"]
+    speed, grade = (drive[name].to_numpy(float) for name in ("speed_mps", "grade_rad"))
     v, a, share = speed[:-1], np.diff(speed) / 0.1, sys.modules.pop("my_car").MAP.numpy()
     force = 110.0 + 1.2 * v + 0.42 * v**2 + 1650.0 * (1.04 * a + 9.81 * np.sin(grade[:-1]))
     by_force = [np.interp(abs(force), [0.0, 2000.0, 4000.0], row) for row in share]
@@ -175,3 +179,4 @@ def test_a_simulated_drive_on_hills_is_priced_as_the_pages_show(tmp_path, monkey
     power = np.where(force > 0.0, force * v / share, force * v * share) + 400.0
     assert found == pytest.approx(power.sum() * 1e-4, rel=1e-4)
     assert abs(found - flat) > 0.01 * flat
+    assert driven.vehicles["energy_kj"][1] == pytest.approx(found, rel=3e-3)

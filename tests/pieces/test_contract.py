@@ -89,6 +89,8 @@ from lcc_rl.pieces import (
     RolePlaces,
     SafetyReward,
     Sensors,
+    Slope,
+    SlopePreview,
     SmoothEfficiency,
     Smoothness,
     SmoothRange,
@@ -113,6 +115,7 @@ BLURRED = Sensors(gap_error=0.5, delay=0.2, dropouts=0.3, longest_dropout=0.2)
 FLEET = Fleet(
     {"car": CirclesFuel(), "electric": ElectricCar()}, roles={"automated": {"electric": 1.0}}
 )
+HILLS = Slope(points=((0.0, 0.0), (30.0, 0.03), (90.0, -0.02)), repeats=True)
 # Whose package is an extra, and not installed here.
 MISSING = set() if find_spec("osqp") else {MPC}
 CONNECTED = ("cacc", "beat", "hybrid")
@@ -264,6 +267,12 @@ def makers(road: str) -> dict[str, Callable[[], Piece]]:
         "ObservationMemory, spread": ObservationMemory(seconds=[0.5, 1.0], kind="spread"),
         "Observation": Observation(scales=SCALES, visible=2, widths={"memory": 4}),
     }
+    hills = {
+        "Slope": ("leader", HILLS),
+        "Slope, vehicles": ("vehicles", HILLS),
+        "SlopePreview": (None, SlopePreview()),
+        "MotorPower, sloped": (None, MotorPower(power="sloped_power")),
+    }
     first = {"RolePlaces": RolePlaces(), **({} if string.ring else leading(road))}
     pieces: dict[str, tuple[str | None, Piece]] = {
         **{name: (None, piece) for name, piece in first.items()},
@@ -272,6 +281,7 @@ def makers(road: str) -> dict[str, Callable[[], Piece]]:
             {"RecordedDriver": ("recorded", RecordedDriver())} if "recorded" in string.names else {}
         ),
         **{name: (None, piece) for name, piece in unnamed.items()},
+        **({} if string.ring else hills),
         "Sensors": ("slow", BLURRED),
         **terms,
         "TotalReward": (None, TotalReward(terms=listed)),
@@ -288,7 +298,9 @@ def world_of(road: str, label: str) -> World:
     world = replace(world, filtered=["automated"], replaced=road == "replaced", **faults)
     if label == "CalibratedDrivers":
         return replace(world, population=MIXED)
-    mixed = label.endswith("mixed") or label == "EnergyClasses"
+    sloped = "lope" in label
+    mixed = sloped or label.endswith("mixed") or label == "EnergyClasses"
+    world = replace(world, slope=HILLS) if sloped else world
     return replace(world, energy=FLEET) if mixed else world
 
 
