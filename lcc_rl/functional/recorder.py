@@ -29,6 +29,8 @@ ARITHMETIC = {
     "exp": "np.exp({0})",
     "log": "np.log({0})",
     "sin": "np.sin({0})",
+    "cos": "np.cos({0})",
+    "floor": "np.floor({0})",
     "atanh": "np.arctanh({0})",
     "tanh": "np.tanh({0})",
     "relu": "pick({0} < 0, f32(0), {0})",

@@ -76,9 +76,10 @@ def test_an_evaluation_counts_the_same(subtests) -> None:
             assert abs(energy / flat["path_energy_kj"][role] - 1.0) > 0.05
 
 
-def test_machine_code_drives_the_same_hills() -> None:
+def test_machine_code_drives_the_same_hills(caplog) -> None:
     leader = np.tile(WAVE[:-1], 3)
     compiled = lcc_rl.simulate(leader, "human*2", overrides=HILLS).steps
+    assert "runs by tensors" not in caplog.text
     plain = lcc_rl.simulate(leader[:1001], "human*2", overrides=HILLS).steps
     for name in ("place_m", "grade_rad", "power_w"):
         np.testing.assert_allclose(
