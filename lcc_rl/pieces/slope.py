@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -21,7 +22,7 @@ from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative
 
 PLACE = "place"
-SPACING = 1.0  # between the stored grades [m]
+SPACING = 1.0  # largest distance between stored grades [m]
 LONGEST = 1e6  # profile [m]
 Point = tuple[Annotated[float, Field(ge=0.0, le=LONGEST)], Grade]
 
@@ -68,15 +69,15 @@ class Slope(StepTransform):
         self.register_buffer("grades", self.table())
 
     def table(self) -> Tensor:
-        """Return the grades at multiples of :data:`SPACING`, float32 [rad]."""
+        """Return the grades at equal distances from the first to the last place, float32 [rad]."""
         places, grades = np.array(self.points).T
-        even = np.arange(0.0, places[-1] + SPACING, SPACING)
+        even = np.linspace(0.0, places[-1], math.ceil(places[-1] / SPACING) + 1)
         return torch.from_numpy(np.interp(even, places, grades).astype(np.float32))
 
     def grade_at(self, place: Tensor) -> Tensor:
         """Return the grade at places of any shape [m]; before the first one it is the first's."""
         last = len(self.grades) - 1
-        number = place / SPACING
+        number = place * (last / self.points[-1][0])
         if self.repeats:
             number = number - last * (number / last).floor()
         number = number.clamp(0.0, last)

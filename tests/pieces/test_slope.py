@@ -162,6 +162,10 @@ def test_roads_that_are_refused() -> None:
 
 def test_a_profile_need_not_repeat() -> None:
     world = World(profiles=wavy_profiles(), energy=Fleet({"all": ElectricCar()}))
+    odd = Slope(points=((0.0, 0.0), (2.5, 0.01)), repeats=True).bind(world, "vehicles")
+    assert odd.grade_at(torch.tensor([2.0, 3.75, -1.0])).tolist() == pytest.approx(
+        [0.008, 0.005, 0.006], abs=1e-6
+    )
     slope = Slope(points=tuple(POINTS)).bind(world, "vehicles")
     place = torch.tensor([-50.0, 0.0, 100.0, 700.0, 9e5])
     assert slope.grade_at(place).tolist() == pytest.approx([0.0, 0.0, 0.02, 0.0, 0.0], abs=1e-6)
