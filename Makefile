@@ -21,7 +21,7 @@ run: $(STAMP)
 	$(BIN)/python -m lcc_rl run $(or $(ARGS),$(BOTH))
 
 test: lint
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal --durations 20 -m "not slow" $(ARGS)
 
 test-all: lint
 	$(BIN)/python -m pytest -n 2 --dist loadgroup $(ARGS)
