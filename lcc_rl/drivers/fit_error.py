@@ -82,23 +82,6 @@ class FitError:
                 GAP_NRMSE: (gap / self._norms[1]).sqrt(),
             }
 
-    def weights(self, fitted: Tensor) -> Tensor:
-        """Return weights ``[2, drivers]`` of the squared errors of speed and gap at a minimum.
-
-        The sum of the errors with these weights is 1. Its gradient is proportional to that of the
-        objective.
-
-        Args:
-            fitted: parameters at the minimum, ``[drivers, dims]``.
-        """
-        speed, _, gap = self.measures(fitted.unsqueeze(1)).values()
-        used = torch.tensor(
-            [[self.objective in (SPEED_RMSPE, "both")], [self.objective != SPEED_RMSPE]]
-        )
-        errors = torch.where(used, torch.stack([speed, gap]).squeeze(-1), 0.0).clamp(min=1e-12)
-        weights = 1.0 / (torch.stack(self._norms).squeeze(-1) * errors * errors.sum(0))
-        return torch.where(used, weights, 0.0)
-
     def parameters(self, candidates: Tensor) -> dict[str, Tensor]:
         """Return the parameters of every candidate by name, ``[drivers, candidates]``."""
         given = dict(zip(self.names, candidates.unbind(-1), strict=True))

@@ -69,17 +69,15 @@ def test_intervals_cover_known_parameters(known, mode, objective, where):
     observed, truth = known
     records = noisy(observed, truth, where)
     found = Calibrator(modes=[mode], objective=objective)(records).drivers
-    shares = []
     for place, name in enumerate(fitted(mode)):
         column = LAWS["idm"].table()[name].column
         low, high = found[f"{column}_low"], found[f"{column}_high"]
         real = truth[:, place].numpy()
-        shares.append((~(low > real) & ~(high < real)).mean())
-        assert shares[-1] >= 0.85, name
+        assert (~(low > real) & ~(high < real)).mean() >= 0.85, name
         if mode == "local":
             assert (high - low).isna().mean() < 0.3, name
-    if mode == "local" and where == "acceleration":
-        assert np.mean(shares) <= 0.99
+        if mode == "local" and where == "acceleration":  # not much wider than 4 σ
+            assert (high - low).median() < 8.0 * (found[column] - real).std(), name
 
 
 def test_what_a_record_does_not_determine_has_no_end(make_episodes):
