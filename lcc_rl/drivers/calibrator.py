@@ -345,8 +345,8 @@ def _findings(
     open_share = pd.concat(ends["desired_speed"], axis=1).isna().any(axis=1).mean()
     low, high = ends["time_gap"]
     lines.append(
-        f"95 % intervals: {100 * open_share:.0f} % do not identify v0 (an end is not within "
-        f"calibration.bounds.desired_speed); median width of T {(high - low).median():.2g} s"
+        f"95 % intervals: v0 is not identified for {100 * open_share:.0f} % of the records (an end "
+        f"is not within calibration.bounds); median width of T {(high - low).median():.2g} s"
     )
     speed, share = drivers["rmspe"].mean(), drivers["gap_nrmse"].mean()
     concerns = []

@@ -88,7 +88,7 @@ def test_what_a_record_does_not_determine_has_no_end(make_episodes):
     for column in ("desired_speed_mps", "time_gap_s"):
         assert (drivers[f"{column}_low"] <= drivers[column]).iloc[1]
         assert (drivers[f"{column}_high"] >= drivers[column]).iloc[1]
-    line = "local: 95 % intervals: 50 % do not identify v0 (an end is not within calibration.bounds"
+    line = "local: 95 % intervals: v0 is not identified for 50 % of the records (an end is not"
     assert any(text.startswith(line) for text in calibrated.report)
     still = episodes.assign(leader_speed_mps=0.0, follower_speed_mps=1.0, gap_m=500.0)
     slow = Calibrator(bounds={"time_gap": [3.9, 4.0]})(still).drivers
