@@ -39,7 +39,7 @@ from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.inputs import build_drivers, build_energy, constant_profiles
 from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, require
 from lcc_rl.evaluation.comparison import Comparison
-from lcc_rl.evaluation.entrants import check_installed, check_used
+from lcc_rl.evaluation.entrants import check_effective, check_installed
 from lcc_rl.evaluation.fit import task_of
 from lcc_rl.evaluation.named import (
     DIRECT,
@@ -217,7 +217,7 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
     """Play all tasks that fit, and write and return the scores."""
     entrant = scored(options.policy, tuple(options.trust))
     if entrant.policy is None:
-        check_used(further, [entrant.label], [entrant.spec])
+        check_effective(further, [entrant.label], [entrant.spec])
     name = entrant.label if options.name is None else _own_name(options.name)
     file = re.sub(r"\W+", "_", name)
     default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{file}"

@@ -12,9 +12,9 @@ from lcc_rl.drivers.fit_error import SPEED_RMSPE, FitError
 from lcc_rl.drivers.twins import drive, running
 from lcc_rl.functional.driver_models import Reaction
 
-DRAWS, NOISE = 32, Reaction(noise=0.2)  # simulated records of each driver
+REPLICATES, DISTURBANCE = 32, Reaction(noise=0.2)  # simulated records of each driver
 SHIFT = 1e-3  # relative change of a parameter that measures its effect
-SHARES = (0.0, 0.5, 1.0)  # of the linear change of the other parameters with one
+ANSWERS = (0.0, 0.5, 1.0)  # of the linear change of the other parameters with one
 VALUES = 32  # values between the fitted one and a bound, the densest near the fitted one
 
 
@@ -44,7 +44,7 @@ def intervals(
     place, limits = best.log().unsqueeze(1), torch.tensor(bounds).to(best).log().T
     share = torch.linspace(0.0, 1.0, VALUES + 1).to(best)[1:] ** 3
     steps = (limits - place).unsqueeze(-1) * share  # [drivers, ends, names, values]
-    others = torch.tensor(SHARES).to(best).unsqueeze(-1)
+    others = torch.tensor(ANSWERS).to(best).unsqueeze(-1)
     ways = others * (inverse / variance.unsqueeze(2)).unsqueeze(
         2
     )  # [drivers, names, shares, names]
@@ -87,7 +87,7 @@ def _products(error: FitError, best: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     change = SHIFT * torch.eye(count).to(best)
     shifts = torch.cat([change, -change, 0.0 * change[:1]])
     more, less, plain = motion(shifts, Reaction()).split([count, count, 1], 2)
-    strayed = motion(torch.zeros(DRAWS, count).to(best), NOISE) - plain
+    strayed = motion(torch.zeros(REPLICATES, count).to(best), DISTURBANCE) - plain
     effects = (more - less) / (2.0 * SHIFT)
     seen = torch.stack([observed.follower_speed, observed.gaps])
     squares = (plain[:, :, 0] - seen).square().sum(1).clamp(min=1e-12)

@@ -110,7 +110,9 @@ class Entrants:
         rows = [*self.rivals, *self.cfg.evaluation.baselines]
         if self.own or self.further or self.cfg.variant in rows or not self.cfg.automated:
             return
-        check_used(typed, self.rivals or rows, [*rows, *self.rivals.values()], bool(self.paths))
+        check_effective(
+            typed, self.rivals or rows, [*rows, *self.rivals.values()], bool(self.paths)
+        )
 
     def _of_task(self, path: str) -> str:
         return of_task(path, None if self.task is None else self.task.name)
@@ -183,7 +185,7 @@ class Entrants:
         return [f"task.limits.{key}={RECORDED}" for key, x in limits.items() if x == RECORDED]
 
 
-def check_used(
+def check_effective(
     typed: Sequence[str], rows: Iterable[str], specs: Iterable[Any], learned: bool = False
 ) -> None:
     """Refuse overrides of a controller or a safety filter that no row has.
