@@ -39,7 +39,7 @@ from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.inputs import build_drivers, build_energy, constant_profiles
 from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, require
 from lcc_rl.evaluation.comparison import Comparison
-from lcc_rl.evaluation.entrants import check_installed
+from lcc_rl.evaluation.entrants import check_effective, check_installed
 from lcc_rl.evaluation.fit import task_of
 from lcc_rl.evaluation.named import (
     DIRECT,
@@ -216,6 +216,8 @@ def about(entrant: Scored) -> dict[str, Any]:
 def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
     """Play all tasks that fit, and write and return the scores."""
     entrant = scored(options.policy, tuple(options.trust))
+    if entrant.policy is None:
+        check_effective(further, [entrant.label], [entrant.spec])
     name = entrant.label if options.name is None else _own_name(options.name)
     file = re.sub(r"\W+", "_", name)
     default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{file}"
@@ -238,12 +240,16 @@ def _run(
     offered, selected = {**LEADER_SOURCES, **users}, {*options.on, *users} if options.on else None
     scores: list[dict[str, Any]] = []
     left_out: list[str] = []
+    found: dict[str, dict[str, EvaluateConfig]] = {}
     for task in options.task or choices("task"):
-        sources: dict[str, EvaluateConfig] = {}
         with leaving_out(task, left_out):
-            sources = roads(entrant, task, offered, further)
+            found[task] = roads(entrant, task, offered, further)
+    known = dict.fromkeys(name for sources in found.values() for name in sources)
+    for source in options.on if known else ():
+        require(source in known, f"--on {source}: no such source, only {', '.join(known)}")
+    for task, sources in found.items():
         chosen = [one for one in sources if one in (selected or [one])]
-        if sources and not chosen:
+        if not chosen:
             left_out.append(f"{task}: no such source, only {', '.join(sources)}")
         for source in chosen:
             with leaving_out(f"{task}, {source}", left_out):

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lcc_rl.drivers.fit_error import GAP_NRMSE, GAP_RMSE, SPEED_RMSPE, FitError, FitMeasure
 from lcc_rl.drivers.genetic import Evolution, Fitness, GeneticSettings, Progress, minimise
+from lcc_rl.drivers.intervals import intervals
 from lcc_rl.drivers.observed import Observed, Selection, observe
 from lcc_rl.drivers.parameters import (
     DEFAULT_BOUNDS,
@@ -275,16 +276,16 @@ class _Fit:
         for name, one in self.table_of.items():
             columns[one.column] = own.get(name, getattr(constants, name, None))
         columns |= self.equilibrium(own, constants)
+        objective, exact = self.settings.objective, {}
         for end, part in self.parts.items():
-            exact = FitError(part.to("cpu", torch.float64), constants, self.names)
-            measures = exact.measures(best.unsqueeze(1))
+            exact[end] = FitError(part.to("cpu", torch.float64), constants, self.names, objective)
+            measures = exact[end].measures(best.unsqueeze(1))
             for name, column in ERROR_COLUMNS.items():
                 columns[column + end] = measures[name].squeeze(1).numpy()
             columns[f"samples{end}"] = part.samples
         for name in self.table_of:
             columns[f"{name}_at_bound"] = name in own and at_bound(own[name], self.limits[name])
         drivers = pd.DataFrame({**columns, "mode": self.mode, MODEL: self.model})
-        objective = self.settings.objective
         needed = (
             [ERROR_COLUMNS[objective]]
             if objective in ERROR_COLUMNS
@@ -298,6 +299,9 @@ class _Fit:
                 "follower that never moves has no relative speed error, see "
                 "selection.min_mean_speed_mps"
             )
+        ends = intervals(exact[""], best, [self.limits[name] for name in self.names])
+        for end, values in zip(("low", "high"), ends, strict=True):
+            drivers[[f"{self.table_of[x].column}_{end}" for x in self.names]] = values.numpy()
         # The episodes are sorted by length; the table has the order of the input.
         return drivers.sort_values("episode", kind="stable", ignore_index=True)
 
@@ -337,6 +341,13 @@ def _findings(
             speed, gap, share = (drivers[f"{x}{end}"].mean() for x in ERROR_COLUMNS.values())
             both = f"RMSPE {100.0 * speed:.2f} %, gap RMSE {gap:.2f} m, {100.0 * share:.1f} %"
             lines.append(f"{part}: {both} of the gap (means)")
+    ends = {x: [drivers[f"{table[x].column}_{end}"] for end in ("low", "high")] for x in INDIVIDUAL}
+    open_share = pd.concat(ends["desired_speed"], axis=1).isna().any(axis=1).mean()
+    low, high = ends["time_gap"]
+    lines.append(
+        f"95 % intervals: v0 is not identified for {100 * open_share:.0f} % of the records (an end "
+        f"is not within calibration.bounds); median width of T {(high - low).median():.2g} s"
+    )
     speed, share = drivers["rmspe"].mean(), drivers["gap_nrmse"].mean()
     concerns = []
     apart = objective == SPEED_RMSPE

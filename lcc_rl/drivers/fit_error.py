@@ -75,14 +75,14 @@ class FitError:
         """
         with torch.no_grad():
             simulate = self._by_kernel if self.compiled else self._by_tensors
-            speed, gap = simulate(self._parameters(candidates), apart)
+            speed, gap = simulate(self.parameters(candidates), apart)
             return {
                 SPEED_RMSPE: (speed / self._norms[0]).sqrt(),
                 GAP_RMSE: (gap / self._samples).sqrt(),
                 GAP_NRMSE: (gap / self._norms[1]).sqrt(),
             }
 
-    def _parameters(self, candidates: Tensor) -> dict[str, Tensor]:
+    def parameters(self, candidates: Tensor) -> dict[str, Tensor]:
         """Return the parameters of every candidate by name, ``[drivers, candidates]``."""
         given = dict(zip(self.names, candidates.unbind(-1), strict=True))
         like: dict[str, Any] = {"dtype": self.observed.gaps.dtype, "device": candidates.device}

@@ -82,7 +82,7 @@ def measure_motion(
         found = _energies(speed, samples, time_step, smoothing)
         units = {"energy": "j", "lost": "j", "distance": "m"}
         table |= {f"{x}_{smoothing}s_{unit}": found[x] for x, unit in units.items()}
-    alive = _inside(len(speed), samples)
+    alive = running(len(speed), samples)
     table["gap_m"] = (gap * alive).mean(1).sum(0) / samples
     moving = alive & (speed > 1.0)
     far = moving & (gap > LONG_GAP * speed)
@@ -90,7 +90,7 @@ def measure_motion(
     return pd.DataFrame(table | _spectrum(speed, samples, time_step))
 
 
-def _inside(length: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
+def running(length: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return which of ``length`` samples belong to a record, ``[length, 1, drivers]``."""
     return (np.arange(length)[:, None] < samples)[:, None]
 
@@ -102,7 +102,7 @@ def _energies(
     width, motor = round(smoothing / time_step), PaperMotor()
     total = np.cumsum(np.concatenate([0.0 * speed[:1], speed]), axis=0)
     smooth = (total[width:] - total[:-width]) / width
-    inside = _inside(len(smooth) - 1, samples - width)
+    inside = running(len(smooth) - 1, samples - width)
     accelerations = torch.from_numpy(np.diff(smooth, axis=0) / time_step)
     motion = (torch.from_numpy(smooth[:-1]), accelerations)
     rates = {
@@ -167,9 +167,9 @@ def drive_twins(
     leader, *start = (x.double().cpu() for x in series)
     generator = torch.Generator().manual_seed(0)
     people, shape = _people(observed, drivers), (len(reactions), repeats, observed.count)
-    motion = _follow(people, leader, start, reactions, shape, generator, observed.time_step)
+    motion = drive(people, leader, start, reactions, shape, generator, observed.time_step)
     truth = observed.follower_speed.double().cpu().numpy()[:, None]
-    alive = _inside(len(truth), observed.samples)
+    alive = running(len(truth), observed.samples)
     norm = (truth**2).sum(0)
     found = []
     for speed, gap in motion:
@@ -191,13 +191,13 @@ def growth(observed: Observed, drivers: pd.DataFrame, reactions: Sequence[Reacti
     generator, chance = torch.Generator().manual_seed(0), np.random.default_rng(0)
     shape, step = (len(reactions), 1, observed.count), observed.time_step
     energies, collided = [], np.zeros(len(reactions), bool)
-    inside = _inside(len(leader), observed.samples)
+    inside = running(len(leader), observed.samples)
     for car in range(CARS):
         order = torch.from_numpy(chance.permutation(observed.count))
         shared = {name: getattr(law, name)[order] for name in law.shared()}
         people = (law.with_(**shared), (own[0][order], own[1][order]))
         gap = people[0].equilibrium_gap(leader[0], *people[1])
-        motion = _follow(people, leader, (leader[0], gap), reactions, shape, generator, step)
+        motion = drive(people, leader, (leader[0], gap), reactions, shape, generator, step)
         collided |= [bool(((gaps <= 0.0) & inside).any()) for _, gaps in motion]
         if car in (0, CARS - 1):
             each = [_energies(x, observed.samples, step, AVERAGES[0]) for x, _ in motion]
@@ -207,7 +207,7 @@ def growth(observed: Observed, drivers: pd.DataFrame, reactions: Sequence[Reacti
     return [float(x) for x in np.where(collided, np.inf, grown)]
 
 
-def _follow(
+def drive(
     people: People,
     leader: Tensor,
     start: Sequence[Tensor],
@@ -218,7 +218,8 @@ def _follow(
 ) -> list[tuple[_Array, _Array]]:
     """Drive followers; return speeds and gaps ``[time, draws, drivers]`` for every reaction.
 
-    The leader's speed is ``[time, …]``, broadcast to ``shape``: reactions, draws, drivers.
+    The leader's speed is ``[time, …]``, broadcast to reactions, draws and drivers, the ``shape`` of
+    the noise. Its last number is 1 if all drivers have the same noise.
     """
     law, own = people
     level, gap_level = (
@@ -243,7 +244,7 @@ def _follow(
     def seen(gap: Tensor) -> Tensor:
         return gap * (gap_level * next(gap_noise)).exp()
 
-    speed, gap = (x.expand(shape) for x in start)
+    speed, gap = (x.expand(*shape[:2], -1) for x in start)
     late = round(reactions[0].delay / step)
     sight = seen if gap_level.any() else None
     driven = follow(law, leader, speed, gap, own, step, late, strayed, sight)

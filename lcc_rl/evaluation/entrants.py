@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -107,19 +107,12 @@ class Entrants:
         return rivals, policies
 
     def _check_used(self, typed: Sequence[str]) -> None:
-        """Refuse settings of a controller or a safety filter that no row has."""
         rows = [*self.rivals, *self.cfg.evaluation.baselines]
         if self.own or self.further or self.cfg.variant in rows or not self.cfg.automated:
             return
-        unused = {AUTO: "every controller is named and has its own settings"}
-        named = any(str(x).endswith(FILTERED) for x in (*rows, *self.rivals.values()))
-        if not self.paths and not named:
-            reason = f"nothing drives behind the filter ({', '.join(self.rivals or rows)}); "
-            reason += f"it needs a name that ends in {FILTERED}"
-            unused |= dict.fromkeys(("filter", "scenario.filters"), reason)
-        for word in typed:
-            for key in filter(key_of(word).startswith, unused):
-                raise ConfigError(f"{word.removeprefix('++')} has no effect: {unused[key]}")
+        check_effective(
+            typed, self.rivals or rows, [*rows, *self.rivals.values()], bool(self.paths)
+        )
 
     def _of_task(self, path: str) -> str:
         return of_task(path, None if self.task is None else self.task.name)
@@ -190,6 +183,27 @@ class Entrants:
         """Return the limits of the task that refer to the recorded drivers."""
         limits = self.task.limits if self.task else {}
         return [f"task.limits.{key}={RECORDED}" for key, x in limits.items() if x == RECORDED]
+
+
+def check_effective(
+    typed: Sequence[str], rows: Iterable[str], specs: Iterable[Any], learned: bool = False
+) -> None:
+    """Refuse overrides of a controller or a safety filter that no row has.
+
+    Args:
+        typed: the overrides.
+        rows: names of the rows in tables.
+        specs: names of all controllers.
+        learned: whether a row is a policy.
+    """
+    unused = {AUTO: "every controller is named and has its own settings"}
+    if not learned and not any(str(x).endswith(FILTERED) for x in specs):
+        reason = f"nothing drives behind the filter ({', '.join(rows)}); "
+        reason += f"it needs a name that ends in {FILTERED}"
+        unused |= dict.fromkeys(("filter", "scenario.filters"), reason)
+    for word in typed:
+        for key in filter(key_of(word).startswith, unused):
+            raise ConfigError(f"{word.removeprefix('++')} has no effect: {unused[key]}")
 
 
 def _by_label(named: Sequence[Any] | Mapping[str, Any]) -> Mapping[str, Any]:

@@ -134,10 +134,10 @@ def _named(spec: str) -> Node | None:
     """Return the controller with a name; None if there is none."""
     if spec in (shipped := _shipped()):
         return shipped[spec]
-    if spec in choices("controller"):
-        overrides = ["variant=idm", f"controller@{AUTO}={spec}"]
-    elif spec in choices("variant"):
+    if spec in choices("variant"):  # first, because hcfs needs the policy of its variant
         overrides = [f"variant={spec}"]
+    elif spec in choices("controller"):
+        overrides = ["variant=idm", f"controller@{AUTO}={spec}"]
     else:
         return None
     cfg = load("evaluate", overrides)

@@ -24,7 +24,9 @@ def _bound(value: Any) -> Any:
     relative = value == RECORDED or (isinstance(value, str) and PERCENT.fullmatch(value))
     if relative or (isinstance(value, (int, float)) and value >= 0.0):
         return value
-    expected = f"a number, {RECORDED}, or a share of the value of task.against such as 98 %"
+    expected = (
+        f"a number of at least 0, {RECORDED}, or a share of the value of task.against such as 98 %"
+    )
     raise ValueError(f"must be {expected}, got {value!r}; ~task.limits.<name> removes a limit")
 
 

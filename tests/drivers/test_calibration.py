@@ -220,6 +220,8 @@ def test_rows_keep_the_order_and_identity_of_the_input(uneven_lengths):
         *("rmspe", "gap_rmse_m", "gap_nrmse", "samples"),
         *(f"{name}_at_bound" for name in fitted("global")),
         *("mode", "model"),
+        *(f"{PARAMETERS[x].column}_{end}" for end in ("low", "high") for x in fitted("local")),
+        *(f"{PARAMETERS[x].column}_{end}" for end in ("low", "high") for x in fitted("global")[2:]),
     ]
     assert seen == [(1, 2), (2, 2)] * 2
     renamed = uneven_lengths.rename(columns={"episode": "event", "recording": "period"})

@@ -86,6 +86,8 @@ def test_mistakes_are_named(tmp_path) -> None:
         ("direct", "direct cannot be scored"),
         ("idm --task i80", "nothing could be played: i80: .*i80-follow"),
         ("idm --task i80-follow --on moon", "no such source, only stream, "),
+        ("idm --task i80-follow --on moon --on everyday", "--on moon: no such source, only stream"),
+        ("idm --task i80-follow +filter=cbf", "has no effect: nothing drives behind the filter"),
         ("idm --source ../x leader=i24", "expected a new name"),
         ("idm --source x agent=ddpg", "expected settings of data, "),
         ("idm data=stream", "each task has its own"),

@@ -95,9 +95,10 @@ def test_mistakes_are_named_before_the_data_are_read(tmp_path, monkeypatch) -> N
         ),
         (
             "task=i80-follow compare=[idm] +task.limits.flow_vph=-5",
-            r"flow_vph: must be a number, recorded, or a share .* such as 98 %, got -5",
+            r"flow_vph: must be a number of at least 0, recorded, or a share .*, got -5",
         ),
         ("variant=idm compare=[follower_stoper]", "follower_stopper"),
+        ("variant=idm compare=[hcfs]", "variant hcfs is learned: compare the run folder"),
         ("variant=alcc", "variant alcc is learned: give policy="),
         ("variant=idm evaluation.shards=2 evaluation.shard=2", "shard must lie from 0 to"),
         ("variant=cacc evaluation.warm_up=5", "warm_up needs evaluation.rows=episodes"),
