@@ -13,6 +13,7 @@ from lcc_rl.drivers.twins import drive, running
 from lcc_rl.functional.driver_models import Reaction
 
 REPLICATES, DISTURBANCE = 32, Reaction(noise=0.2)  # simulated records of each driver
+AT_ONCE = 2**23  # samples times draws that are simulated together
 SHIFT = 1e-3  # relative change of a parameter that measures its effect
 ANSWERS = (0.0, 0.5, 1.0)  # of the linear change of the other parameters with one
 VALUES = 32  # values between the fitted one and a bound, the densest near the fitted one
@@ -71,6 +72,7 @@ def _products(error: FitError, best: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """
     observed, count = error.observed, best.shape[1]
     start = observed.follower_speed[0], observed.gaps[0]
+    generator = torch.Generator().manual_seed(0)
     alive = torch.from_numpy(running(len(observed.gaps), observed.samples))
 
     def motion(shift: Tensor, reaction: Reaction) -> Tensor:
@@ -79,7 +81,7 @@ def _products(error: FitError, best: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         people = error.law, (own.pop("desired_speed"), own.pop("time_gap"))
         people = people[0].with_(**own), people[1]
         # All drivers have the same draws, so that none depends on the others.
-        shape, generator = (1, len(shift), 1), torch.Generator().manual_seed(0)
+        shape = (1, len(shift), 1)
         step, leader = observed.time_step, observed.leader_speed
         [found] = drive(people, leader, start, [reaction], shape, generator, step)
         return torch.from_numpy(np.stack(found)).nan_to_num(0.0, 0.0, 0.0) * alive
@@ -87,7 +89,6 @@ def _products(error: FitError, best: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     change = SHIFT * torch.eye(count).to(best)
     shifts = torch.cat([change, -change, 0.0 * change[:1]])
     more, less, plain = motion(shifts, Reaction()).split([count, count, 1], 2)
-    strayed = motion(torch.zeros(REPLICATES, count).to(best), DISTURBANCE) - plain
     effects = (more - less) / (2.0 * SHIFT)
     seen = torch.stack([observed.follower_speed, observed.gaps])
     squares = (plain[:, :, 0] - seen).square().sum(1).clamp(min=1e-12)
@@ -95,7 +96,12 @@ def _products(error: FitError, best: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     norms = seen.square().sum(1).clamp(min=1e-12)
     weights = torch.tensor(used).unsqueeze(-1) / (squares * norms).sqrt()
     weights = weights / (weights * squares).sum(0)
-    rows = torch.cat([effects, strayed], 2)
-    products = torch.einsum("ctid,ctjd,cd->dij", effects, rows, weights)
-    noise = torch.einsum("ctjd,cd->dj", strayed.square(), weights)
-    return products[..., :count], products[..., count:], noise
+    normal = torch.einsum("ctid,ctjd,cd->dij", effects, effects, weights)
+    joint, noise, left = [], [], REPLICATES
+    while left:  # groups of draws, whose motion fits into memory
+        group = min(left, max(1, AT_ONCE // seen[0].numel()))
+        strayed = motion(torch.zeros(group, count).to(best), DISTURBANCE) - plain
+        joint.append(torch.einsum("ctid,ctjd,cd->dij", effects, strayed, weights))
+        noise.append(torch.einsum("ctjd,cd->dj", strayed.square(), weights))
+        left -= group
+    return normal, torch.cat(joint, -1), torch.cat(noise, -1)

@@ -93,3 +93,14 @@ def test_what_a_record_does_not_determine_has_no_end(make_episodes):
     still = episodes.assign(leader_speed_mps=0.0, follower_speed_mps=1.0, gap_m=500.0)
     slow = Calibrator(bounds={"time_gap": [3.9, 4.0]})(still).drivers
     assert slow[["time_gap_s_low", "time_gap_s_high"]].isna().all(axis=None)
+
+
+def test_draws_in_groups_give_intervals_of_the_same_width(known, monkeypatch):
+    records = noisy(*known, "acceleration")
+    widths = []
+    for samples in (2**23, 1):
+        monkeypatch.setattr("lcc_rl.drivers.intervals.AT_ONCE", samples)
+        found = Calibrator()(records).drivers
+        widths.append(found["time_gap_s_high"] - found["time_gap_s_low"])
+    assert 0.6 < (widths[1] / widths[0]).median() < 1.6
+    assert len(widths[0]) == DRIVERS
