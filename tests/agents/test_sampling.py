@@ -65,9 +65,9 @@ def test_a_network_on_a_rule_is_the_rule_at_first(agent: str) -> None:
     torch.testing.assert_close(residual.policy.module(seen), residual.rule(seen))
 
 
-@pytest.mark.parametrize("agent", ["ppo", "td3"])
-def test_prices_of_limits_are_recorded_and_resume(tmp_path, agent: str) -> None:
-    words = (f"agent={agent}", "surrogates@agent=limits", "agent.policy=residual_idm")
+@pytest.mark.parametrize(("agent", "terms"), [("ppo", "alcc_ppo"), ("td3", "limits")])
+def test_prices_of_limits_are_recorded_and_resume(tmp_path, agent: str, terms: str) -> None:
+    words = (f"agent={agent}", f"surrogates@agent={terms}", "agent.policy=residual_idm")
     sizes = ("scenario.horizon=20", "training.segment=10", "agent.hold=0.5", "agent.batch_size=8")
     sizes += (
         "agent.scale_rewards=true",
@@ -77,7 +77,7 @@ def test_prices_of_limits_are_recorded_and_resume(tmp_path, agent: str) -> None:
     )
     check_resuming(lambda folder: small_loop(folder, *words, *sizes), tmp_path)
     record = small_loop(tmp_path, *words, *sizes).run()
-    assert {"price_safety", "share_efficiency", "reward_cav_energy"} <= {*record.columns}
+    assert {"limit_efficiency", "share_efficiency", "reward_cav_energy"} <= {*record.columns}
     assert record["price_efficiency"].nunique() > 1
 
 
