@@ -169,7 +169,9 @@ def learners(reference: Path, docs: Path) -> None:
     how |= {name: (name, "mean") for name in rows.columns[4:]}
     table = rows.groupby(["task", "strategy"], sort=False).agg(**how).reset_index()
     table.loc[table["score_low"] == table["score_high"], ["score_low", "score_high"]] = np.nan
-    fill(docs / "learners.md", {"learners": as_markdown(table.dropna(axis=1, how="all"))})
+    chosen = table["task"].str.contains("training")  # where settings were chosen
+    for page, own in (("learners.md", table[~chosen]), ("notes/agents.md", table[chosen])):
+        fill(docs / page, {"learners": as_markdown(own.dropna(axis=1, how="all"))})
 
 
 def task_table(name: str, table: pd.DataFrame) -> str:
