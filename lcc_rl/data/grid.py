@@ -166,7 +166,7 @@ def _usual_steps(samples: pd.DataFrame, same: Mask, what: str, source: str) -> F
             f"{', or are rows missing' * (unit != 's')}?"
         )
     if not ((steps - step).abs() > UNEVEN * step).any():
-        return np.full(len(samples), step)
+        return np.broadcast_to(step, len(samples))
     medians = steps.groupby(samples["episode"]).transform("median")
     many = samples.groupby("episode")["time_s"].transform("size") > round(1 / MANY_HOLES)
     return medians.where(many, step).to_numpy()
@@ -225,6 +225,8 @@ def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 def cut_by_files(samples: pd.DataFrame, key: str, files: Sequence[str]) -> list[Concern]:
     """Return a warning on records, named in the column ``key``, that continue in another file."""
+    if len(files) < 2:
+        return []
     times = (
         samples.groupby([key, "file"], observed=True)["time_s"]
         .agg(["min", "max", "size"])
@@ -262,41 +264,55 @@ def on_grid(
     Returns:
         The samples, with the frames' ``time_s``, and the frame of each.
     """
-    at = ((samples["time_s"] - origin) / FRAME).to_numpy()
+    samples = samples.assign(origin=origin)
+    at = _at(samples)
     if at.max() > LAST_FRAME:
         row = int(np.argmax(at > LAST_FRAME))
         raise DataError(
             f"{report.source}: {place(samples)(row, '')} is {FRAME * at[row]:g} s after the first; "
             "is the time in another unit?"
         )
-    frame, episode = np.rint(at).astype(np.int64), samples["episode"].to_numpy()
-    same = np.diff(episode) == 0
-    skipped = (np.diff(frame)[same] > 1).any() or np.abs(at - frame).max() > REGULAR
+    frame = np.rint(at).astype(np.int32)
+    at -= frame
+    skipped = np.abs(at, out=at).max() > REGULAR
+    del at  # a table may hold millions of rows
+    skipped |= (np.diff(frame)[np.diff(samples["episode"]) == 0] > 1).any()
     line = interpolated(samples, FRAME, skipped)
-    samples = samples.assign(origin=origin)
     if line:
         report.notes += line
-        samples, frame = _interpolated(samples, at, [*smooth], report)
+        samples, frame = _interpolated(samples, [*smooth], report)
     samples["time_s"] = samples.pop("origin") + frame / round(1 / FRAME)
     return samples, frame
 
 
+def _at(samples: pd.DataFrame) -> Floats:
+    """Return the times of samples, in frames after the ``origin``."""
+    return ((samples["time_s"] - samples["origin"]) / FRAME).to_numpy(copy=True)
+
+
 def interpolated(samples: pd.DataFrame, step: float, skipped: bool = False) -> list[str]:
     """Return a line on samples that are not ``step`` seconds apart, or with ``skipped`` frames."""
-    steps = np.diff(samples["time_s"])[np.diff(samples["episode"]) == 0]
-    usual = float(np.median(steps))
-    odd = int((np.abs(steps - usual) > UNEVEN * usual).sum())
+    steps = steps_of(samples)
+    usual = float(np.median(steps, overwrite_input=True))
+    steps -= usual
+    odd = int((np.abs(steps, out=steps) > UNEVEN * usual).sum())
     irregular = f", {odd:,} of them irregular," * bool(odd)
     line = f"samples {usual:g} s apart{irregular} were interpolated to {step:g} s"
     return [line] * bool(skipped or odd or abs(usual - step) > UNEVEN * step)
 
 
+def steps_of(samples: pd.DataFrame) -> Floats:
+    """Return the times between consecutive samples of a record [s]."""
+    return np.diff(samples["time_s"])[np.diff(samples["episode"]) == 0]
+
+
 def _interpolated(
-    samples: pd.DataFrame, at: Floats, smooth: list[str], report: ReadReport
+    samples: pd.DataFrame, smooth: list[str], report: ReadReport
 ) -> tuple[pd.DataFrame, Integers]:
-    """Return samples at the whole frames of each record; ``at``: frames of the given samples."""
+    """Return samples at the whole frames of each record."""
     from scipy.interpolate import PchipInterpolator  # here: it loads for a second
 
+    at = _at(samples)
     table, episode = samples[smooth].to_numpy(np.float64), samples["episode"].to_numpy()
     frames, before, values = [], [], []
     for start, length in zip(*stretches(episode), strict=True):
@@ -308,7 +324,7 @@ def _interpolated(
         motion = PchipInterpolator(sampled, table[start : start + length])
         values.append(motion(grid.clip(sampled[0], sampled[-1])))
         before.append(start + np.searchsorted(sampled, grid + 1e-6, side="right") - 1)
-        frames.append(grid.astype(np.int64))
+        frames.append(grid.astype(np.int32))
     if not frames:
         raise DataError(
             f"{report.source}: no record lasts {FRAME:g} s; is the time in another unit?"
