@@ -62,8 +62,8 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     width, every, reach = (round(seconds / FRAME) for seconds in (CHANGE_S, EVERY_S, LONGEST_LAG))
     span = width + 2 * reach
     rows = np.flatnonzero(number[span:] == number[:-span])[::every] + reach
-    gap, *speeds = (episodes[name] for name in PAIR_SIGNALS.values())
-    series = [gap.to_numpy(np.float64), *map(_distance, speeds)]
+    gap, *speeds = (episodes[name].to_numpy() for name in PAIR_SIGNALS.values())
+    series = [gap.astype(float), *((np.cumsum(v, dtype=float) - v / 2) * FRAME for v in speeds)]
 
     fits = partial(_fits, series, pair, pairs, width)
     lags = [(0, 0), *((i, k) for k in range(-reach, reach + 1) if k for i in range(3))]
@@ -98,16 +98,6 @@ def numbers_of_pairs(episodes: pd.DataFrame) -> NDArray[np.int32]:
     starts, lengths = stretches(episodes["episode"].to_numpy())
     first = episodes[keys or ["episode"]].iloc[starts]
     return np.repeat(first.groupby([*first], sort=False).ngroup().to_numpy(np.int32), lengths)
-
-
-def _distance(speed: pd.Series) -> Floats:
-    """Return the integral of a speed [m]."""
-    values = speed.to_numpy(np.float64)
-    total = np.cumsum(values)
-    total *= 2
-    total -= values
-    total *= FRAME / 2
-    return total
 
 
 def _fits(

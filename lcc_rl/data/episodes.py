@@ -128,10 +128,12 @@ def _table(
     start = np.repeat(table["time_s"].to_numpy()[first], lengths)
     table, _ = on_grid(table, start, MOTION_COLUMNS, place, report)
     table["time_s"] = table["time_s"].round(6)
-    table["episode"] = _numbered(table["episode"].to_numpy(), numbers)
+    # Parts after holes have numbers beyond the file's own.
+    further = np.arange(table["episode"].max() + 1 - len(numbers)) + numbers.max() + 1
+    table["episode"] = np.append(numbers, further)[table["episode"]]
     table = table[[*SCHEMA, "row", "label"]]
     for name in (name for name in SCHEMA if name not in TEXTS):  # one by one, to spare memory
-        table[name] = table[name].astype(SCHEMA[name])
+        table[name] = table[name].astype(np.dtype(SCHEMA[name]))
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
         notes.append(DERIVED_POSITIONS)
@@ -198,12 +200,6 @@ def _targets(read: dict[str, Any], file: TableFile) -> tuple[dict[str, Any], pd.
     first = f"data row {int(read['row'][np.argmin(mask)]) + 1}"
     file.notes.append(f"left out {int((~mask).sum()):,} rows without a valid target, {first} …")
     return chosen(read, mask), cars[mask]
-
-
-def _numbered(episode: NDArray, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the file's numbers of episodes; parts after holes have further numbers."""
-    further = np.arange(episode.max() + 1 - len(numbers)) + numbers.max() + 1
-    return np.append(numbers, further)[episode]
 
 
 def _names(file: TableFile, columns: Names) -> dict[str, str | None]:

@@ -225,8 +225,6 @@ def stretches(values: NDArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 def cut_by_files(samples: pd.DataFrame, key: str, files: Sequence[str]) -> list[Concern]:
     """Return a warning on records, named in the column ``key``, that continue in another file."""
-    if len(files) < 2:
-        return []
     times = (
         samples.groupby([key, "file"], observed=True)["time_s"]
         .agg(["min", "max", "size"])
@@ -264,8 +262,7 @@ def on_grid(
     Returns:
         The samples, with the frames' ``time_s``, and the frame of each.
     """
-    samples = samples.assign(origin=origin)
-    at = _at(samples)
+    at = ((samples["time_s"] - origin) / FRAME).to_numpy()
     if at.max() > LAST_FRAME:
         row = int(np.argmax(at > LAST_FRAME))
         raise DataError(
@@ -273,21 +270,16 @@ def on_grid(
             "is the time in another unit?"
         )
     frame = np.rint(at).astype(np.int32)
-    at -= frame
-    skipped = np.abs(at, out=at).max() > REGULAR
+    skipped = np.abs(at - frame).max() > REGULAR
     del at  # a table may hold millions of rows
     skipped |= (np.diff(frame)[np.diff(samples["episode"]) == 0] > 1).any()
     line = interpolated(samples, FRAME, skipped)
+    samples = samples.assign(origin=origin)
     if line:
         report.notes += line
         samples, frame = _interpolated(samples, [*smooth], report)
     samples["time_s"] = samples.pop("origin") + frame / round(1 / FRAME)
     return samples, frame
-
-
-def _at(samples: pd.DataFrame) -> Floats:
-    """Return the times of samples, in frames after the ``origin``."""
-    return ((samples["time_s"] - samples["origin"]) / FRAME).to_numpy(copy=True)
 
 
 def interpolated(samples: pd.DataFrame, step: float, skipped: bool = False) -> list[str]:
@@ -308,11 +300,11 @@ def steps_of(samples: pd.DataFrame) -> Floats:
 
 def _interpolated(
     samples: pd.DataFrame, smooth: list[str], report: ReadReport
-) -> tuple[pd.DataFrame, Integers]:
+) -> tuple[pd.DataFrame, NDArray]:
     """Return samples at the whole frames of each record."""
     from scipy.interpolate import PchipInterpolator  # here: it loads for a second
 
-    at = _at(samples)
+    at = ((samples["time_s"] - samples["origin"]) / FRAME).to_numpy()
     table, episode = samples[smooth].to_numpy(np.float64), samples["episode"].to_numpy()
     frames, before, values = [], [], []
     for start, length in zip(*stretches(episode), strict=True):

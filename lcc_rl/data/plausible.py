@@ -14,7 +14,7 @@ from lcc_rl.arrays import Floats, Mask
 from lcc_rl.data.agreement import OF_PAIRS, check_pairs, numbers_of_pairs
 from lcc_rl.data.columns import Units
 from lcc_rl.data.grid import ORIGIN, Place, Places, divided, steps_of, stretches
-from lcc_rl.data.trajectories import FRAME, starts_of
+from lcc_rl.data.trajectories import BATCH, FRAME, starts_of
 from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
@@ -23,7 +23,6 @@ SHORTEST_PART = 10.0  # least length of parts of a cut record [s]
 HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; least samples of a share
 JUMP_S, HELD_S = 0.5, 1.0  # time in which a gap jumps; longest time without a measurement [s]
 NOISE = 12.0  # least jump, as a multiple of the median change of a gap beyond that by the speeds
-BATCH = 2**17  # rows of whole pairs that are compared at a time
 MOST_JUMPS = 0.5  # largest share of samples that jumps of gaps may cost
 WORDS = {
     "max_speed": "holds {:g} m/s (is it km/h or ft/s?)",
@@ -172,20 +171,19 @@ class Plausible(Settings):
         time = table["time_s"].to_numpy(np.float64)
         step = np.diff(time, prepend=time[0])
         step[starts_of(table["episode"].to_numpy())] = 0.0
-        late = step > self.max_step
-        yield "time_s", "is {:g} s after the sample before it", step, "max_step", late
+        words = "is {:g} s after the sample before it"
+        yield "time_s", words, step, "max_step", step > self.max_step
         step[step <= 0] = np.inf
         for name in map(str, table.columns):
             if not name.endswith(("speed_mps", "length_m", "gap_m")):
                 continue
             values, kind = table[name].to_numpy(np.float64), name.split("_")[-2]
-            for limit, sign in ((f"max_{kind}", 1), (f"min_{kind}", -1)):
-                outside = sign * values > sign * getattr(self, limit)
+            for limit, beyond in ((f"max_{kind}", np.greater), (f"min_{kind}", np.less)):
+                outside = beyond(values, getattr(self, limit))
                 outside &= (kind != "length") | (values != 0)  # a length of 0 is not given
                 yield name, WORDS.get(limit, "holds {:g} m"), values, limit, outside
             if kind == "speed":
-                rate = np.zeros_like(values)
-                np.subtract(values[1:], values[:-1], out=rate[1:])
+                rate = np.diff(values, prepend=values[0])
                 rate /= step
                 rough = (rate > self.max_acceleration) | (rate < -self.max_acceleration)
                 yield name, "changes by {:g} m/s²", rate, "max_acceleration", rough
@@ -210,8 +208,7 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
         _jumps(table.iloc[start:end], limit, reach)
         for start, end in zip([0, *ends[:-1]], ends, strict=True)
     ]
-    off, wrong = map(np.concatenate, zip(*parts, strict=True))
-    return off, wrong
+    return np.concatenate([off for off, _ in parts]), np.concatenate([x for _, x in parts])
 
 
 def _jumps(table: pd.DataFrame, limit: float, reach: int) -> tuple[Floats, Mask]:

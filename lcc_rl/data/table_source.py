@@ -131,9 +131,8 @@ class TableSource(TrajectorySource):
                 remedy = "is blank or 0; data.vehicle_length sets such lengths [m]"
                 raise table.fault(int(block["row"][np.argmax(blank)]), "length", remedy)
             _report_blank_gaps(table, block)
-            rows = len(block["row"])
-            recording = same_text(table.label, rows)
-            blocks.append({"recording": recording, **block, "file": np.full(rows, number)})
+            own = {"recording": same_text(table.label, len(block["row"]))}
+            blocks.append({**own, **block, "file": np.full(len(block["row"]), number)})
             report.notes += table.notes
         columns = joined_columns(blocks)
         count = len(columns["time"])
@@ -146,8 +145,7 @@ class TableSource(TrajectorySource):
             columns["length"] = np.where(length > 0, length, self.vehicle_length)
         if "lane" in columns:
             columns["lane"] = columns["lane"].codes
-        columns["time_s"] = columns.pop("time")
-        return pd.DataFrame(columns, copy=False)
+        return pd.DataFrame({"time_s": columns.pop("time"), **columns}, copy=False)
 
 
 def _report_blank_gaps(table: TableFile, read: Mapping[str, Any]) -> None:

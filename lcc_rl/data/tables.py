@@ -41,14 +41,13 @@ from lcc_rl.data.text import (
     stem,
     unended,
 )
-from lcc_rl.data.trajectories import listed
+from lcc_rl.data.trajectories import BATCH, listed
 from lcc_rl.errors import Concern, DataError, in_short, raised_as
 from lcc_rl.io.memory import require_memory
 
 log = logging.getLogger("lcc_rl")
 
 PARQUET = (".parquet", ".pq")
-BATCH = 2**17  # rows of a parquet file that are converted at a time
 EVERY = 10.0  # time between lines on the progress [s]
 LONGEST_TEXT = 1000  # most characters of a name
 LARGEST_ID = 2**53  # larger whole numbers do not fit a float
@@ -144,10 +143,7 @@ class TableFile:
             if column.key in self.names
         }
         parts = [
-            {
-                column.key: block.values(column, self.names[column.key], scale)
-                for column, scale in scales.items()
-            }
+            {x.key: block.values(x, self.names[x.key], scale) for x, scale in scales.items()}
             for block in self.blocks([*self.names.values()])
         ]
         read = joined_columns(parts)
@@ -296,7 +292,7 @@ def _memory(file: str) -> float:
     if Path(file).suffix in PARQUET:
         with suppress(pa.ArrowException):  # the reader refuses a damaged file
             metadata = pq.read_metadata(file)
-            return 60.0 * metadata.num_rows * metadata.num_columns
+            return 40.0 * metadata.num_rows * metadata.num_columns
     return 10.0 * getsize(file)
 
 
