@@ -126,11 +126,6 @@ def above(found: pd.DataFrame, shape: dict[str, int]) -> list[str]:
     ]
 
 
-def module_of(name: str) -> str:
-    """Return the dotted name of a file of the package."""
-    return name.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-
-
 def shared_names(trees: dict[str, ast.Module]) -> list[str]:
     """Return the top-level names that several modules define, except private ones and ``log``."""
     places: dict[str, set[str]] = {}
@@ -205,7 +200,9 @@ def takes_configuration(node: ast.AST) -> bool:
 def structure(names: Iterable[str]) -> dict[str, int]:
     """Return the numbers of shared names, floors, circles and functions with a configuration."""
     files = [x for x in names if x.startswith("lcc_rl/") and x.endswith(".py")]
-    trees = {module_of(x): ast.parse((ROOT / x).read_text(encoding="utf-8")) for x in files}
+    dotted = (x.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for x in files)
+    texts = ((ROOT / x).read_text(encoding="utf-8") for x in files)
+    trees = {module: ast.parse(text) for module, text in zip(dotted, texts, strict=True)}
     arrows = imports(trees)
     high = max(floors(arrows).values(), default=0)
     reads = sum(takes_configuration(node) for tree in trees.values() for node in ast.walk(tree))

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from lcc_rl.arrays import Floats
 from lcc_rl.data.columns import FRAMES, SI, SPEEDS, UNITS, Units, unit_size
-from lcc_rl.data.grid import Place
-from lcc_rl.data.trajectories import FRAME
+from lcc_rl.data.grid import Place, stretches
+from lcc_rl.data.trajectories import FRAME, starts_of
 from lcc_rl.errors import Concern, DataError
 
 OF_PAIRS = {"episode", "time_s", "gap_m", "follower_speed_mps", "leader_speed_mps"}
@@ -57,12 +57,13 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
         speeds, fitted with and without the coefficients [m/s]).
     """
     pair = numbers_of_pairs(episodes)
+    starts = starts_of(pair)
     number, pairs = episodes["episode"].to_numpy(), int(pair.max(initial=-1)) + 1
     width, every, reach = (round(seconds / FRAME) for seconds in (CHANGE_S, EVERY_S, LONGEST_LAG))
     span = width + 2 * reach
     rows = np.flatnonzero(number[span:] == number[:-span])[::every] + reach
-    gap, *speeds = (episodes[name].to_numpy(np.float64) for name in PAIR_SIGNALS.values())
-    series = [gap, *(np.cumsum((v + np.append(0.0, v[:-1])) * FRAME / 2) for v in speeds)]
+    gap, *speeds = (episodes[name].to_numpy() for name in PAIR_SIGNALS.values())
+    series = [gap.astype(float), *((np.cumsum(v, dtype=float) - v / 2) * FRAME for v in speeds)]
 
     fits = partial(_fits, series, pair, pairs, width)
     lags = [(0, 0), *((i, k) for k in range(-reach, reach + 1) if k for i in range(3))]
@@ -77,7 +78,7 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     ahead, own, grown = sums[[0, 1, 3], 2] * [[1], [-1], [1]] * EVERY_S / CHANGE_S
     names = ["leader", "follower", "constant", "slope"]
     return pd.DataFrame(coefs[best, :, index], columns=names).assign(
-        row=np.append(np.unique(pair, return_index=True)[1], 0),
+        row=np.append(starts[np.unique(pair[starts], return_index=True)[1]], 0),
         seconds=EVERY_S * count,
         fit=1 - rest[best, index],
         motion=np.sqrt(sums[:2, :2].sum(axis=(0, 1)).clip(0.0) / count.clip(1.0)),
@@ -91,11 +92,12 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def numbers_of_pairs(episodes: pd.DataFrame) -> NDArray[np.int64]:
+def numbers_of_pairs(episodes: pd.DataFrame) -> NDArray[np.int32]:
     """Return the number of the pair of each row, from 0; see :func:`agreement`."""
     keys = [name for name in ("recording", "follower_id", "leader_id") if name in episodes]
-    numbers = episodes.groupby(keys or ["episode"], sort=False).ngroup()
-    return np.asarray(numbers, np.int64)
+    starts, lengths = stretches(episodes["episode"].to_numpy())
+    first = episodes[keys or ["episode"]].iloc[starts]
+    return np.repeat(first.groupby([*first], sort=False).ngroup().to_numpy(np.int32), lengths)
 
 
 def _fits(

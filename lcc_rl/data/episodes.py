@@ -98,7 +98,7 @@ def read_episodes(
         if parts:
             table["episode"] = episode + parts[-1]["episode"].max() + 1 - episode.min()
         seen, count = seen | {*table["recording"].cat.categories}, count + episode.nunique()
-        parts.append(table.assign(file=number))
+        parts.append(table.assign(file=np.int32(number)))
         notes += lines
     texts = {name: joined([frame.pop(name).array for frame in parts]) for name in TEXTS}
     rows = parts[0] if len(parts) == 1 else pd.concat(parts, ignore_index=True)
@@ -124,12 +124,16 @@ def _table(
             notes.append(note)
     report = ReadReport([str(file.path)])
     table = continuous(table, "episode", place, report)
-    start = table.groupby("episode")["time_s"].transform("min").to_numpy()
+    first, lengths = stretches(table["episode"].to_numpy())
+    start = np.repeat(table["time_s"].to_numpy()[first], lengths)
     table, _ = on_grid(table, start, MOTION_COLUMNS, place, report)
     table["time_s"] = table["time_s"].round(6)
-    table["episode"] = _numbered(table["episode"].to_numpy(), numbers)
-    kinds = {name: kind for name, kind in SCHEMA.items() if name not in TEXTS}
-    table = table[[*SCHEMA, "row", "label"]].astype(kinds)
+    # Parts after holes have numbers beyond the file's own.
+    further = np.arange(table["episode"].max() + 1 - len(numbers)) + numbers.max() + 1
+    table["episode"] = np.append(numbers, further)[table["episode"]]
+    table = table[[*SCHEMA, "row", "label"]]
+    for name in (name for name in SCHEMA if name not in TEXTS):  # one by one, to spare memory
+        table[name] = table[name].astype(np.dtype(SCHEMA[name]))
     if not {"leader_position", "follower_position"} <= {key for key in names if names[key]}:
         derive_positions(table)
         notes.append(DERIVED_POSITIONS)
@@ -151,20 +155,20 @@ def _rows(
     rows = len(row)
     labels = read.pop("episode", same_text("", rows))
     codes, distinct = pd.factorize(labels)
-    numbers = whole_numbers(np.asarray(distinct))
+    codes, numbers = codes.astype(np.int32), whole_numbers(np.asarray(distinct))
     if numbers is None or (np.abs(numbers) >= 2**31).any():
         numbers = np.arange(len(distinct))
     recording = read.get("recording", same_text(file.label, rows))
     before = count * bool(seen & {*recording.categories})
-    # Unknown vehicles of several files are different ones.
-    follower = 2 * (pd.factorize(cars)[0] + before) + 2
     values = {
         **dict.fromkeys(SCHEMA, np.zeros(rows)),
         **{EPISODE_NAMES[key]: cells for key, cells in read.items()},
         "recording": recording,
-        "follower_id": read.get("follower_id", follower),
-        "leader_id": read.get("leader_id", 2 * (codes + before) + 1),
     }
+    if "follower_id" not in read:  # unknown vehicles of several files are different ones
+        values["follower_id"] = 2 * (pd.factorize(cars)[0] + before) + 2
+    if "leader_id" not in read:
+        values["leader_id"] = 2 * (codes + before) + 1
     values |= {"time_s": read["time"].round(6), "row": row, "label": labels, "episode": codes}
     table = pd.DataFrame(values, copy=False)  # times have a resolution of 1 µs
     _check_pairs(table, file)
@@ -196,12 +200,6 @@ def _targets(read: dict[str, Any], file: TableFile) -> tuple[dict[str, Any], pd.
     first = f"data row {int(read['row'][np.argmin(mask)]) + 1}"
     file.notes.append(f"left out {int((~mask).sum()):,} rows without a valid target, {first} …")
     return chosen(read, mask), cars[mask]
-
-
-def _numbered(episode: NDArray, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the file's numbers of episodes; parts after holes have further numbers."""
-    further = np.arange(episode.max() + 1 - len(numbers)) + numbers.max() + 1
-    return np.append(numbers, further)[episode]
 
 
 def _names(file: TableFile, columns: Names) -> dict[str, str | None]:

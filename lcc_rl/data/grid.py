@@ -166,7 +166,7 @@ def _usual_steps(samples: pd.DataFrame, same: Mask, what: str, source: str) -> F
             f"{', or are rows missing' * (unit != 's')}?"
         )
     if not ((steps - step).abs() > UNEVEN * step).any():
-        return np.full(len(samples), step)
+        return np.broadcast_to(step, len(samples))
     medians = steps.groupby(samples["episode"]).transform("median")
     many = samples.groupby("episode")["time_s"].transform("size") > round(1 / MANY_HOLES)
     return medians.where(many, step).to_numpy()
@@ -269,34 +269,42 @@ def on_grid(
             f"{report.source}: {place(samples)(row, '')} is {FRAME * at[row]:g} s after the first; "
             "is the time in another unit?"
         )
-    frame, episode = np.rint(at).astype(np.int64), samples["episode"].to_numpy()
-    same = np.diff(episode) == 0
-    skipped = (np.diff(frame)[same] > 1).any() or np.abs(at - frame).max() > REGULAR
+    frame = np.rint(at).astype(np.int32)
+    skipped = np.abs(at - frame).max() > REGULAR
+    del at  # a table may hold millions of rows
+    skipped |= (np.diff(frame)[np.diff(samples["episode"]) == 0] > 1).any()
     line = interpolated(samples, FRAME, skipped)
     samples = samples.assign(origin=origin)
     if line:
         report.notes += line
-        samples, frame = _interpolated(samples, at, [*smooth], report)
+        samples, frame = _interpolated(samples, [*smooth], report)
     samples["time_s"] = samples.pop("origin") + frame / round(1 / FRAME)
     return samples, frame
 
 
 def interpolated(samples: pd.DataFrame, step: float, skipped: bool = False) -> list[str]:
     """Return a line on samples that are not ``step`` seconds apart, or with ``skipped`` frames."""
-    steps = np.diff(samples["time_s"])[np.diff(samples["episode"]) == 0]
-    usual = float(np.median(steps))
-    odd = int((np.abs(steps - usual) > UNEVEN * usual).sum())
+    steps = steps_of(samples)
+    usual = float(np.median(steps, overwrite_input=True))
+    steps -= usual
+    odd = int((np.abs(steps, out=steps) > UNEVEN * usual).sum())
     irregular = f", {odd:,} of them irregular," * bool(odd)
     line = f"samples {usual:g} s apart{irregular} were interpolated to {step:g} s"
     return [line] * bool(skipped or odd or abs(usual - step) > UNEVEN * step)
 
 
+def steps_of(samples: pd.DataFrame) -> Floats:
+    """Return the times between consecutive samples of a record [s]."""
+    return np.diff(samples["time_s"])[np.diff(samples["episode"]) == 0]
+
+
 def _interpolated(
-    samples: pd.DataFrame, at: Floats, smooth: list[str], report: ReadReport
-) -> tuple[pd.DataFrame, Integers]:
-    """Return samples at the whole frames of each record; ``at``: frames of the given samples."""
+    samples: pd.DataFrame, smooth: list[str], report: ReadReport
+) -> tuple[pd.DataFrame, NDArray]:
+    """Return samples at the whole frames of each record."""
     from scipy.interpolate import PchipInterpolator  # here: it loads for a second
 
+    at = ((samples["time_s"] - samples["origin"]) / FRAME).to_numpy()
     table, episode = samples[smooth].to_numpy(np.float64), samples["episode"].to_numpy()
     frames, before, values = [], [], []
     for start, length in zip(*stretches(episode), strict=True):
@@ -308,7 +316,7 @@ def _interpolated(
         motion = PchipInterpolator(sampled, table[start : start + length])
         values.append(motion(grid.clip(sampled[0], sampled[-1])))
         before.append(start + np.searchsorted(sampled, grid + 1e-6, side="right") - 1)
-        frames.append(grid.astype(np.int64))
+        frames.append(grid.astype(np.int32))
     if not frames:
         raise DataError(
             f"{report.source}: no record lasts {FRAME:g} s; is the time in another unit?"

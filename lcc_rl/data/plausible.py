@@ -13,8 +13,8 @@ from pydantic import Field
 from lcc_rl.arrays import Floats, Mask
 from lcc_rl.data.agreement import OF_PAIRS, check_pairs, numbers_of_pairs
 from lcc_rl.data.columns import Units
-from lcc_rl.data.grid import ORIGIN, Place, Places, divided, stretches
-from lcc_rl.data.trajectories import FRAME, starts_of
+from lcc_rl.data.grid import ORIGIN, Place, Places, divided, steps_of, stretches
+from lcc_rl.data.trajectories import BATCH, FRAME, starts_of
 from lcc_rl.errors import LARGEST, Concern, DataError
 from lcc_rl.settings import NonNegative, Number, Positive, Settings
 
@@ -171,19 +171,21 @@ class Plausible(Settings):
         time = table["time_s"].to_numpy(np.float64)
         step = np.diff(time, prepend=time[0])
         step[starts_of(table["episode"].to_numpy())] = 0.0
-        late = step > self.max_step
-        yield "time_s", "is {:g} s after the sample before it", step, "max_step", late
+        words = "is {:g} s after the sample before it"
+        yield "time_s", words, step, "max_step", step > self.max_step
+        step[step <= 0] = np.inf
         for name in map(str, table.columns):
             if not name.endswith(("speed_mps", "length_m", "gap_m")):
                 continue
             values, kind = table[name].to_numpy(np.float64), name.split("_")[-2]
-            for limit, sign in ((f"max_{kind}", 1), (f"min_{kind}", -1)):
-                outside = sign * values > sign * getattr(self, limit)
+            for limit, beyond in ((f"max_{kind}", np.greater), (f"min_{kind}", np.less)):
+                outside = beyond(values, getattr(self, limit))
                 outside &= (kind != "length") | (values != 0)  # a length of 0 is not given
                 yield name, WORDS.get(limit, "holds {:g} m"), values, limit, outside
             if kind == "speed":
-                rate = np.diff(values, prepend=values[0]) / np.where(step > 0, step, np.inf)
-                rough = np.abs(rate) > self.max_acceleration
+                rate = np.diff(values, prepend=values[0])
+                rate /= step
+                rough = (rate > self.max_acceleration) | (rate < -self.max_acceleration)
                 yield name, "changes by {:g} m/s²", rate, "max_acceleration", rough
 
 
@@ -198,6 +200,19 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
         The change of each gap in 0.5 s, or a longer step, beyond that by both speeds ``[rows]``
         [m]; and the rows at which it exceeds the limit, or a gap beside them is held for 1 s.
     """
+    rows = len(starts_of(table["row"].to_numpy())) if "row" in table else len(table)
+    reach = max(round(JUMP_S / FRAME), round(len(table) / rows))  # or a step of the recording
+    ends = np.flatnonzero(np.diff(numbers_of_pairs(table), append=-1)) + 1  # of pairs
+    ends = ends[np.diff(ends // BATCH, append=-1) != 0]
+    parts = [
+        _jumps(table.iloc[start:end], limit, reach)
+        for start, end in zip([0, *ends[:-1]], ends, strict=True)
+    ]
+    return np.concatenate([off for off, _ in parts]), np.concatenate([x for _, x in parts])
+
+
+def _jumps(table: pd.DataFrame, limit: float, reach: int) -> tuple[Floats, Mask]:
+    """Return :func:`gap_jumps` of whole pairs; ``reach``: samples in which a gap changes."""
     number, gap, time = (table[x].to_numpy(np.float64) for x in ("episode", "gap_m", "time_s"))
     relative = (table["leader_speed_mps"] - table["follower_speed_mps"]).to_numpy(np.float64)
     path = np.cumsum(np.diff(time, prepend=time[0]) * (relative + np.append(0, relative[:-1])) / 2)
@@ -211,8 +226,6 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
         node[places] = True
     nodes = np.flatnonzero(node)
     rest = pd.Series(np.interp(np.arange(len(gap)), nodes, gap[nodes]) - path)
-    rows = len(starts_of(table["row"].to_numpy())) if "row" in table else len(table)
-    reach = max(round(JUMP_S / FRAME), round(len(table) / rows))  # or a step of the recording
     change = rest.groupby(number).diff(reach)
     change -= change.groupby(number).transform("median")
     noise = change.abs().groupby(number).transform("median")
@@ -262,8 +275,8 @@ def hard_share(table: pd.DataFrame) -> float | None:
 
 def usual_step(table: pd.DataFrame) -> float:
     """Return the median step within records [s]; 0 if no record has two samples."""
-    step = table["time_s"].diff()[table["episode"].diff() == 0].median()
-    return float(step) if step == step else 0.0
+    steps = steps_of(table)
+    return float(np.median(steps, overwrite_input=True)) if len(steps) else 0.0
 
 
 def _not_negative(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:

@@ -18,7 +18,7 @@ from lcc_rl.data.episodes import NO_LEADER
 from lcc_rl.data.grid import Places, continuous, cut_by_files, on_grid, places
 from lcc_rl.data.plausible import SMOOTHING
 from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource, find_files, read_as, units_of
-from lcc_rl.data.tables import TableFile, joined, same_text, tables_of, whole_numbers
+from lcc_rl.data.tables import TableFile, joined_columns, same_text, tables_of, whole_numbers
 from lcc_rl.data.trajectories import (
     CAR_LENGTH,
     FRAME,
@@ -131,11 +131,10 @@ class TableSource(TrajectorySource):
                 remedy = "is blank or 0; data.vehicle_length sets such lengths [m]"
                 raise table.fault(int(block["row"][np.argmax(blank)]), "length", remedy)
             _report_blank_gaps(table, block)
-            rows = len(block["row"])
-            recording = same_text(table.label, rows)
-            blocks.append({"recording": recording, **block, "file": np.full(rows, number)})
+            own = {"recording": same_text(table.label, len(block["row"]))}
+            blocks.append({**own, **block, "file": np.full(len(block["row"]), number)})
             report.notes += table.notes
-        columns = {key: joined([block.pop(key) for block in blocks]) for key in [*blocks[0]]}
+        columns = joined_columns(blocks)
         count = len(columns["time"])
         report.drop("blank time, speed or position", report.rows_read - count)
         if not report.rows_read:
@@ -146,7 +145,7 @@ class TableSource(TrajectorySource):
             columns["length"] = np.where(length > 0, length, self.vehicle_length)
         if "lane" in columns:
             columns["lane"] = columns["lane"].codes
-        return pd.DataFrame(columns).rename(columns={"time": "time_s"})
+        return pd.DataFrame({"time_s": columns.pop("time"), **columns}, copy=False)
 
 
 def _report_blank_gaps(table: TableFile, read: Mapping[str, Any]) -> None:

@@ -41,7 +41,7 @@ from lcc_rl.data.text import (
     stem,
     unended,
 )
-from lcc_rl.data.trajectories import listed
+from lcc_rl.data.trajectories import BATCH, listed
 from lcc_rl.errors import Concern, DataError, in_short, raised_as
 from lcc_rl.io.memory import require_memory
 
@@ -142,15 +142,11 @@ class TableFile:
             for column in columns
             if column.key in self.names
         }
-        chunks = [
-            [
-                block.values(column, self.names[column.key], scale)
-                for column, scale in scales.items()
-            ]
+        parts = [
+            {x.key: block.values(x, self.names[x.key], scale) for x, scale in scales.items()}
             for block in self.blocks([*self.names.values()])
         ]
-        arrays = map(joined, zip(*chunks, strict=True))
-        read = {column.key: values for column, values in zip(scales, arrays, strict=True)}
+        read = joined_columns(parts)
         self.count = len(next(iter(read.values())))
         return self._measured({**read, "row": np.arange(self.count)}, measured)
 
@@ -210,10 +206,18 @@ class TableFile:
     def _rows(self, names: Sequence[str]) -> Iterator[tuple[pa.Table, int]]:
         """Yield rows of the file, and the number of rows before them."""
         if self.parquet:
-            with raised_as(DataError, f"{self.path}: not a readable table", Exception):
-                content = pq.read_table(self.path, columns=[*names], read_dictionary=[*names])
-                content.validate(full=True)  # else damaged text would fail only when used
-            yield content, 0
+            with (
+                raised_as(DataError, f"{self.path}: not a readable table", Exception),
+                pq.ParquetFile(self.path, read_dictionary=[*names], buffer_size=2**20) as file,
+            ):
+                row = 0
+                for group in range(file.num_row_groups):  # all at once are all in the memory
+                    for batch in file.iter_batches(BATCH, row_groups=[group], columns=[*names]):
+                        batch.validate(full=True)  # else damaged text would fail only when used
+                        yield pa.Table.from_batches([batch]), row
+                        row += len(batch)
+                if not row:
+                    yield file.schema_arrow.empty_table().select([*names]), 0
             return
         places, row = {str(self.header.index(name)): name for name in names}, 0
         for lines in self.lines:
@@ -288,7 +292,7 @@ def _memory(file: str) -> float:
     if Path(file).suffix in PARQUET:
         with suppress(pa.ArrowException):  # the reader refuses a damaged file
             metadata = pq.read_metadata(file)
-            return 60.0 * metadata.num_rows * metadata.num_columns
+            return 40.0 * metadata.num_rows * metadata.num_columns
     return 10.0 * getsize(file)
 
 
@@ -398,6 +402,15 @@ def joined(parts: Sequence[Any]) -> Any:
     if isinstance(parts[0], pd.Categorical):
         return parts[0] if len(parts) == 1 else union_categoricals([*parts], sort_categories=True)
     return np.concatenate(parts)
+
+
+def joined_columns(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the joined columns of consecutive parts, which are emptied to spare memory."""
+    whole = {}
+    for key in [*parts[0]]:
+        whole[key] = joined([part.pop(key) for part in parts])
+        pa.default_memory_pool().release_unused()
+    return whole
 
 
 def _shown(cell: pa.Scalar) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 FOOT = 0.3048  # m
 FRAME = 0.1  # s; every published NGSIM file has 10 frames a second
+BATCH = 2**17  # rows of a large table that are converted or compared at a time
 CAR_LENGTH = (3.0, 12.0)  # range of the median length of vehicles on any road [m]
 SAMPLE_KEYS = ("recording", "vehicle", "frame", "preceding")
 # Columns of trajectories besides the recording.

@@ -61,8 +61,7 @@ def path_power(speed: Tensor, acceleration: Tensor) -> Tensor:
     """Power of a path: :func:`steady_power` plus :func:`acceleration_loss`.
 
     Args:
-        speed: speed at the start of the step, any shape [m/s].
-        acceleration: executed acceleration, same shape [m/s²].
+        speed, acceleration: see :func:`acceleration_loss`.
 
     Returns:
         Power [W], same shape: A2 without the change of kinetic energy.

@@ -123,7 +123,8 @@ def _written(
     else:
         changes = (safety, limits)
         module = _rule(policy, trust, *changes) if rule else program(policy, trust, cfg, *changes)
-        content, names = EXPORTERS[path.suffix](module, _name(policy)), module.names
+        name = str(policy) if isinstance(policy, (str, PathLike)) else type(policy).__name__
+        content, names = EXPORTERS[path.suffix](module, name), module.names
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path, names
@@ -134,10 +135,6 @@ def _rule(name: Any, trust: Sequence[str], safety: Safety, limits: Any) -> Drivi
     module = Driver(str(name), 0.1, trust, safety, limits=limits).program
     require(SEED not in module.kept, f"{name} draws noise from seeds: it cannot be exported")
     return module
-
-
-def _name(policy: Any) -> str:
-    return str(policy if isinstance(policy, (str, PathLike)) else type(policy).__name__)
 
 
 def described(module: DrivingProgram, name: str) -> str:

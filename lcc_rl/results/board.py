@@ -125,7 +125,8 @@ def score_table(name: str, rows: Sequence[BoardRow]) -> Table:
         if not lines or row["task"] not in (line["where"] for line in lines):
             lines.append(dict.fromkeys((column.key for column in BOARD_COLUMNS), ""))
             against = in_words(row["against"])
-            lines[-1] |= {"where": row["task"], "score": unit_of(row), "saved": against}
+            unit = row["unit"] or ("m/s" if row["measure"].endswith("_mps") else "–")
+            lines[-1] |= {"where": row["task"], "score": str(unit), "saved": against}
         lines.append({"where": f"  {row['source']}", **_cells(row)})
     caption = (
         "saved, distance, flow: against the baseline; 95 % interval over drives, or over windows "
@@ -133,11 +134,6 @@ def score_table(name: str, rows: Sequence[BoardRow]) -> Table:
         "value."
     )
     return render.as_rich(pd.DataFrame(lines), BOARD_COLUMNS, in_words(name), caption)
-
-
-def unit_of(row: BoardRow) -> str:
-    """Return the unit of a row's score."""
-    return str(row["unit"] or ("m/s" if row["measure"].endswith("_mps") else "–"))
 
 
 def _cells(row: BoardRow) -> dict[str, str]:

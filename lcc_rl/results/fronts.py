@@ -80,11 +80,7 @@ def compare_fronts(
 
 
 def energy_at(
-    energy: Floats,
-    share: Floats,
-    at: Any,
-    least: float | None = np.nan,
-    most: float | None = None,
+    energy: Floats, share: Floats, at: Any, least: float | None, most: float | None
 ) -> Floats:
     """Return the energy of a front, ``[..., limits]`` each, at the share ``at``.
 
@@ -97,20 +93,6 @@ def energy_at(
         return float(np.interp(at, share[order], energy[order], left=least, right=most))
 
     return np.asarray(np.vectorize(read, signature="(),(n),(n)->()")(at, share, energy))
-
-
-def saving_at(
-    windows: pd.DataFrame, one: Sequence[str], other: Sequence[str], at: float
-) -> Estimate:
-    """Return the share of energy that one kind of controller saves against another.
-
-    Both violate the limit for at most the share ``at`` of the time; see :func:`compare_fronts`.
-    """
-
-    def measure(*curves: Curve) -> Any:
-        return share_saved(*(energy_at(x[ENERGY], x[LONG_SHARE], at) for x in curves))
-
-    return compare_fronts(windows, one, other, columns=(ENERGY, LONG_SHARE), measure=measure)
 
 
 def energy_per_distance(curve: Curve) -> Floats:

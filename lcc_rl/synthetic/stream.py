@@ -68,9 +68,10 @@ class StreamSource(Settings):
             drawn.append((generator.integers(low, high + 1, self.platoons), generator))
         drivers = self.drivers or bootstrap()
         made = drive_platoons(self.leader, drivers, self.vehicles, self.noise, drawn)
+        starts = (FIRST_START + timedelta(hours=index) for index in range(self.recordings))
         made = [
             Stream(one.samples.assign(recording=name), one.truth.assign(recording=name))
-            for name, one in zip(map(recording_name, range(self.recordings)), made, strict=True)
+            for name, one in zip((f"{x:%Y-%m-%dT%H:%M:%SZ}" for x in starts), made, strict=True)
         ]
         samples = pd.concat([one.samples for one in made], ignore_index=True)
         return Stream(samples, pd.concat([one.truth for one in made], ignore_index=True))
@@ -103,8 +104,3 @@ def as_recorded(samples: pd.DataFrame) -> Trajectories:
         if name.endswith(("_m", "_mps", "_mps2")):
             columns[name] = (np.round(columns[name] / FOOT, 3) + 0.0) * FOOT
     return assembled(columns, list(names), ReadReport(["the stream"], rows_read=len(samples)))
-
-
-def recording_name(index: int) -> str:
-    """Return the name of a recording, its start; starts are one hour apart."""
-    return (FIRST_START + timedelta(hours=index)).strftime("%Y-%m-%dT%H:%M:%SZ")

@@ -6,6 +6,8 @@ import ctypes
 import json
 import shutil
 import subprocess
+import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +27,19 @@ from lcc_rl.results.policies import load_policy
 @pytest.fixture(scope="module")
 def module() -> DrivingProgram:
     return program("pretrained/i80-follow")
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory) -> dict[str, Path]:
+    """Its files by their ending: an export takes seconds."""
+    pytest.importorskip("onnxscript", reason="extra interfaces")
+    folder = tmp_path_factory.mktemp("exported")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the exporters' own making
+        return {
+            end: lcc_rl.export("pretrained/i80-follow", folder / f"policy{end}")
+            for end in (".onnx", ".pt2")
+        }
 
 
 def states(module: DrivingProgram, count: int = 256) -> torch.Tensor:
@@ -78,8 +93,8 @@ def test_the_filter_is_inside(module) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
-def test_a_pytorch_program_computes_the_same_and_says_what_it_reads(module, tmp_path) -> None:
-    path = lcc_rl.export("pretrained/i80-follow", tmp_path / "policy.pt2")
+def test_a_pytorch_program_computes_the_same_and_says_what_it_reads(module, exported) -> None:
+    path = exported[".pt2"]
     about = {"lcc_rl": ""}
     loaded = torch.export.load(path, extra_files=about).module()
     given = (states(module), memories(module))
@@ -90,11 +105,9 @@ def test_a_pytorch_program_computes_the_same_and_says_what_it_reads(module, tmp_
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_onnxruntime_computes_the_same(module, tmp_path) -> None:
+def test_onnxruntime_computes_the_same(module, exported) -> None:
     runtime = pytest.importorskip("onnxruntime", reason="extra interfaces")
-    pytest.importorskip("onnxscript", reason="extra interfaces")
-    path = lcc_rl.export("pretrained/i80-follow", tmp_path / "policy.onnx")
-    session = runtime.InferenceSession(path)
+    session = runtime.InferenceSession(exported[".onnx"])
     state, memory = states(module), memories(module)
     found = session.run(None, {"state": state.numpy(), "memory": memory.numpy()})
     for one, other in zip(found, module(state, memory), strict=True):
@@ -135,17 +148,14 @@ def test_c_code_computes_the_same(name, tmp_path) -> None:
     assert all(f": {column} [" in head for column in module.names)
 
 
-def test_a_measurement_that_is_no_number_brakes_or_shows(module, tmp_path) -> None:
+def test_a_measurement_that_is_no_number_brakes_or_shows(exported, tmp_path) -> None:
     """In every input of every format: clamp and minimum let NaN through, and hide nothing."""
     ort = pytest.importorskip("onnxruntime", reason="extra interfaces")
     network = nn.Sequential(nn.Linear(7, 1), nn.Hardtanh())
-    for policy, wanted in (("pretrained/i80-follow", -3.0), (network, np.nan)):
-        files = [
-            lcc_rl.export(policy, tmp_path / f"{np.isnan(wanted)}{end}")
-            for end in (".onnx", ".pt2")
-        ]
-        session = ort.InferenceSession(files[0])
-        makes = torch.export.load(files[1]).module()
+    plain = {end: lcc_rl.export(network, tmp_path / f"network{end}") for end in exported}
+    for paths, wanted in ((exported, -3.0), (plain, np.nan)):
+        session = ort.InferenceSession(paths[".onnx"])
+        makes = torch.export.load(paths[".pt2"]).module()
         given = [one.name for one in session.get_inputs()]
         widths = [one.shape[1] for one in session.get_inputs()]
         inputs = json.loads(session.get_modelmeta().custom_metadata_map["lcc_rl"])["inputs"]
