@@ -117,10 +117,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--strategy", action="append", default=[], help=words_of)
     number = typed(NonNegative)
     parser.add_argument(
-        "--episode",
-        type=typed(Whole),
-        default=0,
-        help="index of the sample episode",
+        "--episode", type=typed(Whole), default=0, help="index of the sample episode"
     )
     parser.add_argument("--out", type=Path, help=f"file to write, {', '.join(ANIMATION_FORMATS)}")
     parser.add_argument("--start", type=number, default=0.0, help="start [s]")

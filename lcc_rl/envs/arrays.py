@@ -24,16 +24,7 @@ from lcc_rl.envs.step import (
 )
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.finite import require_finite
-from lcc_rl.pieces.base import (
-    ACTION,
-    OBSERVATION,
-    REWARD,
-    SEED,
-    STEP,
-    Key,
-    State,
-    as_key,
-)
+from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD, SEED, STEP, Key, State, as_key
 from lcc_rl.pieces.rewards import TERMS, TotalReward
 
 LARGEST_SCALED = 1e6  # exceeds all scaled speeds [m/s], gaps [m] and times [s]

@@ -14,15 +14,7 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.envs.compiled import Traced
 from lcc_rl.envs.step import DONE, TERMINATED, Step, closure, pieces_of, read_before, written
 from lcc_rl.functional.layout import reverse
-from lcc_rl.pieces.base import (
-    ACTION,
-    OBSERVATION,
-    SEED,
-    STEP,
-    State,
-    StepTransform,
-    as_key,
-)
+from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP, State, StepTransform, as_key
 from lcc_rl.pieces.views import NEXT
 
 

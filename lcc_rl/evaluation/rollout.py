@@ -13,15 +13,7 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.envs.clock import option_specs
 from lcc_rl.envs.compiled import Traced
 from lcc_rl.envs.rowwise import Rows, Rowwise
-from lcc_rl.envs.step import (
-    TERMINATED,
-    Step,
-    closure,
-    entries_of,
-    pieces_of,
-    read_before,
-    written,
-)
+from lcc_rl.envs.step import TERMINATED, Step, closure, entries_of, pieces_of, read_before, written
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.finite import require_finite
 from lcc_rl.functional.layout import batch_innermost

@@ -80,11 +80,7 @@ def compare_fronts(
 
 
 def energy_at(
-    energy: Floats,
-    share: Floats,
-    at: Any,
-    least: float | None = np.nan,
-    most: float | None = None,
+    energy: Floats, share: Floats, at: Any, least: float | None = np.nan, most: float | None = None
 ) -> Floats:
     """Return the energy of a front, ``[..., limits]`` each, at the share ``at``.
 

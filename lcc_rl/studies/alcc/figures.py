@@ -89,10 +89,7 @@ def reward_terms(training: pd.DataFrame) -> Figure:
         axis.set_title(label)
     for axis in axes[len(shown) :]:
         axis.remove()
-    look: dict[str, Any] = {
-        "loc": "outside upper center",
-        "ncols": 2,
-    }
+    look: dict[str, Any] = {"loc": "outside upper center", "ncols": 2}
     figure.legend(handles=axes[0].get_lines(), **look)
     figure.supxlabel(f"training episodes\n{BAND_NOTE}", fontsize=8)
     figure.supylabel("sum per episode", fontsize=8)
