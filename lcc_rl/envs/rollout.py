@@ -154,13 +154,7 @@ class DifferentiableRollout:
         return (self._packed(self.step({**before, ACTION: action})),)
 
     def _drive(self, row: Tensor, shift: Tensor, *fixed: Tensor) -> Sequence[Tensor]:
-        """Return the next moment and the action before it.
-
-        Args:
-            row: a moment.
-            shift: added to the policy's action.
-            fixed: the constants, the policy's fixed tensors, its learned ones.
-        """
+        """Return the next moment and the action; fixed: constants, fixed and learned tensors."""
         constants, tensors = fixed[: len(self.constants)], fixed[len(self.constants) :]
         named = dict(zip((*self.fixed, *self.learned), tensors, strict=True))
         observed = self._entries(row)[OBSERVATION].contiguous()

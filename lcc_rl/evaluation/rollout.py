@@ -190,11 +190,7 @@ class Player:
         return dict(zip(self.names, tensors[:count], strict=True)), tensors[count:], running
 
     def _move(self, *tensors: Tensor) -> Sequence[Tensor]:
-        """Return the next state, the entries to keep, and which episodes still run.
-
-        Args:
-            *tensors: the state, the action if there is a policy, and which episodes run.
-        """
+        """Return the next state, the entries and who runs, from state, action and who runs."""
         before = dict(zip((*self.names, ACTION), tensors[:-1], strict=False))
         shown = {**before, **self.step(before)}
         entries = [self.arranged(shown[key]) for key in (*self.names, *self.checked)]

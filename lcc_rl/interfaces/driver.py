@@ -253,11 +253,7 @@ class Driver:
 
 
 def _ids(cars: Iterable[Hashable]) -> list[Hashable]:
-    """Return the ids of cars as a list.
-
-    Raises:
-        ConfigError: if they are a text, or cannot be keys.
-    """
+    """Return the ids of cars as a list of hashable values."""
     require(not isinstance(cars, str), f"cars must be a list of ids, got {cars!r}")
     with raised_as(ConfigError, "cars must be a list of ids", TypeError):
         ids = list(cars)

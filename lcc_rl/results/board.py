@@ -250,10 +250,7 @@ def _sample(row: BoardRow) -> str:
 
 
 def _markdown(row: BoardRow) -> list[str]:
-    """Return saving, flow and broken limits.
-
-    The saving is bold if all limits are kept, the flow if much of it is lost.
-    """
+    """Return saving, flow and broken limits; bold: a saving within limits, a large loss of flow."""
     cells = _cells(row)
     share = f"**{cells['saved']}**" if row["kept"] else cells["saved"]
     much = (row[FLOW_LOST] or 0.0) > FLOW_NAMED

@@ -338,10 +338,7 @@ def _rows(task: Task | None, against: str | None) -> list[Measure]:
 def _of_energy(
     table: pd.DataFrame, energy: Fleet | None, filtered: bool, second: Fleet | None
 ) -> dict[str, Any]:
-    """Return the parts of a report that are specific to one without a task.
-
-    The short table has rows for strategies with an automated vehicle, largest energy first.
-    """
+    """Return the parts of a report that are specific to one without a task, most energy first."""
     # A string without automated vehicles has fewer vehicles and is not comparable.
     cars = table[table[PATH].notna()] if table[PATH].notna().any() else table
     cars = cars.sort_values(PATH_PER_KM, ascending=False, kind="stable").reset_index(drop=True)
