@@ -30,23 +30,18 @@ def alternate(runs: Mapping[str, Run], repeats: int) -> dict[str, np.ndarray]:
     spent: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(repeats + 1):
         for name, run in runs.items():
-            spent[name].append(seconds(run))
+            begun = TIMERS[timer]()
+            run()
+            spent[name].append(TIMERS[timer]() - begun)
     return {name: np.array(each[1:]) for name, each in spent.items()}
-
-
-def seconds(run: Run) -> float:
-    """Return the seconds of a run."""
-    begun = TIMERS[timer]()
-    run()
-    return TIMERS[timer]() - begun
 
 
 def rates(
     options: Namespace,
     runs: Mapping[str, Run],
     unit: str,
-    counts: Mapping[str, int],
-    against: Against,
+    count: int,
+    against: Against | None = None,
     batch: int | None = None,
     grad: bool = False,
 ) -> list[Row]:
@@ -56,15 +51,14 @@ def rates(
         options: those of the command line.
         runs: the cases by name.
         unit: unit of the rates.
-        counts: what one call of each run makes or does.
+        count: what one call of a run makes or does.
         against: the alternatives of each case; those that are no case are left out.
         batch: the batch size.
         grad: keep gradients.
     """
     with torch.set_grad_enabled(grad):
         spent = alternate(runs, options.repeats)
-    values = {name: counts[name] / each for name, each in spent.items()}
-    return rows_of(values, unit, against, batch)
+    return rows_of({name: count / each for name, each in spent.items()}, unit, against, batch)
 
 
 def rows_of(
