@@ -79,7 +79,6 @@ def run(
 
 
 def _episode(steps: pd.DataFrame, strategy: str, episode: int) -> tuple[str, pd.DataFrame]:
-    """Return name and rows of a sample episode."""
     episodes = list(sample_episodes(steps, strategy).items())
     if not 0 <= episode < len(episodes):
         raise ConfigError(f"--episode must lie from 0 to {len(episodes) - 1}, got {episode}")

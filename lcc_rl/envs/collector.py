@@ -149,7 +149,6 @@ class StringCollector(BaseCollector):
         return segment
 
     def _act(self, state: State) -> State:
-        """Return a state with the policy's action."""
         td = TensorDict(batch_size=self.env.batch_size)
         for key in self.reads:
             td.set(key, self._look(state, key))

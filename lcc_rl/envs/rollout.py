@@ -149,7 +149,6 @@ class DifferentiableRollout:
         return entries
 
     def _advance(self, row: Tensor, action: Tensor, *constants: Tensor) -> Sequence[Tensor]:
-        """Return the next moment from an action and the constants."""
         before = dict(zip(self.constants, constants, strict=True)) | self._entries(row)
         return (self._packed(self.step({**before, ACTION: action})),)
 

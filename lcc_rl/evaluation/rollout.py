@@ -175,7 +175,6 @@ class Player:
         return rows, kernel, {key: reached[key] for key in names}
 
     def _begin(self, options: TensorDictBase) -> State:
-        """Return the first state of the episodes."""
         state = entries_of(self.env.reset(options=options))
         if self.policy is not None and not self.reads:
             return state  # it may read anything

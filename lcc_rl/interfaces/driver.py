@@ -133,7 +133,6 @@ class Driver:
         self.program.step(*self._examples(BATCH), apply=check_step)  # type: ignore[misc]
 
     def _examples(self, count: int) -> list[Tensor]:
-        """Return measurements, and the memory of new cars, if there is one."""
         state, seeds = torch.ones(count, len(self.names)), torch.zeros(count, 1).long()
         return [state, self.program.begin(state.double(), seeds)] if self.program.width else [state]
 

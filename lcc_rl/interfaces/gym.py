@@ -71,14 +71,12 @@ def _seeds(seed: Any, count: int) -> list[int | None]:
 
 
 def _options(options: Any) -> dict[str, Any]:
-    """Return a copy of reset options as a dictionary."""
     if not isinstance(options, Mapping | None):
         raise ConfigError(f"options must be a dictionary of reset options, got {options!r}")
     return dict(options or {})
 
 
 def _spaces(episodes: ArrayEpisodes) -> tuple[Box, Box]:
-    """Return the spaces of observation and action (a share of 3 m/s²)."""
     shape = episodes.observation.shape[1:]
     return Box(-LARGEST_SCALED, LARGEST_SCALED, shape, np.float32), Box(-1.0, 1.0, (1,), np.float32)
 

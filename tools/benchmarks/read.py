@@ -117,7 +117,6 @@ def _write(folder: Path, runs: int, size: int) -> None:
 
 
 def _episodes(size: int, draw: np.random.Generator) -> pd.DataFrame:
-    """Return rows with the types of those of an evaluation."""
     names = {
         "strategy": ["direct", "idm", "alcc"],
         "profile": [f"rec0/{x}@0.0s" for x in range(40)],

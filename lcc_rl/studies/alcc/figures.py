@@ -223,6 +223,5 @@ def comparison_figure(windows: pd.DataFrame) -> Figure:
 
 
 def _how_many(seeds: pd.Series) -> str:
-    """Return the different numbers of seeds in a column, in words."""
     counts = sorted({int(count) for count in seeds if str(count).isdigit()})
     return f"{' or '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"
