@@ -68,9 +68,7 @@ def by_sumo(name: str) -> Price:
             binary = str(home / "bin" / "emissionsDrivingCycle")
             words = [binary, "-t", str(given), "-o", str(found), "-e", name]
             environment = {**os.environ, "SUMO_HOME": str(home)}
-            done = subprocess.run(
-                [*words, "-e", name], env=environment, capture_output=True, text=True
-            )
+            done = subprocess.run(words, env=environment, capture_output=True, text=True)
             require(done.returncode == 0, f"SUMO, {name}: {done.stderr.strip()}")
             grams = pd.read_csv(found, sep=";", header=None)[9].to_numpy() / 1e3  # per second
         joules = grams.reshape(len(speeds), -1).sum(1) * step * PETROL.heating_value

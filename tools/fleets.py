@@ -33,7 +33,7 @@ from lcc_rl.results.fronts import (
 )
 from lcc_rl.results.measures import between, signed
 from lcc_rl.results.names import NETWORK, in_words
-from lcc_rl.results.render import markdown_row
+from lcc_rl.results.render import markdown_table
 
 SHARE, LEARNED = "penetration", "learned"
 SHOWN = {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"}
@@ -65,7 +65,7 @@ def fronts(rows: pd.DataFrame) -> str:
         "saved against the rule at equal flow",
         "largest saving of the rule",
     ]
-    lines = [head, ["---"] * len(head)]
+    lines = []
     for setting, share, part in by_setting(rows):
         saving, flow = curve(part, RULE)
         own, best = curve(part, LEARNED)[1].iloc[0], saving.index.to_numpy(float)[saving.argmax()]
@@ -75,7 +75,7 @@ def fronts(rows: pd.DataFrame) -> str:
         cells.append(f"{percent(against(part, RULE, saved_at_flow))}; T = {gap:.2f} s")
         cells.append(f"{saving[best]:.1f} %; T = {best:.1f} s, {flow[best]:,.0f}")
         lines.append(cells)
-    return "\n".join(map(markdown_row, lines))
+    return markdown_table(head, lines)
 
 
 def by_setting(rows: pd.DataFrame) -> Iterator[tuple[str, float, pd.DataFrame]]:

@@ -48,7 +48,7 @@ from lcc_rl.results import board
 from lcc_rl.results.fronts import ENERGY, FRONT_KINDS, LONG_SHARE, at_equal_flow, points
 from lcc_rl.results.measures import FLOW, SIGNS, Measure, signed
 from lcc_rl.results.names import NETWORK, ON_FRONT, in_words, worded
-from lcc_rl.results.render import as_markdown, markdown_row, saved_text
+from lcc_rl.results.render import as_markdown, markdown_row, markdown_table, saved_text
 from lcc_rl.results.runs import naming_run
 from lcc_rl.results.task import Task
 from lcc_rl.studies.alcc.results import narrow
@@ -142,8 +142,7 @@ def averaged(rows: pd.DataFrame) -> str:
             with the energies of raw and of averaged speeds and of petrol, distance and flow.
     """
     energies = [f"total_{name}" for name in ("path_energy_kj", *AVERAGED, SECOND)]
-    lines = [["traffic", "", "raw", *(f"{seconds:g} s" for seconds in AVERAGES), "petrol, raw"]]
-    lines.append(["---"] * len(lines[0]))
+    head, lines = ["traffic", "", "raw", *(f"{x:g} s" for x in AVERAGES), "petrol, raw"], []
     for source, words in SOURCES.items():
         part = rows[rows["source"] == source]
         names = part["strategy"].unique()
@@ -158,7 +157,7 @@ def averaged(rows: pd.DataFrame) -> str:
         ):
             found = (at_equal_flow(part, mine, other, x, RECORDED) for x in energies)
             lines.append([words, label, *map(fleets.percent, found)])
-    return "\n".join(map(markdown_row, lines))
+    return markdown_table(head, lines)
 
 
 def learners(reference: Path, docs: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from lcc_rl.results.render import markdown_row
+from lcc_rl.results.render import markdown_table
 from lcc_rl.synthetic.stream import StreamSource
 
 TOLERANCE = 1e-4  # within which two ways to the same result must agree before they are timed
@@ -122,8 +122,7 @@ def cells_of(row: Any) -> list[str]:
 def table(rows: pd.DataFrame) -> str:
     """Return rows as a table in Markdown."""
     cases = rows.assign(case=rows["benchmark"] + ": " + rows["case"])
-    lines = [HEADINGS, ["---"] * len(HEADINGS), *map(cells_of, cases.to_dict("records"))]
-    return "\n".join(map(markdown_row, lines))
+    return markdown_table(HEADINGS, map(cells_of, cases.to_dict("records")))
 
 
 def page(rows: pd.DataFrame) -> str:
