@@ -9,16 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from lcc_rl.config.words import FILTERED
-from lcc_rl.figures.drawing import (
-    INK,
-    INTERVAL,
-    PAGE_WIDTH,
-    SERIES,
-    colour,
-    footnote,
-    new_figure,
-    paper,
-)
+from lcc_rl.figures import drawing
 from lcc_rl.results.bootstrap import Estimate
 from lcc_rl.results.fronts import (
     DISTANCE,
@@ -33,7 +24,7 @@ from lcc_rl.results.fronts import (
 )
 from lcc_rl.results.measures import between, signed
 from lcc_rl.results.names import NETWORK, in_words
-from lcc_rl.results.render import markdown_row
+from lcc_rl.results.render import markdown_table
 
 SHARE, LEARNED = "penetration", "learned"
 SHOWN = {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"}
@@ -65,7 +56,7 @@ def fronts(rows: pd.DataFrame) -> str:
         "saved against the rule at equal flow",
         "largest saving of the rule",
     ]
-    lines = [head, ["---"] * len(head)]
+    lines = []
     for setting, share, part in by_setting(rows):
         saving, flow = curve(part, RULE)
         own, best = curve(part, LEARNED)[1].iloc[0], saving.index.to_numpy(float)[saving.argmax()]
@@ -75,7 +66,7 @@ def fronts(rows: pd.DataFrame) -> str:
         cells.append(f"{percent(against(part, RULE, saved_at_flow))}; T = {gap:.2f} s")
         cells.append(f"{saving[best]:.1f} %; T = {best:.1f} s, {flow[best]:,.0f}")
         lines.append(cells)
-    return "\n".join(map(markdown_row, lines))
+    return markdown_table(head, lines)
 
 
 def by_setting(rows: pd.DataFrame) -> Iterator[tuple[str, float, pd.DataFrame]]:
@@ -106,15 +97,15 @@ def percent(found: Estimate) -> str:
     return f"{signed(value, '{:.1f}')} % ({between(low, high)})"
 
 
-@paper
+@drawing.paper
 def drawn_fronts(rows: pd.DataFrame) -> Figure:
     """Draw, for each setting, the learned fleets and the rule's fronts, a colour per share."""
-    figure = new_figure(PAGE_WIDTH, 5.4)
+    figure = drawing.new_figure(drawing.PAGE_WIDTH, 5.4)
     titles = [SETTINGS[name] for name in PANELS]
     rows = rows[~rows["setting"].str.startswith(DRIVES)]
     axes = dict(zip(titles, figure.subplots(2, 2).flat, strict=True))
     shares = 100.0 * np.sort(rows[SHARE].unique())
-    hues = dict(zip(shares.round(), SERIES, strict=False))
+    hues = dict(zip(shares.round(), drawing.SERIES, strict=False))
     for setting, share, part in by_setting(rows):
         axis, hue = axes[setting.partition(TAUGHT)[0]], hues[round(share)]
         look = {"marker": "D"} if TAUGHT in setting else {"label": f"{share:g} % automated"}
@@ -122,16 +113,18 @@ def drawn_fronts(rows: pd.DataFrame) -> Figure:
         (saving, flow), (own, point) = curve(part, RULE), curve(part, LEARNED)
         axis.plot(100.0 * (flow / people - 1.0), saving, ".-", color=hue)
         x, found = 100.0 * (point / people - 1.0), against(part, HUMAN, fleet_saved)
-        axis.vlines(x, 100.0 * found.low, 100.0 * found.high, color=hue, **INTERVAL)
-        axis.plot(x, own, **{"marker": "o"} | look, ls="", color=hue, mec=INK, ms=7, zorder=5)
+        axis.vlines(x, 100.0 * found.low, 100.0 * found.high, color=hue, **drawing.INTERVAL)
+        axis.plot(
+            x, own, **{"marker": "o"} | look, ls="", color=hue, mec=drawing.INK, ms=7, zorder=5
+        )
     for setting, axis in axes.items():
-        axis.axhline(0.0, color=INK, lw=0.6)
-        axis.axvline(0.0, color=INK, lw=0.6)
+        axis.axhline(0.0, color=drawing.INK, lw=0.6)
+        axis.axvline(0.0, color=drawing.INK, lw=0.6)
         axis.set(xlim=(-15.0, 15.0), ylim=(-2.0, None), title=setting)  # fronts are longer
         axis.set(xlabel="flow against human drivers [%]", ylabel="fuel saved per km [%]")
     handles = axes[SETTINGS["front"]].get_legend_handles_labels()
     figure.legend(*handles, loc="outside upper left", ncols=4)
-    footnote(
+    drawing.footnote(
         figure,
         "large: network with its 95 % interval (circle: trained on I-24 over 100 s; diamond: "
         "trained as in the panel);\nsmall: tuned IDM with several time gaps, shorter to the right",
@@ -139,10 +132,10 @@ def drawn_fronts(rows: pd.DataFrame) -> Figure:
     return figure
 
 
-@paper
+@drawing.paper
 def drawn_ring(table: pd.DataFrame) -> Figure:
     """Draw the results of the ring over the share, with hollow dots beyond a limit."""
-    figure = new_figure(PAGE_WIDTH, 3.2)
+    figure = drawing.new_figure(drawing.PAGE_WIDTH, 3.2)
     axes = figure.subplots(1, len(SHOWN))
     humans = table[table["strategy"] == HUMAN]
     for axis, (column, label) in zip(axes, SHOWN.items(), strict=True):
@@ -150,7 +143,7 @@ def drawn_ring(table: pd.DataFrame) -> Figure:
         for name in (LEARNED, *RIVALS):
             rows = table[table["strategy"] == name].sort_values(SHARE)
             shown = NETWORK if name == LEARNED else name
-            hue, dashed = colour(shown), "--" if name.endswith(FILTERED) else "-"
+            hue, dashed = drawing.colour(shown), "--" if name.endswith(FILTERED) else "-"
             if rows.empty:
                 continue
             x = 100.0 * rows[SHARE]
@@ -161,18 +154,18 @@ def drawn_ring(table: pd.DataFrame) -> Figure:
             axis.plot([], [], "o" + dashed, color=hue, label=in_words(shown))
             if name == LEARNED and column == "saving":
                 ends = (scale * rows[f"saving_{end}"] for end in ("low", "high"))
-                axis.vlines(x, *ends, color=hue, zorder=above, **INTERVAL)
+                axis.vlines(x, *ends, color=hue, zorder=above, **drawing.INTERVAL)
         # The saving is zero; means over the shares average the noise.
-        axis.axhline(scale * humans[column].fillna(0.0).mean(), color=INK, ls=":")
+        axis.axhline(scale * humans[column].fillna(0.0).mean(), color=drawing.INK, ls=":")
         axis.set_xscale("log")
         shares = sorted(100.0 * table[SHARE].unique())
         axis.set_xticks(shares, [f"{float(f'{share:.2g}'):g}" for share in shares])
         axis.minorticks_off()
         axis.set(xlabel="automated vehicles [%]", ylabel=label)
-    axes[0].plot([], [], color=INK, ls=":", label="human drivers")
+    axes[0].plot([], [], color=drawing.INK, ls=":", label="human drivers")
     handles = axes[0].get_legend_handles_labels()
     figure.legend(*handles, loc="outside upper left", ncols=4)
-    footnote(
+    drawing.footnote(
         figure, "filled: keeps all limits of the task; vertical lines: 95 % interval of the network"
     )
     return figure

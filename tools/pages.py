@@ -29,16 +29,8 @@ from lcc_rl.config.words import RECORDED
 from lcc_rl.data.leaders import stretch
 from lcc_rl.energy import AVERAGED, AVERAGES, SECOND
 from lcc_rl.errors import require
+from lcc_rl.figures import drawing
 from lcc_rl.figures.calibration import twins_figure
-from lcc_rl.figures.drawing import (
-    COLUMN_WIDTH,
-    OWN_COLOURS,
-    colour,
-    footnote,
-    new_figure,
-    paper,
-    save,
-)
 from lcc_rl.figures.platoon import record_figure
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.atomic import atomic_path
@@ -48,7 +40,7 @@ from lcc_rl.results import board
 from lcc_rl.results.fronts import ENERGY, FRONT_KINDS, LONG_SHARE, at_equal_flow, points
 from lcc_rl.results.measures import FLOW, SIGNS, Measure, signed
 from lcc_rl.results.names import NETWORK, ON_FRONT, in_words, worded
-from lcc_rl.results.render import as_markdown, markdown_row, saved_text
+from lcc_rl.results.render import as_markdown, markdown_row, markdown_table, saved_text
 from lcc_rl.results.runs import naming_run
 from lcc_rl.results.task import Task
 from lcc_rl.studies.alcc.results import narrow
@@ -69,12 +61,12 @@ SHOWN = {
     "alcc": "one car: network",
 }
 KINDS_SHOWN = {  # label and colour by variant and policy
-    ("alcc", "idm"): ("IDM, tuned by search", colour("idm_acc")),
-    ("alcc", "idm_gradient"): ("IDM, tuned by gradient", colour("rule")),
-    ("own_energy", "network"): (in_words("own_energy"), colour("own_energy")),
-    ("alcc", "network"): (in_words(NETWORK), colour(NETWORK)),
-    ("alcc", "memory"): ("network with memory", OWN_COLOURS[0]),
-    ("alcc", "preview"): ("network with preview", OWN_COLOURS[1]),
+    ("alcc", "idm"): ("IDM, tuned by search", drawing.colour("idm_acc")),
+    ("alcc", "idm_gradient"): ("IDM, tuned by gradient", drawing.colour("rule")),
+    ("own_energy", "network"): (in_words("own_energy"), drawing.colour("own_energy")),
+    ("alcc", "network"): (in_words(NETWORK), drawing.colour(NETWORK)),
+    ("alcc", "memory"): ("network with memory", drawing.OWN_COLOURS[0]),
+    ("alcc", "preview"): ("network with preview", drawing.OWN_COLOURS[1]),
 }
 # Labels of the sources of averaged energies.
 SOURCES = {
@@ -142,8 +134,7 @@ def averaged(rows: pd.DataFrame) -> str:
             with the energies of raw and of averaged speeds and of petrol, distance and flow.
     """
     energies = [f"total_{name}" for name in ("path_energy_kj", *AVERAGED, SECOND)]
-    lines = [["traffic", "", "raw", *(f"{seconds:g} s" for seconds in AVERAGES), "petrol, raw"]]
-    lines.append(["---"] * len(lines[0]))
+    head, lines = ["traffic", "", "raw", *(f"{x:g} s" for x in AVERAGES), "petrol, raw"], []
     for source, words in SOURCES.items():
         part = rows[rows["source"] == source]
         names = part["strategy"].unique()
@@ -158,7 +149,7 @@ def averaged(rows: pd.DataFrame) -> str:
         ):
             found = (at_equal_flow(part, mine, other, x, RECORDED) for x in energies)
             lines.append([words, label, *map(fleets.percent, found)])
-    return "\n".join(map(markdown_row, lines))
+    return markdown_table(head, lines)
 
 
 def learners(reference: Path, docs: Path) -> None:
@@ -226,14 +217,14 @@ def figure_of_record() -> Figure:
     return record_figure(record, used["from_s"], leaders.cases)
 
 
-@paper
+@drawing.paper
 def figure_of_limits(windows: pd.DataFrame) -> Figure:
     """Draw path energy over the share of long time gaps: a dot per training, a line per kind.
 
     Args:
         windows: one row per training and held-out window.
     """
-    figure = new_figure(COLUMN_WIDTH, 3.2)
+    figure = drawing.new_figure(drawing.COLUMN_WIDTH, 3.2)
     axes = figure.subplots()
     kinds = dict(list(windows.groupby(FRONT_KINDS)))
     for kind, (label, hue) in KINDS_SHOWN.items():
@@ -245,7 +236,7 @@ def figure_of_limits(windows: pd.DataFrame) -> Figure:
     figure.legend(loc="outside upper left", ncols=2)
     axes.set(xlabel="time gap > 2.5 s above 1 m/s [% of the time]")
     axes.set(ylabel="path energy [kJ per episode]")
-    footnote(figure, "dot: one training; line: means at limits of 0.5, 1 and 2 %")
+    drawing.footnote(figure, "dot: one training; line: means at limits of 0.5, 1 and 2 %")
     return figure
 
 
@@ -273,7 +264,7 @@ def figures(reference: Path, folder: Path) -> list[Path]:
         "ring": lambda: figure_of_ring(reference),
         "twins": lambda: twins_figure(kept("twins")),
     }
-    return [save(draw(), folder / f"{x}.png") for x, draw in drawn.items()]
+    return [drawing.save(draw(), folder / f"{x}.png") for x, draw in drawn.items()]
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
-from lcc_rl.results.render import markdown_row
+from lcc_rl.results.render import markdown_table
 from lcc_rl.settings import Settings, defaults
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -88,8 +88,7 @@ def page() -> str:
         summary = (kind.__doc__ or "").partition("\n")[0]
         parts.append(f"## {kind.__module__}.{kind.__name__}\n\n{summary}{also}\n")
         cells = ((*(f"`{x}`" for x in coded), text) for *coded, text in rows)
-        table = [("setting", "type", "default", ""), ("---",) * 4, *cells]
-        parts.append("\n".join(map(markdown_row, table)) + "\n")
+        parts.append(markdown_table(("setting", "type", "default", ""), cells) + "\n")
     return "\n".join(parts)
 
 

@@ -79,7 +79,6 @@ def run(
 
 
 def _episode(steps: pd.DataFrame, strategy: str, episode: int) -> tuple[str, pd.DataFrame]:
-    """Return name and rows of a sample episode."""
     episodes = list(sample_episodes(steps, strategy).items())
     if not 0 <= episode < len(episodes):
         raise ConfigError(f"--episode must lie from 0 to {len(episodes) - 1}, got {episode}")
@@ -117,10 +116,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--strategy", action="append", default=[], help=words_of)
     number = typed(NonNegative)
     parser.add_argument(
-        "--episode",
-        type=typed(Whole),
-        default=0,
-        help="index of the sample episode",
+        "--episode", type=typed(Whole), default=0, help="index of the sample episode"
     )
     parser.add_argument("--out", type=Path, help=f"file to write, {', '.join(ANIMATION_FORMATS)}")
     parser.add_argument("--start", type=number, default=0.0, help="start [s]")

@@ -102,7 +102,6 @@ def _run(
 
 
 def _named(result: Calibration, vehicles: Mapping[int, str]) -> Calibration:
-    """Add the data's names of followers and leaders."""
     names = {role: result.drivers[f"{role}_id"].map(vehicles) for role in ("follower", "leader")}
     return replace(result, drivers=result.drivers.assign(**names))
 

@@ -13,11 +13,7 @@ from lcc_rl.config.nodes import CALLED
 from lcc_rl.config.schemas import StudyConfig, TrainConfig
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import moment_bytes
-from lcc_rl.envs.inputs import (
-    LOADS,
-    build_drivers,
-    constant_profiles,
-)
+from lcc_rl.envs.inputs import LOADS, build_drivers, constant_profiles
 from lcc_rl.envs.rollout import OBSERVATION
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError, require

@@ -27,11 +27,7 @@ from lcc_rl.results.names import counted_windows, several
 from lcc_rl.results.platoons import case_report
 from lcc_rl.results.remarks import few_windows, leader_too_fast, remarks
 from lcc_rl.results.render import print_table, terminal
-from lcc_rl.results.report import (
-    Report,
-    report,
-    windows_for,
-)
+from lcc_rl.results.report import Report, report, windows_for
 from lcc_rl.results.runs import EPISODES, check_folder, resumed_config, save_config
 from lcc_rl.results.windows import by_source
 from lcc_rl.runs.precision import prepare_torch

@@ -43,19 +43,11 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows, parquet_metadata, write_parquet
 from lcc_rl.io.settings import read_text
+from lcc_rl.results import runs
 from lcc_rl.results.names import RULE
 from lcc_rl.results.remarks import sample_of
 from lcc_rl.results.render import print_table, terminal
 from lcc_rl.results.report import report, windows_for
-from lcc_rl.results.runs import (
-    EPISODES,
-    FINAL,
-    PARTS,
-    check_folder,
-    load_config,
-    resumed_config,
-    save_config,
-)
 from lcc_rl.results.trust import own_modules, trust_option
 from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import log_report, show_headline
@@ -97,13 +89,15 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
         if cfg.resume is None:
             trainings, final = composed_part(cfg, overrides)
             cfg = cfg.with_(variants=list(trainings))
-            check_folder(cfg, folder)
+            runs.check_folder(cfg, folder)
             command = shlex.join(["lcc-rl", "run", *overrides])
         elif (folder / COMMAND_FILE).is_file():
             read = (folder / TRAJECTORIES).exists()  # then no other data are read
-            cfg = (load_config if read else resumed_config)(folder, cfg.trust)
-            trainings = {x: load_config(folder / PARTS / x, cfg.trust) for x in cfg.variants or ()}
-            final = load_config(folder / PARTS / FINAL, cfg.trust)
+            cfg = (runs.load_config if read else runs.resumed_config)(folder, cfg.trust)
+            trainings = {
+                x: runs.load_config(folder / runs.PARTS / x, cfg.trust) for x in cfg.variants or ()
+            }
+            final = runs.load_config(folder / runs.PARTS / runs.FINAL, cfg.trust)
             command = read_text(folder / COMMAND_FILE)
         else:
             raise ConfigError(f"{folder}: not the folder of a pipeline: it has no {COMMAND_FILE}")
@@ -111,9 +105,9 @@ def run(cfg: PipelineConfig, folder: str | Path, overrides: list[str]) -> Rows:
         for name, training in trainings.items():
             check_settings(training, folder / name)
         check_measured(final)
-        save_config(cfg, folder)
-        for name, settings in {**trainings, FINAL: final}.items():
-            save_config(settings, folder / PARTS / name)
+        runs.save_config(cfg, folder)
+        for name, settings in {**trainings, runs.FINAL: final}.items():
+            runs.save_config(settings, folder / runs.PARTS / name)
         with atomic_path(folder / COMMAND_FILE) as temporary:
             temporary.write_text(command, encoding="utf-8")
         return _run(cfg, trainings, final, folder, command)
@@ -164,10 +158,10 @@ def _run(
     final = final.with_(**traffic, compare=[str(folder / name) for name in learned])
     show_headline("evaluating them and the baselines on held-out windows")
     paged = final.evaluation.rows == "episodes"
-    rows = evaluation.run(final, folder / FINAL, own=False, quiet=paged)
+    rows = evaluation.run(final, folder / runs.FINAL, own=False, quiet=paged)
     if final.compare:
         curve = training_figure(results.load(folder, "training"))
-        path = folder / FINAL / "figures" / "learning_curve.png"
+        path = folder / runs.FINAL / "figures" / "learning_curve.png"
         save(curve, path, formats=cfg.figure_formats)
     if paged and isinstance(rows, pd.DataFrame):
         size = sample_of(rows)
@@ -175,7 +169,7 @@ def _run(
         models = build_energy(final), second_energy(final)
         one = report(windows_for(rows), None, models[0], filtered, few=True, second=models[1])
         one = replace(one, remarks=[*filter(None, [held_to(trainings.values())]), *one.remarks])
-        write_figures(folder / FINAL, reports=[one])
+        write_figures(folder / runs.FINAL, reports=[one])
         page = write_page(folder, [command], one, size)
         print_table(terminal(one, f"Leader, car, human behind it: {size}"))
         show_headline(f"rows, figures and policies: {folder}")
@@ -220,7 +214,7 @@ def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
     drivers = folder / "calibration" / "drivers.parquet"
     shared = {field.name: getattr(cfg, field.name) for field in fields(CalibrateConfig)}
     settings = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})
-    check_folder(settings, drivers.parent)
+    runs.check_folder(settings, drivers.parent)
     if not drivers.exists():
         fits = calibration.run(settings, drivers.parent, Console(quiet=True), emit=log_report)
         modes = {str(mode): rows for mode, rows in fits.groupby("mode", sort=False)}
@@ -296,8 +290,8 @@ def _train_one(cfg: TrainConfig, folder: str) -> None:
 
 def _finished(folder: Path, cfg: TrainConfig) -> bool:
     """Whether a training is complete; other settings are refused."""
-    check_folder(cfg, folder, *NOT_IDENTITY)
-    return (folder / EPISODES).exists()
+    runs.check_folder(cfg, folder, *NOT_IDENTITY)
+    return (folder / runs.EPISODES).exists()
 
 
 def known_settings(overrides: list[str], entry: str) -> list[str]:

@@ -76,10 +76,7 @@ def run(cfg: TrainConfig, folder: str | Path, quiet: bool = False, resume: bool 
 
 
 def _resumed(cfg: TrainConfig, folder: Path) -> TrainConfig:
-    """Return the configuration of the run in a folder, checked against its tables.
-
-    The logger may be given again, because stored configurations name no path to write to.
-    """
+    """Return the checked configuration of the run in a folder; its logger may be given again."""
     own: TrainConfig = resumed_config(folder, cfg.trust)
     for table in (EPISODES, RECORD):
         if made_by(folder / table) not in (None, identity(own)):

@@ -24,16 +24,7 @@ from lcc_rl.envs.step import (
 )
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.functional.finite import require_finite
-from lcc_rl.pieces.base import (
-    ACTION,
-    OBSERVATION,
-    REWARD,
-    SEED,
-    STEP,
-    Key,
-    State,
-    as_key,
-)
+from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD, SEED, STEP, Key, State, as_key
 from lcc_rl.pieces.rewards import TERMS, TotalReward
 
 LARGEST_SCALED = 1e6  # exceeds all scaled speeds [m/s], gaps [m] and times [s]
@@ -92,7 +83,6 @@ class ArrayEpisodes:
         return self.rows.packed(reached), observation, torch.cat([*results, finite], 1)
 
     def _begin(self, seeds: Tensor) -> tuple[Tensor, Tensor]:
-        """Return state and observation at the start of episodes."""
         first = self.one_step.begin(seeds)
         return self.rows.packed(first), first[OBSERVATION].flatten(1)
 
@@ -181,7 +171,6 @@ class ArrayEpisodes:
         return results[:, :-1]
 
     def _check(self, named: dict[Key, Array], step: int) -> None:
-        """Raise Diverged if an entry is not finite."""
         numbers = {key: torch.as_tensor(x).unsqueeze(0) for key, x in named.items()}
         require_finite(numbers, torch.ones(1, self.count, 1, dtype=torch.bool), step)
 

@@ -87,10 +87,7 @@ def check_step(piece: Piece, before: State, reached: State) -> None:
 
 
 def _kept(piece: Piece) -> dict[str, list[Any]]:
-    """Return the attributes of a piece and its modules in a form that shows changes.
-
-    A tensor is accompanied by the number of its changes in place, a list or mapping by its items.
-    """
+    """Return the attributes of a piece and its modules, with counts or items that show changes."""
     attributes = {}
     for path, module in piece.named_modules():
         for name, value in {**vars(module), **dict(module.named_buffers(recurse=False))}.items():
@@ -107,11 +104,7 @@ def _kept(piece: Piece) -> dict[str, list[Any]]:
 
 
 def _check_forgets(piece: Piece, before: Mapping[str, list[Any]]) -> None:
-    """Refuse a piece that stores state in an attribute, which all episodes would share.
-
-    Raises:
-        ConfigError: naming the attribute and the place for state.
-    """
+    """Refuse a piece that stores state in an attribute, which all episodes would share."""
     after = _kept(piece)
     for name, values in after.items():
         old = before.get(name, [])
@@ -158,11 +151,7 @@ def _compare(piece: Piece, entries: Mapping[Key, Tensor], when: str) -> None:
 
 
 def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
-    """Check that every entry that is read is written by one piece.
-
-    Raises:
-        ConfigError: naming the entry and the piece.
-    """
+    """Refuse entries that are read and not written, or written by several pieces."""
     writers = Counter(
         key for piece in pieces if not isinstance(piece, Collision) for key in piece.targets
     )

@@ -249,11 +249,7 @@ class Traffic(TransformedEnv):
             raise ConfigError(f"{'.'.join(as_key(key))} must be {expected}, got {got}")
 
     def _checked(self, options: Any) -> dict[Key, torch.Tensor]:
-        """Return reset options by their full keys.
-
-        Raises:
-            ConfigError: naming the key, what was expected and the valid options.
-        """
+        """Return reset options by their full keys, after a check of names, shapes and types."""
         leaves = options.items(True, True) if is_tensor_collection(options) else options.items()
         entries, specs = {as_key(key): value for key, value in leaves}, option_specs(self)
         for key, value in entries.items():

@@ -149,7 +149,6 @@ class StringCollector(BaseCollector):
         return segment
 
     def _act(self, state: State) -> State:
-        """Return a state with the policy's action."""
         td = TensorDict(batch_size=self.env.batch_size)
         for key in self.reads:
             td.set(key, self._look(state, key))
@@ -174,13 +173,7 @@ class StringCollector(BaseCollector):
         return state[key] if inner == key else state[inner].squeeze(-2)
 
     def _renew(self, state: State, renewed: Callable[..., State], size: int = 0) -> State:
-        """Begin a new episode in every place where one is over.
-
-        Args:
-            state: the next state.
-            renewed: :meth:`_renewed`, plain or compiled.
-            size: number of episodes for which it is compiled; 0 for any number.
-        """
+        """Begin new episodes where one is over, ``size`` at a time; 0: all at once."""
         rows = state[DONE].flatten().nonzero().flatten()
         seeds = self.env.base_env.draw_seeds().view(-1, 1)[rows]
         for first in range(0, len(rows), size or len(rows)):
@@ -228,11 +221,7 @@ class StringCollector(BaseCollector):
 
 
 def _view(env: TransformedEnv) -> Any:
-    """Return the view of the automated vehicles that an environment shows, if any.
-
-    Raises:
-        ConfigError: if it has other transforms, which a collector of pieces would not apply.
-    """
+    """Return the view of the automated vehicles, if there is one; refuse other transforms."""
     foreign = [t for t in env.transform if t not in pieces_of(env)]
     strange = [type(t).__name__ for t in foreign if not isinstance(t, VIEWS)]
     if strange:

@@ -154,11 +154,7 @@ def after_uncounted(cfg: StudyConfig) -> tuple[StudyConfig, int, int]:
 
 
 def _by_role(scenario: ScenarioConfig, group: str) -> list[tuple[str, Node]]:
-    """Return the nodes of a group by role, for the roles in the string.
-
-    Raises:
-        ConfigError: if it names a role that has no controller.
-    """
+    """Return the nodes of a group by role, for the roles in the string; refuse unknown roles."""
     nodes = getattr(scenario, group)
     require_known(f"role (scenario.{group})", nodes, scenario.controllers)
     return [(role, nodes[role]) for role in scenario.vehicles.names if nodes.get(role) is not None]

@@ -14,15 +14,7 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.envs.compiled import Traced
 from lcc_rl.envs.step import DONE, TERMINATED, Step, closure, pieces_of, read_before, written
 from lcc_rl.functional.layout import reverse
-from lcc_rl.pieces.base import (
-    ACTION,
-    OBSERVATION,
-    SEED,
-    STEP,
-    State,
-    StepTransform,
-    as_key,
-)
+from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP, State, StepTransform, as_key
 from lcc_rl.pieces.views import NEXT
 
 
@@ -157,18 +149,11 @@ class DifferentiableRollout:
         return entries
 
     def _advance(self, row: Tensor, action: Tensor, *constants: Tensor) -> Sequence[Tensor]:
-        """Return the next moment from an action and the constants."""
         before = dict(zip(self.constants, constants, strict=True)) | self._entries(row)
         return (self._packed(self.step({**before, ACTION: action})),)
 
     def _drive(self, row: Tensor, shift: Tensor, *fixed: Tensor) -> Sequence[Tensor]:
-        """Return the next moment and the action before it.
-
-        Args:
-            row: a moment.
-            shift: added to the policy's action.
-            fixed: the constants, the policy's fixed tensors, its learned ones.
-        """
+        """Return the next moment and the action; fixed: constants, fixed and learned tensors."""
         constants, tensors = fixed[: len(self.constants)], fixed[len(self.constants) :]
         named = dict(zip((*self.fixed, *self.learned), tensors, strict=True))
         observed = self._entries(row)[OBSERVATION].contiguous()

@@ -231,10 +231,7 @@ class Pieces(Compose):
         return _apply(waiting, td, next_td)
 
     def _repeat(self, index: int, td: TensorDictBase, next_td: TensorDictBase) -> TensorDictBase:
-        """Repeat the action, adding up rewards, until an episode ends.
-
-        TorchRL's own transform would step from the same TensorDict again, which holds the state.
-        """
+        """Repeat the action and add up rewards; TorchRL's transform would lose the state."""
         skip: Any = self.transforms[index]
         rewards = skip.parent.reward_keys
         for _ in range(skip.frame_skip - 1):
@@ -247,11 +244,7 @@ class Pieces(Compose):
         return next_td
 
     def _check_numbers(self, td: TensorDictBase, next_td: TensorDictBase) -> None:
-        """Check that the entries before and after a step are finite.
-
-        Raises:
-            Diverged: naming the first entry that is not, its step and its episode.
-        """
+        """Raise Diverged if an entry before or after a step is not finite."""
         checked = [td.get(ACTION, None), *(next_td.get(key, None) for key in FINITE_CHECKED)]
         if not any_nonfinite(value for value in checked if value is not None):
             return

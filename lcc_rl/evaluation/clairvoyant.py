@@ -115,7 +115,6 @@ def clairvoyant(
 def _episodes(
     strategy: Strategy, inputs: Inputs, drivers: int | None, seed: int
 ) -> tuple[TransformedEnv, TensorDict]:
-    """Return the environment of all episodes, and their reset options."""
     count = len(inputs.population.time_gap)
     profile, driver = pairs(len(inputs.evaluation), count, drivers)
     cfg = strategy.cfg.for_any_leader()

@@ -78,12 +78,7 @@ class Entrants:
             raise no_policy(cfg)
 
     def _compared(self) -> tuple[dict[str, Any], list[tuple[str, str]]]:
-        """Return the controllers of ``compare`` by their names in tables, and its policies.
-
-        Policies are pairs of a name, if one was given, and a path; the folder of a sweep stands for
-        those of its runs. If no vehicle of the string is automated, as at the share 0 of a sweep,
-        nothing is compared.
-        """
+        """Return the controllers of ``compare`` by name, and its policies with name, if given."""
         cfg, named = self.cfg, _by_label(self.cfg.compare)
         by_name = isinstance(cfg.compare, Mapping)
         policies = [

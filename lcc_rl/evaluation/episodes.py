@@ -18,25 +18,10 @@ from lcc_rl.envs.factory import after_uncounted, moment_bytes
 from lcc_rl.envs.inputs import Inputs, build_energy, second_energy
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import require
+from lcc_rl.evaluation import rows as of_rows
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.metrics import SERIES, damping_time
 from lcc_rl.evaluation.rollout import Player, reset_options
-from lcc_rl.evaluation.rows import (
-    FILTER_ENTRIES,
-    INDEX,
-    ROW_KEYS,
-    VALUE_BYTES,
-    as_frame,
-    brakings,
-    describe,
-    desired_speeds,
-    grouped,
-    leader_faster,
-    leader_measures,
-    measures,
-    sample,
-    traffic,
-)
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, RING
 from lcc_rl.pieces.base import SEED
@@ -187,7 +172,8 @@ class Episodes:
         self.energy, self.second = build_energy(self.cfg), second_energy(self.cfg)
         self.slope = next((piece for piece in pieces if isinstance(piece, Slope)), None)
         filtered = self.cfg.scenario.filters.get(AUTOMATED) is not None
-        self.keys = [*ROW_KEYS, INDEX, CLASS, *(FILTER_ENTRIES if filtered else ())]
+        entries = of_rows.FILTER_ENTRIES if filtered else ()
+        self.keys = [*of_rows.ROW_KEYS, of_rows.INDEX, CLASS, *entries]
         learned = strategy.policy is not None and self.cfg.evaluation.terms
         self.terms = [x for x in pieces if learned and isinstance(x, RewardTerm)]
         read = (key for term in self.terms for _, key in term.needs)
@@ -196,7 +182,7 @@ class Episodes:
         count = min(sample_episodes, len(plan))
         self.samples = set(np.linspace(0, len(plan) - 1, count).round().astype(int).tolist())
         # Size of their time series in a file, which hardly compress [bytes].
-        values = len(self.cfg.scenario.vehicles) * len(SERIES) * VALUE_BYTES
+        values = len(self.cfg.scenario.vehicles) * len(SERIES) * of_rows.VALUE_BYTES
         self.sampled = len(self.samples) * (self.cfg.scenario.horizon - self.begun) * values
 
     def count(self, block: int) -> int:
@@ -223,14 +209,14 @@ class Episodes:
         counted = {key: x[self.begun - len(alive) :] for key, x in record.items()}
         record = {key: x for key, x in record.items() if key in self.keys}
         crashed = (alive.unsqueeze(-2) & (record["vehicles", "gap"] <= 0.0)).any(0).any(-2)
-        braked = brakings(record, alive, self.cfg.scenario.vehicles)
+        braked = of_rows.brakings(record, alive, self.cfg.scenario.vehicles)
         driven = alive[self.begun - self.warm_up :]  # from a handover on, also uncounted steps
         speed = record["vehicles", "speed"][-len(driven) :]
         record, alive = {key: x[self.begun :] for key, x in record.items()}, alive[self.begun :]
         if self.cfg.scenario.fleet:
             record["vehicles", "length"] = self.energy.lengths(record[CLASS])
-        groups = grouped(record, self.cfg.scenario.vehicles)
-        described = describe(
+        groups = of_rows.grouped(record, self.cfg.scenario.vehicles)
+        described = of_rows.describe(
             self.strategy,
             inputs.evaluation,
             inputs.population,
@@ -238,18 +224,18 @@ class Episodes:
             driver,
             repeat if plan.repeats > 1 else None,
         )
-        desired = desired_speeds(self.strategy, described)
-        described[FASTER] = leader_faster(inputs.evaluation, profile, desired, self.warm_up)
+        desired = of_rows.desired_speeds(self.strategy, described)
+        described[FASTER] = of_rows.leader_faster(inputs.evaluation, profile, desired, self.warm_up)
         time_step = self.cfg.scenario.time_step
         args = inputs.evaluation, profile, self.energy, self.warm_up, self.slope
-        leader = leader_measures(*args)
+        leader = of_rows.leader_measures(*args)
         if self.cfg.scenario.road == RING:  # it has no leader
             leader[:] = np.nan
         # The noise of sensors adds energy to the motion of recorded drivers.
         recorded = RECORDED in self.cfg.evaluation.baselines
-        measured = measures(groups, alive, time_step, self.energy, recorded, self.second)
+        measured = of_rows.measures(groups, alive, time_step, self.energy, recorded, self.second)
         length, free = self.cfg.scenario.vehicle_length, inputs.population.desired_speed[driver]
-        measured |= traffic(record, alive, length, time_step, free, self.energy)
+        measured |= of_rows.traffic(record, alive, length, time_step, free, self.energy)
         for term in self.terms:  # means of a step, sums over vehicles
             values = term.reward(*term.views(*(counted[key] for _, key in term.needs)))
             mean = (values.sum(-2) * alive).sum(0) / alive.sum(0)
@@ -257,11 +243,11 @@ class Episodes:
             measured |= dict(zip(names, (term.weight * mean, mean), strict=True))
         if self.cfg.scenario.road == RING:
             measured["damping_time_s"] = damping_time(speed, driven, time_step)
-        rows = pd.concat([described, leader, braked, as_frame(measured, crashed)], axis=1)
+        rows = pd.concat([described, leader, braked, of_rows.as_frame(measured, crashed)], axis=1)
         rows = rows.iloc[:count]
         inside = [index - block * plan.size for index in sorted(self.samples)]
         inside = [index for index in inside if 0 <= index < count]
-        steps = list(sample(groups, alive, rows, inside, time_step))
+        steps = list(of_rows.sample(groups, alive, rows, inside, time_step))
         return rows, pd.concat(steps, ignore_index=True) if steps else pd.DataFrame()
 
 

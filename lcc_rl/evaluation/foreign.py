@@ -130,11 +130,7 @@ def _normalizes(module: nn.Module) -> bool:
 
 
 def _still(head: Any, name: str) -> Transform:
-    """Return a transform whose statistics, if it has some, do not change.
-
-    Raises:
-        ConfigError: if it has none yet, or separate ones for each environment.
-    """
+    """Return a transform whose statistics do not change; refuse missing or separate ones."""
     kind = type(head).__name__
     message = f"{name}: {kind} has no statistics yet; pass the one of the training"
     with raised_as(ConfigError, message, Exception):  # torchrl has no check

@@ -310,7 +310,6 @@ def register(measure: Measure, metric: Metric, every: bool = False) -> None:
 
 
 def _place(metric: Metric) -> tuple[Any, ...]:
-    """Return module and line of a function."""
     return metric.__module__, getattr(getattr(metric, "__code__", None), "co_firstlineno", None)
 
 

@@ -152,7 +152,6 @@ def _named(spec: str) -> Node | None:
 
 @cache
 def _files() -> frozenset[str]:
-    """Return the names of the package's files of controllers."""
     folder = Path(str(files("lcc_rl.conf"))) / "controller"
     return frozenset(path.stem for path in folder.glob("*.yaml"))
 

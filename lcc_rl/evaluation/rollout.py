@@ -13,15 +13,7 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.envs.clock import option_specs
 from lcc_rl.envs.compiled import Traced
 from lcc_rl.envs.rowwise import Rows, Rowwise
-from lcc_rl.envs.step import (
-    TERMINATED,
-    Step,
-    closure,
-    entries_of,
-    pieces_of,
-    read_before,
-    written,
-)
+from lcc_rl.envs.step import TERMINATED, Step, closure, entries_of, pieces_of, read_before, written
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.finite import require_finite
 from lcc_rl.functional.layout import batch_innermost
@@ -183,7 +175,6 @@ class Player:
         return rows, kernel, {key: reached[key] for key in names}
 
     def _begin(self, options: TensorDictBase) -> State:
-        """Return the first state of the episodes."""
         state = entries_of(self.env.reset(options=options))
         if self.policy is not None and not self.reads:
             return state  # it may read anything
@@ -198,11 +189,7 @@ class Player:
         return dict(zip(self.names, tensors[:count], strict=True)), tensors[count:], running
 
     def _move(self, *tensors: Tensor) -> Sequence[Tensor]:
-        """Return the next state, the entries to keep, and which episodes still run.
-
-        Args:
-            *tensors: the state, the action if there is a policy, and which episodes run.
-        """
+        """Return the next state, the entries and who runs, from state, action and who runs."""
         before = dict(zip((*self.names, ACTION), tensors[:-1], strict=False))
         shown = {**before, **self.step(before)}
         entries = [self.arranged(shown[key]) for key in (*self.names, *self.checked)]

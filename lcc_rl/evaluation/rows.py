@@ -16,16 +16,7 @@ from torch import Tensor
 from lcc_rl.config.words import RECORDED
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.energy import AVERAGED, BURNT, SECOND, Fleet, as_fleet
-from lcc_rl.evaluation.metrics import (
-    KILO,
-    ROAD_METRICS,
-    SERIES,
-    averaged_energies,
-    energy_measures,
-    measured_ttc,
-    safety_measures,
-    string_measures,
-)
+from lcc_rl.evaluation import metrics
 from lcc_rl.evaluation.rollout import Record
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, VehicleString
@@ -58,7 +49,7 @@ SAMPLED = (
 )
 VALUE_BYTES = 4  # of a value in a time series
 ROW_KEYS = [("leader", name) for name in ("speed", "acceleration")]
-ROW_KEYS += [("vehicles", name) for name in (*SERIES, GRADE)]
+ROW_KEYS += [("vehicles", name) for name in (*metrics.SERIES, GRADE)]
 INDEX = (AUTOMATED, "index")
 # Safety filter: steps covered by the guarantee, steps that begin safe, desired and commanded
 # acceleration.
@@ -131,20 +122,20 @@ def measures(
         kinds = series.get(CLASS[1])
         kind, grade = None if kinds is None else kinds[0], series.get(GRADE)
         args = alive.unsqueeze(-2), time_step, energy, kind, grade
-        energies = energy_measures(series["power"], series["speed"], *args)
+        energies = metrics.energy_measures(series["power"], series["speed"], *args)
         if second is not None:
             speed = series["speed"]
             power = second.at(grade).power(speed[:-1], speed.diff(dim=0) / time_step)
-            drawn = energy_measures(power, speed, *args[:2], second, grade=grade)
+            drawn = metrics.energy_measures(power, speed, *args[:2], second, grade=grade)
             energies[SECOND] = drawn["path_energy_kj"]
-        energies |= averaged_energies(series["speed"], *args) if averaged else {}
+        energies |= metrics.averaged_energies(series["speed"], *args) if averaged else {}
         for name, value in energies.items():
             added = value.mean(-2) if name.startswith("share_") else value.sum(-2)
             columns[f"{group}_{name}"] = added
     cav = groups["cav"]
     if "gap" in cav:
         ahead = {f"leader_{name}": x for name, x in groups["leader"].items()}
-        columns |= safety_measures({**cav, **ahead}, alive.unsqueeze(-2), time_step)
+        columns |= metrics.safety_measures({**cav, **ahead}, alive.unsqueeze(-2), time_step)
         for name in SUMMED:
             keys = [f"{group}_{name}" for group in ("cav", "hdv")]
             terms = [columns[key] for key in keys if key in columns]
@@ -197,8 +188,8 @@ def traffic(
         kinds = record[CLASS][0]
         series["free"] = torch.minimum(series["free"], fleet.speed_limits(kinds))
         mean = length + (fleet.lengths(kinds) - length).mean(-2)
-    columns = safety_measures(series, alive.unsqueeze(-2), time_step, ROAD_METRICS)
-    return columns | string_measures(
+    columns = metrics.safety_measures(series, alive.unsqueeze(-2), time_step, metrics.ROAD_METRICS)
+    return columns | metrics.string_measures(
         record["vehicles", "speed"][-steps:],
         record["vehicles", "gap"],
         alive,
@@ -275,7 +266,7 @@ def leader_measures(
         grade = None if slope is None else slope.along(speed)[first:]
         speed = speed[first:]
         power = fleet.at(grade).path_power(speed[:-1], speed.diff() / profiles.time_step)
-        drawn = power.sum() * profiles.time_step * KILO
+        drawn = power.sum() * profiles.time_step * metrics.KILO
         values[index] = (float(drawn), float(speed.mean()))
     return pd.DataFrame([values[index] for index in profile.tolist()], columns=list(LEADER_COLUMNS))
 
@@ -290,7 +281,7 @@ def sample(
         for group, series in groups.items():
             for name, values in series.items():
                 rows = values[-alive.shape[0] :][:steps, index].flatten(1)
-                rows = measured_ttc(rows) if name == "ttc" else rows
+                rows = metrics.measured_ttc(rows) if name == "ttc" else rows
                 for place in range(rows.shape[1]):
                     label = group if rows.shape[1] == 1 else f"{group}{place + 1}"
                     columns[f"{label}_{name}"] = rows[:, place].cpu().numpy()

@@ -94,7 +94,6 @@ class StableBaselinesPolicy(nn.Module):
         return vectors, names
 
     def _action(self, inputs: Tensor) -> Tensor:
-        """Return the actions for normalised observations."""
         outputs = self.network(inputs)
         return outputs if self.squashed else ((outputs - self.middle) / self.reach).clamp(-1.0, 1.0)
 

@@ -154,7 +154,6 @@ def _given(controller: Any) -> tuple[Any, Any]:
 
 
 def _words(string: str | Mapping[str, Any]) -> str:
-    """Return a string of vehicles as a word of the command line."""
     if isinstance(string, str):
         return f"'{string}'"
     return f"{{{', '.join(f'{key}: {value}' for key, value in string.items())}}}"

@@ -19,12 +19,7 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.errors import ConfigError, ResultsError, raised_as, require
 from lcc_rl.evaluation.fit import check_action, check_scenario, check_width
-from lcc_rl.evaluation.named import (
-    DIRECT,
-    PEOPLE,
-    controller_of,
-    label_of,
-)
+from lcc_rl.evaluation.named import DIRECT, PEOPLE, controller_of, label_of
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces import Observation, Piece, TimeGapStart

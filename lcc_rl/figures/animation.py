@@ -197,7 +197,6 @@ def _along(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int) 
 
 
 def _around(axis: Axes, cars: LineCollection, motion: SampleMotion, moment: int) -> None:
-    """Place the cars on a circle."""
     turn = 2.0 * np.pi / float(motion.circumference or 1.0)
     reach = np.linspace(-motion.lengths[1:], 0.0, 5, axis=1)
     angles = turn * (motion.position[moment][:, None] + reach)

@@ -12,15 +12,7 @@ from matplotlib.figure import Figure
 from lcc_rl.drivers.parameters import DEFAULT_MODEL, MODEL, parameters_of
 from lcc_rl.drivers.twins import REACTING, RECORDED_DRIVERS, TWINS, densities, ratios
 from lcc_rl.errors import DataError
-from lcc_rl.figures.drawing import (
-    COLUMN_WIDTH,
-    INK,
-    PAGE_WIDTH,
-    SOFT,
-    footnote,
-    new_figure,
-    paper,
-)
+from lcc_rl.figures.drawing import COLUMN_WIDTH, INK, PAGE_WIDTH, SOFT, footnote, new_figure, paper
 from lcc_rl.results.measures import signed
 
 MODE_COLOURS = {"local": "#0072b2", "global": "#d55e00"}

@@ -94,10 +94,7 @@ def footnote(figure: Figure, text: str) -> None:
 def legend_above(axis: Axes, columns: int = 3) -> Legend:
     """Put the legend above the frame."""
     return axis.legend(
-        ncols=columns,
-        loc="lower left",
-        bbox_to_anchor=(0.0, 1.0),
-        borderaxespad=0.2,
+        ncols=columns, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2
     )
 
 

@@ -221,7 +221,6 @@ def measures_of(report: Report, seeds: Sequence[Report] = ()) -> Figure:
 
 
 def _over_time(axis: Axes, rows: pd.DataFrame, entry: str) -> None:
-    """Draw a line per vehicle with the entry."""
     for vehicle, (name, hue) in VEHICLE_STYLES.items():
         column = f"{vehicle}_{entry}"
         if column in rows and rows[column].notna().any():

@@ -133,7 +133,6 @@ class Driver:
         self.program.step(*self._examples(BATCH), apply=check_step)  # type: ignore[misc]
 
     def _examples(self, count: int) -> list[Tensor]:
-        """Return measurements, and the memory of new cars, if there is one."""
         state, seeds = torch.ones(count, len(self.names)), torch.zeros(count, 1).long()
         return [state, self.program.begin(state.double(), seeds)] if self.program.width else [state]
 
@@ -253,11 +252,7 @@ class Driver:
 
 
 def _ids(cars: Iterable[Hashable]) -> list[Hashable]:
-    """Return the ids of cars as a list.
-
-    Raises:
-        ConfigError: if they are a text, or cannot be keys.
-    """
+    """Return the ids of cars as a list of hashable values."""
     require(not isinstance(cars, str), f"cars must be a list of ids, got {cars!r}")
     with raised_as(ConfigError, "cars must be a list of ids", TypeError):
         ids = list(cars)

@@ -150,7 +150,6 @@ def described(module: DrivingProgram, name: str) -> str:
 
 
 def _program(module: DrivingProgram) -> Any:
-    """Return the exported program."""
     widths = [len(module.names), module.width][: 1 + (module.width > 0)]
     batch = dict(zip(TAKES, [{0: torch.export.Dim("batch", min=1)}] * len(widths), strict=False))
     examples = tuple(torch.ones(2, width) for width in widths)

@@ -63,7 +63,6 @@ class Film:
         return road_picture(SampleMotion(time, roles, speed, gap, front, leader, lengths, around))
 
     def _look(self, *key: str) -> Any:
-        """Return an entry of the present state."""
         rows = self.episodes.rows
         index = rows.keys.index(key)
         first = sum(rows.sizes[:index])

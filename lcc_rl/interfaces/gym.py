@@ -44,11 +44,7 @@ def register() -> None:
 def _episodes(
     variant: str, count: int, overrides: Sequence[str], held_out: bool, render_mode: Any
 ) -> ArrayEpisodes:
-    """Build parallel episodes; arguments as for the environments.
-
-    Raises:
-        ConfigError: naming the setting at fault.
-    """
+    """Build parallel episodes; arguments as for the environments."""
     require(
         render_mode in (None, *MODES), f"render_mode must be None or {MODES}, got {render_mode!r}"
     )
@@ -62,11 +58,7 @@ def _episodes(
 
 
 def _seeds(seed: Any, count: int) -> list[int | None]:
-    """Return the seed of each place from a number, None or a list of these.
-
-    Raises:
-        ConfigError: naming a seed and its range, or the number of places.
-    """
+    """Return the seed of each place from a number, None or a list of these."""
     seeds = np.asarray(seed, np.object_)
     if seeds.ndim == 0:
         first = checked_seed(seeds.item())
@@ -79,18 +71,12 @@ def _seeds(seed: Any, count: int) -> list[int | None]:
 
 
 def _options(options: Any) -> dict[str, Any]:
-    """Return a copy of reset options as a dictionary.
-
-    Raises:
-        ConfigError: if they are no dictionary.
-    """
     if not isinstance(options, Mapping | None):
         raise ConfigError(f"options must be a dictionary of reset options, got {options!r}")
     return dict(options or {})
 
 
 def _spaces(episodes: ArrayEpisodes) -> tuple[Box, Box]:
-    """Return the spaces of observation and action (a share of 3 m/s²)."""
     shape = episodes.observation.shape[1:]
     return Box(-LARGEST_SCALED, LARGEST_SCALED, shape, np.float32), Box(-1.0, 1.0, (1,), np.float32)
 

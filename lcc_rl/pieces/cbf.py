@@ -223,10 +223,7 @@ class CBFFilter(RoleTransform):
         doubt: Tensor,
         safe: Tensor,
     ) -> Tensor:
-        """Return the command within all bounds that is nearest to the desired one, not clamped.
-
-        The vehicle ahead may be faster than in ``now`` by ``doubt``.
-        """
+        """Return the nearest command within all bounds; ``doubt``: excess of the speed ahead."""
         speed, gap, closing = now.speed, now.gap, now.speed - now.ahead
         opening = doubt - closing
         free, half = gap - self.margin, 0.5 * self.time_step

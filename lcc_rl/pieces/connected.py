@@ -8,15 +8,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.cacc import (
-    Chain,
-    Errors,
-    Gains,
-    cacc_acceleration,
-    find_chains,
-    next_leader_speed,
-    platoon_errors,
-)
+from lcc_rl.functional import cacc
 from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION
 from lcc_rl.functional.string import entries_ahead, gather
 from lcc_rl.pieces.base import Entry, Feature, as_key
@@ -91,16 +83,16 @@ class Communication(Feature):
         else:
             chain = self._chain(speed, indices)
             lead, lead_acceleration = gather(ahead, chain.first), gather(accelerating, chain.first)
-        errors = platoon_errors(ahead, lead, speed, gap, self.headway, self.delay, chain)
+        errors = cacc.platoon_errors(ahead, lead, speed, gap, self.headway, self.delay, chain)
         return (*errors, errors.gap + self.headway, lead, lead_acceleration)
 
-    def _chain(self, speed: Tensor, indices: tuple[Tensor, ...]) -> Chain:
+    def _chain(self, speed: Tensor, indices: tuple[Tensor, ...]) -> cacc.Chain:
         connected = self.hearing.expand(speed.shape[:-1])
         if indices:
             connected = torch.zeros_like(connected)
             for index in indices:
                 connected = connected.scatter(-1, index, True)
-        return find_chains(connected, self.leader_sends and not self.string.ring)
+        return cacc.find_chains(connected, self.leader_sends and not self.string.ring)
 
 
 # Names of the entries that only vehicles in a platoon have.
@@ -131,14 +123,14 @@ class CACC(Controller):
     def setup(self, world: World) -> None:
         """Refuse gains at which the closed loop is unstable, naming the condition that fails."""
         self.declare(world, (*self.reads, "self.speed") if self.literal else self.reads)
-        self.gains = Gains(self.k1, self.k2, self.k3, self.k4)
+        self.gains = cacc.Gains(self.k1, self.k2, self.k3, self.k4)
         if not self.literal:
             self.gains.check_stable(world.time_step)
 
     def command(self, *read: Tensor) -> Tensor:
-        errors, speed = Errors(*read[: len(PLATOON_ERRORS)]), read[len(PLATOON_ERRORS) :]
+        errors, speed = cacc.Errors(*read[: len(PLATOON_ERRORS)]), read[len(PLATOON_ERRORS) :]
         # A hybrid controller uses the command without these limits.
-        return cacc_acceleration(errors, self.gains, self.time_step, *speed)
+        return cacc.cacc_acceleration(errors, self.gains, self.time_step, *speed)
 
 
 class DeadBeat(Controller):
@@ -159,7 +151,7 @@ class DeadBeat(Controller):
         check_leader(self.lookahead, self)
 
     def command(self, speed: Tensor, *leader: Tensor) -> Tensor:
-        target = next_leader_speed(leader, self.lookahead, self.time_step)
+        target = cacc.next_leader_speed(leader, self.lookahead, self.time_step)
         return (target - speed) / self.time_step
 
 

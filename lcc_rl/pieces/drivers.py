@@ -11,12 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.driver_models import (
-    GAP_NOISE_TIME,
-    DriverConstants,
-    NoiseStep,
-    Reaction,
-)
+from lcc_rl.functional.driver_models import GAP_NOISE_TIME, DriverConstants, NoiseStep, Reaction
 from lcc_rl.functional.gipps import GippsConstants
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.layout import join, reverse

@@ -140,10 +140,7 @@ class StringMotion(StepTransform):
         self.arrange = selector([order.index(place) for place in range(len(order))], len(order))
 
     def _ring_gaps(self, world: World) -> tuple[float, float]:
-        """Return the least and the largest gap at which vehicles spread evenly over a ring [m].
-
-        Vehicles have no classes here; :meth:`begin` uses the lengths of classes.
-        """
+        """Return least and largest gap on a ring [m]; :meth:`begin` uses the lengths of classes."""
         if self.circumference is None:
             raise ConfigError("scenario.road=ring needs scenario.circumference [m]")
         count, length = len(self.string), self.vehicle_length

@@ -20,7 +20,7 @@ from lcc_rl.results.bootstrap import LEAST_DRIVES
 from lcc_rl.results.measures import FINAL_SPREAD, FLOW, MEASURES, Shown, signed
 from lcc_rl.results.names import in_words
 from lcc_rl.results.remarks import FLOW_LOST, FLOW_NAMED
-from lcc_rl.results.render import DASH, markdown_row, saved_text
+from lcc_rl.results.render import DASH, markdown_table, saved_text
 from lcc_rl.results.task import Task
 from lcc_rl.settings import Number, Settings, Whole, parse
 
@@ -171,8 +171,7 @@ def leaderboard(documents: Mapping[str, Mapping[str, Any]]) -> str:
             [f"{row['source']}, {_sample(row)}", f"`{row['by']}`", *_markdown(row)]
             for row in sorted(rows, key=lambda x: sources.index(x["source"]))
         ]
-        lines = [HEAD, ["---"] * len(HEAD), *lines]
-        text = "\n".join(map(markdown_row, lines))
+        text = markdown_table(HEAD, lines)
         sections.append(f"### {task}\n\nAgainst {in_words(rows[0]['against'])}.\n\n{text}\n")
     return "\n".join(sections)
 
@@ -246,10 +245,7 @@ def _sample(row: BoardRow) -> str:
 
 
 def _markdown(row: BoardRow) -> list[str]:
-    """Return saving, flow and broken limits.
-
-    The saving is bold if all limits are kept, the flow if much of it is lost.
-    """
+    """Return saving, flow and broken limits; bold: a saving within limits, a large loss of flow."""
     cells = _cells(row)
     share = f"**{cells['saved']}**" if row["kept"] else cells["saved"]
     much = (row[FLOW_LOST] or 0.0) > FLOW_NAMED

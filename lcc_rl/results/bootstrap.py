@@ -95,10 +95,7 @@ def estimate(
 def _over_drives(
     statistic: Callable[..., Any], sides: Sequence[Side], drives: Sequence[object], value: float
 ) -> tuple[float, float] | None:
-    """Return the t-interval of a statistic over two to four drives.
-
-    Its standard error is that of the jackknife, which leaves out each drive once.
-    """
+    """Return the t-interval over two to four drives, by the jackknife's standard error."""
     names = list(dict.fromkeys(drives))
     if not 2 <= len(names) < LEAST_DRIVES:
         return None

@@ -22,14 +22,7 @@ from pyarrow.dataset import Dataset
 
 from lcc_rl.errors import ResultsError, require_known, unknown_name
 from lcc_rl.io.atomic import SUBFOLDERS
-from lcc_rl.io.files import (
-    Rows,
-    as_dataset,
-    read_table,
-    schema_of,
-    texts_of,
-    unified,
-)
+from lcc_rl.io.files import Rows, as_dataset, read_table, schema_of, texts_of, unified
 from lcc_rl.results.runs import CONFIG, FINAL, PARTS, flat_settings
 from lcc_rl.runs.plans import unfinished
 

@@ -50,9 +50,13 @@ def columns(frame: pd.DataFrame) -> list[TableColumn]:
 def as_markdown(frame: pd.DataFrame) -> str:
     """Return a table for a Markdown page, with the headings and cells of :func:`columns`."""
     shown = columns(frame)
-    rows = [[column.heading for column in shown], ["---"] * len(shown)]
-    rows += map(list, zip(*(column.cells for column in shown), strict=True))
-    return "\n".join(markdown_row(row) for row in rows)
+    rows = zip(*(column.cells for column in shown), strict=True)
+    return markdown_table([column.heading for column in shown], rows)
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
+    """Return a Markdown table with escaped cells."""
+    return "\n".join(map(markdown_row, [head, ["---"] * len(head), *rows]))
 
 
 def markdown_row(cells: Iterable[str]) -> str:

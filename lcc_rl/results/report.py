@@ -27,14 +27,7 @@ from lcc_rl.results.measures import (
     Measure,
     Shown,
 )
-from lcc_rl.results.names import (
-    HUMAN,
-    ON_FRONT,
-    RULE,
-    RULE_ROWS,
-    in_words,
-    strategy_named,
-)
+from lcc_rl.results.names import HUMAN, ON_FRONT, RULE, RULE_ROWS, in_words, strategy_named
 from lcc_rl.results.remarks import (
     FEW_DRIVES,
     FLOW_LOST,
@@ -52,14 +45,7 @@ from lcc_rl.results.remarks import (
 )
 from lcc_rl.results.task import Task
 from lcc_rl.results.units import burns_one_fuel, check_unit, in_unit
-from lcc_rl.results.windows import (
-    DRIVE,
-    TRAINED,
-    ratio,
-    savings,
-    seeds_left_out,
-    windows_of,
-)
+from lcc_rl.results.windows import DRIVE, TRAINED, ratio, savings, seeds_left_out, windows_of
 
 # Baselines of tables and verdicts; the first one that was evaluated is used.
 AGAINST = (RECORDED, HUMAN, "idm", "idm_acc_filtered", "idm_acc", "rule", "reference")
@@ -352,10 +338,7 @@ def _rows(task: Task | None, against: str | None) -> list[Measure]:
 def _of_energy(
     table: pd.DataFrame, energy: Fleet | None, filtered: bool, second: Fleet | None
 ) -> dict[str, Any]:
-    """Return the parts of a report that are specific to one without a task.
-
-    The short table has rows for strategies with an automated vehicle, largest energy first.
-    """
+    """Return the parts of a report that are specific to one without a task, most energy first."""
     # A string without automated vehicles has fewer vehicles and is not comparable.
     cars = table[table[PATH].notna()] if table[PATH].notna().any() else table
     cars = cars.sort_values(PATH_PER_KM, ascending=False, kind="stable").reset_index(drop=True)

@@ -137,7 +137,6 @@ def _section(text: str) -> list[tuple[str, Any]]:
 
 
 def _settings(text: str, where: str) -> dict[str, Any]:
-    """Parse settings or a section of them."""
     content = parse_yaml(text, where)
     for name in SECTIONS:
         if not isinstance(content.get(name, {}), Mapping):

@@ -16,14 +16,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from lcc_rl.errors import (
-    ConfigError,
-    Interrupted,
-    LccError,
-    ResultsError,
-    input_error,
-    one_line,
-)
+from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, input_error, one_line
 from lcc_rl.io.atomic import SUBFOLDERS, atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json, read_text
 from lcc_rl.runs.interrupts import was_interrupted

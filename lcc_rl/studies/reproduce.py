@@ -102,7 +102,6 @@ def _subcommand(commands: Any, name: str, text: str) -> ArgumentParser:
 
 
 def _trained(commands: Any, name: str, text: str) -> ArgumentParser:
-    """Add the subcommand of a study with trainings."""
     command = _subcommand(commands, name, text)
     command.add_argument("--seeds", type=int, default=8, help="trainings of every learned variant")
     command.add_argument("--jobs", type=int, default=2, help="parallel trainings")

@@ -41,8 +41,7 @@ def collect(options: Namespace) -> list[Row]:
             own: collector(first, policy, steps, bool(ending)),
             theirs: torchrl_collector(second, policy, steps, bool(ending)),
         }
-        counts = dict.fromkeys(runs, batch * steps)
-        rows += rates(options, runs, "steps/s", counts, {theirs: [own]}, batch)
+        rows += rates(options, runs, "steps/s", batch * steps, {theirs: [own]}, batch)
     for size in (batch,) if options.quick else (20, 64, batch, 8192):
         for ending in endings(options):
             rows += in_training(options, policy, size, steps, ending)
@@ -61,8 +60,7 @@ def in_training(options: Namespace, policy: Any, batch: int, steps: int, ending:
         from benchmarks.theirs import PlainVector, predicting
 
         runs[other] = predicting(PlainVector(training(options, batch), compiled), steps)
-    counts = dict.fromkeys(runs, batch * steps)
-    return rates(options, runs, "steps/s", counts, {own: [plain, other]}, batch)
+    return rates(options, runs, "steps/s", batch * steps, {own: [plain, other]}, batch)
 
 
 def collector(env: TransformedEnv, policy: Any, steps: int, compiled: bool) -> Run:

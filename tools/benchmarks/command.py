@@ -18,17 +18,14 @@ import pandas as pd
 import torch
 
 from benchmarks import harness
-from benchmarks.analytic import analytic
 from benchmarks.calibrate import calibrate
 from benchmarks.collect import collect
 from benchmarks.env import env
-from benchmarks.evaluate import evaluate
 from benchmarks.gym import gym
 from benchmarks.harness import EXTRA, Row, installed, page, table
-from benchmarks.loading import loading, start
-from benchmarks.read import read
+from benchmarks.jobs import analytic, evaluate, train
+from benchmarks.read import loading, read, start
 from benchmarks.string import string
-from benchmarks.train import train
 from benchmarks.update import update
 from lcc_rl.data.tables import TableFile
 from lcc_rl.errors import how_to_install, require_known

@@ -28,7 +28,7 @@ def gym(options: Namespace) -> list[Row]:
     steps, how = (50, {"overrides": SMALL}) if options.quick else (3000, {})
     name, many = "lcc_rl/alcc-v0", 4 if options.quick else MANY
     runs = {"gymnasium.make": stepping(gymnasium.make(name, **how), steps)}
-    rows = rates(options, runs, "steps/s", dict.fromkeys(runs, steps), {}, 1)
+    rows = rates(options, runs, "steps/s", steps, batch=1)
     steps //= 10
     vector = gymnasium.make_vec(name, num_envs=many, **how)
     ones = [lambda: gymnasium.make(name, **how)] * many
@@ -37,8 +37,8 @@ def gym(options: Namespace) -> list[Row]:
         "gymnasium.make_vec": stepping(vector, steps),
         SYNC: stepping(gymnasium.vector.SyncVectorEnv(ones, autoreset_mode=same), steps),
     }
-    counts = dict.fromkeys(runs, steps * many)
-    return rows + rates(options, runs, "steps/s", counts, {"gymnasium.make_vec": [SYNC]}, many)
+    against = {"gymnasium.make_vec": [SYNC]}
+    return rows + rates(options, runs, "steps/s", steps * many, against, many)
 
 
 def stepping(env: Any, steps: int) -> Run:

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from lcc_rl.results.render import markdown_row
+from lcc_rl.results.render import markdown_table
 from lcc_rl.synthetic.stream import StreamSource
 
 TOLERANCE = 1e-4  # within which two ways to the same result must agree before they are timed
@@ -30,23 +30,18 @@ def alternate(runs: Mapping[str, Run], repeats: int) -> dict[str, np.ndarray]:
     spent: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(repeats + 1):
         for name, run in runs.items():
-            spent[name].append(seconds(run))
+            begun = TIMERS[timer]()
+            run()
+            spent[name].append(TIMERS[timer]() - begun)
     return {name: np.array(each[1:]) for name, each in spent.items()}
-
-
-def seconds(run: Run) -> float:
-    """Return the seconds of a run."""
-    begun = TIMERS[timer]()
-    run()
-    return TIMERS[timer]() - begun
 
 
 def rates(
     options: Namespace,
     runs: Mapping[str, Run],
     unit: str,
-    counts: Mapping[str, int],
-    against: Against,
+    count: int,
+    against: Against | None = None,
     batch: int | None = None,
     grad: bool = False,
 ) -> list[Row]:
@@ -56,15 +51,14 @@ def rates(
         options: those of the command line.
         runs: the cases by name.
         unit: unit of the rates.
-        counts: what one call of each run makes or does.
+        count: what one call of a run makes or does.
         against: the alternatives of each case; those that are no case are left out.
         batch: the batch size.
         grad: keep gradients.
     """
     with torch.set_grad_enabled(grad):
         spent = alternate(runs, options.repeats)
-    values = {name: counts[name] / each for name, each in spent.items()}
-    return rows_of(values, unit, against, batch)
+    return rows_of({name: count / each for name, each in spent.items()}, unit, against, batch)
 
 
 def rows_of(
@@ -128,8 +122,7 @@ def cells_of(row: Any) -> list[str]:
 def table(rows: pd.DataFrame) -> str:
     """Return rows as a table in Markdown."""
     cases = rows.assign(case=rows["benchmark"] + ": " + rows["case"])
-    lines = [HEADINGS, ["---"] * len(HEADINGS), *map(cells_of, cases.to_dict("records"))]
-    return "\n".join(map(markdown_row, lines))
+    return markdown_table(HEADINGS, map(cells_of, cases.to_dict("records")))
 
 
 def page(rows: pd.DataFrame) -> str:

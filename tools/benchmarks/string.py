@@ -40,8 +40,8 @@ def batch(options: Namespace) -> list[Row]:
         own, other = f"StringCollector{ending}", f"plain loop{ending}"
         every = ways(options, count, steps, ending, SIZE - 1)
         runs = {name: every[name] for name in (own, other)}
-        counts = dict.fromkeys(runs, count * steps * SIZE)
-        rows += rates(options, runs, "vehicle-steps/s", counts, {own: [other]}, count)
+        moved = count * steps * SIZE
+        rows += rates(options, runs, "vehicle-steps/s", moved, {own: [other]}, count)
     return rows
 
 
@@ -60,9 +60,9 @@ def ring(options: Namespace) -> list[Row]:
         runs[f"Player{ending}"] = partial(player.play, TensorDict(batch_size=[1]))
     against = {name: [SUMO] for name in runs}
     speed = player.play(TensorDict(batch_size=[1]))[0][key][-1]
-    counts = dict.fromkeys([*runs, SUMO], steps * SIZE)
+    how = "vehicle-steps/s", steps * SIZE, against, 1
     if find_spec("libsumo") is None:
-        return rates(options, runs, "vehicle-steps/s", counts, against, 1)
+        return rates(options, runs, *how)
     sumo = load_sumo()
 
     def simulate() -> None:
@@ -75,6 +75,6 @@ def ring(options: Namespace) -> list[Row]:
             simulate()
             theirs = [sumo.vehicle.getSpeed(f"car{number}") for number in range(SIZE)]
             agree("SUMO's speed [m/s]", theirs, speed.flatten(), 1e-3)
-            return rates(options, {**runs, SUMO: simulate}, "vehicle-steps/s", counts, against, 1)
+            return rates(options, {**runs, SUMO: simulate}, *how)
         finally:
             sumo.close()

@@ -26,7 +26,7 @@ QUICK = ((16, 2), (32, 2))
 
 
 def update(options: Namespace) -> list[Row]:
-    """Return updates per second, beside those of TorchRL's losses and stable-baselines3's.
+    """Return updates per second, beside those of stable-baselines3.
 
     All updates include drawing the batch from the buffer, all losses and backward passes, Adam
     and the soft target updates, all in single precision. stable-baselines3's is its ``train()``,
@@ -36,19 +36,12 @@ def update(options: Namespace) -> list[Row]:
     rows: list[Row] = []
     for kind, (batch, count) in product(AGENTS, QUICK if options.quick else SIZES):
         agent = kind(batch_size=batch).start(Scene(7))
-        own, loss = f"{kind.__name__}.update", f"TorchRL's {kind.__name__}Loss"
-        other = f"{OTHER} {kind.__name__}"
-        slow = kind(batch_size=batch, fused=False).start(Scene(7))
-        runs: dict[str, Run] = {
-            own: own_updates(agent, played, count),
-            loss: own_updates(slow, played, count),
-        }
+        own, other = f"{kind.__name__}.update", f"{OTHER} {kind.__name__}"
+        runs: dict[str, Run] = {own: own_updates(agent, played, count)}
         if installed():
             model = their_update(options, agent, played)
             runs[other] = partial(model.train, count, batch)
-        against = {own: [loss, other]}
-        counts = dict.fromkeys(runs, count)
-        rows += rates(options, runs, "updates/s", counts, against, batch, grad=True)
+        rows += rates(options, runs, "updates/s", count, {own: [other]}, batch, grad=True)
     return rows
 
 

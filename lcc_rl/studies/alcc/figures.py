@@ -89,10 +89,7 @@ def reward_terms(training: pd.DataFrame) -> Figure:
         axis.set_title(label)
     for axis in axes[len(shown) :]:
         axis.remove()
-    look: dict[str, Any] = {
-        "loc": "outside upper center",
-        "ncols": 2,
-    }
+    look: dict[str, Any] = {"loc": "outside upper center", "ncols": 2}
     figure.legend(handles=axes[0].get_lines(), **look)
     figure.supxlabel(f"training episodes\n{BAND_NOTE}", fontsize=8)
     figure.supylabel("sum per episode", fontsize=8)
@@ -226,6 +223,5 @@ def comparison_figure(windows: pd.DataFrame) -> Figure:
 
 
 def _how_many(seeds: pd.Series) -> str:
-    """Return the different numbers of seeds in a column, in words."""
     counts = sorted({int(count) for count in seeds if str(count).isdigit()})
     return f"{' or '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"

@@ -152,7 +152,6 @@ def _ablations(study: StudyResults, main: Means | None) -> None:
 
 
 def _people(study: StudyResults) -> None:
-    """Add the calibration and the power map."""
     study.figure("power_map", "The motor's power map (A2; Fig. 2)", figures.power_map())
     if (study.folder / DRIVERS_FILE).exists():
         drivers = read_parquet(study.folder / DRIVERS_FILE)

@@ -161,7 +161,6 @@ def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dic
 
 
 def _calibration(study: Study, runs: dict[str, TrainConfig]) -> PipelineConfig:
-    """Return the settings of the calibration, with the data and division of a training."""
     shared = [item for item in study.overrides if top_key(item) not in OF_TRAINING]
     cfg: PipelineConfig = load("pipeline", ["~experiment", "calibration=both", *shared])
     first = next(iter(runs.values()))

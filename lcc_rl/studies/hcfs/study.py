@@ -17,11 +17,7 @@ from lcc_rl.config.schemas import StudyConfig, TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.evaluation.comparison import Comparison
 from lcc_rl.evaluation.fit import check_policy
-from lcc_rl.evaluation.strategies import (
-    Strategy,
-    baselines,
-    with_weights,
-)
+from lcc_rl.evaluation.strategies import Strategy, baselines, with_weights
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.policies import load_policy

@@ -1,23 +1,35 @@
-"""Benchmark of a whole training: collection, replay, updates."""
+"""Benchmarks of whole trainings, by updates and by the gradient, and of an evaluation."""
 
 from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import torch
 
 from benchmarks.collect import OTHER
-from benchmarks.harness import Row, Run, alternate, installed, rows_of
+from benchmarks.harness import Row, Run, alternate, endings, installed, rates, rows_of
 from benchmarks.plain import alcc, study, training
 from lcc_rl.agents import DDPG
+from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.collecting import transitions
+from lcc_rl.agents.factory import build_agent, make_trainer, training_env
+from lcc_rl.agents.gradient import GradientLoop
 from lcc_rl.agents.replay import ReplayLoop
+from lcc_rl.config import load
+from lcc_rl.envs import load_inputs
+from lcc_rl.evaluation.episodes import Episodes, Plan
+from lcc_rl.evaluation.strategies import Strategy
+from lcc_rl.io.files import write_parquet
 
 WIDTH = 20  # environments side by side
+QUICK = ("scenario.horizon=20", "training.segment=20", "training.environments=8", "agent.warm_up=0")
+OWN = "Analytic"
 
 
 def train(options: Namespace) -> list[Row]:
@@ -80,3 +92,46 @@ def their_training(
     model = their_agent(vector, "DDPG", learning_starts=batch, verbose=0, **how)
     model.learn(batch + every * width)
     return lambda: model.learn(steps, reset_num_timesteps=False)
+
+
+def analytic(options: Namespace) -> list[Row]:
+    """Return iterations/s of the main job's training."""
+    cfg = load("train", ["variant=alcc", "experiment=main", *(QUICK if options.quick else ())])
+    cfg = cfg.with_(training={"compiled": options.compile})
+    inputs = load_inputs(cfg)
+    agent, profiles = build_agent(cfg, inputs.population), inputs.to_learn_from()
+    agent.take(profiles)
+    with TemporaryDirectory(prefix="lcc_rl_benchmark_") as folder, torch.enable_grad():
+        env = training_env(cfg, profiles, inputs.population)
+        trainer = make_trainer(cfg, agent, env, Path(folder))
+        assert isinstance(trainer, GradientLoop)
+        own: Run = partial(trainer._numbers, trainer._source())
+        batch = cfg.training.environments
+        return rates(options, {OWN: own}, "iterations/s", 1, batch=batch, grad=True)
+
+
+def evaluate(options: Namespace) -> list[Row]:
+    """Return episodes per second of an untrained actor, rows and time series written."""
+    cfg, inputs = study(options.quick)
+    agent = build_agent(cfg, inputs.population)
+    strategy = Strategy("untrained", cfg, shared_policy(agent.policy))
+    settings, people = cfg.evaluation, len(inputs.population.time_gap)
+    drivers = 2 if options.quick else settings.drivers
+    plan = Plan(len(inputs.evaluation), people, drivers, settings.batch_size)
+    how = (strategy, inputs, plan, settings.seed, settings.sample_episodes)
+    rows: list[Row] = []
+    with TemporaryDirectory(prefix="lcc_rl_benchmark_") as name:
+        for ending in endings(options):
+            episodes = Episodes(*how, compiled=bool(ending))
+            run: Run = partial(written, episodes, Path(name))
+            own = {f"evaluation{ending}": run}
+            rows += rates(options, own, "episodes/s", len(plan), batch=plan.size)
+    return rows
+
+
+def written(episodes: Episodes, folder: Path) -> None:
+    """Play all episodes and write their rows and time series."""
+    for block in episodes.plan.own:
+        rows, steps = episodes.play(block)
+        write_parquet(rows, folder / f"{block}.parquet")
+        write_parquet(steps, folder / f"{block}_steps.parquet")
