@@ -27,8 +27,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 44_015, "code": 29_015},
-    "tests": {"lines": 25_700},
+    "lcc_rl + tools": {"lines": 43_700, "code": 28_850},
+    "tests": {"lines": 25_740},
     "conf": {"yaml": 164},
 }
 CASES = 1_243  # ceiling of all quick tests, see tests/tools/test_size.py

@@ -13,7 +13,7 @@ from lcc_rl.drivers.twins import drive, running
 from lcc_rl.functional.driver_models import Reaction
 
 REPLICATES, DISTURBANCE = 32, Reaction(noise=0.2)  # simulated records of each driver
-AT_ONCE = 2**23  # samples times draws that are simulated together
+SAMPLES_AT_ONCE = 2**23  # samples times draws that are simulated together
 SHIFT = 1e-3  # relative change of a parameter that measures its effect
 ANSWERS = (0.0, 0.5, 1.0)  # of the linear change of the other parameters with one
 VALUES = 32  # values between the fitted one and a bound, the densest near the fitted one
@@ -99,7 +99,7 @@ def _products(error: FitError, best: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     normal = torch.einsum("ctid,ctjd,cd->dij", effects, effects, weights)
     joint, noise, left = [], [], REPLICATES
     while left:  # groups of draws, whose motion fits into memory
-        group = min(left, max(1, AT_ONCE // seen[0].numel()))
+        group = min(left, max(1, SAMPLES_AT_ONCE // seen[0].numel()))
         strayed = motion(torch.zeros(group, count).to(best), DISTURBANCE) - plain
         joint.append(torch.einsum("ctid,ctjd,cd->dij", effects, strayed, weights))
         noise.append(torch.einsum("ctjd,cd->dj", strayed.square(), weights))

@@ -23,8 +23,8 @@ from lcc_rl.settings import NonNegative
 
 PLACE = "place"
 SPACING = 1.0  # largest distance between stored grades [m]
-LONGEST = 1e6  # profile [m]
-Point = tuple[Annotated[float, Field(ge=0.0, le=LONGEST)], Grade]
+LAST_PLACE = 1e6  # of a profile [m]
+Point = tuple[Annotated[float, Field(ge=0.0, le=LAST_PLACE)], Grade]
 
 
 class Slope(StepTransform):
