@@ -14,10 +14,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba.core.errors import NumbaError
 from torch import Tensor
 
-from lcc_rl.functional.machine_code import kept
 from lcc_rl.functional.recorder import Recorder, TensorsOnly, Untranslatable
 from lcc_rl.pieces.base import Key, State
 
@@ -61,7 +59,7 @@ class Rowwise:
         function: maps tensors ``[n, width]`` to tensors ``[n, width]``, row by row.
         examples: a row of each argument, ``[1, width]``.
         what: name in the log if it is not translated.
-        make: compiles its source to machine code.
+        make: compiles its source to machine code; None: numba, kept on disk.
     Attributes:
         translated: whether it runs as machine code.
     """
@@ -71,15 +69,19 @@ class Rowwise:
         function: TensorFunction,
         examples: Sequence[Tensor],
         what: str,
-        make: Callable[[str], Callable[..., None]] = kept,
+        make: Callable[[str], Callable[..., None]] | None = None,
     ) -> None:
+        from numba.core.errors import NumbaError  # here: numba loads for a third of a second
+
+        from lcc_rl.functional.machine_code import kept
+
         self.function = function
         with torch.no_grad():
             results = function(*examples)
         self.widths = [(x.shape[-1], x.numpy().dtype) for x in results]
         try:
             source, self.tables = translated(function, examples)
-            self.kernel = make(source)
+            self.kernel = (make or kept)(source)
             self.translated = True
             self(*(x.numpy() for x in examples))
         except (Untranslatable, NumbaError) as error:
