@@ -27,11 +27,11 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 43_700, "code": 28_850},
-    "tests": {"lines": 25_740},
+    "lcc_rl + tools": {"lines": 43_900, "code": 29_000},
+    "tests": {"lines": 26_000},
     "conf": {"yaml": 164},
 }
-CASES = 1_256  # ceiling of all quick tests, see tests/tools/test_size.py
+CASES = 1_290  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {
     "names in several modules": 60,
     "floors": 10,

@@ -46,9 +46,7 @@ def intervals(
     share = torch.linspace(0.0, 1.0, VALUES + 1).to(best)[1:] ** 3
     steps = (limits - place).unsqueeze(-1) * share  # [drivers, ends, names, values]
     others = torch.tensor(ANSWERS).to(best).unsqueeze(-1)
-    ways = others * (inverse / variance.unsqueeze(2)).unsqueeze(
-        2
-    )  # [drivers, names, shares, names]
+    ways = others * (inverse / variance.unsqueeze(2)).unsqueeze(2)  # by driver, name, share, name
     ways.diagonal(dim1=1, dim2=3).fill_(1.0)
     tried = steps[:, :, :, None, :, None] * ways[:, None, :, :, None] + place[:, None, None, None]
     errors = error(tried.clamp(*limits).exp().flatten(1, 4)).view(tried.shape[:-1]).amin(3)
@@ -78,13 +76,13 @@ def _products(error: FitError, best: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     def motion(shift: Tensor, reaction: Reaction) -> Tensor:
         candidates = best.unsqueeze(1) * shift.exp()
         own = {name: values.T for name, values in error.parameters(candidates).items()}
-        people = error.law, (own.pop("desired_speed"), own.pop("time_gap"))
-        people = people[0].with_(**own), people[1]
+        pair = own.pop("desired_speed"), own.pop("time_gap")
+        people = error.law.with_(**own), pair
         # All drivers have the same draws, so that none depends on the others.
         shape = (1, len(shift), 1)
         step, leader = observed.time_step, observed.leader_speed
         [found] = drive(people, leader, start, [reaction], shape, generator, step)
-        return torch.from_numpy(np.stack(found)).nan_to_num(0.0, 0.0, 0.0) * alive
+        return torch.from_numpy(np.stack(found)).nan_to_num_(0.0, 0.0, 0.0).mul_(alive)
 
     change = SHIFT * torch.eye(count).to(best)
     shifts = torch.cat([change, -change, 0.0 * change[:1]])
@@ -97,11 +95,9 @@ def _products(error: FitError, best: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     weights = torch.tensor(used).unsqueeze(-1) / (squares * norms).sqrt()
     weights = weights / (weights * squares).sum(0)
     normal = torch.einsum("ctid,ctjd,cd->dij", effects, effects, weights)
-    joint, noise, left = [], [], REPLICATES
-    while left:  # groups of draws, whose motion fits into memory
-        group = min(left, max(1, SAMPLES_AT_ONCE // seen[0].numel()))
-        strayed = motion(torch.zeros(group, count).to(best), DISTURBANCE) - plain
+    joint, noise, group = [], [], max(1, SAMPLES_AT_ONCE // seen[0].numel())
+    for fitted in torch.zeros(REPLICATES, count).to(best).split(group):  # fits into memory
+        strayed = motion(fitted, DISTURBANCE).sub_(plain)
         joint.append(torch.einsum("ctid,ctjd,cd->dij", effects, strayed, weights))
-        noise.append(torch.einsum("ctjd,cd->dj", strayed.square(), weights))
-        left -= group
+        noise.append(torch.einsum("ctjd,cd->dj", strayed.square_(), weights))
     return normal, torch.cat(joint, -1), torch.cat(noise, -1)

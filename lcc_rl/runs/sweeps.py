@@ -53,11 +53,7 @@ ROUNDED = re.compile(r"\d*\.\d{15,}(?:e-?\d+)?")  # 0.8999999999999999 of Hydra'
 def register_resolvers() -> None:
     """Register the OmegaConf resolvers for folders of runs and sweeps and for parallel jobs."""
     OmegaConf.register_new_resolver("lcc.folder", chosen_folder, replace=True)
-    OmegaConf.register_new_resolver(  # folder of Hydra's settings; none beside those of a run
-        "lcc.hydra",
-        lambda folder: None if folder and (Path(folder) / CONFIG).is_file() else ".hydra",
-        replace=True,
-    )
+    OmegaConf.register_new_resolver("lcc.hydra", hydra_folder, replace=True)
     # Cached, so that every job gets the folder of the whole command.
     OmegaConf.register_new_resolver("lcc.sweep", sweep_name, use_cache=True, replace=True)
     OmegaConf.register_new_resolver("lcc.run", run_name, replace=True)
@@ -77,6 +73,11 @@ def chosen_folder(resumed: str | None, fresh: str) -> str:
     if resumed and not (Path(resumed) / CONFIG).is_file():
         raise ConfigError(f"resume={no_run(Path(resumed))}")
     return str(resumed or fresh)
+
+
+def hydra_folder(folder: str | None) -> str | None:
+    """Return the folder of Hydra's settings; None in a folder that already holds a run."""
+    return None if folder and (Path(folder) / CONFIG).is_file() else ".hydra"
 
 
 def run_name(*, _root_: DictConfig) -> str:
