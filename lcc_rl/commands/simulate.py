@@ -30,8 +30,8 @@ ARGUMENTS: dict[str, tuple[Callable[[str], Any], str]] = {
     "repeats": (typed(Count), "episodes behind each leader, by default 1"),
     "seed": (typed(Seed), "of the noise, by default 0"),
 }
-TABLES = {"steps": "a row per time and vehicle", "vehicles": "the printed table"}
-MOST_ROWS = 40  # most vehicles that are printed
+TABLES = {"steps": "a row per time and vehicle", "vehicles": "the printed table with all measures"}
+MOST_ROWS, LAST_SHOWN = 40, "mean_gap_m"  # most vehicles and the last column that are printed
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -49,7 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = {name: value for name, value in options.items() if value is not None}
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     found = simulate(leaders or None, overrides=settings, **given)
-    print(found.vehicles.head(MOST_ROWS).to_string(index=False, float_format="{:,.4g}".format))
+    shown = found.vehicles.loc[: MOST_ROWS - 1, :LAST_SHOWN]
+    print(shown.to_string(index=False, float_format="{:,.4g}".format))
     for name, path in written.items():
         write_table(getattr(found, name), path)
 

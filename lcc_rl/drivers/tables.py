@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from lcc_rl.errors import DataError, ResultsError, raised_as
 from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import read_parquet
+
+log = logging.getLogger("lcc_rl")
 
 SHIPPED_DRIVERS = "i80_drivers.parquet"
 
@@ -44,6 +47,8 @@ def _of_mode(frame: pd.DataFrame, mode: str | None, name: str) -> pd.DataFrame:
     if "mode" not in frame.columns:
         return frame
     held = frame["mode"].unique().tolist()
+    if mode is None and len(held) > 1:
+        log.warning("%s holds drivers of several modes; drivers.mode=local is taken", name)
     mode = mode or ("local" if "local" in held else held[0])
     if mode not in held:
         raise DataError(f"{name}: no drivers of mode {mode!r}; the table holds {', '.join(held)}")

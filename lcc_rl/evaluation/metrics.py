@@ -239,7 +239,9 @@ METRICS: dict[str, Metric] = {
     "standstill_gap_m": lambda over, gap, speed: _extreme(
         over.lowest(torch.where(speed[1:] < STANDSTILL, gap, torch.inf))
     ),
-    "standstill_s": lambda over, speed: over.first(speed[1:] < STANDSTILL),
+    "standstill_s": lambda over, speed: over.first(
+        (speed[1:] < STANDSTILL) & (speed[:-1] >= STANDSTILL)
+    ),
     "speed_overshoot_mps": lambda over, speed, leader_speed: _extreme(
         over.highest((speed - leader_speed.cummax(0).values)[1:]).clamp(min=0.0)
     ),

@@ -16,16 +16,28 @@ from torch import Tensor
 from lcc_rl.config import check_overrides, load
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import RewardConfig, StudyConfig, TimeStep
+from lcc_rl.config.words import quoted
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
-from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.factory import build_env
-from lcc_rl.envs.inputs import POPULATION, Inputs, build_drivers, build_energy, constant_profiles
+from lcc_rl.envs.inputs import (
+    POPULATION,
+    Inputs,
+    build_drivers,
+    build_energy,
+    constant_profiles,
+)
 from lcc_rl.errors import ConfigError, in_short, raised_as, require
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.foreign import GivenPolicy
-from lcc_rl.evaluation.metrics import energy_measures
+from lcc_rl.evaluation.metrics import (
+    METRICS,
+    ROAD_METRICS,
+    SERIES,
+    energy_measures,
+    safety_measures,
+)
 from lcc_rl.evaluation.named import controller_of, is_policy, setting_of
 from lcc_rl.evaluation.rollout import Player, Record, reset_options
 from lcc_rl.evaluation.rows import INDEX
@@ -68,8 +80,10 @@ class Simulation:
             front to back. ``acceleration_mps2`` and ``power_w`` are those of the step that ends at
             ``time_s``. An episode ends with its first collision, a gap of 0 m or less.
         vehicles: a row per episode and vehicle: ``mean_speed_mps`` (of the rows of ``steps``),
-            ``min_gap_m``, ``mean_gap_m``, ``collided``, and distance and energies of
-            :func:`lcc_rl.evaluation.metrics.energy_measures`.
+            ``collided``, distance and energies of
+            :func:`lcc_rl.evaluation.metrics.energy_measures`, and the measures of
+            :data:`lcc_rl.evaluation.metrics.METRICS` and ``ROAD_METRICS``, those of
+            ``measures=[…]`` included, each of one vehicle; NaN where it has none.
     """
 
     steps: pd.DataFrame
@@ -115,7 +129,9 @@ def simulate(
         >>> found.steps.shape[0], found.vehicles["vehicle"].tolist()
         (1204, [0, 1, 2, 3])
     """
-    fixed = OF_ARGUMENTS | {"reward"} | ({"drivers"} if drivers is not None else set())
+    table = isinstance(drivers, (str, PathLike))
+    chosen = {"drivers.path"} if table else {"drivers"} if drivers is not None else set()
+    fixed = OF_ARGUMENTS | {"reward"} | chosen
     check_overrides(overrides, fixed, "has no effect in simulate: see the arguments")
     profiles = _profiles(leader, time_step, seconds)
     compared, spec = _given(controller)
@@ -123,6 +139,7 @@ def simulate(
     settings = (
         *("evaluation.baselines=[]", "evaluation.behind_filter=[]", "evaluation.warm_up=0"),
         f"variant={'alcc' if is_policy(spec) else 'idm'}",
+        *(["drivers=calibrated", f"drivers.path={quoted(drivers)}"] if table else []),
         *(["scenario=platoon"] * (not MESSAGES.isdisjoint(reads)) + list(overrides)),
         *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
@@ -133,11 +150,9 @@ def simulate(
         "simulate: a ring (scenario=ring in overrides) has leader=None, an open road has a leader",
     )
     require(cfg.automated or spec is None, "simulate: controller has no vehicle to drive in string")
-    people = build_drivers(cfg)
-    if drivers is not None:
-        people = bootstrap(drivers) if isinstance(drivers, (str, PathLike)) else drivers
-        fits = all(hasattr(people, name) for name in POPULATION)
-        require(fits, f"drivers: not a population: {in_short(people)}")
+    people = build_drivers(cfg) if table or drivers is None else drivers
+    fits = all(hasattr(people, name) for name in POPULATION)
+    require(fits, f"drivers: not a population: {in_short(people)}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, spec is None, typed=overrides).strategies(inputs)[-1]
     return _simulated(strategy, inputs, repeats, seed)
@@ -210,7 +225,7 @@ def _simulated(strategy: Strategy, inputs: Inputs, repeats: int, seed: int) -> S
     long, short = cfg.scenario.horizon >= LONG, len(cfg.scenario.vehicles) <= SHORT_STRING
     rows = long and short and not isinstance(strategy.policy, GivenPolicy)  # has its own memory
     ahead = [("leader", name) for name in ("speed", "acceleration", PLACE, GRADE)]
-    keys = [*ahead, CLASS, INDEX, *(("vehicles", name) for name in MOTION)]
+    keys = [*ahead, CLASS, INDEX, *(("vehicles", name) for name in (*MOTION, *SERIES))]
     player = Player(env, strategy.policy, keys, strategy.title, long and not rows, rows)
     options = reset_options(env, profile, repeat % people, seed, people, repeat // people)
     record, alive = player.play(options)
@@ -239,13 +254,11 @@ class _Motion:
 
     def _group(self, space: str, start: State) -> dict[str, Tensor]:
         """Return the motion of the leader or of the vehicles, ``[time, episodes, n, 1]``."""
-        keys = {name: (space, name) for name in self.names if (space, name) in self.record}
-        group = {name: self.record[key] for name, key in keys.items()}
+        group = {name: x for (within, name), x in self.record.items() if within == space}
         for name in AT_START & {*group}:
             group[name] = torch.cat([start[space, name].unsqueeze(0), group[name]])
         if space == "leader":
             group = {name: entry.unsqueeze(-2) for name, entry in group.items()}
-            group["gap"] = torch.full_like(group["speed"], torch.nan)
             energy = self.energy.at(_after(group.get(GRADE)))
             group["power"] = energy.power(group["speed"][:-1], group["acceleration"])
         return group
@@ -265,19 +278,16 @@ class _Motion:
             columns[MOTION[name]] = self._whole(name)[time, episode].flatten()
         steps = pd.DataFrame(columns)
         by_vehicle = steps.groupby(["episode", "vehicle"], sort=False)
-        summary = by_vehicle.agg(
-            role=("role", "first"),
-            mean_speed_mps=("speed_mps", "mean"),
-            min_gap_m=("gap_m", "min"),
-            mean_gap_m=("gap_m", "mean"),
-        ).reset_index()
-        summary["collided"] = summary["min_gap_m"] <= 0.0
-        return Simulation(steps, summary.assign(**self._energies()))
+        spans = {"role": ("role", "first"), "mean_speed_mps": ("speed_mps", "mean")}
+        summary, measured = by_vehicle.agg(**spans).reset_index(), self._measures()
+        collided = measured["min_gap_m"] <= 0.0
+        return Simulation(steps, summary.assign(collided=collided, **measured))
 
     def _whole(self, name: str) -> np.ndarray:
         """Return a quantity of all vehicles, ``[steps + 1, episodes, n]``; NaN where unknown."""
-        groups = [group[name].squeeze(-1) for group in self.groups]
-        values = torch.cat(groups, -1).numpy()
+        lacking = [torch.full_like(group["speed"], torch.nan) for group in self.groups]
+        groups = [group.get(name, y) for group, y in zip(self.groups, lacking, strict=True)]
+        values = torch.cat(groups, -2).squeeze(-1).numpy()
         if len(values) == len(self.alive):  # of a step: none before the first one
             values = np.concatenate([np.full_like(values[:1], np.nan), values])
         return values
@@ -292,16 +302,24 @@ class _Motion:
             np.put_along_axis(roles, index, AUTOMATED, axis=1)
         return roles[:, self.vehicles]
 
-    def _energies(self) -> dict[str, np.ndarray]:
-        """Return distance and energies of all vehicles, episode by episode."""
-        running, energies = self.alive.unsqueeze(-2), []
+    def _measures(self) -> dict[str, np.ndarray]:
+        """Return energies and measures of every vehicle, episode by episode; NaN without one."""
+        found, steps, metrics = [], len(self.alive), {**METRICS, **ROAD_METRICS}
+        ahead = {"leader_speed": self.record[LEADER]} if LEADER in self.record else {}
         for group, kind in zip(self.groups, self.kinds, strict=True):
-            args = (running, self.time_step, self.energy, kind, _after(group.get(GRADE)))
-            energies.append(energy_measures(group["power"], group["speed"], *args))
-        names = [name for name in energies[-1] if all(name in x for x in energies)]
-        return {
-            name: torch.cat([x[name] for x in energies], -2).flatten().numpy() for name in names
+            args = (self.time_step, self.energy, kind, _after(group.get(GRADE)))
+            known = energy_measures(group["power"], group["speed"], self.alive.unsqueeze(-2), *args)
+            series = {x: group[x].unsqueeze(-2) for x in SERIES if x in group}
+            series |= {name: x[-steps:] for name, x in series.items() if name in AT_START}
+            series |= {name: x[..., None, None] for name, x in ahead.items()}
+            alive = self.alive[..., None, None].expand_as(series["acceleration"])
+            found.append(known | safety_measures(series, alive, self.time_step, metrics))
+        lacking = [torch.full_like(known["distance_m"], torch.nan) for known in found]
+        columns = {
+            name: [x.get(name, y) for x, y in zip(found, lacking, strict=True)]
+            for name in found[-1]
         }
+        return {name: torch.cat(x, -2).flatten().numpy() for name, x in columns.items()}
 
 
 def _after(entry: Tensor | None) -> Tensor | None:

@@ -271,7 +271,8 @@ class DriverModel(Drivers):
     # v0 of every vehicle; None: that of the population [m/s]. Needs time_gap, too.
     desired_speed: Positive | None = None
     time_gap: Positive | None = None  # T of every vehicle, likewise [s]; needs desired_speed, too
-    # The law's constants besides v0 and T; None: those of the population.
+    # The law's constants besides v0 and T; None: those of the population. A driver of given (v0, T)
+    # has their means if they differ by driver.
     parameters: Annotated[InstanceOf[DriverConstants] | None, BeforeValidator(_made)] = None
 
     def validate(self) -> None:
@@ -287,7 +288,7 @@ class DriverModel(Drivers):
         single = self.desired_speed is not None
         if single:
             pair = torch.tensor([[float(x)] for x in (self.desired_speed, self.time_gap)])  # type: ignore[arg-type]
-            shared = self.law() if world.population is None else world.population.constants
+            shared = self.law() if world.population is None else world.population.constants.mean()
             drivers = (pair[0], pair[1], shared)
         else:
             drivers = super().described(world, where)

@@ -125,6 +125,9 @@ def test_braking_and_overshoot_as_standards_name_them() -> None:
     for name, values in expected.items():
         close = {"atol": 1e-3, "rtol": 1e-3, "equal_nan": True}
         torch.testing.assert_close(found[name].flatten(), torch.tensor(values), **close)
+    standing = {name: entry[70:] for name, entry in series.items()}
+    assert (standing["speed"] == 0.0).all()
+    assert safety_measures(standing, alive[70:], 0.1)["standstill_s"].isnan().all()
 
 
 def test_safety_of_many_vehicles_is_that_of_the_worst_and_shares_are_means() -> None:

@@ -12,9 +12,13 @@ import lcc_rl
 from lcc_rl.commands.simulate import main
 from lcc_rl.config import load
 from lcc_rl.data.profiles import from_records, no_profiles
+from lcc_rl.data.sources import ASSETS
+from lcc_rl.drivers.population import bootstrap
+from lcc_rl.drivers.tables import SHIPPED_DRIVERS
 from lcc_rl.envs import Inputs
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.episodes import evaluate
+from lcc_rl.evaluation.metrics import METRICS
 from lcc_rl.pieces import Controller
 
 STEPS = 200
@@ -41,9 +45,13 @@ def test_the_rows_are_those_of_an_evaluation(policy) -> None:
         own = found.vehicles[found.vehicles["role"] == role].groupby("episode")
         for key, unit in (("path_energy_kj", 1e-4), ("distance_m", 1e-5)):
             np.testing.assert_allclose(own[key].sum(), rows[f"{group}_{key}"], rtol=unit)
-    later = found.steps[(found.steps["vehicle"] == 1) & (found.steps["time_s"] > 0.0)]
-    gaps = later.groupby("episode")["gap_m"].min()
-    np.testing.assert_allclose(gaps, rows["min_gap_m"], rtol=1e-5)
+    own = found.vehicles[found.vehicles["vehicle"] == 1]
+    shared = [key for key in METRICS if key in rows]
+    assert {"min_gap_m", "min_ttc_s", "max_jerk_1s_mps3", "standstill_s"} <= {*shared}
+    np.testing.assert_allclose(own[shared], rows[shared], rtol=1e-5, atol=1e-4)
+    leader = found.vehicles[found.vehicles["vehicle"] == 0]
+    assert leader["max_deceleration_mps2"].notna().all()
+    assert leader["min_gap_m"].isna().all()
 
 
 def test_the_steps_are_a_motion(subtests) -> None:
@@ -180,6 +188,21 @@ def test_a_leader_that_is_replaced_does_not_jump() -> None:
     assert leader["speed_mps"].diff().min() < -3.9  # of two vehicles
     assert leader["acceleration_mps2"].abs().max() < 1.1
     assert leader["power_w"].min() > 0.0  # no braking
+
+
+def test_drivers_of_a_table_are_those_of_its_path(caplog) -> None:
+    path = ASSETS / SHIPPED_DRIVERS  # it has both modes
+    own = "controller@scenario.controllers.human=calibrated"
+    for mode in ("local", "global"):
+        words = [f"drivers.mode={mode}", own]
+        found = lcc_rl.simulate(WAVE, "human*2", drivers=path, overrides=words)
+        given = lcc_rl.simulate(WAVE, "human*2", drivers=bootstrap(mode=mode), overrides=[own])
+        pd.testing.assert_frame_equal(found.steps, given.steps)
+    assert "several modes" not in caplog.text
+    lcc_rl.simulate(WAVE, "human", drivers=path)
+    assert "holds drivers of several modes; drivers.mode=local is taken" in caplog.text
+    cases = [("drivers.path=b.parquet", "has no effect in simulate"), ("drivers=fixed", "path")]
+    check_refused(lambda word: lcc_rl.simulate(WAVE, drivers=path, overrides=[word]), cases)
 
 
 def test_the_command_drives_as_the_function_does(tmp_path, capsys) -> None:

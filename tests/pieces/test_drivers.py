@@ -14,9 +14,11 @@ from lcc_rl.data.profiles import from_records
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import build_env
 from lcc_rl.envs.inputs import constant_profiles
+from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.laws import LAWS
+from lcc_rl.pieces import IDM
 
 MODELS = {"idm": "human", "ovm": "ovm", "fvdm": "fvdm", "gipps": "gipps"}
 EACH = pytest.mark.parametrize("model", list(MODELS))
@@ -187,6 +189,12 @@ def test_calibrated_idm_drivers_are_those_of_the_idm() -> None:
     assert data["next", "vehicles", "speed"].isfinite().all()
     with pytest.raises(ConfigError, match=r"differ by driver.*=calibrated"):
         rolled(human("human"), population=bootstrap(mode="global"))
+    # One driver of given (v0, T) has the mean of what differs by driver.
+    people = "controller@scenario.controllers.human=calibrated"
+    cfg = compose("alcc", "controller@scenario.controllers.automated=idm", people)
+    env = build_env(cfg, steady(), bootstrap(mode="global"), 2)
+    (one,) = (piece for piece in pieces_of(env) if type(piece) is IDM)
+    assert one.drivers == bootstrap(mode="global").constants.mean()
 
 
 def test_a_handover_passes_on_what_a_late_driver_remembers() -> None:

@@ -16,6 +16,7 @@ import pytest
 import torch
 from helpers import check_refused, slow_but
 
+import lcc_rl
 from lcc_rl.cli import table
 from lcc_rl.commands import evaluation, score
 from lcc_rl.config import load
@@ -105,6 +106,12 @@ def test_rows_of_platoons_have_it(mine, tmp_path, capsys) -> None:
     assert "most" in capsys.readouterr().out
     table.main([str(tmp_path), "--all", *TRUSTED])
     assert "hardest jerk [m/s³]" in capsys.readouterr().out
+
+
+def test_vehicles_of_a_simulation_have_it(mine) -> None:
+    vehicles = lcc_rl.simulate([9.0, *[12.0] * 40], "human automated", overrides=[mine]).vehicles
+    np.testing.assert_allclose(vehicles[MINE.key][1:], vehicles["max_jerk_mps3"][1:])
+    assert vehicles[MINE.key][1:].min() > 0.0
 
 
 REFUSED = [
