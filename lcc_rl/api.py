@@ -34,6 +34,8 @@ class Run:
         rows: one row per episode, or vehicle of an episode, as in episodes.parquet; many rows as a
             dataset, which is read on demand.
         cfg: its configuration.
+        unit: energy per distance of its tables, ``"kWh/100km"``; by default that of the task, or
+            kJ/km, and g/km for one fuel.
 
     ``print(run)`` shows the tables that commands print. A run stands for the path of its folder.
     """
@@ -41,6 +43,7 @@ class Run:
     folder: Path
     rows: Rows
     cfg: StudyConfig
+    unit: str | None = None
 
     def __fspath__(self) -> str:
         return str(self.folder)
@@ -62,7 +65,7 @@ class Run:
         Args:
             against: the baseline of savings; by default that of tables.
         """
-        return list(evaluation.reports(self.rows, self.cfg, against))
+        return list(evaluation.reports(self.rows, self.cfg, against, self.unit))
 
     @cached_property
     def table(self) -> pd.DataFrame:

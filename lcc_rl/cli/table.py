@@ -3,6 +3,7 @@
 lcc-rl table outputs/evaluate/<run>
 lcc-rl table outputs/evaluate/<run> --all               # every measure
 lcc-rl table outputs/evaluate/<run> --against idm       # another baseline
+lcc-rl table outputs/evaluate/<run> --unit kWh/100km
 lcc-rl table outputs/evaluate/<run> --format latex      # for booktabs
 lcc-rl table outputs/evaluate/<run> --columns driver,saved_pct
 lcc-rl table outputs/evaluate/<run> --format csv --decimal comma
@@ -30,6 +31,7 @@ from lcc_rl.results.render import as_csv, as_latex, as_markdown, chosen, for_pri
 from lcc_rl.results.report import together
 from lcc_rl.results.runs import EPISODES, FINAL, PARTS, load_config, naming_run
 from lcc_rl.results.sweeps import load_sweep
+from lcc_rl.results.units import ENERGY_UNITS
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.states import CONFIG, run_folders
 
@@ -52,6 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--columns", help="names of columns of --format csv, separated by commas")
     parser.add_argument("--against", help="baseline of savings, a name of the table")
     new = "another name of a row, in all formats; may be repeated"
+    unit = "energy per distance, such as kWh/100km, in short tables"
+    parser.add_argument("--unit", choices=ENERGY_UNITS, help=unit)
     parser.add_argument("--rename", nargs=2, action="append", metavar=("ROW", "NAME"), help=new)
     ending = typed(Annotated[str, Field(pattern=r"\.(png|pdf|svg)$")])
     parser.add_argument("--figure", type=ending, help="also draw the table: a .png, .pdf or .svg")
@@ -67,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.run.suffix == ".parquet":
         table = chosen(worded(read_parquet(options.run)), names)
     else:
-        run = read_run(options.run, options.trust)
+        run = replace(read_run(options.run, options.trust), unit=options.unit)
         for row, label in options.rename or ():
             rename(row, label, names_of(run.rows))
         if options.figure:

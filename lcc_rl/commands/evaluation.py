@@ -15,6 +15,7 @@ from lcc_rl.config import identity, with_inputs
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.envs.inputs import build_energy, second_energy
+from lcc_rl.errors import require
 from lcc_rl.evaluation.comparison import IDENTITY, Comparison
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.episodes import plan_of
@@ -148,9 +149,12 @@ def evaluate_and_write(comparison: Comparison, inputs: Inputs, folder: Path, qui
     return rows
 
 
-def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterator[Report]:
-    """Yield the report of each source of leaders or case of a platoon."""
+def reports(
+    rows: Rows, cfg: StudyConfig, against: str | None = None, unit: str | None = None
+) -> Iterator[Report]:
+    """Yield the report of each source of leaders or case of a platoon, energy in a unit."""
     if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":
+        require(unit is None, f"unit={unit}: tables of platoons have no energy per distance")
         for source, group in by_source(rows):
             of = f"{source}: " if source else ""
             for case in dict.fromkeys(group["case"]):
@@ -168,6 +172,7 @@ def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterato
             source,
             against=against,
             second=second_energy(cfg),
+            unit=unit,
         )
         yield dataclasses.replace(result, remarks=[*result.remarks, *notes, *of_sweep])
 

@@ -63,7 +63,9 @@ NAMES_HINT = (
     "; names before a colon consist of letters, digits, spaces and _-+./%*@?|, begin with a letter "
     "and have no quotes; lcc_rl.compare accepts any name"
 )
-ADDED = ("faults", "filter", "fleet", "knowledge")  # groups that no file of the package chooses
+# Groups that no file of the package chooses.
+ADDED = ("event", "faults", "filter", "fleet", "knowledge", "slope")
+OF_NODE = re.compile(r"([\w.: ]+): expected a node with .*, got '(\w+)'$")
 OWN_FILES = re.compile(r"path=(?!pkg://|structured://)")  # in Hydra's search path
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
@@ -221,6 +223,8 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     try:
         tree = parse_config(content, KINDS[entry])
     except ConfigError as error:  # another choice of the group may have the setting
+        if (found := OF_NODE.match(str(error))) and (hint := _file_of(*found.groups())):
+            raise ConfigError(f"{error}; {hint}") from None
         match = re.match(r"unknown setting of (\w+) \(", str(error))
         group = match.group(1) if match else ""
         if not group or not choices(group):
@@ -337,12 +341,22 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
     return ConfigError(" ".join(tokens))
 
 
+def _groups() -> set[str]:
+    folder = Path(str(files(CONF)))
+    return {path.parts[len(folder.parts)] for path in folder.glob("*/**/*.yaml")}
+
+
+def _file_of(key: str, name: str) -> str:
+    """Return how a file of a group is chosen for a node, if there is one of this name."""
+    group = next((group for group in sorted(_groups()) if name in choices(group)), None)
+    choice = f"{group}@{key.replace(': ', '.')}={name}"
+    return f"the file of {group} is chosen by {choice}, or +{choice}" if group else ""
+
+
 def _unknown_option(name: str) -> ConfigError:
     """Return the error for an unknown option, with its section if there is one."""
     places = {key: at for at, kind in SECTIONS.items() for key in settings_of(kind) or ()}
-    folder = Path(str(files(CONF)))
-    groups = {path.parts[len(folder.parts)] for path in folder.glob("*/**/*.yaml")}
-    root, names = name.partition(".")[0], _top_level() | groups
+    root, names = name.partition(".")[0], _top_level() | _groups()
     if root in places:
         return ConfigError(f"unknown option {name!r}: it is {places[root]}.{name}")
     if root in ADDED:

@@ -71,7 +71,9 @@ def check_overrides(words: Sequence[str], given: Collection[str], reason: str) -
     Raises:
         ConfigError: naming the wrong word.
     """
-    if any(word.startswith("-") or ("=" not in word and word[:1] != "~") for word in words):
+    flags = [word for word in words if word.startswith("-")]
+    require(not flags, f"unknown flag {' '.join(flags)}; -h lists all flags")
+    if any("=" not in word and word[:1] != "~" for word in words):
         raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")
     for word in words:
         for key in typed_keys(word):

@@ -68,7 +68,9 @@ class EnergyModel(Settings, ABC):
             ConfigError: if the model has no grade.
         """
         kind = type(self).__name__
-        require(hasattr(self, "grade"), f"{kind} has no grade; choose another energy=…")
+        require(
+            hasattr(self, "grade"), f"{kind} has no grade; choose another, such as energy=electric"
+        )
         model = copy(self)
         model.grade = self.grade + grade  # type: ignore[attr-defined]
         model.climb = GRAVITY * grade.sin()  # type: ignore[misc]

@@ -19,6 +19,12 @@ from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
 
 BATCH = 2
+# Options that add pieces, by the entries, or the group of them, that these write.
+ADDED = {
+    **{f"{x}.{y}": "+slope=hills" for x in ("vehicles", "leader") for y in ("place", "grade")},
+    "terrain": "+slope=hills +knowledge=terrain",
+    **{name: f"+knowledge={name}" for name in ("memory", "preview", "spread")},
+}
 
 
 def check_pieces(
@@ -175,11 +181,14 @@ def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
                     f"{piece.title} reads {'.'.join(key)}, but only automated vehicles "
                     "have an action"
                 )
+            name = ".".join(key)
+            where = f"{piece.title} reads {name}, which no piece of the scenario writes"
+            option = ADDED.get(key[0], ADDED.get(name))
+            require(option is None, f"{where}; {option} adds one that does")
             near = sorted(".".join(other) for other in keys if other[0] == key[0])
-            close = get_close_matches(".".join(key), near, n=1)
+            close = get_close_matches(name, near, n=1)
             hint = f" Did you mean {close[0]}?" if close else ""
-            where = ", only " + ", ".join(near) if near else "; vehicles' are self.x and ahead.x"
+            where += ", only " + ", ".join(near) if near else "; vehicles' are self.x and ahead.x"
             raise ConfigError(
-                f"{piece.title} reads {'.'.join(key)}, which no piece of the scenario writes"
                 f"{where}; was a piece removed, or does it belong to another scenario=…?{hint}"
             )

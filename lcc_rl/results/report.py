@@ -44,7 +44,7 @@ from lcc_rl.results.remarks import (
     verdict,
 )
 from lcc_rl.results.task import Task
-from lcc_rl.results.units import burns_one_fuel, check_unit, in_unit
+from lcc_rl.results.units import ELECTRIC, burns_one_fuel, check_unit, in_unit
 from lcc_rl.results.windows import DRIVE, TRAINED, ratio, savings, seeds_left_out, windows_of
 
 # Baselines of tables and verdicts; the first one that was evaluated is used.
@@ -267,6 +267,7 @@ def report(
     few: bool = False,
     against: str | None = None,
     second: Fleet | None = None,
+    unit: str | None = None,
 ) -> Report:
     """Return the report of an evaluation.
 
@@ -279,11 +280,18 @@ def report(
         few: whether the verdict mentions too few windows.
         against: the baseline; by default that of the task, or the first of :data:`AGAINST`.
         second: the second energy model, if any, for a heading.
+        unit: energy per distance in short tables, see :func:`lcc_rl.results.units.in_unit`; None:
+            that of the task, or kJ/km, and g/km for one fuel.
+
+    Raises:
+        ConfigError: if the unit is unknown or does not fit the score or the energy models.
     """
+    per = task is None or bool(task.measure.per)
+    require(per or unit is None, f"unit={unit}: the score of this task is no energy per distance")
     against = strategy_named(against, windows["strategy"].unique()) if against else None
     if task:
         task = replace(task, against=against) if against else task.among(windows["strategy"])
-        task = task.resolved(windows)
+        task = replace(task, unit=unit or task.unit).resolved(windows)
     table, notes = summary(windows, task, energy, against), remarks(windows)
     percent = {
         f"{shown}{end}": 100.0 * table[f"{key}{end}"]
@@ -292,7 +300,7 @@ def report(
     }
     percent["distance_pct"] = -100.0 * table["distance_lost"]
     every = pd.concat([table, pd.DataFrame(percent)], axis=1)  # in few blocks, for more columns
-    fields = _of_task(every, task) if task else _of_energy(every, energy, filtered, second)
+    fields = _of_task(every, task) if task else _of_energy(every, energy, filtered, second, unit)
     short, shown = fields.pop("short")
     rows = _rows(task, table["against"].iloc[0])
     text = "" if task else verdict(windows, table, few)
@@ -336,7 +344,11 @@ def _rows(task: Task | None, against: str | None) -> list[Measure]:
 
 
 def _of_energy(
-    table: pd.DataFrame, energy: Fleet | None, filtered: bool, second: Fleet | None
+    table: pd.DataFrame,
+    energy: Fleet | None,
+    filtered: bool,
+    second: Fleet | None,
+    unit: str | None,
 ) -> dict[str, Any]:
     """Return the parts of a report that are specific to one without a task, most energy first."""
     # A string without automated vehicles has fewer vehicles and is not comparable.
@@ -352,10 +364,13 @@ def _of_energy(
     columns = {f"energy_kj_per_km{end}": cars.get(f"{PATH_PER_KM}{end}") for end in ends}
     columns[FLOW_SHARE.key] = flow
     columns |= {one.shown.key: (one.scale * cars[one.key]).round(2) for one in short}
-    shown = [Shown("energy_kj_per_km", "energy\n[kJ/km]")]
-    if energy is not None and burns_one_fuel(energy):
-        columns["fuel_g_per_km"] = cars[PATH_PER_KM] * in_unit(1.0, "g/km", energy)
-        shown.append(Shown("fuel_g_per_km", "fuel\n[g/km]"))
+    shown = [Shown("energy_kj_per_km", "energy\n[kJ/km]")] * (unit is None)
+    if energy is not None and (unit or burns_one_fuel(energy)):
+        unit = unit or "g/km"
+        name = "energy" if unit in ELECTRIC else "fuel"
+        key = f"{name}_{unit.replace('/', '_per_').lower()}"
+        columns[key] = cars[PATH_PER_KM].map(lambda value: in_unit(value, unit, energy))
+        shown.append(Shown(key, f"{name}\n[{unit}]"))
     fronts = [one for one in AT_FLOW if cars[one.key].notna().any()]
     seconds = [SECOND_SAVED] * bool(cars[SECOND_SAVED.key].notna().any() and not fronts)
     shown += [] if against is None else [SAVED, *seconds, loss]

@@ -34,6 +34,8 @@ def run(evaluated, tmp_path) -> Path:
 REFUSED = {
     "trian": "'train'",
     "train variant=idm --experiment 3": "--experiment.*key=value",
+    "evaluate scenario.controllers.human=gipps": "by controller@scenario.controllers.human=gipps",
+    "evaluate slope=hills": r"slope is added: write \+slope=",
     "calibrate experiment=smoke": "this command has no option 'experiment'",
     "train data=ngsim data.path='~nobody-here/x.csv'": "~nobody-here/x.csv: no such file",
     "train resume=nowhere": "nowhere",

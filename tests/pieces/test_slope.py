@@ -11,9 +11,11 @@ import lcc_rl
 from lcc_rl.config import load
 from lcc_rl.energy import ElectricCar, Fleet
 from lcc_rl.envs import Inputs, build_env
+from lcc_rl.envs.checks import ADDED
+from lcc_rl.envs.step import pieces_of
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.episodes import evaluate
-from lcc_rl.pieces import Slope
+from lcc_rl.pieces import Controller, Slope
 from lcc_rl.pieces.base import OBSERVATION
 from lcc_rl.pieces.world import World
 
@@ -158,6 +160,30 @@ def test_roads_that_are_refused() -> None:
     ]
     check_refused(lambda words: lcc_rl.make_env("alcc", 2, [*HILLS[:3], *words]), cases)
     check_refused(lambda x: lcc_rl.make_env("alcc", 2, [x]), [("+knowledge=terrain", "needs a sl")])
+
+
+class Uphill(Controller):
+    """Reads what a slope writes."""
+
+    reads = ("self.speed", "self.grade")
+
+    def command(self, speed, grade):
+        return 0.1 * (20.0 - speed) - grade
+
+
+class Ahead(Uphill):
+    reads = ("self.speed", "terrain.grade")
+
+
+def test_the_option_that_adds_an_entry_is_named() -> None:
+    cases = [(Uphill, r"writes; \+slope=hills adds"), (Ahead, r"\+slope=hills \+knowledge=terrain")]
+    check_refused(lambda kind: lcc_rl.simulate([9.0] * 50, "automated", kind()), cases)
+    for options in ADDED.values():  # each adds all entries for which it stands
+        words = ["energy=electric", *options.split()]
+        written = {name for name, said in ADDED.items() if said == options}
+        env = lcc_rl.make_env("alcc", 2, words)
+        keys = [key for piece in pieces_of(env) for key in piece.entries]
+        assert written <= {".".join(key) for key in keys} | {key[0] for key in keys}, options
 
 
 def test_a_profile_need_not_repeat() -> None:

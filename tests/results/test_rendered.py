@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from helpers import check_refused
 from study_frames import episodes
 
 from lcc_rl.cli import table
@@ -124,3 +125,26 @@ def test_tables_are_printed_as_kept(name: str, tmp_path: Path, capsys, monkeypat
             pd.testing.assert_frame_equal(comma, kept, rtol=1e-9)
         else:
             assert printed == file.read_text(encoding="utf-8"), f"{name}, {form}"
+
+
+def test_energies_come_in_the_unit_asked_for(tmp_path, capsys) -> None:
+    for name in ("episodes", "task", "ring", "platoons"):
+        save_config(load("evaluate", SETTINGS[name]), tmp_path / name)
+        write_parquet(ROWS[name](), tmp_path / name / EPISODES)
+
+    def shown(name: str, *words: str) -> pd.DataFrame:
+        table.main([str(tmp_path / name), "--format", "csv", *words])
+        return pd.read_csv(StringIO(capsys.readouterr().out))
+
+    for name, before, after in (
+        ("episodes", "energy_kj_per_km", "energy_kwh_per_100km"),
+        ("task", "score", "score"),
+    ):
+        asked = shown(name, "--unit", "kWh/100km")
+        np.testing.assert_allclose(asked[after], shown(name)[before] / 36.0)
+    cases = [
+        ("episodes", "mpg", "unit=mpg needs vehicles that all burn one fuel"),
+        ("ring", "Wh/km", "the score of this task is no energy per distance"),
+        ("platoons", "Wh/km", "tables of platoons have no energy per distance"),
+    ]
+    check_refused(lambda name, unit: shown(name, "--unit", unit), cases)
