@@ -198,7 +198,11 @@ def checked(function: Callable[..., R]) -> Callable[..., R]:
     @wraps(function)
     def checking(*args: Any, **kwargs: Any) -> R:
         try:
-            return call(**names.bind(*args, **kwargs).arguments)
+            given = names.bind(*args, **kwargs).arguments
+        except TypeError as error:
+            raise TypeError(f"{function.__name__}() {error}") from None
+        try:
+            return call(**given)
         except ValidationError as error:
             raise refused(error, function, function.__name__) from error
 

@@ -178,6 +178,8 @@ def test_wrong_arguments_are_named() -> None:
         ({**BEHIND, "controller": {"a_filtered": Follow()}}, "a_filtered needs the safety filter"),
     ]
     check_refused(lambda given: lcc_rl.simulate(**given), cases)
+    with pytest.raises(TypeError, match=r"^simulate\(\) got an unexpected .*'driver'"):
+        lcc_rl.simulate(WAVE, driver=POPULATION)  # type: ignore[call-arg]
 
 
 def test_a_leader_that_is_replaced_does_not_jump() -> None:
