@@ -39,7 +39,7 @@ def load_drivers(path: str | Path | None = None, mode: str | None = None) -> pd.
         frame = read_parquet(ASSETS / SHIPPED_DRIVERS if path is None else path)
     name = SHIPPED_DRIVERS if path is None else str(path)
     check_drivers(frame, name)
-    return _of_mode(frame, mode, name)
+    return _of_mode(frame, mode or ("local" if path is None else None), name)
 
 
 def _of_mode(frame: pd.DataFrame, mode: str | None, name: str) -> pd.DataFrame:
