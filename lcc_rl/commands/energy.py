@@ -22,7 +22,6 @@ from lcc_rl.cli.guard import main_guard
 from lcc_rl.config import load, quoted, top_key
 from lcc_rl.data.leaders import DriveLeaders
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.data.speed_records import read_drives
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import require
 from lcc_rl.evaluation.metrics import KILO
@@ -64,8 +63,7 @@ def trip_energies(
     (model, *further), step = build_energy(cfg).models, cfg.scenario.time_step
     require(not further, "energy: a mixture has several models; choose one, such as fuel")
     source = cfg.leader.made(DriveLeaders)
-    options = (source.plausible, source.units, source.average_s)
-    records, lines = read_drives(source.path, source.columns, step, *options)
+    records, lines = source.profiles(step)
     log_report(lines)
     blocks = (slice(first, first + BLOCK) for first in range(0, len(records), BLOCK))
     rows = pd.concat([_energies(records, block, model) for block in blocks])
