@@ -22,9 +22,9 @@ from lcc_rl.errors import Concern, DataError
 
 # Holes are steps longer than HOLE usual ones, plus SPREAD times what the longest tenth of the steps
 # exceeds the usual one by: irregular sampling has few.
-HOLE, SPREAD, LONG_SHARE = 1.75, 5.0, 0.1
-BRIDGE_S = 0.3  # default of ``bridge_s``
-Bridge = Annotated[float, Field(ge=0.0, le=10.0)]  # longest hole that is interpolated [s]
+HOLE, SPREAD, LATE_SHARE = 1.75, 6.0, 0.1
+BRIDGE_S = FRAME  # default of ``bridge_s``: such holes lie between two samples of the result
+LongestHole = Annotated[float, Field(ge=0.0, le=10.0)]  # longest hole that is interpolated [s]
 UNEVEN = 0.1  # deviation from the usual step from which a step is irregular, as a share of it
 REGULAR = 0.01  # tolerance of the grid as a share of 0.1 s; float32 times are off by 10 µs
 SHORTEST_STEP, LONGEST_STEP = 0.002, 10.0  # steps beyond these are not in seconds [s]
@@ -111,13 +111,13 @@ def continuous(
     hole = same & (steps > longest)
     bridged = hole & bridges(steps, bridge)
     hole &= ~bridged
+    setting, other = f"{_node(what)}.bridge_s={bridge:g}", ""
     if "turn" in samples:
+        other = " or with another target"
         turns = same & (np.diff(samples["turn"], prepend=0) != 0)
         hole, bridged = hole | turns, bridged & ~turns
-    setting = f"{_node(what)}.bridge_s={bridge:g}"
     if bridged.any():
-        most = f"{int(bridged.sum()):,} holes of at most {steps[bridged].max():.2g} s"
-        report.notes.append(f"{most} are interpolated, {setting}")
+        report.notes.append(f"{int(bridged.sum()):,} holes up to {setting} are interpolated")
     alone = ~(same & ~hole) & np.append(~(same & ~hole)[1:], True)
     if not (hole.any() or alone.any()):
         return samples
@@ -128,7 +128,7 @@ def continuous(
     if records.empty:
         raise DataError(f"{report.source}: no {what} has two samples in a row")
     counts = f"{count:,} {what}s into {records['episode'].nunique():,}"
-    line = f"{int(hole.sum()):,} holes divide {counts}; longer {setting} interpolates such"
+    line = f"{int(hole.sum()):,} holes longer than {setting}{other} divide {counts}"
     report.notes += [line] * bool(hole.any())
     return records
 
@@ -201,9 +201,9 @@ def _usual_steps(
         usual = np.broadcast_to(step, len(samples))
         return usual, HOLE * usual
     medians = steps.groupby(samples["episode"]).transform("median")
-    many = samples.groupby("episode")["time_s"].transform("size") > round(1 / LONG_SHARE)
+    many = samples.groupby("episode")["time_s"].transform("size") > round(1 / LATE_SHARE)
     usual = medians.where(many, step).to_numpy()
-    late = np.quantile((steps.to_numpy() / usual)[same], 1 - LONG_SHARE)
+    late = np.quantile((steps.to_numpy() / usual)[same], 1 - LATE_SHARE)
     return usual, (HOLE + SPREAD * (late - 1)) * usual
 
 

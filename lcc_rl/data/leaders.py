@@ -15,7 +15,7 @@ import torch
 from pydantic import Field
 
 from lcc_rl.data.columns import check_map
-from lcc_rl.data.grid import BRIDGE_S, Bridge
+from lcc_rl.data.grid import BRIDGE_S, LongestHole
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import (
     EvaluationShare,
@@ -274,7 +274,9 @@ class DriveLeaders(Settings):
     plausible: Plausible | None = None  # None: the defaults
     # Width of a moving average of the speeds, before samples are checked; 0: none [s].
     average_s: Annotated[float, Field(ge=0.0, lt=600.0)] = 0.0
-    bridge_s: Bridge = BRIDGE_S  # longest hole that is interpolated, else it divides records [s]
+    bridge_s: LongestHole = (
+        BRIDGE_S  # longest hole that is interpolated, else it divides records [s]
+    )
 
     def validate(self) -> None:
         self.columns = {**DRIVE_COLUMNS, **self.columns}

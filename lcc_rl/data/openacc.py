@@ -17,7 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.data.columns import Column
-from lcc_rl.data.grid import BRIDGE_S, Bridge, places
+from lcc_rl.data.grid import BRIDGE_S, LongestHole, places
 from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource, find_files
 from lcc_rl.data.table_source import to_trajectories
 from lcc_rl.data.tables import TableFile
@@ -35,7 +35,9 @@ class OpenAccSource(TrajectorySource):
 
     path: str | Sequence[str]  # a file, several files, or a pattern
     driver: Literal["human", "acc"] | None = None  # only followers with this Driver<i>
-    bridge_s: Bridge = BRIDGE_S  # longest hole that is interpolated, else it divides records [s]
+    bridge_s: LongestHole = (
+        BRIDGE_S  # longest hole that is interpolated, else it divides records [s]
+    )
 
     def load(self) -> LoadedEpisodes:
         """Read and extract.

@@ -24,7 +24,7 @@ from lcc_rl.data.episodes import (
     derive_positions,
     read_episodes,
 )
-from lcc_rl.data.grid import BRIDGE_S, Bridge, Places, places
+from lcc_rl.data.grid import BRIDGE_S, LongestHole, Places, places
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.smoothing import averaged
@@ -151,7 +151,9 @@ class EpisodesSource(Source):
     # Instead of ``leader_speed``: ``relative_speed``. ``valid`` and ``target`` divide episodes.
     columns: Mapping[str, str | None] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)  # such as {gap: ft}; else SI
-    bridge_s: Bridge = BRIDGE_S  # longest hole that is interpolated, else it divides episodes [s]
+    bridge_s: LongestHole = (
+        BRIDGE_S  # longest hole that is interpolated, else it divides episodes [s]
+    )
 
     def validate(self) -> None:
         check_map(PAIR_FIELDS, self.columns, self.units, "data")

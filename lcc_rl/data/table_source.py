@@ -17,7 +17,7 @@ from lcc_rl.data.columns import Column, check_map
 from lcc_rl.data.episodes import NO_LEADER
 from lcc_rl.data.grid import (
     BRIDGE_S,
-    Bridge,
+    LongestHole,
     Places,
     bridges,
     continuous,
@@ -80,7 +80,9 @@ class TableSource(TrajectorySource):
     units: Mapping[str, str] = Field(default_factory=dict)  # such as {speed: km/h}; else SI
     vehicle_length: Positive | None = None  # length of vehicles without one in a column [m]
     smoothing: Callable | None = None  # smoothing of positions, see lcc_rl.data.smoothing
-    bridge_s: Bridge = BRIDGE_S  # longest hole that is interpolated, else it divides records [s]
+    bridge_s: LongestHole = (
+        BRIDGE_S  # longest hole that is interpolated, else it divides records [s]
+    )
 
     def validate(self) -> None:
         self.columns = {**TABLE_COLUMNS, **self.columns}
@@ -246,8 +248,8 @@ def _bridge_dropouts(rows: pd.DataFrame, bridge: float, report: ReadReport) -> N
         weight = (time[filled] - time[first]) / (time[last] - time[first])
         rows.loc[filled, "gap"] = (1 - weight) * gap[first] + weight * gap[last]
     report.notes.append(
-        f"{int(filled.sum()):,} samples between two behind the same leader are interpolated, "
-        f"data.bridge_s={bridge:g}"
+        f"{int(filled.sum()):,} samples without a leader, within data.bridge_s={bridge:g} between "
+        "two behind the same one, are interpolated"
     )
 
 
