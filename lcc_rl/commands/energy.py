@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from lcc_rl.arrays import times
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.config import load, quoted, top_key
 from lcc_rl.data.leaders import DriveLeaders
@@ -98,7 +99,7 @@ def _energies(records: Profiles, block: slice, model: Any) -> pd.DataFrame:
         {
             "trip": records.recordings[block],
             "parts": 1,
-            "duration_s": step * (last - first),
+            "duration_s": times(last - first, step),
             "distance_km": KILO * step * total,
             "energy_kj": drawn,
             "net_energy_kj": drawn - KILO * model.stored_energy(edges).diff(dim=0)[0].numpy(),

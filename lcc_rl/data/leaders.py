@@ -274,9 +274,7 @@ class DriveLeaders(Settings):
     plausible: Plausible | None = None  # None: the defaults
     # Width of a moving average of the speeds, before samples are checked; 0: none [s].
     average_s: Annotated[float, Field(ge=0.0, lt=600.0)] = 0.0
-    bridge_s: LongestHole = (
-        BRIDGE_S  # longest hole that is interpolated, else it divides records [s]
-    )
+    bridge_s: LongestHole = BRIDGE_S  # longer holes divide records [s]
 
     def validate(self) -> None:
         self.columns = {**DRIVE_COLUMNS, **self.columns}

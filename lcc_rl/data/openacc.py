@@ -35,9 +35,7 @@ class OpenAccSource(TrajectorySource):
 
     path: str | Sequence[str]  # a file, several files, or a pattern
     driver: Literal["human", "acc"] | None = None  # only followers with this Driver<i>
-    bridge_s: LongestHole = (
-        BRIDGE_S  # longest hole that is interpolated, else it divides records [s]
-    )
+    bridge_s: LongestHole = BRIDGE_S  # longer holes divide records [s]
 
     def load(self) -> LoadedEpisodes:
         """Read and extract.

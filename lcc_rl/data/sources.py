@@ -151,9 +151,7 @@ class EpisodesSource(Source):
     # Instead of ``leader_speed``: ``relative_speed``. ``valid`` and ``target`` divide episodes.
     columns: Mapping[str, str | None] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)  # such as {gap: ft}; else SI
-    bridge_s: LongestHole = (
-        BRIDGE_S  # longest hole that is interpolated, else it divides episodes [s]
-    )
+    bridge_s: LongestHole = BRIDGE_S  # longer holes divide records [s]
 
     def validate(self) -> None:
         check_map(PAIR_FIELDS, self.columns, self.units, "data")

@@ -80,9 +80,7 @@ class TableSource(TrajectorySource):
     units: Mapping[str, str] = Field(default_factory=dict)  # such as {speed: km/h}; else SI
     vehicle_length: Positive | None = None  # length of vehicles without one in a column [m]
     smoothing: Callable | None = None  # smoothing of positions, see lcc_rl.data.smoothing
-    bridge_s: LongestHole = (
-        BRIDGE_S  # longest hole that is interpolated, else it divides records [s]
-    )
+    bridge_s: LongestHole = BRIDGE_S  # longer holes divide records [s]
 
     def validate(self) -> None:
         self.columns = {**TABLE_COLUMNS, **self.columns}
