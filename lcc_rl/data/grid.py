@@ -178,13 +178,9 @@ def _first_of_moments(
 def _usual_steps(
     samples: pd.DataFrame, same: Mask, what: str, source: str
 ) -> tuple[Floats, Floats]:
-    """Return the usual step of each row's record, and its longest one that is no hole [s].
+    """Return the usual step of each row's record, and the longest that is no hole [s].
 
-    Args:
-        samples: sorted rows, see :func:`continuous`.
-        same: whether the row before is of the same record.
-        what: key of the column that identifies records.
-        source: the file or files, for messages.
+    ``same``: whether the row before is of the same record.
     """
     steps = samples["time_s"].diff().where(same)
     step = float(steps.median())
