@@ -18,11 +18,11 @@ import numpy as np
 import pandas as pd
 import torch
 
+from lcc_rl.arrays import times
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.config import load, quoted, top_key
 from lcc_rl.data.leaders import DriveLeaders
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.data.speed_records import read_drives
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import require
 from lcc_rl.evaluation.metrics import KILO
@@ -64,8 +64,7 @@ def trip_energies(
     (model, *further), step = build_energy(cfg).models, cfg.scenario.time_step
     require(not further, "energy: a mixture has several models; choose one, such as fuel")
     source = cfg.leader.made(DriveLeaders)
-    options = (source.plausible, source.units, source.average_s)
-    records, lines = read_drives(source.path, source.columns, step, *options)
+    records, lines = source.profiles(step)
     log_report(lines)
     blocks = (slice(first, first + BLOCK) for first in range(0, len(records), BLOCK))
     rows = pd.concat([_energies(records, block, model) for block in blocks])
@@ -100,7 +99,7 @@ def _energies(records: Profiles, block: slice, model: Any) -> pd.DataFrame:
         {
             "trip": records.recordings[block],
             "parts": 1,
-            "duration_s": step * (last - first),
+            "duration_s": times(last - first, step),
             "distance_km": KILO * step * total,
             "energy_kj": drawn,
             "net_energy_kj": drawn - KILO * model.stored_energy(edges).diff(dim=0)[0].numpy(),

@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from lcc_rl.arrays import Mask
 from lcc_rl.data.columns import Column, Names, Units
-from lcc_rl.data.grid import Places, continuous, cut_by_files, on_grid, places, stretches
+from lcc_rl.data.grid import BRIDGE_S, Places, continuous, cut_by_files, on_grid, places, stretches
 from lcc_rl.data.tables import (
     LARGEST_ID,
     TableFile,
@@ -69,7 +70,10 @@ MOTION_COLUMNS = [name for name in SCHEMA if name.endswith(("_position_m", "_spe
 
 
 def read_episodes(
-    paths: Sequence[str], columns: Names | None = None, units: Units | None = None
+    paths: Sequence[str],
+    columns: Names | None = None,
+    units: Units | None = None,
+    bridge: float = BRIDGE_S,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Read tables of pairs: a row per pair and time, at any rate, possibly with holes.
 
@@ -79,11 +83,12 @@ def read_episodes(
             ``episode`` and ``recording``.
         columns: names of the columns by the keys of ``FIELDS``; by default those of ``SCHEMA``.
         units: units by key; by default SI.
+        bridge: longest hole that does not divide an episode [s].
 
     Returns:
         The columns ``SCHEMA``, samples 0.1 s apart, ``file`` and its ``row``, from 0, and
-        ``label``, the file's name of the episode; and lines on the tables. Holes divide an
-        episode. Speeds and gaps may be negative.
+        ``label``, the file's name of the episode; and lines on the tables. Speeds and gaps
+        may be negative.
 
     Raises:
         DataError: naming file, row and column, if a cell is missing or no number, or rows
@@ -93,7 +98,7 @@ def read_episodes(
     notes: list[str] = []
     place, seen, count = partial(places, columns=columns), set[str](), 0
     for number, file in enumerate(tables_of(paths)):
-        table, lines = _table(file, columns or {}, units or {}, place, seen, count)
+        table, lines = _table(file, columns or {}, units or {}, place, seen, count, bridge)
         episode = table["episode"]
         if parts:
             table["episode"] = episode + parts[-1]["episode"].max() + 1 - episode.min()
@@ -110,7 +115,13 @@ def read_episodes(
 
 
 def _table(
-    file: TableFile, columns: Names, units: Units, place: Places, seen: Set[str], count: int
+    file: TableFile,
+    columns: Names,
+    units: Units,
+    place: Places,
+    seen: Set[str],
+    count: int,
+    bridge: float,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Read a file after ``count`` episodes of the recordings ``seen``, and resample it."""
     names = _names(file, columns)
@@ -123,7 +134,7 @@ def _table(
         if names.get(name) is None:
             notes.append(note)
     report = ReadReport([str(file.path)])
-    table = continuous(table, "episode", place, report)
+    table = continuous(table, "episode", place, report, bridge)
     first, lengths = stretches(table["episode"].to_numpy())
     start = np.repeat(table["time_s"].to_numpy()[first], lengths)
     table, _ = on_grid(table, start, MOTION_COLUMNS, place, report)
@@ -151,7 +162,7 @@ def _rows(
     read, cars = _targets(read, file)
     if not len(read["time"]):
         raise DataError(f"{file.path}: has no episodes; expected at least one row")
-    row = read.pop("row")
+    row, turn = read.pop("row"), read.pop("turn", None)
     rows = len(row)
     labels = read.pop("episode", same_text("", rows))
     codes, distinct = pd.factorize(labels)
@@ -170,6 +181,8 @@ def _rows(
     if "leader_id" not in read:
         values["leader_id"] = 2 * (codes + before) + 1
     values |= {"time_s": read["time"].round(6), "row": row, "label": labels, "episode": codes}
+    if turn is not None:
+        values["turn"] = turn
     table = pd.DataFrame(values, copy=False)  # times have a resolution of 1 µs
     _check_pairs(table, file)
     return table, numbers
@@ -195,11 +208,21 @@ def _targets(read: dict[str, Any], file: TableFile) -> tuple[dict[str, Any], pd.
         mask &= ~target.isin(NO_LEADER)
         names = np.char.add(np.asarray(cars).astype(str), " target ")
         read["episode"] = pd.Categorical(np.char.add(names, np.asarray(target).astype(str)))
+        read["turn"] = _turns(read, cars, ~target.isin(NO_LEADER))
     if mask.all():
         return read, cars
     first = f"data row {int(read['row'][np.argmin(mask)]) + 1}"
     file.notes.append(f"left out {int((~mask).sum()):,} rows without a valid target, {first} …")
     return chosen(read, mask), cars[mask]
+
+
+def _turns(read: dict[str, Any], cars: pd.Categorical, named: Mask) -> NDArray[np.int32]:
+    """Return numbers that differ if another target is ``named`` between two rows of a car."""
+    codes, turn = read["episode"].codes, np.zeros(len(named), dtype=np.int32)
+    order = np.lexsort((read["time"], cars.codes))
+    order = order[named[order]]
+    turn[order] = np.cumsum(np.diff(codes[order], prepend=0) != 0)
+    return turn
 
 
 def _names(file: TableFile, columns: Names) -> dict[str, str | None]:

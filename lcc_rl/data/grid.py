@@ -9,17 +9,22 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pydantic import Field
 
 from lcc_rl.arrays import Floats, Integers, Mask
 from lcc_rl.data.trajectories import FRAME, ReadReport, starts_of
 from lcc_rl.errors import Concern, DataError
 
-HOLE = 1.75  # steps longer than this multiple of the usual one are holes
-HOLE_S, MANY_HOLES = 2.0, 0.1  # least hole [s] if more than this share of steps would be holes
+# Holes are steps longer than HOLE usual ones, plus SPREAD times what the longest tenth of the steps
+# exceeds the usual one by: irregular sampling has few.
+HOLE, SPREAD, LATE_SHARE = 1.75, 6.0, 0.1
+BRIDGE_S = FRAME  # default of ``bridge_s``: such holes lie between two samples of the result
+LongestHole = Annotated[float, Field(ge=0.0, le=10.0)]  # longest hole that is interpolated [s]
 UNEVEN = 0.1  # deviation from the usual step from which a step is irregular, as a share of it
 REGULAR = 0.01  # tolerance of the grid as a share of 0.1 s; float32 times are off by 10 µs
 SHORTEST_STEP, LONGEST_STEP = 0.002, 10.0  # steps beyond these are not in seconds [s]
@@ -79,17 +84,17 @@ def places(
 
 
 def continuous(
-    samples: pd.DataFrame, what: str, place: Places, report: ReadReport, divide: bool = True
+    samples: pd.DataFrame, what: str, place: Places, report: ReadReport, bridge: float
 ) -> pd.DataFrame:
     """Sort records by time, keep the first row of each time, and divide records at holes.
 
     Args:
         samples: rows in any order: ``episode`` (number of the record, from 0), ``time_s``, ``row``
-            and further columns.
+            and further columns. A record is also divided where ``turn`` changes, if it is present.
         what: key of the column that identifies records: vehicle, episode or drive.
         place: returns for a table the function that describes its rows.
-        report: counts the rows left out.
-        divide: whether holes divide a record.
+        report: counts the rows left out and the holes.
+        bridge: longest hole that does not divide a record [s].
 
     Returns:
         The sorted rows; the parts of a divided record have different numbers.
@@ -101,10 +106,18 @@ def continuous(
     same = np.append(False, np.diff(samples["episode"]) == 0)
     if not same.any():
         raise DataError(f"{report.source}: no {what} has two samples: {place(samples)(0, what)}")
-    usual = _usual_steps(samples, same, what, report.source)
+    usual, longest = _usual_steps(samples, same, what, report.source)
     steps = np.diff(samples["time_s"], prepend=0.0)
-    long = same & (steps > HOLE * usual)  # irregular sampling has few
-    hole = divide & (long & (steps > HOLE_S) if long.mean() > MANY_HOLES else long)
+    hole = same & (steps > longest)
+    bridged = hole & bridges(steps, bridge)
+    hole &= ~bridged
+    setting, other = f"{_node(what)}.bridge_s={bridge:g}", ""
+    if "turn" in samples:
+        other = " or with another target"
+        turns = same & (np.diff(samples["turn"], prepend=0) != 0)
+        hole, bridged = hole | turns, bridged & ~turns
+    if bridged.any():
+        report.notes.append(f"{int(bridged.sum()):,} holes up to {setting} are interpolated")
     alone = ~(same & ~hole) & np.append(~(same & ~hole)[1:], True)
     if not (hole.any() or alone.any()):
         return samples
@@ -115,8 +128,18 @@ def continuous(
     if records.empty:
         raise DataError(f"{report.source}: no {what} has two samples in a row")
     counts = f"{count:,} {what}s into {records['episode'].nunique():,}"
-    report.notes += [f"{int(hole.sum()):,} holes divide {counts}"] * bool(hole.any())
+    line = f"{int(hole.sum()):,} holes longer than {setting}{other} divide {counts}"
+    report.notes += [line] * bool(hole.any())
     return records
+
+
+def bridges(steps: Floats, bridge: float) -> Mask:
+    """Return which holes [s] are interpolated."""
+    return steps <= bridge + REGULAR * FRAME
+
+
+def _node(what: str) -> str:
+    return "leader" if what == "drive" else "data"
 
 
 def _sorted(samples: pd.DataFrame, report: ReadReport) -> pd.DataFrame:
@@ -152,24 +175,32 @@ def _first_of_moments(
     return samples[~again].reset_index(drop=True)
 
 
-def _usual_steps(samples: pd.DataFrame, same: Mask, what: str, source: str) -> Floats:
-    """Return the usual step of each row's record [s]; ``same``: as that of the row before."""
+def _usual_steps(
+    samples: pd.DataFrame, same: Mask, what: str, source: str
+) -> tuple[Floats, Floats]:
+    """Return the usual step of each row's record, and the longest that is no hole [s].
+
+    ``same``: whether the row before is of the same record.
+    """
     steps = samples["time_s"].diff().where(same)
     step = float(steps.median())
     if not SHORTEST_STEP <= step < LONGEST_STEP:
         unit = "ms" if step < 1e3 * LONGEST_STEP else "us" if step < 1e6 * LONGEST_STEP else "ns"
-        unit, node = "s" if step < SHORTEST_STEP else unit, "leader" if what == "drive" else "data"
+        unit = "s" if step < SHORTEST_STEP else unit
         span = "from {:.15g} to {:.15g}".format(*samples["time_s"].agg(["min", "max"]))
         raise DataError(
             f"{source}: samples of a {what} are {step:g} s apart; expected {SHORTEST_STEP:g} to "
-            f"{LONGEST_STEP:g} s; is the time, {span}, in {unit} ({node}.units.time={unit})"
+            f"{LONGEST_STEP:g} s; is the time, {span}, in {unit} ({_node(what)}.units.time={unit})"
             f"{', or are rows missing' * (unit != 's')}?"
         )
     if not ((steps - step).abs() > UNEVEN * step).any():
-        return np.broadcast_to(step, len(samples))
+        usual = np.broadcast_to(step, len(samples))
+        return usual, HOLE * usual
     medians = steps.groupby(samples["episode"]).transform("median")
-    many = samples.groupby("episode")["time_s"].transform("size") > round(1 / MANY_HOLES)
-    return medians.where(many, step).to_numpy()
+    many = samples.groupby("episode")["time_s"].transform("size") > round(1 / LATE_SHARE)
+    usual = medians.where(many, step).to_numpy()
+    late = np.quantile((steps.to_numpy() / usual)[same], 1 - LATE_SHARE)
+    return usual, (HOLE + SPREAD * (late - 1)) * usual
 
 
 def _check_clock(rows: pd.DataFrame, hole: Mask, usual: Floats, place: Place, source: str) -> None:

@@ -15,6 +15,7 @@ import torch
 from pydantic import Field
 
 from lcc_rl.data.columns import check_map
+from lcc_rl.data.grid import BRIDGE_S, LongestHole
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import (
     EvaluationShare,
@@ -255,6 +256,8 @@ class DriveLeaders(Settings):
     file. Of a single record the end is held out.
     """
 
+    LATER = ("bridge_s",)
+
     # One or several .csv or .parquet files, a pattern or a folder. A file without the column of
     # drives is one drive with the file's name; a native OpenACC file is that of its first car.
     path: str | Sequence[str]
@@ -271,6 +274,7 @@ class DriveLeaders(Settings):
     plausible: Plausible | None = None  # None: the defaults
     # Width of a moving average of the speeds, before samples are checked; 0: none [s].
     average_s: Annotated[float, Field(ge=0.0, lt=600.0)] = 0.0
+    bridge_s: LongestHole = BRIDGE_S  # longer holes divide records [s]
 
     def validate(self) -> None:
         self.columns = {**DRIVE_COLUMNS, **self.columns}
@@ -285,9 +289,7 @@ class DriveLeaders(Settings):
     def load(self, time_step: float, horizon: int, followers: int | None = None) -> Leaders:
         """Read all records; see :meth:`RecordLeaders.load`."""
         single = self.columns["drive"] is None
-        profiles, report = read_drives(
-            self.path, self.columns, time_step, self.plausible, self.units, self.average_s
-        )
+        profiles, report = self.profiles(time_step)
         if profiles.grades is not None:
             raise ConfigError("leader.columns.grade: only lcc-rl energy uses grades")
         drives = {*profiles.recordings}
@@ -311,6 +313,11 @@ class DriveLeaders(Settings):
         line = f"{self.path}: {count}{', '.join(held_out.names)}"
         report += [*described_records(profiles, horizon), line]
         return Leaders(training, windows, report=tuple(report))
+
+    def profiles(self, time_step: float) -> tuple[Profiles, list[str]]:
+        """Read all records, see :func:`lcc_rl.data.speed_records.read_drives`."""
+        options = (self.plausible, self.units, self.average_s, self.bridge_s)
+        return read_drives(self.path, self.columns, time_step, *options)
 
     def _by_name(self, profiles: Profiles, again: bool = False) -> tuple[Profiles, Profiles]:
         """Divide drives by a hash of their names; twice for tuning."""

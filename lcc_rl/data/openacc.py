@@ -17,7 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from lcc_rl.data.columns import Column
-from lcc_rl.data.grid import places
+from lcc_rl.data.grid import BRIDGE_S, LongestHole, places
 from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource, find_files
 from lcc_rl.data.table_source import to_trajectories
 from lcc_rl.data.tables import TableFile
@@ -35,6 +35,7 @@ class OpenAccSource(TrajectorySource):
 
     path: str | Sequence[str]  # a file, several files, or a pattern
     driver: Literal["human", "acc"] | None = None  # only followers with this Driver<i>
+    bridge_s: LongestHole = BRIDGE_S  # longer holes divide records [s]
 
     def load(self) -> LoadedEpisodes:
         """Read and extract.
@@ -50,7 +51,8 @@ class OpenAccSource(TrajectorySource):
             for number, (name, label) in enumerate(zip(files, labels(files), strict=True))
         ]
         place = partial(places, files=files)
-        trajectories = to_trajectories(pd.concat(cars, ignore_index=True), place, report)
+        rows = pd.concat(cars, ignore_index=True)
+        trajectories = to_trajectories(rows, place, report, self.bridge_s)
         return self.extracted(trajectories, place=place)
 
 
@@ -79,15 +81,16 @@ def _cars(table: TableFile, driver: str | None, report: ReadReport) -> pd.DataFr
     report.notes.append(f"{table.path}: {len(numbers)} cars{': ' if named else ''}{named}")
     report.notes.append(f"{table.path}: {_marked(table, followers, read)}")
     if unknown:
-        report.notes.append(f"{table.path}: {unknown:,} samples with a blank gap follow no vehicle")
+        report.notes.append(f"{table.path}: {unknown:,} samples have a blank gap")
+    cars["leader"] = (cars.vehicle - 1).where(cars.gap.notna(), 0)
     if driver is not None:
         none = np.full(rows, "")
         drivers = np.concatenate([read.get(f"Driver{n}", none) for n in numbers]).astype(str)
         other = cars.gap.notna() & (np.char.lower(drivers) != driver)
         cars["gap"] = cars.gap.mask(other)
+        cars["leader"] = np.where(other, -1, cars.leader)
         note = f"{int(cars.gap.notna().sum()):,} samples of followers driven by {driver}"
         report.notes.append(f"{table.path}: {note}, {int(other.sum()):,} of others")
-    cars["leader"] = (cars.vehicle - 1).where(cars.gap.notna(), 0)
     return cars[seen]
 
 

@@ -200,8 +200,8 @@ def gap_jumps(table: pd.DataFrame, limit: float) -> tuple[Floats, Mask]:
         The change of each gap in 0.5 s, or a longer step, beyond that by both speeds ``[rows]``
         [m]; and the rows at which it exceeds the limit, or a gap beside them is held for 1 s.
     """
-    rows = len(starts_of(table["row"].to_numpy())) if "row" in table else len(table)
-    reach = max(round(JUMP_S / FRAME), round(len(table) / rows))  # or a step of the recording
+    _, held = stretches(table["row"].to_numpy()) if "row" in table else ([], np.ones(1, int))
+    reach = max(round(JUMP_S / FRAME), int(held.max()))  # or the longest step of the recording
     ends = np.flatnonzero(np.diff(numbers_of_pairs(table), append=-1)) + 1  # of pairs
     ends = ends[np.diff(ends // BATCH, append=-1) != 0]
     parts = [

@@ -24,7 +24,7 @@ from lcc_rl.data.episodes import (
     derive_positions,
     read_episodes,
 )
-from lcc_rl.data.grid import Places, places
+from lcc_rl.data.grid import BRIDGE_S, LongestHole, Places, places
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.smoothing import averaged
@@ -64,7 +64,7 @@ class LoadedEpisodes:
 class Source(Settings):
     """Base of sources of recorded episodes."""
 
-    LATER = ("average_s",)
+    LATER = ("average_s", "bridge_s")
 
     plausible: Plausible | None = None  # None: the defaults
     # Width of a moving average of speeds, gaps and positions, see
@@ -151,6 +151,7 @@ class EpisodesSource(Source):
     # Instead of ``leader_speed``: ``relative_speed``. ``valid`` and ``target`` divide episodes.
     columns: Mapping[str, str | None] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)  # such as {gap: ft}; else SI
+    bridge_s: LongestHole = BRIDGE_S  # longer holes divide records [s]
 
     def validate(self) -> None:
         check_map(PAIR_FIELDS, self.columns, self.units, "data")
@@ -163,7 +164,7 @@ class EpisodesSource(Source):
                 than ``plausible`` allows.
         """
         files = find_files(self.path)
-        episodes, notes = read_episodes(files, self.columns, self.units)
+        episodes, notes = read_episodes(files, self.columns, self.units, self.bridge_s)
         count, source = episodes["episode"].nunique(), listed(files)
         lines = [f"read {count:,} episodes, {len(episodes):,} rows, {source}", *notes]
         named = {**{key: EPISODE_NAMES[key] for key in self.units}, **self.columns}

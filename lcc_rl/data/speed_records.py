@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.data.columns import SLOPES, Column, Names, Units
-from lcc_rl.data.grid import continuous, interpolated, places, stretches
+from lcc_rl.data.grid import BRIDGE_S, continuous, interpolated, places, stretches
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
 from lcc_rl.data.sources import SHIPPED_FILES, find_files, units_of
@@ -61,9 +62,7 @@ def read_speed_record(
     if not Path(expanduser(file)).is_file():
         names = ", ".join(sorted(cycles))
         raise DataError(f"{path}: no such file, and none of the package ({names})")
-    samples, _ = _read(
-        TableFile(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {}, divide=False
-    )
+    samples, _ = _read(TableFile(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {})
     return samples[TIME_COLUMN].to_numpy(), samples[SPEED_COLUMN].to_numpy()
 
 
@@ -74,13 +73,15 @@ def read_drives(
     plausible: Plausible | None = None,
     units: Units | None = None,
     average_s: float = 0.0,
+    bridge: float = BRIDGE_S,
 ) -> tuple[Profiles, list[str]]:
     """Read the speed records of tables.
 
     A table without the column ``drive`` is one drive, unless another name is configured.
 
     Args:
-        path, columns, plausible, units, average_s: see :class:`lcc_rl.data.leaders.DriveLeaders`.
+        path, columns, plausible, units, average_s, bridge: see
+            :class:`lcc_rl.data.leaders.DriveLeaders`.
         time_step: step of the profiles [s]; the records are interpolated to it.
 
     Returns:
@@ -98,7 +99,7 @@ def read_drives(
     records: dict[str, tuple[str, Tensor, Tensor | None]] = {}
     lines: list[str] = []
     for table in tables_of(files):
-        samples, report = _read(table, columns, plausible, units or {}, average_s=average_s)
+        samples, report = _read(table, columns, plausible, units or {}, average_s, bridge)
         loaded = dict(_records(samples, time_step))
         if twice := loaded.keys() & records.keys():
             raise DataError(f"{path}: drive {min(twice)!r} is in several files; expected one")
@@ -134,14 +135,18 @@ def _read(
     columns: Names,
     plausible: Plausible | None,
     units: Units,
-    divide: bool = True,
     average_s: float = 0.0,
+    bridge: float = math.inf,
 ) -> tuple[pd.DataFrame, list[str]]:
-    """Return recording, episode and motion of the plausible samples of a file, and the report."""
+    """Return recording, episode and motion of the plausible samples of a file, and the report.
+
+    Without a finite ``bridge``, the record is not divided, and names of columns are fixed.
+    """
+    divide = math.isfinite(bridge)
     option = "leader.columns" if divide else ""
     samples, report = _samples(table, columns, units, option), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
-    samples = continuous(samples, "drive", place, report, divide)
+    samples = continuous(samples, "drive", place, report, bridge)
     declared = units_of(DRIVE_FIELDS, DRIVE_COLUMNS, units) if divide else {}
     if average_s:
         samples = _averaged(samples, average_s, str(table.path))

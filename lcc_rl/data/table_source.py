@@ -15,7 +15,17 @@ from lcc_rl.arrays import Integers
 from lcc_rl.data.agreement import LEAST_WAY
 from lcc_rl.data.columns import Column, check_map
 from lcc_rl.data.episodes import NO_LEADER
-from lcc_rl.data.grid import Places, continuous, cut_by_files, on_grid, places
+from lcc_rl.data.grid import (
+    BRIDGE_S,
+    LongestHole,
+    Places,
+    bridges,
+    continuous,
+    cut_by_files,
+    on_grid,
+    places,
+    stretches,
+)
 from lcc_rl.data.plausible import SMOOTHING
 from lcc_rl.data.sources import LoadedEpisodes, TrajectorySource, find_files, read_as, units_of
 from lcc_rl.data.tables import TableFile, joined_columns, same_text, tables_of, whole_numbers
@@ -70,6 +80,7 @@ class TableSource(TrajectorySource):
     units: Mapping[str, str] = Field(default_factory=dict)  # such as {speed: km/h}; else SI
     vehicle_length: Positive | None = None  # length of vehicles without one in a column [m]
     smoothing: Callable | None = None  # smoothing of positions, see lcc_rl.data.smoothing
+    bridge_s: LongestHole = BRIDGE_S  # longer holes divide records [s]
 
     def validate(self) -> None:
         self.columns = {**TABLE_COLUMNS, **self.columns}
@@ -102,7 +113,7 @@ class TableSource(TrajectorySource):
         place = partial(places, files=report.files, columns=names, vehicles=report.names)
         if self.columns.get("recording") is None:
             report.notes += cut_by_files(rows, "vehicle", report.files)
-        trajectories = to_trajectories(rows, place, report)
+        trajectories = to_trajectories(rows, place, report, self.bridge_s)
         sound = self.columns.get("length") is None or "length" in self.units
         for name, length in median_lengths(trajectories.samples).items():
             if not (sound or CAR_LENGTH[0] <= length <= CAR_LENGTH[1]):
@@ -156,8 +167,7 @@ def _report_blank_gaps(table: TableFile, read: Mapping[str, Any]) -> None:
     if blank.any():
         first = table.fault(int(read["row"][np.argmax(blank)]), "gap", "is blank")
         table.notes.append(
-            f"{int(blank.sum()):,} samples with a leader but a blank gap follow no vehicle, "
-            f"the first: {first}"
+            f"{int(blank.sum()):,} samples have a leader but a blank gap, the first: {first}"
         )
 
 
@@ -186,16 +196,20 @@ def _vehicles(
     return {"vehicle": ids, "leader": np.where((front < 0) | (front == ids), 0, front)}
 
 
-def to_trajectories(rows: pd.DataFrame, place: Places, report: ReadReport) -> Trajectories:
+def to_trajectories(
+    rows: pd.DataFrame, place: Places, report: ReadReport, bridge: float
+) -> Trajectories:
     """Convert rows to trajectories.
 
     Args:
         rows: one per vehicle and time, in any order and in SI: recording (its name), vehicle
             (positive), time_s, speed, file and row (numbers from 0) and, if known, leader (0
-            for none), position (front bumper, along the road), lane (a number), gap (bumper to
-            bumper; NaN for none), length (NaN or 0 for unknown).
+            for none, −1 for one that is not to be bridged), position (front bumper, along the
+            road), lane (a number), gap (bumper to bumper; NaN for none), length (NaN or 0 for
+            unknown).
         place: returns for a table the function that describes its rows.
         report: the report, which is completed.
+        bridge: longest hole or dropout of the leader that is interpolated [s].
 
     Raises:
         DataError: if rows contradict each other, times are uneven, or speeds and positions do not
@@ -203,12 +217,38 @@ def to_trajectories(rows: pd.DataFrame, place: Places, report: ReadReport) -> Tr
     """
     rows["recording"] = pd.Categorical(rows["recording"])
     rows["episode"] = rows.groupby(["recording", "vehicle"], observed=True).ngroup()
-    rows = continuous(rows, "vehicle", place, report)
+    rows = continuous(rows, "vehicle", place, report, bridge)
+    if "leader" in rows:
+        _bridge_dropouts(rows, bridge, report)
     _check_way(rows, place, report)
     origin = rows.groupby("recording", observed=True)["time_s"].transform("min").to_numpy()
     motion = [name for name in ("speed", "position") if name in rows]
     rows, frame = on_grid(rows, origin, motion, place, report)
     return _samples(rows, frame, report)
+
+
+def _bridge_dropouts(rows: pd.DataFrame, bridge: float, report: ReadReport) -> None:
+    """Interpolate short dropouts of the same leader; ``rows`` of records, changed in place."""
+    episode, time, leader = (rows[name].to_numpy() for name in ("episode", "time_s", "leader"))
+    gap = rows["gap"].to_numpy() if "gap" in rows else np.zeros(len(rows))
+    lost = (leader <= 0) | np.isnan(gap)
+    starts, lengths = stretches(episode + 1j * lost)
+    before, after = np.maximum(starts - 1, 0), np.minimum(starts + lengths, len(rows) - 1)
+    short = ~(lost[before] | lost[after]) & (episode[before] == episode[after])
+    short &= (leader[before] == leader[after]) & bridges(time[after] - time[before], bridge)
+    other = (leader != 0) & (leader != np.repeat(leader[before], lengths))
+    filled = lost & np.repeat(short & ~np.logical_or.reduceat(other, starts), lengths)
+    if not filled.any():
+        return
+    first, last = np.repeat(before, lengths)[filled], np.repeat(after, lengths)[filled]
+    rows.loc[filled, "leader"] = leader[first]
+    if "gap" in rows:
+        weight = (time[filled] - time[first]) / (time[last] - time[first])
+        rows.loc[filled, "gap"] = (1 - weight) * gap[first] + weight * gap[last]
+    report.notes.append(
+        f"{int(filled.sum()):,} samples without a leader, within data.bridge_s={bridge:g} between "
+        "two behind the same one, are interpolated"
+    )
 
 
 def _check_way(rows: pd.DataFrame, place: Places, report: ReadReport) -> None:

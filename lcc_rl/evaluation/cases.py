@@ -10,6 +10,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from lcc_rl.arrays import times
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.leaders import Case
 from lcc_rl.envs import build_env
@@ -198,6 +199,6 @@ def trace(series: CaseSeries, time_step: float) -> pd.DataFrame:
             values = series[name][:, 0].to(leader.dtype)
             columns[label] = torch.cat([torch.full_like(leader, torch.nan), values], dim=-1)
     frame = pd.DataFrame({name: value.flatten().cpu().numpy() for name, value in columns.items()})
-    frame.insert(0, "time_s", np.repeat(np.arange(1, steps + 1) * time_step, vehicles + 1))
+    frame.insert(0, "time_s", np.repeat(times(np.arange(1, steps + 1), time_step), vehicles + 1))
     frame.insert(1, "follower", np.tile(np.arange(vehicles + 1), steps))
     return frame

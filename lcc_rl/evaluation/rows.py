@@ -13,6 +13,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from lcc_rl.arrays import times
 from lcc_rl.config.words import RECORDED
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.energy import AVERAGED, BURNT, SECOND, Fleet, as_fleet
@@ -277,7 +278,7 @@ def sample(
     """Yield the time series of chosen episodes of a batch, one row per step."""
     for index in inside:
         steps = int(alive[:, index].sum())
-        columns: dict[str, np.ndarray] = {"time_s": np.arange(1, steps + 1) * time_step}
+        columns: dict[str, np.ndarray] = {"time_s": times(np.arange(1, steps + 1), time_step)}
         for group, series in groups.items():
             for name, values in series.items():
                 rows = values[-alive.shape[0] :][:steps, index].flatten(1)

@@ -13,6 +13,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from lcc_rl.arrays import times
 from lcc_rl.config import check_overrides, load
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import RewardConfig, StudyConfig, TimeStep
@@ -270,7 +271,7 @@ class _Motion:
         count = len(self.vehicles)
         columns = {
             "episode": np.repeat(episode, count),
-            "time_s": np.repeat(time * self.time_step, count),
+            "time_s": np.repeat(times(time, self.time_step), count),
             "vehicle": np.tile(self.vehicles, len(time)),
             "role": self._roles()[episode].flatten(),
         }

@@ -166,7 +166,7 @@ def test_samples_left_out_are_described_by_their_rows(tmp_path) -> None:
     vehicle = frame["id"].iloc[700]
     assert f"data row 701, vehicle {vehicle}, column 'v' holds 90 m/s" in report
     blank = f"the first: {path}: data row 801, column 'gap' is blank"
-    assert f"1 samples with a leader but a blank gap follow no vehicle, {blank}" in report
+    assert f"1 samples have a leader but a blank gap, {blank}" in report
 
 
 @pytest.mark.parametrize(("step", "columns"), [(0.04, BY_GAP), (1.0, BY_LANE)])
@@ -369,7 +369,7 @@ def test_pairs_of_any_columns_units_and_rate_with_holes(tmp_path) -> None:
         np.testing.assert_allclose(part["follower_speed_mps"], own, atol=0.01)
         np.testing.assert_allclose(part["leader_speed_mps"], ahead, atol=0.01)
     report = "\n".join(loaded.report)
-    assert "1 holes divide 2 episodes into 3" in report
+    assert "1 holes longer than data.bridge_s=0.1 divide 2 episodes into 3" in report
     assert "samples 0.2 s apart were interpolated to 0.1 s" in report
 
 

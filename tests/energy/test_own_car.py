@@ -31,3 +31,24 @@ def test_the_car_of_the_page_draws_what_its_map_says(tmp_path) -> None:
     np.testing.assert_allclose(found.detach().numpy(), expected, rtol=1e-5)
     assert found.requires_grad
     assert in_unit(720.0, "kWh/100km", car) == pytest.approx(20.0)
+
+
+def test_the_search_of_the_page_prefers_gains_that_damp_waves(tmp_path, monkeypatch) -> None:
+    """Gains that the search chose without its penalty on waves, and what it chooses with it."""
+    trial = pytest.importorskip("optuna").trial.FixedTrial
+    car, search = (
+        next(b.text for b in blocks(ROOT / "docs" / "your_car.md") if words in b.text)
+        for words in ("class MyCar", "import optuna")
+    )
+    (tmp_path / "my_car.py").write_text(car)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    space: dict = {}
+    exec(search.split("\nstudy =")[0], space)
+    growing, damped = {"time_gap": 0.845, "gain": 0.0204}, {"time_gap": 1.183, "gain": 0.0212}
+    assert space["growth"](damped) < 0.98 < 1.05 < space["growth"](growing)
+    us06 = space["lcc_rl"].simulate("us06", "automated*8", space["Follow"](**damped)).steps
+    deviation = us06.groupby("vehicle")["speed_mps"].std()
+    assert deviation[8] / deviation[0] == pytest.approx(0.98, abs=0.005)  # of the page
+    assert us06["gap_m"].min() > 1.0
+    assert space["cost"](trial(damped)) < 0.8 * space["cost"](trial(growing))

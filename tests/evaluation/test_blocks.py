@@ -229,6 +229,7 @@ def test_time_series_are_thinned_to_the_largest_size_of_their_file(tmp_path, sub
                 tables[limit] = read_parquet(folder / "steps.parquet")
             assert (folder / "steps.parquet").stat().st_size < most * 1e6 + 20_000  # columns' heads
             all_steps, kept = tables[None], tables[most]
+            assert (all_steps["time_s"] == all_steps["time_s"].round(3)).all()  # 0.3, not 0.30…04
             times = sorted(set(kept["time_s"]))
             step = cfg.scenario.time_step
             every = round((times[1] - times[0]) / step)

@@ -66,6 +66,7 @@ def test_the_steps_are_a_motion(subtests) -> None:
         with subtests.test(name=name):
             steps = lcc_rl.simulate(**case, overrides=ring).steps
             by = ["episode", "vehicle"]
+            assert (steps["time_s"] == steps["time_s"].round(3)).all()  # 0.3, not 0.30…04
             assert not steps.duplicated([*by, "time_s"]).any()
             speed = steps.groupby(by)["speed_mps"].diff()
             np.testing.assert_allclose(

@@ -91,6 +91,7 @@ def test_trips_of_files_rates_and_with_holes(tmp_path, path, subtests) -> None:
         found = lcc_rl.trip_energies(path, ["energy=bolt", COLUMNS])
         assert found["parts"].tolist() == [2, 2]
         assert (found["duration_s"] < SECONDS - 8).all()
+        assert (found["duration_s"] == found["duration_s"].round(1)).all()
         assert (found["distance_km"] < whole["distance_km"]).all()
 
 
