@@ -27,8 +27,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 43_900, "code": 29_000},
-    "tests": {"lines": 26_000},
+    "lcc_rl + tools": {"lines": 44_000, "code": 29_000},
+    "tests": {"lines": 26_100},
     "conf": {"yaml": 164},
 }
 CASES = 1_290  # ceiling of all quick tests, see tests/tools/test_size.py
