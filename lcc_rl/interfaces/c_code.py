@@ -37,7 +37,10 @@ static void layer(const float *weights, const float *bias, const float *inputs, 
 }
 """
 # Functions of the recorder's statements and their names in C, of numbers of single precision.
-FUNCTIONS = {f"np.{name}": f"{name}f" for name in ("sqrt", "exp", "log", "sin", "tanh")}
+FUNCTIONS = {
+    f"np.{name}": f"{name}f"
+    for name in ("sqrt", "exp", "log", "log1p", "sin", "cos", "floor", "tanh")
+}
 FUNCTIONS |= {"np.arctanh": "atanhf", "abs": "fabsf", "inf": "INFINITY", "nan": "NAN"}
 FUNCTIONS |= {"True": "1", "False": "0"}
 WORD = re.compile("|".join(rf"\b{re.escape(word)}\b" for word in FUNCTIONS))

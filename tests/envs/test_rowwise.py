@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
+from torch.nn.functional import softplus
 
 from lcc_rl.envs.rowwise import Rowwise, translated
 
@@ -19,6 +20,7 @@ PLACES = torch.tensor([3, 0, 2])
 FUNCTIONS = {
     "arithmetic": lambda x, n: (x * 2.0 - x / (x.abs() + 1.0)).neg() + 3 - 1.0 / (x * x + 1.0),
     "functions": lambda x, n: x.abs().log() + x.exp() * x.sin() + x.tanh() - x.abs().rsqrt(),
+    "smooth": lambda x, n: softplus(9.0 * x) + x.sigmoid() * x.abs().log1p(),
     "normal": lambda x, n: torch.special.ndtri(n * 0.2 + 0.1),
     "powers": lambda x, n: x**2 + x.abs() ** 1.7 + x.square().sqrt(),
     "clamp": lambda x, n: x.clamp(-0.5, 0.5) + x.clamp(min=0.0) + torch.minimum(x, x.flip(-1)),
@@ -83,6 +85,7 @@ def test_what_has_no_translation_is_computed_by_tensors(subtests) -> None:
         lambda x, n: (x if x.sum() > 0.0 else -x,),  # another graph for other numbers
         lambda x, n: (torch.div(x, 2.0, rounding_mode="floor"),),
         lambda x, n: (x.half(),),
+        lambda x, n: (softplus(x, 2.0),),
         lambda x, n: (torch.rsub(x, 1.0, alpha=2.0),),
         lambda x, n: (x.gather(-1, n),),  # no constant to read from
         lambda x, n: (x.clone().mul_(2.0),),  # changes what it is given
