@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import reduce
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -32,6 +33,7 @@ ARITHMETIC = {
     "sin": "np.sin({0})",
     "cos": "np.cos({0})",
     "floor": "np.floor({0})",
+    "round": "np.rint({0})",
     "atanh": "np.arctanh({0})",
     "tanh": "np.tanh({0})",
     "sigmoid": "f32(1) / (f32(1) + np.exp(-{0}))",
@@ -60,7 +62,10 @@ COMPARISONS = {
     "eq": "{0} == {1}",
     "ne": "{0} != {1}",
 }
-METHODS = ("addmm", "bitwise_not", "clamp", "index", "searchsorted", "where")  # methods of Recorder
+METHODS = (  # methods of Recorder
+    *("addmm", "bitwise_not", "bucketize", "clamp", "cumsum", "gather", "index", "masked_fill"),
+    *("searchsorted", "where"),
+)
 REDUCTIONS = {
     "sum": "add",
     "any": "logical_or",
@@ -267,6 +272,24 @@ class Recorder(TorchDispatchMode):
         parts = [self.numbers(x, result.dtype) for x in values]
         return self._stated("pick({0}, {1}, {2})", [self.numbers(condition, torch.bool), *parts])
 
+    def _masked_fill(self, result: Tensor, value: Tensor, condition: Tensor, other: Any) -> Tensor:
+        return self._where(result, condition, other, value)
+
+    def _cumsum(self, result: Tensor, value: Tensor, dim: int, **more: Any) -> Tensor:
+        parts = self.numbers(value, result.dtype).unbind(dim)
+        sums = accumulate(parts, lambda *two: self._stated(ARITHMETIC["add"], two))
+        return torch.stack([*sums], dim)
+
+    def _gather(self, result: Tensor, value: Tensor, dim: int, place: Tensor) -> Tensor:
+        dim, places = dim % value.ndim, self.numbers(place, torch.int64)
+        within = (slice(None if x == dim else n) for x, n in enumerate(place.shape))
+        parts = self.numbers(value, result.dtype)[tuple(within)].unbind(dim)
+        chosen = parts[0].unsqueeze(dim).expand(place.shape)
+        for number, part in enumerate(parts[1:], 1):
+            formula = f"pick({{0}} == {number}, {{1}}, {{2}})"
+            chosen = self._stated(formula, [places, part.unsqueeze(dim), chosen])
+        return chosen
+
     def _clamp(self, result: Tensor, value: Tensor, low: Any = None, high: Any = None) -> Tensor:
         variables = self.numbers(value, result.dtype)
         for bound, order in ((low, "<"), (high, ">")):
@@ -304,6 +327,9 @@ class Recorder(TorchDispatchMode):
         side = "right" if right else "left"
         formula = f"i64(np.searchsorted({self._table(table)}, {{0}}, '{side}'))"
         return self._stated(formula, [self.numbers(value, table.dtype)])
+
+    def _bucketize(self, result: Tensor, value: Tensor, table: Tensor, **more: Any) -> Tensor:
+        return self._searchsorted(result, table, value, **more)
 
     def _table(self, table: Tensor) -> str:
         """Return the name by which statements read a table."""

@@ -39,7 +39,7 @@ static void layer(const float *weights, const float *bias, const float *inputs, 
 # Functions of the recorder's statements and their names in C, of numbers of single precision.
 FUNCTIONS = {
     f"np.{name}": f"{name}f"
-    for name in ("sqrt", "exp", "log", "log1p", "sin", "cos", "floor", "tanh")
+    for name in ("sqrt", "exp", "log", "log1p", "sin", "cos", "floor", "rint", "tanh")
 }
 FUNCTIONS |= {"np.arctanh": "atanhf", "abs": "fabsf", "inf": "INFINITY", "nan": "NAN"}
 FUNCTIONS |= {"True": "1", "False": "0"}

@@ -21,6 +21,11 @@ FUNCTIONS = {
     "arithmetic": lambda x, n: (x * 2.0 - x / (x.abs() + 1.0)).neg() + 3 - 1.0 / (x * x + 1.0),
     "functions": lambda x, n: x.abs().log() + x.exp() * x.sin() + x.tanh() - x.abs().rsqrt(),
     "smooth": lambda x, n: softplus(9.0 * x) + x.sigmoid() * x.abs().log1p(),
+    "filled": lambda x, n: (
+        (3.0 * x).round() + x.masked_fill(n > 1, 2.0).masked_fill(x > 0.5, TABLE[2, 2])
+    ),
+    "gathered": lambda x, n: x.gather(-1, n) + x[:, :3].gather(-1, n[:, :1].clamp(max=2)),
+    "running": lambda x, n: x.cumsum(-1) + torch.bucketize(x, TABLE[0], right=True),
     "normal": lambda x, n: torch.special.ndtri(n * 0.2 + 0.1),
     "powers": lambda x, n: x**2 + x.abs() ** 1.7 + x.square().sqrt(),
     "clamp": lambda x, n: x.clamp(-0.5, 0.5) + x.clamp(min=0.0) + torch.minimum(x, x.flip(-1)),
@@ -87,7 +92,6 @@ def test_what_has_no_translation_is_computed_by_tensors(subtests) -> None:
         lambda x, n: (x.half(),),
         lambda x, n: (softplus(x, 2.0),),
         lambda x, n: (torch.rsub(x, 1.0, alpha=2.0),),
-        lambda x, n: (x.gather(-1, n),),  # no constant to read from
         lambda x, n: (x.clone().mul_(2.0),),  # changes what it is given
         lambda x, n: (torch.as_tensor(2.0 * x.numpy()),),  # leaves tensors
         lambda x, n: (torch.as_tensor(2.0 * np.asarray(x)),),
