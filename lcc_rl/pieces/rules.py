@@ -175,7 +175,7 @@ class Calm(Averaging):
     gain: NonNegative = 0.015  # k, of gaps above ``gap`` [1/s]
     gap: NonNegative = 9.5  # g [m]
     standstill_gap: NonNegative = 2.0  # s [m]
-    time_gap: Positive = 0.8  # T, which the speed does not fall below [s]
+    time_gap: Positive = 1.0  # T, which the speed does not fall below [s]
     braking: Positive = 1.5  # d, deceleration behind a slower vehicle [m/s²]
     response: Positive = 0.7  # τ [s]
 
