@@ -54,9 +54,7 @@ class SampledAction(TensorDictModuleBase):
 
     sigma: Tensor
 
-    def __init__(
-        self, head: nn.Module, rule: nn.Module | None = None, bound: float = 1.0
-    ) -> None:
+    def __init__(self, head: nn.Module, rule: nn.Module | None = None, bound: float = 1.0) -> None:
         self.in_keys = [OBSERVATION, SEED, STEP]
         self.out_keys = [ACTION]
         super().__init__()
