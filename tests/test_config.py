@@ -81,7 +81,7 @@ def test_the_tests_know_every_variant() -> None:
 def test_every_experiment_composes(caplog) -> None:
     for experiment in options("experiment"):
         words = ["variant=ddpg"] if "hcfs" in experiment else []
-        words += ["task=ring-22"] if "ring" in experiment else []
+        words += ["task=ring-22", "agent=ppo"] if "ring" in experiment else []
         load("pipeline", [f"experiment={experiment}", *words])
     assert not caplog.text  # whole batches
 

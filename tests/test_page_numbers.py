@@ -121,7 +121,8 @@ def waves() -> list[str]:
     columns = ("energy_kj_per_km", "mean_speed_mps")
     rows = means("tasks/ring_reactions", *columns, delay_s=0.4, noise_mps2=0.4)
     fuel, speed = rows[columns[0]] / FUEL, rows[columns[1]]
-    return [f"{speed[x]:.2f} m/s, {fuel[x]:.0f} g/km" for x in ("human", "drawn_reactions")]
+    found = ("human", "drawn_reactions", "calm")
+    return [f"{speed[x]:.2f} m/s, {fuel[x]:.0f} g/km" for x in found]
 
 
 def tasks() -> list[str]:

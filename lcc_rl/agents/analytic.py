@@ -36,6 +36,7 @@ class Analytic(Aiming):
     # (residual_idm, residual_acc, residual_calm).
     policy: Any = "network"
     constants: dict[str, Positive] | None = None  # of a rule at the start; the others keep theirs
+    bound: Positive = 1.0  # largest action that a network adds to a rule
     hidden: Sequence[Count] = (200, 100, 50)  # layers of a network
     activation: Activation = "relu"  # between the layers of networks
     # As limits, but behind each record of leaders by itself, each with a price of its own.
@@ -65,7 +66,7 @@ class Analytic(Aiming):
     # Compile the step of the simulator; None: if the training is long enough to pay for it.
     compiled: bool | None = None
 
-    LATER = ("activation", "schedule", "warm_up")
+    LATER = ("activation", "bound", "schedule", "warm_up")
     loop = GradientLoop
 
     def validate(self) -> None:
@@ -73,7 +74,7 @@ class Analytic(Aiming):
 
     def setup(self, scene: Scene) -> None:
         self.objective = Objective(self, scene.device, scene.world)
-        given = self.hidden, self.constants, self.activation
+        given = self.hidden, self.constants, self.activation, self.bound
         self.policy = make_policy(self.policy, scene, *given)
         size, seed = scene.observation_size, scene.seed + 1
         self.burn_in = scene.world.steps(self.humans_first, "agent.humans_first")

@@ -123,7 +123,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
             missed.append(self._scored(batch))
             batch = decisions(batch.exclude(*self.wanted), self.every)
             if self.rule is not None:  # the policy's part of the action
-                own = batch.get(ACTION) - self.rule(batch.get(OBSERVATION))
+                own = (batch.get(ACTION) - self.rule(batch.get(OBSERVATION))) / self.agent.bound
                 batch.set(ACTION, own.clamp(-ONE, ONE))
             if self.returns is not None:
                 last = self.returns.add(

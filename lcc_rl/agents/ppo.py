@@ -76,7 +76,7 @@ class PPO(Sampling):
         self.count = 0
         learned = self.make_actor(scene)
         self.head = head = Gaussian(learned.module[0], self.sigma).to(device)
-        self.noise = SampledAction(head, self.rule)
+        self.noise = SampledAction(head, self.rule, self.bound)
         self.actor = tanh_gaussian(head)
         value = ValueOperator(seeded_mlp(size, 1, self.hidden, scene.seed + 1, kind)).to(device)
         self.advantage = GAE(gamma=self.gamma, lmbda=self.td_lambda, value_network=value)

@@ -75,19 +75,20 @@ class Residual(nn.Module):
     Args:
         rule: the rule.
         network: maps an observation to a number.
+        bound: largest action that the network adds.
     """
 
-    def __init__(self, rule: Rule, network: nn.Module) -> None:
+    def __init__(self, rule: Rule, network: nn.Module, bound: float = 1.0) -> None:
         super().__init__()
         self.rule = rule.requires_grad_(False)
-        self.network = network
+        self.network, self.bound = network, bound
         last = [layer for layer in network.modules() if isinstance(layer, nn.Linear)][-1]
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the action in [−1, 1], ``[*batch, 1]``."""
-        correction = torch.tanh(self.network(observation))
+        correction = self.bound * torch.tanh(self.network(observation))
         return (self.rule(observation) + correction).clamp(-1.0, 1.0)
 
 
@@ -102,6 +103,7 @@ def make_policy(
     hidden: Sequence[int],
     constants: Mapping[str, float] | None,
     activation: Activation = "relu",
+    bound: float = 1.0,
 ) -> TensorDictModule:
     """Build the policy of an agent.
 
@@ -112,6 +114,7 @@ def make_policy(
         hidden: sizes of the hidden layers of a network.
         constants: initial constants of a rule.
         activation: activation between the layers of a network.
+        bound: largest action that a network adds to a rule.
 
     Returns:
         A module that reads ``"observation"`` ``[*batch, n]`` and writes ``"action"``
@@ -138,6 +141,6 @@ def make_policy(
     rule = Rule(RULE_KINDS[name], scene.observation, constants, scene.max_acceleration)
     module: nn.Module = rule
     if kind != name:
-        module = Residual(rule, seeded_mlp(size, 1, hidden, seed, activation))
+        module = Residual(rule, seeded_mlp(size, 1, hidden, seed, activation), bound)
     policy = TensorDictModule(module, in_keys=["observation"], out_keys=["action"])
     return policy.to(scene.device)

@@ -49,15 +49,17 @@ class SampledAction(TensorDictModuleBase):
     Args:
         head: the distribution; ``sigma`` multiplies its standard deviation.
         rule: its action is added.
+        bound: largest action that is added to the rule's.
     """
 
     sigma: Tensor
 
-    def __init__(self, head: nn.Module, rule: nn.Module | None = None) -> None:
+    def __init__(self, head: nn.Module, rule: nn.Module | None = None, bound: float = 1.0) -> None:
         self.in_keys = [OBSERVATION, SEED, STEP]
         self.out_keys = [ACTION]
         super().__init__()
-        self.head, self.rule, self.stream = head, rule, stream_id("exploration")
+        self.head, self.rule, self.bound = head, rule, bound
+        self.stream = stream_id("exploration")
         self.register_buffer("sigma", torch.tensor(1.0))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -65,7 +67,7 @@ class SampledAction(TensorDictModuleBase):
         mean, spread = self.head(seen)
         noise = action_noise(mean, tensordict, self.stream)
         action = (mean + self.sigma * spread * noise).tanh()
-        action = action if self.rule is None else action + self.rule(seen)
+        action = action if self.rule is None else self.bound * action + self.rule(seen)
         return tensordict.set(ACTION, action.clamp(-ONE, ONE))
 
 
@@ -109,7 +111,7 @@ class SAC(OffPolicy):
         size, seed, device = scene.observation_size, scene.seed, scene.device
         spread = seeded_mlp(size, 1, self.hidden[-1:], seed + 2, self.activation).to(device)
         head = Head(self.actor.module[0], spread)
-        self.noise = SampledAction(head, self.rule)
+        self.noise = SampledAction(head, self.rule, self.bound)
         loss = SACLoss(
             tanh_gaussian(head),
             self.values,

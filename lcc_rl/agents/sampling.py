@@ -50,6 +50,7 @@ class Sampling(Aiming):
     activation: Activation = "relu"  # between the layers of networks
     policy: Any = NETWORK_ALONE  # or a network on top of a rule, such as residual_idm
     constants: dict[str, Positive] | None = None  # of the rule; the others keep their defaults
+    bound: Positive = 1.0  # largest action that the network adds to the rule
     # Time between two decisions in training, in which the action is held [s]; 0: a step. A trained
     # policy decides in every step.
     hold: NonNegative = 0.0
@@ -61,7 +62,7 @@ class Sampling(Aiming):
     scale_rewards: bool = False
 
     LATER: ClassVar[Sequence[str]] = (
-        *("policy", "constants", "hold", "horizon", "scale_rewards", "humans_first"),
+        *("policy", "constants", "bound", "hold", "horizon", "scale_rewards", "humans_first"),
         *("surrogates", "regularizers", "limits", "limit_rate"),
     )
 
@@ -94,7 +95,8 @@ class Sampling(Aiming):
             f"agent.policy={kind}: only agent=analytic learns the constants of a rule; expected "
             f"{NETWORK_ALONE} or {RESIDUAL}{kind}",
         )
-        self.policy = make_policy(kind, scene, self.hidden, self.constants, self.activation)
+        given = self.hidden, self.constants, self.activation, self.bound
+        self.policy = make_policy(kind, scene, *given)
         whole = self.policy.module
         if not isinstance(whole, Residual):
             return self.policy

@@ -172,12 +172,12 @@ class Calm(Averaging):
     """
 
     window: Window = 15.0  # length of the mean [s]
-    gain: NonNegative = 0.02  # k, of gaps above ``gap`` [1/s]
-    gap: NonNegative = 12.0  # g [m]
+    gain: NonNegative = 0.015  # k, of gaps above ``gap`` [1/s]
+    gap: NonNegative = 9.5  # g [m]
     standstill_gap: NonNegative = 2.0  # s [m]
-    time_gap: Positive = 1.2  # T, which the speed does not fall below [s]
+    time_gap: Positive = 1.0  # T, which the speed does not fall below [s]
     braking: Positive = 1.5  # d, deceleration behind a slower vehicle [m/s²]
-    response: Positive = 1.0  # τ [s]
+    response: Positive = 0.7  # τ [s]
 
     reads = ("self.speed", "self.gap", "self.relative_speed")
     # A learned policy reads the mean from a memory of the own speed.

@@ -50,7 +50,9 @@ def test_calm_reads_the_mean_of_its_speed_from_a_memory() -> None:
     kept = Observation(scales=scales, relative_to={"memory": sources}, **words).bind()
     state, lags = seen(4.0, 14.0, -0.3), torch.tensor([0.5 * 0.4, 0.5 * 0.8, 9.0, 9.0])
     # The mean of both is 0.6 m/s above the speed, 2 m above 12 m add 0.04 m/s, in 1 s.
-    action = policy("calm", kept)(torch.cat([state, lags.expand(1, 1, 4)], -1))
+    constants = {"gain": 0.02, "gap": 12.0, "time_gap": 1.2, "response": 1.0}
+    rule = policy("calm", kept, constants=constants)
+    action = rule(torch.cat([state, lags.expand(1, 1, 4)], -1))
     assert action.item() == pytest.approx(0.64 / 3.0)
     with pytest.raises(ConfigError, match=r"needs memory\.entries relative to self\.speed"):
         policy("residual_calm")

@@ -21,7 +21,7 @@ from lcc_rl.agents.collecting import decisions, of_decisions, transitions
 from lcc_rl.agents.factory import check_lengths, make_trainer, training_env
 from lcc_rl.agents.sampling import Returns
 from lcc_rl.envs import make_env
-from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD, STEP
+from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD, SEED, STEP
 
 LEARNERS = ("ppo", "sac", "td3", "ddpg")
 
@@ -63,6 +63,31 @@ def test_a_network_on_a_rule_is_the_rule_at_first(agent: str) -> None:
     assert residual.gamma == pytest.approx(math.exp(-0.05))
     seen = torch.rand(5, 7)
     torch.testing.assert_close(residual.policy.module(seen), residual.rule(seen))
+
+
+def test_a_network_moves_a_rule_within_its_bound(tmp_path, monkeypatch) -> None:
+    words = ("agent=ppo", "agent.policy=residual_idm", "agent.bound=0.1", "agent.sigma=5")
+    sizes = ("scenario.horizon=20", "training.segment=20", "training.environments=4")
+    loop = small_loop(tmp_path, *words, *sizes, "training.episodes=4")
+    parts = []
+
+    def learn(batch: TensorDict, before: int) -> dict[str, float]:
+        parts.append(batch.get(ACTION))
+        return {"loss_value": 0.0}
+
+    monkeypatch.setattr(loop, "learn", learn)
+    loop.run()
+    assert parts[0].abs().max() > 0.9  # what the network adds, as a share of the bound
+    agent, seen = loop.agent, torch.rand(50, 1, 7)
+    drawn = TensorDict({}, [50])
+    clock = torch.arange(50).unsqueeze(-1)
+    for key, value in {OBSERVATION: seen, SEED: clock, STEP: clock}.items():
+        drawn.set(key, value)
+    away = (agent.noise(drawn).get(ACTION) - agent.rule(seen)).abs()
+    assert 0.09 < away.max() < 0.1 + 1e-6
+    agent.policy.module.network[-1].bias.data.fill_(50.0)
+    away = agent.policy.module(seen) - agent.rule(seen)
+    assert 0.09 < away.max() < 0.1 + 1e-6
 
 
 @pytest.mark.parametrize(("agent", "terms"), [("ppo", "alcc_ppo"), ("td3", "limits")])

@@ -286,7 +286,8 @@ def test_a_handover_switches_at_its_moment() -> None:
 
 
 def test_calm_follows_its_formula() -> None:
-    piece = Calm(window=2.0, response=2.0, max_acceleration=50.0, max_deceleration=50.0)
+    constants = {"gain": 0.02, "gap": 12.0, "time_gap": 1.2, "response": 2.0}
+    piece = Calm(window=2.0, max_acceleration=50.0, max_deceleration=50.0, **constants)
     piece = piece.bind(World(time_step=1.0, max_braking=50.0, max_acceleration=50.0))
     history, speed = torch.zeros(1, 4, 2), torch.full((1, 4, 1), 4.0)
     gap = torch.tensor([10.0, 62.0, 5.0, 5.0]).view(1, 4, 1)
