@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from concurrent.futures import ProcessPoolExecutor
 
 import pandas as pd
 import pytest
@@ -15,7 +14,7 @@ import lcc_rl
 from lcc_rl import api
 from lcc_rl.agents.replay import ReplayLoop
 from lcc_rl.commands import evaluation, training
-from lcc_rl.commands.pipeline import calibrate_once, read_once, train_all
+from lcc_rl.commands.pipeline import calibrate_once, read_once
 from lcc_rl.config.words import with_variant
 from lcc_rl.errors import LccError
 from lcc_rl.io.files import read_parquet
@@ -81,17 +80,6 @@ def test_baselines_share_the_scenario_under_study(trained, tmp_path) -> None:
     for name in ("idm", "direct"):
         one, two = (r[r["strategy"] == name].reset_index(drop=True) for r in (rows, alone))
         pd.testing.assert_frame_equal(one, two, check_exact=True)
-
-
-def test_trainings_share_the_imports_of_one_process(tmp_path, monkeypatch) -> None:
-    with ProcessPoolExecutor(1) as pool:
-        contexts = []
-        monkeypatch.setattr(
-            "lcc_rl.commands.pipeline.ProcessPoolExecutor",
-            lambda jobs, context, begin: contexts.append(context) or pool,
-        )
-        train_all({}, tmp_path, 1)
-    assert contexts[0].get_start_method() == "forkserver"
 
 
 @pytest.mark.usefixtures("blank_figures")

@@ -239,10 +239,8 @@ def train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
     """
     parts = {name: with_inputs(cfg) for name, cfg in parts.items()}
     todo = {name: cfg for name, cfg in parts.items() if not _finished(folder / name, cfg)}
-    # Forks of a process that has imported all modules and computed nothing: to fork this one, with
-    # torch's threads, can hang.
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__])
+    # A new interpreter per training: forking a process with torch's threads can hang.
+    context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, _end_with_parent) as pool:
         futures: dict[str, Future[None]] = {
             name: pool.submit(_train_one, cfg, str(folder / name)) for name, cfg in todo.items()
@@ -260,7 +258,7 @@ def train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
 
 def _end_with_parent() -> None:
     """End this process when its parent is killed; else it would wait for work forever."""
-    gc.freeze()  # modules
+    gc.freeze()  # later garbage collection skips modules
     logging.getLogger().setLevel(logging.INFO)
     logging.raiseExceptions = False  # a failing log must not end a training
     parent = multiprocessing.parent_process()
