@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import multiprocessing
 import os
@@ -257,6 +258,7 @@ def train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
 
 def _end_with_parent() -> None:
     """End this process when its parent is killed; else it would wait for work forever."""
+    gc.freeze()  # later garbage collection skips modules
     logging.getLogger().setLevel(logging.INFO)
     logging.raiseExceptions = False  # a failing log must not end a training
     parent = multiprocessing.parent_process()

@@ -1,10 +1,11 @@
-"""Free memory of this machine, and a check before allocations."""
+"""Free memory of this machine, a check before allocations, and a pause of garbage collection."""
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,18 @@ PROCESS, MEMINFO, GROUPS = Path("/proc/self/cgroup"), Path("/proc/meminfo"), Pat
 VERSION_1 = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 VERSION_2 = ("memory.max", "memory.current", "inactive_file")
 SIZE_UNITS = ("B", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB")
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Pause garbage collection, which takes a fifth of the time of imports and compilers."""
+    paused = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if paused:
+            gc.enable()
 
 
 def require_memory(needs: Mapping[str, float], device: torch.device | str = "cpu") -> None:

@@ -11,6 +11,8 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
 
+from lcc_rl.io.memory import uncollected
+
 # Exit codes.
 BAD_INPUT, INTERRUPTED = 2, 130
 ENDING_SIGNALS = (
@@ -77,13 +79,11 @@ def interruptible() -> Iterator[threading.Event]:
 @contextmanager
 def ending_quietly() -> Iterator[None]:
     """Exit on a signal as :func:`end_quietly` does, while a command imports further modules."""
-    gc.disable()  # saves a fifth of the time
     try:
-        with _handled_by(_end):
+        with uncollected(), _handled_by(_end):
             yield
     finally:
         gc.freeze()  # later garbage collection skips modules
-        gc.enable()
 
 
 def was_interrupted(error: BaseException | None) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 from dataclasses import replace
@@ -29,7 +30,7 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.agents.actor import make_actor, shared_policy
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import DifferentiableRollout, build_env
-from lcc_rl.envs.compiled import CACHE_LOG, Compiled
+from lcc_rl.envs.compiled import CACHE_LOG, Compiled, Traced
 
 WANTED = [("vehicles", name) for name in ("gap", "power", "relative_speed")]
 OBSERVED = [REWARD, (*TERMS, "hdv_energy"), (*TERMS, "safety")]
@@ -129,6 +130,24 @@ def test_a_damaged_file_of_torchs_cache_is_no_traceback(capfd) -> None:
     except EOFError:  # as torch does, before it compiles anew
         logging.getLogger(CACHE_LOG).warning("unable to load compiled graph", exc_info=True)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(("batch", "rest"), [(64, False), (5, True)])
+def test_compilation_leaves_out_what_costs_seconds(batch, rest, monkeypatch) -> None:
+    seen = []
+
+    def compiled(graph: Any, inputs: list[torch.Tensor], options: dict[str, Any]) -> Any:
+        seen.append((options, gc.isenabled()))
+        return graph
+
+    monkeypatch.setattr("torch._inductor.compile", compiled)
+    row = torch.rand(7, batch)
+    assert torch.equal(*Traced(lambda x: (x + 1.0,), "a sum", True)(row), row + 1.0)
+    ((options, collected),) = seen
+    assert options["cpp.enable_loop_tail_vec"] is rest  # kernels of tails, where there are none
+    assert options["cpp.vec_isa_ok"]  # torch's programs that test vector instructions
+    assert not collected
+    assert gc.isenabled()
 
 
 @pytest.mark.slow
