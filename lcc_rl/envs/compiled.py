@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -25,14 +24,10 @@ def options(device: torch.device | None) -> dict[str, Any]:
     """Return Inductor's options for a device.
 
     On the CPU the code between kernels is C++, too: a step of a small batch then takes three
-    quarters of the time. On a GPU that would need the headers of CUDA. The processor's vector
-    instructions are used without torch's test programs, which take 7 s on a machine's first run
-    and 1 s later, unless TORCHINDUCTOR_VEC_ISA_OK=0.
+    quarters of the time. On a GPU that would need the headers of CUDA.
     """
-    if device is not None and device.type != "cpu":
-        return {}
-    vectors = os.environ.get("TORCHINDUCTOR_VEC_ISA_OK") != "0"
-    return {"cpp_wrapper": True, "size_asserts": False, "cpp.vec_isa_ok": vectors}
+    on_cpu = device is None or device.type == "cpu"
+    return {"cpp_wrapper": True, "size_asserts": False} if on_cpu else {}
 
 
 def compiler_errors() -> tuple[type[Exception], ...]:
