@@ -167,7 +167,8 @@ class EpisodesSource(Source):
         episodes, notes = read_episodes(files, self.columns, self.units, self.bridge_s)
         count, source = episodes["episode"].nunique(), listed(files)
         lines = [f"read {count:,} episodes, {len(episodes):,} rows, {source}", *notes]
-        named = {**{key: EPISODE_NAMES[key] for key in self.units}, **self.columns}
+        usual = {key: name for key, name in EPISODE_NAMES.items() if key in self.units}
+        named = {**usual, **self.columns}
         source += read_as(PAIR_FIELDS, named, self.units)
         units = units_of(PAIR_FIELDS, EPISODE_NAMES, self.units)
         place = partial(places, files=files, columns=self.columns)

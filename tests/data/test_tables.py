@@ -467,6 +467,7 @@ def test_lengths_in_feet_and_gaps_that_jump_are_named_in_tables(tmp_path) -> Non
 
 # -- the log of one car ----------------------------------------------------------------------------
 
+SPEEDS = ["leader_speed_mps", "follower_speed_mps"]
 LOG = {"time": "t", "follower_speed": "v", "gap": "range", "relative_speed": "range_rate"}
 LOG |= {"valid": "ok", "target": "id", "leader_speed": None}
 
@@ -500,6 +501,10 @@ def test_the_log_of_a_car_has_relative_speeds_targets_and_a_flag(tmp_path) -> No
                 part["leader_speed_mps"], 15.0 + 2.0 * np.sin(time / 7.0), atol=1e-3
             )
             assert part["gap_m"].diff().abs().max() < 0.5
+    log.assign(range_rate=3.6 * log["range_rate"]).to_csv(tmp_path / "fast.csv", index=False)
+    units = {"relative_speed": "km/h"}
+    fast = EpisodesSource(path=str(tmp_path / "fast.csv"), columns=LOG, units=units).load()
+    np.testing.assert_allclose(fast.episodes[SPEEDS], found[SPEEDS], atol=1e-4)
     bad = other.assign(ok="maybe")
     bad.to_csv(tmp_path / "bad.csv", index=False)
     with pytest.raises(DataError, match="data row 1, column 'ok' is 'maybe'; expected 1 or 0"):
