@@ -348,9 +348,10 @@ def _groups() -> set[str]:
 
 def _file_of(key: str, name: str) -> str:
     """Return how a file of a group is chosen for a node, if there is one of this name."""
-    group = next((group for group in sorted(_groups()) if name in choices(group)), None)
+    group = next((group for group in sorted(_groups()) if name in choices(group)), "")
     choice = f"{group}@{key.replace(': ', '.')}={name}"
-    return f"the file of {group} is chosen by {choice}, or +{choice}" if group else ""
+    choice = f"+{group}={name}" if group in ADDED else f"{choice}, or +{choice}"
+    return f"the file of {group} is chosen by {choice}" if group else ""
 
 
 def _unknown_option(name: str) -> ConfigError:

@@ -20,7 +20,7 @@ from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_
 
 BATCH = 2
 # Options that add pieces, by the entries, or the group of them, that these write.
-ADDED = {
+ADDED_BY = {
     **{f"{x}.{y}": "+slope=hills" for x in ("vehicles", "leader") for y in ("place", "grade")},
     "terrain": "+slope=hills +knowledge=terrain",
     **{name: f"+knowledge={name}" for name in ("memory", "preview", "spread")},
@@ -183,7 +183,7 @@ def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
                 )
             name = ".".join(key)
             where = f"{piece.title} reads {name}, which no piece of the scenario writes"
-            option = ADDED.get(key[0], ADDED.get(name))
+            option = ADDED_BY.get(key[0], ADDED_BY.get(name))
             require(option is None, f"{where}; {option} adds one that does")
             near = sorted(".".join(other) for other in keys if other[0] == key[0])
             close = get_close_matches(name, near, n=1)

@@ -22,13 +22,7 @@ from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.envs.factory import build_env
-from lcc_rl.envs.inputs import (
-    POPULATION,
-    Inputs,
-    build_drivers,
-    build_energy,
-    constant_profiles,
-)
+from lcc_rl.envs.inputs import POPULATION, Inputs, build_drivers, build_energy, constant_profiles
 from lcc_rl.errors import ConfigError, in_short, raised_as, require
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.foreign import GivenPolicy

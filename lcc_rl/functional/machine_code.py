@@ -25,7 +25,7 @@ def pick(condition: Any, one: Any, other: Any) -> Any:
 
 @numba.njit(boundscheck=True)
 def read(table: Any, place: Any) -> Any:
-    """Return an entry of a table.
+    """Return an entry of a table, or of a tuple.
 
     Raises:
         IndexError: if there is none at that place.

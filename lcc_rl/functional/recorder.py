@@ -283,12 +283,9 @@ class Recorder(TorchDispatchMode):
     def _gather(self, result: Tensor, value: Tensor, dim: int, place: Tensor) -> Tensor:
         dim, places = dim % value.ndim, self.numbers(place, torch.int64)
         within = (slice(None if x == dim else n) for x, n in enumerate(place.shape))
-        parts = self.numbers(value, result.dtype)[tuple(within)].unbind(dim)
-        chosen = parts[0].unsqueeze(dim).expand(place.shape)
-        for number, part in enumerate(parts[1:], 1):
-            formula = f"pick({{0}} == {number}, {{1}}, {{2}})"
-            chosen = self._stated(formula, [places, part.unsqueeze(dim), chosen])
-        return chosen
+        parts = self.numbers(value, result.dtype)[tuple(within)].split(1, dim)
+        numbers = "".join(f"{{{number}}}, " for number in range(1, len(parts) + 1))
+        return self._stated(f"read(({numbers}), {{0}})", [places, *parts])
 
     def _clamp(self, result: Tensor, value: Tensor, low: Any = None, high: Any = None) -> Tensor:
         variables = self.numbers(value, result.dtype)

@@ -36,11 +36,11 @@ def in_unit(kj_per_km: float, unit: str, energy: Fleet) -> float:
 
 def check_unit(unit: str, energy: Fleet) -> None:
     """Check that a unit is known and valid for all vehicles, see :func:`in_unit`."""
-    require_known("unit", unit, ENERGY_UNITS)
+    require_known("unit (task.unit, --unit)", unit, ENERGY_UNITS)
     if unit in OF_FUEL and not burns_one_fuel(energy):
         raise ConfigError(
-            f"unit={unit} needs vehicles that all burn one fuel; here they burn several or "
-            "no fuel (energy=…): choose kJ/km or Wh/km"
+            f"unit={unit} (task.unit, --unit) needs vehicles that all burn one fuel; here they "
+            "burn several or no fuel (energy=…): choose kJ/km or Wh/km"
         )
 
 

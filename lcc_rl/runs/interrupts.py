@@ -79,11 +79,12 @@ def interruptible() -> Iterator[threading.Event]:
 @contextmanager
 def ending_quietly() -> Iterator[None]:
     """Exit on a signal as :func:`end_quietly` does, while a command imports further modules."""
-    try:
-        with uncollected(), _handled_by(_end):
-            yield
-    finally:
-        gc.freeze()  # later garbage collection skips modules
+    with uncollected():
+        try:
+            with _handled_by(_end):
+                yield
+        finally:
+            gc.freeze()  # later garbage collection skips modules
 
 
 def was_interrupted(error: BaseException | None) -> bool:

@@ -35,6 +35,7 @@ REFUSED = {
     "trian": "'train'",
     "train variant=idm --experiment 3": "--experiment.*key=value",
     "evaluate scenario.controllers.human=gipps": "by controller@scenario.controllers.human=gipps",
+    "evaluate scenario.pieces.slope=hills": r"is chosen by \+slope=hills$",
     "evaluate slope=hills": r"slope is added: write \+slope=",
     "calibrate experiment=smoke": "this command has no option 'experiment'",
     "train data=ngsim data.path='~nobody-here/x.csv'": "~nobody-here/x.csv: no such file",

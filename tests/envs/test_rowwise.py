@@ -110,3 +110,7 @@ def test_a_place_beyond_a_table_is_an_error() -> None:
     assert rows.translated
     with pytest.raises(IndexError):
         rows(np.array([[4]]))
+    gathered = Rowwise(lambda x, n: (x.gather(-1, n),), examples(1), "a test")
+    assert gathered.translated
+    with pytest.raises(IndexError):
+        gathered(np.ones((1, 4), np.float32), np.array([[0, 1, 4, 2]]))

@@ -11,7 +11,7 @@ import lcc_rl
 from lcc_rl.config import load
 from lcc_rl.energy import ElectricCar, Fleet
 from lcc_rl.envs import Inputs, build_env
-from lcc_rl.envs.checks import ADDED
+from lcc_rl.envs.checks import ADDED_BY
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.episodes import evaluate
@@ -178,9 +178,9 @@ class Ahead(Uphill):
 def test_the_option_that_adds_an_entry_is_named() -> None:
     cases = [(Uphill, r"writes; \+slope=hills adds"), (Ahead, r"\+slope=hills \+knowledge=terrain")]
     check_refused(lambda kind: lcc_rl.simulate([9.0] * 50, "automated", kind()), cases)
-    for options in ADDED.values():  # each adds all entries for which it stands
+    for options in ADDED_BY.values():  # each adds all entries for which it stands
         words = ["energy=electric", *options.split()]
-        written = {name for name, said in ADDED.items() if said == options}
+        written = {name for name, said in ADDED_BY.items() if said == options}
         env = lcc_rl.make_env("alcc", 2, words)
         keys = [key for piece in pieces_of(env) for key in piece.entries]
         assert written <= {".".join(key) for key in keys} | {key[0] for key in keys}, options

@@ -143,7 +143,11 @@ def test_energies_come_in_the_unit_asked_for(tmp_path, capsys) -> None:
         asked = shown(name, "--unit", "kWh/100km")
         np.testing.assert_allclose(asked[after], shown(name)[before] / 36.0)
     cases = [
-        ("episodes", "mpg", "unit=mpg needs vehicles that all burn one fuel"),
+        (
+            "episodes",
+            "mpg",
+            r"unit=mpg \(task.unit, --unit\) needs vehicles that all burn one fuel",
+        ),
         ("ring", "Wh/km", "the score of this task is no energy per distance"),
         ("platoons", "Wh/km", "tables of platoons have no energy per distance"),
     ]
