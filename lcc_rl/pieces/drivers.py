@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -14,6 +14,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import GAP_NOISE_TIME, DriverConstants, NoiseStep, Reaction
 from lcc_rl.functional.gipps import GippsConstants
 from lcc_rl.functional.idm import IDMConstants
+from lcc_rl.functional.laws import LAWS
 from lcc_rl.functional.layout import join, reverse
 from lcc_rl.functional.ovm import FVDMConstants, OVMConstants
 from lcc_rl.functional.pattern import HUMAN
@@ -24,7 +25,7 @@ from lcc_rl.pieces.features import first_speeds, of_role, speed_limits
 from lcc_rl.pieces.leader import LEADER_SPEED
 from lcc_rl.pieces.views import MOTION_READS
 from lcc_rl.pieces.world import MOST_LATE, World
-from lcc_rl.settings import Factors, Increasing, NonNegative, Positive, Share
+from lcc_rl.settings import Factors, Increasing, NonNegative, Positive, Share, defaults, values
 
 Delay = Annotated[int, Field(ge=0, le=MOST_LATE)]
 # Draws that all drivers of an episode share.
@@ -293,11 +294,11 @@ class DriverModel(Drivers):
         else:
             drivers = super().described(world, where)
         models = getattr(world.population, "models", None)
+        own = f"; CalibratedDrivers (scenario.controllers.{HUMAN}) drives each by its own"
         if models and not single:
             raise ConfigError(
                 f"{where}: the population holds drivers of the model(s) "
-                f"{', '.join(sorted(set(models)))}, expected IDM drivers; "
-                f"controller@{where}=calibrated drives each by its own model"
+                f"{', '.join(sorted(set(models)))}, expected IDM drivers{own} model"
             )
         constants = drivers[2] if self.parameters is None else self.parameters
         if not isinstance(constants, self.law):
@@ -306,14 +307,74 @@ class DriverModel(Drivers):
         if any(isinstance(value, Tensor) for value in vars(constants).values()):
             raise ConfigError(
                 f"{where}: drivers must share a, b and s0 (a locally calibrated population, "
-                "drivers.mode=local), got a population in which they differ by driver; "
-                f"controller@{where}=calibrated drives each by its own"
+                f"drivers.mode=local), got a population in which they differ by driver{own}"
             )
         return (*drivers[:2], constants)
 
 
+class CalibratedDrivers(Drivers):
+    """Drivers of the population; each follows its calibrated model and parameters."""
+
+    tells_gap = True
+    further = ("driver",)
+    kinds: ClassVar[Tensor]
+
+    def setup(self, world: World) -> None:
+        super().setup(world)
+        population = world.population
+        models = getattr(population, "models", None) or ("idm",) * len(population.time_gap)
+        self.models = [name for name in LAWS if name in models]
+        self.register_buffer("kinds", torch.tensor([self.models.index(name) for name in models]))
+        for name, own in population.parameters().items():
+            # Parameters that a driver's model lacks are computed, too, and need a finite gradient.
+            otherwise = [getattr(LAWS[model], name, 1.0) for model in self.models]
+            self.register_buffer(f"own_{name}", own.float().nan_to_num(nan=otherwise[0]))
+
+    def described(self, world: World, where: str) -> tuple[Tensor, Tensor, DriverConstants]:
+        """Return the drivers, see :class:`Drivers`."""
+        if not hasattr(world.population, "parameters"):
+            raise ConfigError(f"{where}: expected a population with its drivers' parameters")
+        return super().described(world, where)
+
+    def acceleration(self, speed: Tensor, *more: Tensor) -> Tensor:
+        """Return the desired acceleration of each driver by its model."""
+        gap, relative_speed, desired_speed, time_gap, driver = more
+        motion = (speed, gap, -relative_speed, desired_speed, time_gap)
+        return self._each(driver, lambda law: law(*motion))
+
+    def equilibrium_gap(
+        self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor, driver: Tensor
+    ) -> Tensor:
+        """Return the equilibrium gap of each driver by its model."""
+        steady = (speed, desired_speed, time_gap, LONGEST_TIME_GAP)
+        return self._each(driver, lambda law: law.equilibrium_gap(*steady))
+
+    def _each(self, driver: Tensor, quantity: Callable[[DriverConstants], Tensor]) -> Tensor:
+        kind, result = self.kinds[driver], None
+        for number, name in enumerate(self.models):
+            law = LAWS[name]
+            constants = {x: getattr(self, f"own_{x}")[driver] for x in law.shared()}
+            values = quantity(law(**constants))
+            result = values if result is None else torch.where(kind == number, values, result)
+        assert result is not None  # a population holds drivers
+        return result
+
+
 class IDM(DriverModel):
-    """Drivers of the Intelligent Driver Model (A3–A4)."""
+    """Drivers of the Intelligent Driver Model (A3–A4).
+
+    Drivers of the population that differ in a, b and s0, or have other models, become
+    :class:`CalibratedDrivers`.
+    """
+
+    def bind(self, world: World | None = None, name: str | None = None) -> Any:
+        population = None if world is None or self.desired_speed else world.population
+        shared = vars(getattr(population, "constants", None) or IDMConstants()).values()
+        differ = getattr(population, "models", None) or any(isinstance(x, Tensor) for x in shared)
+        if type(self) is not IDM or self.parameters is not None or not differ:
+            return super().bind(world, name)
+        own = {x: value for x, value in values(self).items() if x in defaults(Drivers)}
+        return CalibratedDrivers(**own).bind(world, name)
 
 
 class OVM(DriverModel):
