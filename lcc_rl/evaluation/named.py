@@ -16,7 +16,7 @@ from lcc_rl.config import choices, composed, load, own_file
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.config.words import DOTTED, FILTERED, YAML
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import ConfigError, in_short, require, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.pieces.controllers import Controller, Law
@@ -82,6 +82,21 @@ def setting_of(spec: Any, where: str = "compare") -> str | Node:
     if isinstance(spec, PathLike):
         return fspath(spec)
     return path_of(spec) if callable(spec) else str(spec)
+
+
+def one_of(given: Any) -> tuple[str, str | Node]:
+    """Return the name and the setting of one policy or controller, see :func:`setting_of`.
+
+    A mapping of one gives it a name, which may end in ``_filtered``; else the name is empty.
+
+    Raises:
+        ConfigError: if the mapping has several, or it cannot be named.
+    """
+    named = isinstance(given, Mapping) and TARGET not in given
+    message = f"controller: expected one, such as {{'name': MyACC()}}, got {in_short(given)}"
+    require(not named or len(given) == 1, message)
+    name, value = next(iter(given.items())) if named else ("", given)
+    return str(name), setting_of(value, "controller")
 
 
 def is_policy(spec: Any) -> TypeGuard[str]:

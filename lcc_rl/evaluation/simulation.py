@@ -33,7 +33,7 @@ from lcc_rl.evaluation.metrics import (
     energy_measures,
     safety_measures,
 )
-from lcc_rl.evaluation.named import controller_of, is_policy, setting_of
+from lcc_rl.evaluation.named import controller_of, is_policy, one_of
 from lcc_rl.evaluation.rollout import Player, Record, reset_options
 from lcc_rl.evaluation.rows import INDEX
 from lcc_rl.evaluation.strategies import Strategy
@@ -155,12 +155,10 @@ def simulate(
 
 def _given(controller: Any) -> tuple[Any, Any]:
     """Return the value of ``compare`` for a controller, and its setting; None without one."""
-    named = isinstance(controller, Mapping) and TARGET not in controller
-    message = f"controller: expected one, such as {{'name': MyACC()}}, got {in_short(controller)}"
-    require(not named or len(controller) == 1, message)
-    name, value = next(iter(controller.items())) if named else ("", controller)
-    spec = None if value is None else setting_of(value, "controller")
-    return {name: spec} if named else [spec] * (spec is not None), spec
+    if controller is None:
+        return [], None
+    name, spec = one_of(controller)
+    return {name: spec} if name else [spec], spec
 
 
 def _words(string: str | Mapping[str, Any]) -> str:

@@ -18,11 +18,13 @@ from typing import Any
 
 import torch
 from omegaconf import OmegaConf
+from torch import nn
 
 from lcc_rl.config import key_of, load, with_variant
+from lcc_rl.config.nodes import Node
 from lcc_rl.errors import ConfigError, needing, require, require_known
 from lcc_rl.evaluation.foreign import network_of
-from lcc_rl.evaluation.named import is_policy
+from lcc_rl.evaluation.named import is_policy, label_of, one_of
 from lcc_rl.interfaces.c_code import c_code
 from lcc_rl.interfaces.driver import Driver
 from lcc_rl.interfaces.exported import DrivingProgram, Safety, described_input, program
@@ -30,6 +32,7 @@ from lcc_rl.interfaces.onnx_policy import MAKES, TAKES
 from lcc_rl.interfaces.ring_page import ring_page
 from lcc_rl.io.atomic import atomic_path, new_file
 from lcc_rl.pieces.base import SEED
+from lcc_rl.pieces.controllers import Controller
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.version import __version__
 
@@ -56,8 +59,8 @@ def export(
 
     Args:
         policy: a run folder, a policy file, or ``pretrained/<name>``; a rule by name, with steps of
-            0.1 s (``"idm_acc_filtered"``); or a model of
-            stable-baselines3 or a torch module from observations ``[batch, n]`` to actions
+            0.1 s (``"idm_acc_filtered"``); a controller as for :func:`lcc_rl.simulate`; or a model
+            of stable-baselines3 or a torch module from observations ``[batch, n]`` to actions
             ``[batch, 1]``.
         path: the file to write.
         trust: modules outside this package that the policy may name.
@@ -98,14 +101,14 @@ def _written(
     path = new_file(path, "name")
     require_known("ending", path.suffix, [*EXPORTERS, PAGE])
     cfg, page = None, path.suffix == PAGE
-    if not isinstance(policy, (str, PathLike)):
-        source = policy
-        if (policy := network_of(source, normalize)) is None:
-            kind = type(source).__name__
-            raise ConfigError(f"expected a run, a file, a torch module or a model, got {kind}")
-        cfg = load("train", with_variant(variant, overrides))
-    rule = cfg is None and not is_policy(str(policy))
-    text = f"{policy}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
+    name, spec = _named(policy)
+    if not spec:
+        if (network := network_of(policy, normalize)) is None:
+            expected = "a run, a file, a controller, a torch module or a model"
+            raise ConfigError(f"expected {expected}, got {type(policy).__name__}")
+        policy, cfg = network, load("train", with_variant(variant, overrides))
+    rule = bool(spec) and not is_policy(spec)
+    text = f"{name}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
     require(not page or (cfg is None and not (safety or limits or rule)), text)
     if cfg is None and not page and overrides:
         text = (
@@ -122,18 +125,28 @@ def _written(
         content = ring_page(policy, trust, overrides).encode()
     else:
         changes = (safety, limits)
-        module = _rule(policy, trust, *changes) if rule else program(policy, trust, cfg, *changes)
-        name = str(policy) if isinstance(policy, (str, PathLike)) else type(policy).__name__
+        own: Any = policy if cfg else spec
+        module = _rule(policy, trust, *changes) if rule else program(own, trust, cfg, *changes)
         content, names = EXPORTERS[path.suffix](module, name), module.names
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path, names
 
 
-def _rule(name: Any, trust: Sequence[str], safety: Safety, limits: Any) -> DrivingProgram:
+def _named(policy: Any) -> tuple[str, str | Node]:
+    """Return name and setting of a run, file or controller; no setting of a network or model."""
+    named = isinstance(policy, (str, PathLike, Mapping, Node, Controller))
+    if not named and (isinstance(policy, nn.Module) or not callable(policy)):
+        return type(policy).__name__, ""
+    name, spec = one_of(policy)
+    return name or (spec if isinstance(spec, str) else label_of(spec)), spec
+
+
+def _rule(given: Any, trust: Sequence[str], safety: Safety, limits: Any) -> DrivingProgram:
     """Return the program of a rule with steps of 0.1 s."""
-    module = Driver(str(name), 0.1, trust, safety, limits=limits).program
-    require(SEED not in module.kept, f"{name} draws noise from seeds: it cannot be exported")
+    driver = Driver(given, 0.1, trust, safety, limits=limits)
+    module, noisy = driver.program, SEED in driver.program.kept
+    require(not noisy, f"{driver.name} draws noise from seeds: it cannot be exported")
     return module
 
 
@@ -200,7 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = Arguments(description="Export a policy for other software.")
     parser.add_argument("policy", help="run folder, policy.pt, pretrained/<name> or a rule")
     parser.add_argument("path", help="file: a program (.onnx, .pt2, .c) or a page (.html)")
-    parser.add_argument("--trust", action="append", default=[], help="module that it may name")
+    parser.add_trust()
     text = "of a page's ring (drivers=i80), of a program (safety.margin=2 limits.max_braking=6)"
     parser.add_argument("settings", nargs="*", default=[], help=text)
     options = parser.parse_args(arguments)

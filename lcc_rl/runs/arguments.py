@@ -25,8 +25,17 @@ class Arguments(ArgumentParser):
         settings.setdefault("allow_abbrev", False)
         super().__init__(description=wrapped(description or ""), **settings)
 
+    def add_trust(self) -> None:
+        """Add ``--trust``, whose modules are separated by commas; it may be repeated."""
+        text = "modules that files may name, separated by commas"
+        self.add_argument("--trust", action="extend", type=_words, default=[], help=text)
+
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message} ({self.prog} -h lists all flags)")
+
+
+def _words(word: str) -> list[str]:
+    return word.strip("[]").split(",")
 
 
 def wrapped(text: str) -> str:
