@@ -27,6 +27,7 @@ from lcc_rl.errors import ConfigError, in_short, raised_as, require
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.metrics import (
+    MEAN_SPEED,
     METRICS,
     ROAD_METRICS,
     SERIES,
@@ -35,7 +36,7 @@ from lcc_rl.evaluation.metrics import (
 )
 from lcc_rl.evaluation.named import controller_of, is_policy, one_of
 from lcc_rl.evaluation.rollout import Player, Record, reset_options
-from lcc_rl.evaluation.rows import INDEX
+from lcc_rl.evaluation.rows import INDEX, highest
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.base import Key, State
@@ -74,8 +75,8 @@ class Simulation:
         steps: a row per episode, time and vehicle; vehicle 0 is the leader, the others are from
             front to back. ``acceleration_mps2`` and ``power_w`` are those of the step that ends at
             ``time_s``. An episode ends with its first collision, a gap of 0 m or less.
-        vehicles: a row per episode and vehicle: ``mean_speed_mps`` (of the rows of ``steps``),
-            ``collided``, distance and energies of
+        vehicles: a row per episode and vehicle: ``collided``, ``mean_speed_mps`` (of the speeds
+            after each step, as in evaluations), distance and energies of
             :func:`lcc_rl.evaluation.metrics.energy_measures`, and the measures of
             :data:`lcc_rl.evaluation.metrics.METRICS` and ``ROAD_METRICS``, those of
             ``measures=[…]`` included, each of one vehicle; NaN where it has none.
@@ -271,8 +272,8 @@ class _Motion:
             columns[MOTION[name]] = self._whole(name)[time, episode].flatten()
         steps = pd.DataFrame(columns)
         by_vehicle = steps.groupby(["episode", "vehicle"], sort=False)
-        spans = {"role": ("role", "first"), "mean_speed_mps": ("speed_mps", "mean")}
-        summary, measured = by_vehicle.agg(**spans).reset_index(), self._measures()
+        summary = by_vehicle.agg(role=("role", "first")).reset_index()
+        measured = self._measures()
         collided = measured["min_gap_m"] <= 0.0
         return Simulation(steps, summary.assign(collided=collided, **measured))
 
@@ -298,15 +299,15 @@ class _Motion:
     def _measures(self) -> dict[str, np.ndarray]:
         """Return energies and measures of every vehicle, episode by episode; NaN without one."""
         found, steps, metrics = [], len(self.alive), {**METRICS, **ROAD_METRICS}
-        ahead = {"leader_speed": self.record[LEADER]} if LEADER in self.record else {}
+        ahead = {name: x.unsqueeze(-2) for name, x in highest(self.record).items()}
         for group, kind in zip(self.groups, self.kinds, strict=True):
             args = (self.time_step, self.energy, kind, _after(group.get(GRADE)))
             known = energy_measures(group["power"], group["speed"], self.alive.unsqueeze(-2), *args)
             series = {x: group[x].unsqueeze(-2) for x in SERIES if x in group}
-            series |= {name: x[-steps:] for name, x in series.items() if name in AT_START}
-            series |= {name: x[..., None, None] for name, x in ahead.items()}
+            series |= {name: x[-steps:] for name, x in series.items() if name in AT_START} | ahead
             alive = self.alive[..., None, None].expand_as(series["acceleration"])
-            found.append(known | safety_measures(series, alive, self.time_step, metrics))
+            mean = safety_measures(series, alive, self.time_step, MEAN_SPEED)
+            found.append(mean | known | safety_measures(series, alive, self.time_step, metrics))
         lacking = [torch.full_like(known["distance_m"], torch.nan) for known in found]
         columns = {
             name: [x.get(name, y) for x, y in zip(found, lacking, strict=True)]
