@@ -32,7 +32,7 @@ STRAY = 0.2  # largest distance left of a relative speed, as a share of the foll
 LOUD, LOUD_RATE, LOUD_FACTOR = 0.3, 0.3, 1.15  # reported: lag [s], bias of a speed [m/s], factor
 STANDING, LEAST_STANDING = 0.5, 300  # speed [m/s], samples
 FAR_STANDING = 15.0  # gap that may be in feet [m]
-RELATIVE = "relative_speed"  # key of a log's column from which the leader's speed is computed
+OF_LOGS = "relative_speed"  # key of a log's column from which the leader's speed is computed
 RATES = (5, 10, 15, 20, 25, 30, 50, 60)  # frames per second of recordings
 
 
@@ -161,17 +161,15 @@ def mistakes(units: Units) -> Iterator[tuple[bool, str, str, float, float]]:
         coefficients of leader and follower in :func:`agreement`.
     """
     yield True, "follower", "are leader and follower exchanged?", -1.0, -1.0
-    speeds: tuple[tuple[str, str, str, tuple[str, ...], int, int], ...] = (
+    for signal, subject, quantity, keys, leader, follower in (
+        ("gap", "is the gap", "length", ("gap", "position"), -1, -1),
+        ("leader", "is the relative speed", "speed", (OF_LOGS,), 1, 1),
         ("follower", "are both speeds", "speed", ("speed", "follower_speed", "leader_speed"), 1, 1),
         ("leader", "is the leader's speed", "speed", ("leader_speed",), 1, 0),
         ("follower", "is the follower's speed", "speed", ("follower_speed",), 0, 1),
-    )
-    if RELATIVE in units:
-        speeds = (("leader", "is the relative speed", "speed", (RELATIVE,), 1, 1),)
-    for signal, subject, quantity, keys, leader, follower in (
-        ("gap", "is the gap", "length", ("gap", "position"), -1, -1),
-        *speeds,
     ):
+        if signal != "gap" and (OF_LOGS in keys) != (OF_LOGS in units):
+            continue
         named = [key for key in keys if key in units][: 1 if signal == "gap" else None]
         declared = units.get([*named, quantity][0], SI[quantity])
         for unit, size in (UNITS["length"] if signal == "gap" else SPEEDS).items():
@@ -289,25 +287,24 @@ def _mistaken(
 
 
 def _own_speed(episodes: pd.DataFrame, units: Units, max_mismatch: float) -> Iterator[str]:
-    """Yield words on a log's own speed that is read in too small a unit.
+    """Yield words on a log's own speed in too small a unit, with which gaps agree nevertheless.
 
-    The leader's speed is the sum of this and the relative speed, so that gaps agree in any unit.
     Least squares fit the change of the relative speed in 1 s by that of the own speed, and by both
-    in the 2 s before. As leaders do not react to followers, the first coefficient is −1 or nearer
-    to 0.
+    in the 2 s before. As leaders do not react to followers, the first coefficient is at least −1.
     """
-    declared = SPEEDS.get(units.get("follower_speed", ""), 1.0) if RELATIVE in units else 1.0
+    declared = SPEEDS.get(units.get("follower_speed", ""), 1.0)
     width, number = round(EVERY_S / FRAME), episodes["episode"].to_numpy()
     rows = np.flatnonzero(number[3 * width :] == number[: -3 * width]) + 2 * width
-    if declared == 1.0 or len(rows) * FRAME < LEAST_ALL_S:
+    if OF_LOGS not in units or len(rows) * FRAME < LEAST_ALL_S:
         return
     own, ahead = (episodes[PAIR_SIGNALS[x]].to_numpy(float) for x in ("follower", "leader"))
-    series = own, ahead - own
-    later, *before = (
-        [v[rows + k * width] - v[rows + (k - 1) * width] for v in series] for k in (1, 0, -1)
-    )
-    terms = np.stack([later[0], *before[0], *before[1], series[1][rows]], axis=1)
-    change = float(np.linalg.lstsq(terms, later[1], rcond=None)[0][0])
+    terms = [(ahead - own)[rows]]
+    for since in (-1, 0, 1):
+        terms += [
+            (v[rows + since * width] - v[rows + (since - 1) * width]) for v in (ahead - own, own)
+        ]
+    relative = terms.pop(-2)
+    change = float(np.linalg.lstsq(np.stack(terms, axis=1), relative, rcond=None)[0][-1])
     unit, size = min(SPEEDS.items(), key=lambda x: abs(x[1] / declared + change))
     if -change > max_mismatch and size > declared:
         yield (

@@ -130,7 +130,7 @@ def simulate(
     fixed = OF_ARGUMENTS | {"reward"} | chosen
     check_overrides(overrides, fixed, "has no effect in simulate: see the arguments")
     profiles = _profiles(leader, time_step, seconds)
-    compared, spec = _given(controller)
+    name, spec = ("", None) if controller is None else one_of(controller)
     reads = () if spec is None or is_policy(spec) else controller_of(spec).kind.reads
     settings = (
         *("evaluation.baselines=[]", "evaluation.behind_filter=[]", "evaluation.warm_up=0"),
@@ -140,7 +140,7 @@ def simulate(
         *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
     )
-    cfg = load("evaluate", settings).with_(compare=compared, reward=UNREAD)
+    cfg = load("evaluate", settings).with_(compare={name: spec} if spec else [], reward=UNREAD)
     require(
         (cfg.scenario.road == RING) == (leader is None),
         "simulate: a ring (scenario=ring in overrides) has leader=None, an open road has a leader",
@@ -152,14 +152,6 @@ def simulate(
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, spec is None, typed=overrides).strategies(inputs)[-1]
     return _simulated(strategy, inputs, repeats, seed)
-
-
-def _given(controller: Any) -> tuple[Any, Any]:
-    """Return the value of ``compare`` for a controller, and its setting; None without one."""
-    if controller is None:
-        return [], None
-    name, spec = one_of(controller)
-    return {name: spec} if name else [spec], spec
 
 
 def _words(string: str | Mapping[str, Any]) -> str:

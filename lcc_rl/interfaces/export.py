@@ -12,19 +12,16 @@ import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from io import BytesIO
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import OmegaConf
-from torch import nn
 
 from lcc_rl.config import key_of, load, with_variant
-from lcc_rl.config.nodes import Node
-from lcc_rl.errors import ConfigError, needing, require, require_known
+from lcc_rl.errors import needing, require, require_known
 from lcc_rl.evaluation.foreign import network_of
-from lcc_rl.evaluation.named import is_policy, label_of, one_of
+from lcc_rl.evaluation.named import is_policy, one_of
 from lcc_rl.interfaces.c_code import c_code
 from lcc_rl.interfaces.driver import Driver
 from lcc_rl.interfaces.exported import DrivingProgram, Safety, described_input, program
@@ -100,14 +97,11 @@ def _written(
     """Write the file, see :func:`export`; return its path and the inputs of its program."""
     path = new_file(path, "name")
     require_known("ending", path.suffix, [*EXPORTERS, PAGE])
-    cfg, page = None, path.suffix == PAGE
-    name, spec = _named(policy)
-    if not spec:
-        if (network := network_of(policy, normalize)) is None:
-            expected = "a run, a file, a controller, a torch module or a model"
-            raise ConfigError(f"expected {expected}, got {type(policy).__name__}")
-        policy, cfg = network, load("train", with_variant(variant, overrides))
-    rule = bool(spec) and not is_policy(spec)
+    page = path.suffix == PAGE
+    network = None if isinstance(policy, Controller) else network_of(policy, normalize)
+    name, spec = one_of(policy) if network is None else (type(policy).__name__, network)
+    cfg = None if network is None else load("train", with_variant(variant, overrides))
+    rule = cfg is None and not is_policy(spec)
     text = f"{name}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
     require(not page or (cfg is None and not (safety or limits or rule)), text)
     if cfg is None and not page and overrides:
@@ -125,29 +119,19 @@ def _written(
         content = ring_page(policy, trust, overrides).encode()
     else:
         changes = (safety, limits)
-        own: Any = policy if cfg else spec
-        module = _rule(policy, trust, *changes) if rule else program(own, trust, cfg, *changes)
+        module = _rule(policy, trust, *changes) if rule else program(spec, trust, cfg, *changes)
         content, names = EXPORTERS[path.suffix](module, name), module.names
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path, names
 
 
-def _named(policy: Any) -> tuple[str, str | Node]:
-    """Return name and setting of a run, file or controller; no setting of a network or model."""
-    named = isinstance(policy, (str, PathLike, Mapping, Node, Controller))
-    if not named and (isinstance(policy, nn.Module) or not callable(policy)):
-        return type(policy).__name__, ""
-    name, spec = one_of(policy)
-    return name or (spec if isinstance(spec, str) else label_of(spec)), spec
-
-
 def _rule(given: Any, trust: Sequence[str], safety: Safety, limits: Any) -> DrivingProgram:
     """Return the program of a rule with steps of 0.1 s."""
     driver = Driver(given, 0.1, trust, safety, limits=limits)
-    module, noisy = driver.program, SEED in driver.program.kept
+    noisy = SEED in driver.program.kept
     require(not noisy, f"{driver.name} draws noise from seeds: it cannot be exported")
-    return module
+    return driver.program
 
 
 def described(module: DrivingProgram, name: str) -> str:

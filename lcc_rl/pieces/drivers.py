@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, InstanceOf
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require
 from lcc_rl.functional.driver_models import GAP_NOISE_TIME, DriverConstants, NoiseStep, Reaction
 from lcc_rl.functional.gipps import GippsConstants
 from lcc_rl.functional.idm import IDMConstants
@@ -293,22 +293,13 @@ class DriverModel(Drivers):
             drivers = (pair[0], pair[1], shared)
         else:
             drivers = super().described(world, where)
-        models = getattr(world.population, "models", None)
-        own = f"; CalibratedDrivers (scenario.controllers.{HUMAN}) drives each by its own"
-        if models and not single:
-            raise ConfigError(
-                f"{where}: the population holds drivers of the model(s) "
-                f"{', '.join(sorted(set(models)))}, expected IDM drivers{own} model"
-            )
         constants = drivers[2] if self.parameters is None else self.parameters
-        if not isinstance(constants, self.law):
-            expected = self.law.__name__
-            raise ConfigError(f"{where}.parameters: expected {expected}, got {constants!r}")
-        if any(isinstance(value, Tensor) for value in vars(constants).values()):
-            raise ConfigError(
-                f"{where}: drivers must share a, b and s0 (a locally calibrated population, "
-                f"drivers.mode=local), got a population in which they differ by driver{own}"
-            )
+        text = f"{where}.parameters: expected {self.law.__name__}, got {constants!r}"
+        require(isinstance(constants, self.law), text)
+        shared = not any(isinstance(value, Tensor) for value in vars(constants).values())
+        shared = shared and (single or not getattr(world.population, "models", None))
+        own = f"controller@scenario.controllers.{HUMAN}=calibrated drives each by its own"
+        require(shared, f"{where}: drivers differ in model, a, b or s0; {own}")
         return (*drivers[:2], constants)
 
 
@@ -322,6 +313,8 @@ class CalibratedDrivers(Drivers):
     def setup(self, world: World) -> None:
         super().setup(world)
         population = world.population
+        known = hasattr(population, "parameters")
+        require(known, f"{self.title}: expected a population with its drivers' parameters")
         models = getattr(population, "models", None) or ("idm",) * len(population.time_gap)
         self.models = [name for name in LAWS if name in models]
         self.register_buffer("kinds", torch.tensor([self.models.index(name) for name in models]))
@@ -330,46 +323,37 @@ class CalibratedDrivers(Drivers):
             otherwise = [getattr(LAWS[model], name, 1.0) for model in self.models]
             self.register_buffer(f"own_{name}", own.float().nan_to_num(nan=otherwise[0]))
 
-    def described(self, world: World, where: str) -> tuple[Tensor, Tensor, DriverConstants]:
-        """Return the drivers, see :class:`Drivers`."""
-        if not hasattr(world.population, "parameters"):
-            raise ConfigError(f"{where}: expected a population with its drivers' parameters")
-        return super().described(world, where)
-
     def acceleration(self, speed: Tensor, *more: Tensor) -> Tensor:
         """Return the desired acceleration of each driver by its model."""
         gap, relative_speed, desired_speed, time_gap, driver = more
         motion = (speed, gap, -relative_speed, desired_speed, time_gap)
         return self._each(driver, lambda law: law(*motion))
 
-    def equilibrium_gap(
-        self, speed: Tensor, desired_speed: Tensor, time_gap: Tensor, driver: Tensor
-    ) -> Tensor:
+    def equilibrium_gap(self, speed: Tensor, *more: Tensor) -> Tensor:
         """Return the equilibrium gap of each driver by its model."""
+        desired_speed, time_gap, driver = more
         steady = (speed, desired_speed, time_gap, LONGEST_TIME_GAP)
         return self._each(driver, lambda law: law.equilibrium_gap(*steady))
 
     def _each(self, driver: Tensor, quantity: Callable[[DriverConstants], Tensor]) -> Tensor:
-        kind, result = self.kinds[driver], None
-        for number, name in enumerate(self.models):
-            law = LAWS[name]
+        results = []
+        for law in map(LAWS.__getitem__, self.models):
             constants = {x: getattr(self, f"own_{x}")[driver] for x in law.shared()}
-            values = quantity(law(**constants))
-            result = values if result is None else torch.where(kind == number, values, result)
-        assert result is not None  # a population holds drivers
-        return result
+            results.append(quantity(law(**constants)))
+        for number, result in enumerate(results[1:], 1):
+            results[0] = torch.where(self.kinds[driver] == number, result, results[0])
+        return results[0]
 
 
 class IDM(DriverModel):
     """Drivers of the Intelligent Driver Model (A3–A4).
 
-    Drivers of the population that differ in a, b and s0, or have other models, become
-    :class:`CalibratedDrivers`.
+    Drivers of the population that differ in model, a, b or s0 become :class:`CalibratedDrivers`.
     """
 
     def bind(self, world: World | None = None, name: str | None = None) -> Any:
-        population = None if world is None or self.desired_speed else world.population
-        shared = vars(getattr(population, "constants", None) or IDMConstants()).values()
+        population: Any = None if world is None or self.desired_speed else world.population
+        shared = vars(population.constants).values() if population else ()
         differ = getattr(population, "models", None) or any(isinstance(x, Tensor) for x in shared)
         if type(self) is not IDM or self.parameters is not None or not differ:
             return super().bind(world, name)

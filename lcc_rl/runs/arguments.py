@@ -27,15 +27,11 @@ class Arguments(ArgumentParser):
 
     def add_trust(self) -> None:
         """Add ``--trust``, whose modules are separated by commas; it may be repeated."""
-        text = "modules that files may name, separated by commas"
-        self.add_argument("--trust", action="extend", type=_words, default=[], help=text)
+        how: Any = {"action": "extend", "type": lambda word: word.split(","), "default": []}
+        self.add_argument("--trust", help="modules that files may name, with commas", **how)
 
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message} ({self.prog} -h lists all flags)")
-
-
-def _words(word: str) -> list[str]:
-    return word.strip("[]").split(",")
 
 
 def wrapped(text: str) -> str:

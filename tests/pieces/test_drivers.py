@@ -189,7 +189,9 @@ def test_calibrated_idm_drivers_are_those_of_the_idm() -> None:
     for population in (bootstrap(mode="global"), MIXED):
         both = (rolled(human(x), population=population) for x in ("human", "calibrated"))
         assert torch.equal(*(data["next", "vehicles", "speed"] for data in both))
-    with pytest.raises(ConfigError, match=r"differ by driver; CalibratedDrivers .*human"):
+    with pytest.raises(
+        ConfigError, match=r"s0; controller@scenario\.controllers\.human=calibrated"
+    ):
         type("Own", (IDM,), {})().bind(World(population=bootstrap(mode="global")))
     # One driver of given (v0, T) has the mean of what differs by driver.
     people = "controller@scenario.controllers.human=calibrated"
