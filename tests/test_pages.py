@@ -38,7 +38,7 @@ NOT_RUN = {
     "lcc-rl animate": "tests/results/test_motion.py runs it",
     "lcc-rl evaluate experiment=main": "tests/test_entry_points.py does it with a job of its own",
     "lcc-rl score": "tests/evaluation/test_score.py runs it",
-    "python docs/recipes": "tests/envs/test_stock_torchrl.py and tests/test_card.py run them",
+    "python docs/recipes": "tests/envs/test_stock_torchrl.py and two more run them",
     "python tools/benchmarks": "tests/tools/test_benchmark.py runs it",
     "python tools/kill_test.py": "takes an hour",
 }
@@ -64,7 +64,6 @@ ENOUGH = {
     '["+filter=cbf"]': repr(["+filter=cbf", LENGTH, *WINDOWS, *DATA]),
     'learn("alcc", words,': f'learn("alcc", [*words, *{list(SMALL)}],',
     "n_trials=40": "n_trials=2",
-    "TRIALS = 30": "TRIALS = 1",
     "batch_size=1024": "batch_size=4",
     "num_envs=64": "num_envs=2",
     "batch_size=64": "batch_size=4",
@@ -80,7 +79,6 @@ ENTRIES = {"run": "pipeline"}  # entry points that are not called as their comma
 NEEDS = {
     "interfaces.md": ("gymnasium", "stable_baselines3", "onnx", "onnxscript", "onnxruntime"),
     "sweeps.md": ("optuna",),
-    "your_car.md": ("optuna",),
     "learners.md": ("stable_baselines3", "onnx", "onnxscript", "onnxruntime"),
 }
 PLACEHOLDER = re.compile(r"<[^<>=]*>…?|…")

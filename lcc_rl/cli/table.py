@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--rename", nargs=2, action="append", metavar=("ROW", "NAME"), help=new)
     ending = typed(Annotated[str, Field(pattern=r"\.(png|pdf|svg)$")])
     parser.add_argument("--figure", type=ending, help="also draw the table: a .png, .pdf or .svg")
-    parser.add_argument("--trust", action="append", default=[], help="module that it may name")
+    parser.add_trust()
     marks = "decimal mark of --format csv; with comma, columns are separated by ;"
     parser.add_argument("--decimal", choices=("point", "comma"), default="point", help=marks)
     options = parser.parse_args(arguments)

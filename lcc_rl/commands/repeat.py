@@ -98,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> Any:
     parser = Arguments(prog="lcc-rl repeat", description=__doc__)
     parser.add_argument("run", type=Path, help="folder of a training, evaluation, job, calibration")
     parser.add_argument("--out", type=Path, help="new folder; by default outputs/repeat/<run>")
-    parser.add_argument("--trust", action="append", default=[], help="module that it may name")
+    parser.add_trust()
     options = parser.parse_args(arguments)
     target = options.out or Path("outputs", "repeat", options.run.resolve().name)
     repeat(options.run, target, options.trust)

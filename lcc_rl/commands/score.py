@@ -321,7 +321,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="a further source of leaders, such as i24 leader=i24 leader.path=…",
     )
     parser.add_argument("--out", type=Path, help="folder, by default below outputs/score")
-    parser.add_argument("--trust", action="append", default=[], help="module that it may name")
+    parser.add_trust()
     options, further = parser.parse_known_args(arguments)
     check_overrides(further, SET_BY_SCORE, "each task has its own; --task and --source choose")
     logging.basicConfig(level=HEADLINE, format="%(message)s")  # without details

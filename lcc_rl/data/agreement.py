@@ -32,6 +32,7 @@ STRAY = 0.2  # largest distance left of a relative speed, as a share of the foll
 LOUD, LOUD_RATE, LOUD_FACTOR = 0.3, 0.3, 1.15  # reported: lag [s], bias of a speed [m/s], factor
 STANDING, LEAST_STANDING = 0.5, 300  # speed [m/s], samples
 FAR_STANDING = 15.0  # gap that may be in feet [m]
+OF_LOGS = "relative_speed"  # key of a log's column from which the leader's speed is computed
 RATES = (5, 10, 15, 20, 25, 30, 50, 60)  # frames per second of recordings
 
 
@@ -162,10 +163,13 @@ def mistakes(units: Units) -> Iterator[tuple[bool, str, str, float, float]]:
     yield True, "follower", "are leader and follower exchanged?", -1.0, -1.0
     for signal, subject, quantity, keys, leader, follower in (
         ("gap", "is the gap", "length", ("gap", "position"), -1, -1),
+        ("leader", "is the relative speed", "speed", (OF_LOGS,), 1, 1),
         ("follower", "are both speeds", "speed", ("speed", "follower_speed", "leader_speed"), 1, 1),
         ("leader", "is the leader's speed", "speed", ("leader_speed",), 1, 0),
         ("follower", "is the follower's speed", "speed", ("follower_speed",), 0, 1),
     ):
+        if signal != "gap" and (OF_LOGS in keys) != (OF_LOGS in units):
+            continue
         named = [key for key in keys if key in units][: 1 if signal == "gap" else None]
         declared = units.get([*named, quantity][0], SI[quantity])
         for unit, size in (UNITS["length"] if signal == "gap" else SPEEDS).items():
@@ -228,7 +232,7 @@ def check_pairs(
         lag = f"{abs(pair['late']):.1f} s{most} {'late' if pair['late'] > 0 else 'early'}"
         late.append((pair["row"], pair["signal"], f"{pair['signal']} {lag}; are clocks apart?"))
         too_late += late[-1:] * (abs(pair["late"]) > max_lag)
-    for line in (*middle(wrong), *middle(too_late)):
+    for line in (*middle(wrong), *middle(too_late), *_own_speed(episodes, units, max_mismatch)):
         raise DataError(line)
     odd = pairs[clear & ~right & ~pairs["slope"].between(*span)].to_dict("records")
     sure = right & (pairs["fit"] >= SURE_FIT)  # noise lowers the coefficients
@@ -280,6 +284,33 @@ def _mistaken(
     near = [x for x in sorted(near, key=lambda x: x[1:2]) if x[0] < least + log(ALIKE)]
     questions = " or ".join(x[3] for x in near)
     return [(pair["row"], near[0][2], f"{message}; {questions}")]
+
+
+def _own_speed(episodes: pd.DataFrame, units: Units, max_mismatch: float) -> Iterator[str]:
+    """Yield words on a log's own speed in too small a unit, with which gaps agree nevertheless.
+
+    Least squares fit the change of the relative speed in 1 s by that of the own speed, and by both
+    in the 2 s before. As leaders do not react to followers, the first coefficient is at least −1.
+    """
+    declared = SPEEDS.get(units.get("follower_speed", ""), 1.0)
+    width, number = round(EVERY_S / FRAME), episodes["episode"].to_numpy()
+    rows = np.flatnonzero(number[3 * width :] == number[: -3 * width]) + 2 * width
+    if OF_LOGS not in units or len(rows) * FRAME < LEAST_ALL_S:
+        return
+    own, ahead = (episodes[PAIR_SIGNALS[x]].to_numpy(float) for x in ("follower", "leader"))
+    terms = [(ahead - own)[rows]]
+    for since in (-1, 0, 1):
+        terms += [
+            (v[rows + since * width] - v[rows + (since - 1) * width]) for v in (ahead - own, own)
+        ]
+    relative = terms.pop(-2)
+    change = float(np.linalg.lstsq(np.stack(terms, axis=1), relative, rcond=None)[0][-1])
+    unit, size = min(SPEEDS.items(), key=lambda x: abs(x[1] / declared + change))
+    if -change > max_mismatch and size > declared:
+        yield (
+            f"where the follower's speed changes by 1 m/s, relative_speed changes by {change:.2f} "
+            f"m/s; is the follower's speed in {unit} (data.units.follower_speed={unit})?"
+        )
 
 
 def _biased(pair: Mapping[Any, Any]) -> list[tuple[int, str, str]]:

@@ -170,7 +170,7 @@ class EpisodesSource(Source):
         usual = {key: name for key, name in EPISODE_NAMES.items() if key in self.units}
         named = {**usual, **self.columns}
         source += read_as(PAIR_FIELDS, named, self.units)
-        units = units_of(PAIR_FIELDS, EPISODE_NAMES, self.units)
+        units = units_of(PAIR_FIELDS, {**EPISODE_NAMES, **self.columns}, self.units)
         place = partial(places, files=files, columns=self.columns)
         return self.select(episodes, source, lines, place=place, units=units)
 

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 from omegaconf import OmegaConf
+from torch import nn
 
 from lcc_rl.config import choices, composed, load, own_file
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.config.words import DOTTED, FILTERED, YAML
-from lcc_rl.errors import ConfigError, unknown_name
+from lcc_rl.errors import ConfigError, in_short, require, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.pieces.controllers import Controller, Law
@@ -71,9 +72,9 @@ def setting_of(spec: Any, where: str = "compare") -> str | Node:
         where: its place in the configuration, for messages.
 
     Raises:
-        ConfigError: if a class or function is not at the top level of a module.
+        ConfigError: if it is none, or a class or function is not at the top level of a module.
     """
-    if isinstance(spec, Node):
+    if isinstance(spec, (str, Node)):
         return spec
     if isinstance(spec, Controller):
         spec = {TARGET: path_of(type(spec)), **values(spec)}
@@ -81,7 +82,24 @@ def setting_of(spec: Any, where: str = "compare") -> str | Node:
         return Node.of(spec, where)
     if isinstance(spec, PathLike):
         return fspath(spec)
-    return path_of(spec) if callable(spec) else str(spec)
+    expected = "expected a run, a file, a controller, a torch module or a model"
+    known = callable(spec) and not isinstance(spec, nn.Module)
+    require(known, f"{where}: {expected}, got {in_short(spec)}")
+    return path_of(spec)
+
+
+def one_of(given: Any) -> tuple[str, Any]:
+    """Return name and setting of a policy or controller, or of a mapping of one by its name.
+
+    Raises:
+        ConfigError: as :func:`setting_of`, or if the mapping has several.
+    """
+    named = isinstance(given, Mapping) and TARGET not in given
+    message = f"controller: expected one, such as {{'name': MyACC()}}, got {in_short(given)}"
+    require(not named or len(given) == 1, message)
+    name, value = next(iter(given.items())) if named else ("", given)
+    spec = setting_of(value, "controller")
+    return name or (spec if isinstance(spec, str) else label_of(spec)), spec
 
 
 def is_policy(spec: Any) -> TypeGuard[str]:

@@ -34,7 +34,7 @@ from lcc_rl.evaluation.metrics import (
     energy_measures,
     safety_measures,
 )
-from lcc_rl.evaluation.named import controller_of, is_policy, setting_of
+from lcc_rl.evaluation.named import controller_of, is_policy, one_of
 from lcc_rl.evaluation.rollout import Player, Record, reset_options
 from lcc_rl.evaluation.rows import INDEX, highest
 from lcc_rl.evaluation.strategies import Strategy
@@ -130,7 +130,7 @@ def simulate(
     fixed = OF_ARGUMENTS | {"reward"} | chosen
     check_overrides(overrides, fixed, "has no effect in simulate: see the arguments")
     profiles = _profiles(leader, time_step, seconds)
-    compared, spec = _given(controller)
+    name, spec = ("", None) if controller is None else one_of(controller)
     reads = () if spec is None or is_policy(spec) else controller_of(spec).kind.reads
     settings = (
         *("evaluation.baselines=[]", "evaluation.behind_filter=[]", "evaluation.warm_up=0"),
@@ -140,7 +140,7 @@ def simulate(
         *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
     )
-    cfg = load("evaluate", settings).with_(compare=compared, reward=UNREAD)
+    cfg = load("evaluate", settings).with_(compare={name: spec} if spec else [], reward=UNREAD)
     require(
         (cfg.scenario.road == RING) == (leader is None),
         "simulate: a ring (scenario=ring in overrides) has leader=None, an open road has a leader",
@@ -152,16 +152,6 @@ def simulate(
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, spec is None, typed=overrides).strategies(inputs)[-1]
     return _simulated(strategy, inputs, repeats, seed)
-
-
-def _given(controller: Any) -> tuple[Any, Any]:
-    """Return the value of ``compare`` for a controller, and its setting; None without one."""
-    named = isinstance(controller, Mapping) and TARGET not in controller
-    message = f"controller: expected one, such as {{'name': MyACC()}}, got {in_short(controller)}"
-    require(not named or len(controller) == 1, message)
-    name, value = next(iter(controller.items())) if named else ("", controller)
-    spec = None if value is None else setting_of(value, "controller")
-    return {name: spec} if named else [spec] * (spec is not None), spec
 
 
 def _words(string: str | Mapping[str, Any]) -> str:

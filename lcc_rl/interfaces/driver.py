@@ -19,7 +19,7 @@ from lcc_rl.envs.checks import BATCH, check_step
 from lcc_rl.envs.clock import checked_seed
 from lcc_rl.envs.rowwise import Array, Rowwise
 from lcc_rl.errors import ConfigError, Diverged, raised_as, require, unknown_name
-from lcc_rl.evaluation.named import controller_of, is_policy, label_of, setting_of
+from lcc_rl.evaluation.named import controller_of, is_policy, one_of
 from lcc_rl.functional.machine_code import kept
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.recorder import Untranslatable
@@ -52,7 +52,7 @@ class Driver:
     Args:
         name: a run, a run folder, a policy file, ``pretrained/<name>``, or a controller by name
             (``"idm_acc"``), as object, class, function, file or node, see :func:`lcc_rl.compare`.
-            Append ``_filtered`` to the name of a rule to put it behind the safety filter.
+            ``_filtered`` at the end of a rule's name, also in ``{name: rule}``, adds the filter.
         time_step: duration of a step of the simulator [s]; a policy needs that of its training.
         trust: modules outside this package that a policy may name.
         safety: the safety filter, or changed settings, such as ``{"margin": 2.0}``, of the default:
@@ -92,8 +92,7 @@ class Driver:
     ) -> None:
         usable = isinstance(time_step, (int, float)) and 0.0 < time_step < math.inf
         require(usable, f"time_step must be a positive number of seconds, got {time_step!r}")
-        spec = setting_of(name)
-        self.name = spec if isinstance(spec, str) else label_of(spec)
+        self.name, spec = one_of(name)
         first = checked_seed(seed)
         require(first is not None, "seed must be a whole number, got None")
         self.time_step, self.seed = time_step, first or 0
@@ -116,7 +115,7 @@ class Driver:
 
     def _rule(self, spec: Any, safety: Safety, world: World, limits: Any) -> DrivingProgram:
         active = None
-        if isinstance(spec, str) and spec.endswith(FILTERED):
+        if any(str(word).endswith(FILTERED) for word in (self.name, spec)):
             filters = load("evaluate", ["variant=idm", "+filter=cbf"]).scenario.filters
             active = filters[AUTOMATED].made(CBFFilter)
         active = filter_of(safety, active, self.name)

@@ -12,7 +12,6 @@ import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from io import BytesIO
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,9 @@ import torch
 from omegaconf import OmegaConf
 
 from lcc_rl.config import key_of, load, with_variant
-from lcc_rl.errors import ConfigError, needing, require, require_known
+from lcc_rl.errors import needing, require, require_known
 from lcc_rl.evaluation.foreign import network_of
-from lcc_rl.evaluation.named import is_policy
+from lcc_rl.evaluation.named import is_policy, one_of
 from lcc_rl.interfaces.c_code import c_code
 from lcc_rl.interfaces.driver import Driver
 from lcc_rl.interfaces.exported import DrivingProgram, Safety, described_input, program
@@ -30,6 +29,7 @@ from lcc_rl.interfaces.onnx_policy import MAKES, TAKES
 from lcc_rl.interfaces.ring_page import ring_page
 from lcc_rl.io.atomic import atomic_path, new_file
 from lcc_rl.pieces.base import SEED
+from lcc_rl.pieces.controllers import Controller
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.version import __version__
 
@@ -56,8 +56,8 @@ def export(
 
     Args:
         policy: a run folder, a policy file, or ``pretrained/<name>``; a rule by name, with steps of
-            0.1 s (``"idm_acc_filtered"``); or a model of
-            stable-baselines3 or a torch module from observations ``[batch, n]`` to actions
+            0.1 s (``"idm_acc_filtered"``); a controller as for :func:`lcc_rl.simulate`; or a model
+            of stable-baselines3 or a torch module from observations ``[batch, n]`` to actions
             ``[batch, 1]``.
         path: the file to write.
         trust: modules outside this package that the policy may name.
@@ -97,15 +97,12 @@ def _written(
     """Write the file, see :func:`export`; return its path and the inputs of its program."""
     path = new_file(path, "name")
     require_known("ending", path.suffix, [*EXPORTERS, PAGE])
-    cfg, page = None, path.suffix == PAGE
-    if not isinstance(policy, (str, PathLike)):
-        source = policy
-        if (policy := network_of(source, normalize)) is None:
-            kind = type(source).__name__
-            raise ConfigError(f"expected a run, a file, a torch module or a model, got {kind}")
-        cfg = load("train", with_variant(variant, overrides))
-    rule = cfg is None and not is_policy(str(policy))
-    text = f"{policy}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
+    page = path.suffix == PAGE
+    network = None if isinstance(policy, Controller) else network_of(policy, normalize)
+    name, spec = one_of(policy) if network is None else (type(policy).__name__, network)
+    cfg = None if network is None else load("train", with_variant(variant, overrides))
+    rule = cfg is None and not is_policy(spec)
+    text = f"{name}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
     require(not page or (cfg is None and not (safety or limits or rule)), text)
     if cfg is None and not page and overrides:
         text = (
@@ -122,19 +119,19 @@ def _written(
         content = ring_page(policy, trust, overrides).encode()
     else:
         changes = (safety, limits)
-        module = _rule(policy, trust, *changes) if rule else program(policy, trust, cfg, *changes)
-        name = str(policy) if isinstance(policy, (str, PathLike)) else type(policy).__name__
+        module = _rule(policy, trust, *changes) if rule else program(spec, trust, cfg, *changes)
         content, names = EXPORTERS[path.suffix](module, name), module.names
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path, names
 
 
-def _rule(name: Any, trust: Sequence[str], safety: Safety, limits: Any) -> DrivingProgram:
+def _rule(given: Any, trust: Sequence[str], safety: Safety, limits: Any) -> DrivingProgram:
     """Return the program of a rule with steps of 0.1 s."""
-    module = Driver(str(name), 0.1, trust, safety, limits=limits).program
-    require(SEED not in module.kept, f"{name} draws noise from seeds: it cannot be exported")
-    return module
+    driver = Driver(given, 0.1, trust, safety, limits=limits)
+    noisy = SEED in driver.program.kept
+    require(not noisy, f"{driver.name} draws noise from seeds: it cannot be exported")
+    return driver.program
 
 
 def described(module: DrivingProgram, name: str) -> str:
@@ -200,7 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = Arguments(description="Export a policy for other software.")
     parser.add_argument("policy", help="run folder, policy.pt, pretrained/<name> or a rule")
     parser.add_argument("path", help="file: a program (.onnx, .pt2, .c) or a page (.html)")
-    parser.add_argument("--trust", action="append", default=[], help="module that it may name")
+    parser.add_trust()
     text = "of a page's ring (drivers=i80), of a program (safety.margin=2 limits.max_braking=6)"
     parser.add_argument("settings", nargs="*", default=[], help=text)
     options = parser.parse_args(arguments)

@@ -101,10 +101,10 @@ class DrivingProgram(nn.Module):
     """Maps measurements ``[batch, inputs]`` to accelerations ``[batch, 1]`` [m/s²].
 
     A program with a memory also reads and returns the memory, ``[batch, width]``. If its first
-    number is zero, the vehicle starts anew. Inputs of ``behind.`` that are NaN get their stand-ins.
-    With a safety filter, an input ahead that is not finite, or a gap that is not positive, is no
-    measurement. After one such step the last measurements are used again. In further ones the
-    filter brakes fully, and the vehicle starts anew.
+    number is zero, the vehicle starts anew, as after a NaN in the memory. Inputs of ``behind.``
+    that are NaN get their stand-ins. With a safety filter, an input ahead that is not finite, or a
+    gap that is not positive, is no measurement. After one such step the last measurements are used
+    again. In further ones the filter brakes fully, and the vehicle starts anew.
 
     Args:
         pieces: a policy's memory and observation, the controller, the safety filter, in this order
@@ -203,9 +203,8 @@ class DrivingProgram(nn.Module):
         if memory is None:
             return (command,)
         after = self._packed(reached, memory, last)
-        if self.safety is not None:  # without measurements the vehicle starts anew
-            after = torch.where(after.isfinite().all(-1, keepdim=True), after, 0.0)
-        return command, after
+        # Without measurements the vehicle starts anew.
+        return command, torch.where(after.isfinite().all(-1, keepdim=True), after, 0.0)
 
     def _with_stand_ins(self, state: Tensor) -> Tensor:
         """Return the inputs with the stand-ins of a vehicle behind that is not measured."""

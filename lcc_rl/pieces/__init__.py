@@ -5,12 +5,11 @@
 from lcc_rl.functional.pattern import VehicleString, parse_string
 from lcc_rl.pieces.actuation import Actuation
 from lcc_rl.pieces.base import Entry, Feature, Piece, RewardPiece, StepTransform
-from lcc_rl.pieces.calibrated import CalibratedDrivers
 from lcc_rl.pieces.cbf import CBFFilter, Corrected
 from lcc_rl.pieces.connected import CACC, Communication, DeadBeat
 from lcc_rl.pieces.controllers import Action, ConstantAcceleration, Controller, Law
 from lcc_rl.pieces.cruise import IDMACC, LinearACC
-from lcc_rl.pieces.drivers import FVDM, IDM, OVM, DriverModel, Gipps
+from lcc_rl.pieces.drivers import FVDM, IDM, OVM, CalibratedDrivers, DriverModel, Gipps
 from lcc_rl.pieces.estimator import DriverEstimator
 from lcc_rl.pieces.features import EnergyClasses, MotorPower, TimeGap, TimeToCollision
 from lcc_rl.pieces.hybrid import HCFS

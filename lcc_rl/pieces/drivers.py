@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -10,10 +10,11 @@ from pydantic import BeforeValidator, Field, InstanceOf
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require
 from lcc_rl.functional.driver_models import GAP_NOISE_TIME, DriverConstants, NoiseStep, Reaction
 from lcc_rl.functional.gipps import GippsConstants
 from lcc_rl.functional.idm import IDMConstants
+from lcc_rl.functional.laws import LAWS
 from lcc_rl.functional.layout import join, reverse
 from lcc_rl.functional.ovm import FVDMConstants, OVMConstants
 from lcc_rl.functional.pattern import HUMAN
@@ -24,7 +25,7 @@ from lcc_rl.pieces.features import first_speeds, of_role, speed_limits
 from lcc_rl.pieces.leader import LEADER_SPEED
 from lcc_rl.pieces.views import MOTION_READS
 from lcc_rl.pieces.world import MOST_LATE, World
-from lcc_rl.settings import Factors, Increasing, NonNegative, Positive, Share
+from lcc_rl.settings import Factors, Increasing, NonNegative, Positive, Share, defaults, values
 
 Delay = Annotated[int, Field(ge=0, le=MOST_LATE)]
 # Draws that all drivers of an episode share.
@@ -292,28 +293,72 @@ class DriverModel(Drivers):
             drivers = (pair[0], pair[1], shared)
         else:
             drivers = super().described(world, where)
-        models = getattr(world.population, "models", None)
-        if models and not single:
-            raise ConfigError(
-                f"{where}: the population holds drivers of the model(s) "
-                f"{', '.join(sorted(set(models)))}, expected IDM drivers; "
-                f"controller@{where}=calibrated drives each by its own model"
-            )
         constants = drivers[2] if self.parameters is None else self.parameters
-        if not isinstance(constants, self.law):
-            expected = self.law.__name__
-            raise ConfigError(f"{where}.parameters: expected {expected}, got {constants!r}")
-        if any(isinstance(value, Tensor) for value in vars(constants).values()):
-            raise ConfigError(
-                f"{where}: drivers must share a, b and s0 (a locally calibrated population, "
-                "drivers.mode=local), got a population in which they differ by driver; "
-                f"controller@{where}=calibrated drives each by its own"
-            )
+        text = f"{where}.parameters: expected {self.law.__name__}, got {constants!r}"
+        require(isinstance(constants, self.law), text)
+        shared = not any(isinstance(value, Tensor) for value in vars(constants).values())
+        shared = shared and (single or not getattr(world.population, "models", None))
+        own = f"controller@scenario.controllers.{HUMAN}=calibrated drives each by its own"
+        require(shared, f"{where}: drivers differ in model, a, b or s0; {own}")
         return (*drivers[:2], constants)
 
 
+class CalibratedDrivers(Drivers):
+    """Drivers of the population; each follows its calibrated model and parameters."""
+
+    tells_gap = True
+    further = ("driver",)
+    kinds: ClassVar[Tensor]
+
+    def setup(self, world: World) -> None:
+        super().setup(world)
+        population = world.population
+        known = hasattr(population, "parameters")
+        require(known, f"{self.title}: expected a population with its drivers' parameters")
+        models = getattr(population, "models", None) or ("idm",) * len(population.time_gap)
+        self.models = [name for name in LAWS if name in models]
+        self.register_buffer("kinds", torch.tensor([self.models.index(name) for name in models]))
+        for name, own in population.parameters().items():
+            # Parameters that a driver's model lacks are computed, too, and need a finite gradient.
+            otherwise = [getattr(LAWS[model], name, 1.0) for model in self.models]
+            self.register_buffer(f"own_{name}", own.float().nan_to_num(nan=otherwise[0]))
+
+    def acceleration(self, speed: Tensor, *more: Tensor) -> Tensor:
+        """Return the desired acceleration of each driver by its model."""
+        gap, relative_speed, desired_speed, time_gap, driver = more
+        motion = (speed, gap, -relative_speed, desired_speed, time_gap)
+        return self._each(driver, lambda law: law(*motion))
+
+    def equilibrium_gap(self, speed: Tensor, *more: Tensor) -> Tensor:
+        """Return the equilibrium gap of each driver by its model."""
+        desired_speed, time_gap, driver = more
+        steady = (speed, desired_speed, time_gap, LONGEST_TIME_GAP)
+        return self._each(driver, lambda law: law.equilibrium_gap(*steady))
+
+    def _each(self, driver: Tensor, quantity: Callable[[DriverConstants], Tensor]) -> Tensor:
+        results = []
+        for law in map(LAWS.__getitem__, self.models):
+            constants = {x: getattr(self, f"own_{x}")[driver] for x in law.shared()}
+            results.append(quantity(law(**constants)))
+        for number, result in enumerate(results[1:], 1):
+            results[0] = torch.where(self.kinds[driver] == number, result, results[0])
+        return results[0]
+
+
 class IDM(DriverModel):
-    """Drivers of the Intelligent Driver Model (A3–A4)."""
+    """Drivers of the Intelligent Driver Model (A3–A4).
+
+    Drivers of the population that differ in model, a, b or s0 become :class:`CalibratedDrivers`.
+    """
+
+    def bind(self, world: World | None = None, name: str | None = None) -> Any:
+        population: Any = None if world is None or self.desired_speed else world.population
+        shared = vars(population.constants).values() if population else ()
+        differ = getattr(population, "models", None) or any(isinstance(x, Tensor) for x in shared)
+        if type(self) is not IDM or self.parameters is not None or not differ:
+            return super().bind(world, name)
+        own = {x: value for x, value in values(self).items() if x in defaults(Drivers)}
+        return CalibratedDrivers(**own).bind(world, name)
 
 
 class OVM(DriverModel):

@@ -49,8 +49,8 @@ class ReplacedLeader(NGSIMLeader):
         end = world.horizon * world.time_step
         require(
             world.time_step <= self.at[0] and self.at[1] < end,
-            f"scenario.pieces.leader.at must lie within the episode of {end:g} s, got "
-            f"{list(self.at)}",
+            f"scenario.pieces.leader.at={list(self.at)} must lie within the episode of {end:g} s "
+            "(scenario.horizon); scenario.pieces.leader.at=[2,3] sets other times",
         )
         names = ("at", "distance", "excess")
         self.changes = [stream_id(f"leader.replaced.{name}") for name in names]

@@ -25,6 +25,11 @@ class Arguments(ArgumentParser):
         settings.setdefault("allow_abbrev", False)
         super().__init__(description=wrapped(description or ""), **settings)
 
+    def add_trust(self) -> None:
+        """Add ``--trust``, whose modules are separated by commas; it may be repeated."""
+        how: Any = {"action": "extend", "type": lambda word: word.split(","), "default": []}
+        self.add_argument("--trust", help="modules that files may name, with commas", **how)
+
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message} ({self.prog} -h lists all flags)")
 

@@ -511,6 +511,23 @@ def test_the_log_of_a_car_has_relative_speeds_targets_and_a_flag(tmp_path) -> No
         EpisodesSource(path=str(tmp_path / "bad.csv"), columns=LOG).load()
 
 
+def test_a_log_with_one_speed_in_another_unit_is_refused(tmp_path) -> None:
+    found = EpisodesSource(path="platoons").load().episodes
+    log = pd.DataFrame({"t": found["time_s"] + 1000.0 * found["episode"], "v": found[SPEEDS[1]]})
+    log["range"], log["range_rate"] = found["gap_m"], found[SPEEDS[0]] - log["v"]
+    log.assign(ok=1, id=found["episode"] + 1).to_csv(tmp_path / "log.csv", index=False)
+
+    def read(**units: str):
+        return EpisodesSource(path=str(tmp_path / "log.csv"), columns=LOG, units=units)
+
+    assert "slope of gaps over speeds 0.96" in read().load().report[-1]
+    words = r"where the follower's speed changes by 1 m/s, relative_speed changes by -3\.\d\d m/s; "
+    words += r"is the follower's speed in m/s \(data\.units\.follower_speed=m/s\)\?.*max_mismatch"
+    other = r"is the relative speed in m/s \(data\.units\.relative_speed=m/s\)\?"
+    cases = [("follower_speed", words), ("relative_speed", other)]
+    check_refused(lambda key: read(**{key: "km/h"}).load(), cases, DataError)
+
+
 def test_noisy_speeds_of_a_fast_raster_are_smoothed_by_the_option_of_the_message(tmp_path) -> None:
     log = car_log()
     noise = 0.2 * np.random.default_rng(0).normal(size=len(log))

@@ -7,6 +7,7 @@ import runpy
 import numpy as np
 import pytest
 import torch
+import yaml
 from page_blocks import ROOT, blocks
 from scipy.interpolate import RegularGridInterpolator
 
@@ -33,22 +34,18 @@ def test_the_car_of_the_page_draws_what_its_map_says(tmp_path) -> None:
     assert in_unit(720.0, "kWh/100km", car) == pytest.approx(20.0)
 
 
-def test_the_search_of_the_page_prefers_gains_that_damp_waves(tmp_path, monkeypatch) -> None:
-    """Gains that the search chose without its penalty on waves, and what it chooses with it."""
+def test_the_search_of_the_page_keeps_flow_and_damps_waves(tmp_path, monkeypatch) -> None:
+    """The gains of the page, and those that short windows or no penalty on waves would choose."""
     trial = pytest.importorskip("optuna").trial.FixedTrial
-    car, search = (
-        next(b.text for b in blocks(ROOT / "docs" / "your_car.md") if words in b.text)
-        for words in ("class MyCar", "import optuna")
-    )
-    (tmp_path / "my_car.py").write_text(car)
+    page = blocks(ROOT / "docs" / "your_car.md")
+    (tmp_path / "my_car.py").write_text(next(b.text for b in page if "class MyCar" in b.text))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    space: dict = {}
-    exec(search.split("\nstudy =")[0], space)
-    growing, damped = {"time_gap": 0.845, "gain": 0.0204}, {"time_gap": 1.183, "gain": 0.0212}
-    assert space["growth"](damped) < 0.98 < 1.05 < space["growth"](growing)
-    us06 = space["lcc_rl"].simulate("us06", "automated*8", space["Follow"](**damped)).steps
-    deviation = us06.groupby("vehicle")["speed_mps"].std()
-    assert deviation[8] / deviation[0] == pytest.approx(0.98, abs=0.005)  # of the page
-    assert us06["gap_m"].min() > 1.0
-    assert space["cost"](trial(damped)) < 0.8 * space["cost"](trial(growing))
+    space = runpy.run_path(str(ROOT / "docs" / "recipes" / "my_gains.py"))
+    tuned = yaml.safe_load(next(b.text for b in page if b.before == "`tuned.yaml`:"))
+    assert tuned.pop("_target_") == "my_car.Follow"
+    start = {"time_gap": 1.4, "gain": 0.2, "damping": 0.8}
+    short = {**start, "time_gap": 1.183, "gain": 0.02}
+    assert space["growth"](tuned) < 0.96 < 1.05 < space["growth"]({**short, "time_gap": 0.845})
+    assert space["cost"](trial(tuned)) < 0.8 * space["cost"](trial(start))  # of less flow
+    assert space["cost"](trial(short)) == np.inf  # what windows of 6 s do not show

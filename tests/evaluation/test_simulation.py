@@ -197,11 +197,10 @@ def test_a_leader_that_is_replaced_does_not_jump() -> None:
 
 def test_drivers_of_a_table_are_those_of_its_path(caplog) -> None:
     path = ASSETS / SHIPPED_DRIVERS  # it has both modes
-    own = "controller@scenario.controllers.human=calibrated"
     for mode in ("local", "global"):
-        words = [f"drivers.mode={mode}", own]
-        found = lcc_rl.simulate(WAVE, "human*2", drivers=path, overrides=words)
-        given = lcc_rl.simulate(WAVE, "human*2", drivers=bootstrap(mode=mode), overrides=[own])
+        args = WAVE, "automated human*2", "human"
+        found = lcc_rl.simulate(*args, drivers=path, overrides=[f"drivers.mode={mode}"])
+        given = lcc_rl.simulate(*args, drivers=bootstrap(mode=mode))
         pd.testing.assert_frame_equal(found.steps, given.steps)
     assert "several modes" not in caplog.text
     lcc_rl.simulate(WAVE, "human", drivers=path)

@@ -420,7 +420,7 @@ def test_models_of_stable_baselines3_are_compared_and_exported(sb3, tmp_path) ->
     wide = nn.Linear(9, 1)
     cases = [
         (wide, "Linear fails for observations of 7"),
-        (object(), "expected a run, a file, a torch module or a"),
+        (object(), "expected a run, a file, a controller, a torch"),
     ]
     check_refused(lambda who: lcc_rl.export(who, tmp_path / "x.onnx"), cases, ConfigError)
     with pytest.raises(ConfigError, match="needs a run or a policy file"):

@@ -19,6 +19,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.pieces import IDM
+from lcc_rl.pieces.world import World
 
 MODELS = {"idm": "human", "ovm": "ovm", "fvdm": "fvdm", "gipps": "gipps"}
 EACH = pytest.mark.parametrize("model", list(MODELS))
@@ -184,11 +185,14 @@ def test_calibrated_idm_drivers_are_those_of_the_idm() -> None:
     by_table = rolled(human("calibrated"))
     for key in (("vehicles", "speed"), ("human", "driver")):
         assert torch.equal(by_idm["next", key], by_table["next", key])
-    # A globally calibrated population drives, too.
-    data = rolled(human("calibrated"), population=bootstrap(mode="global"))
-    assert data["next", "vehicles", "speed"].isfinite().all()
-    with pytest.raises(ConfigError, match=r"differ by driver.*=calibrated"):
-        rolled(human("human"), population=bootstrap(mode="global"))
+    # Drivers that differ in more than (v0, T) are those of the table by default.
+    for population in (bootstrap(mode="global"), MIXED):
+        both = (rolled(human(x), population=population) for x in ("human", "calibrated"))
+        assert torch.equal(*(data["next", "vehicles", "speed"] for data in both))
+    with pytest.raises(
+        ConfigError, match=r"s0; controller@scenario\.controllers\.human=calibrated"
+    ):
+        type("Own", (IDM,), {})().bind(World(population=bootstrap(mode="global")))
     # One driver of given (v0, T) has the mean of what differs by driver.
     people = "controller@scenario.controllers.human=calibrated"
     cfg = compose("alcc", "controller@scenario.controllers.automated=idm", people)

@@ -123,7 +123,7 @@ def test_what_does_not_fit_is_refused() -> None:
         build_pieces(cfg, world_of(cfg, STEADY, POPULATION))
 
     cases = [
-        (["+event=cut_in", f"{LEADER}.at=[20,30]"], "leader.at must lie within .* 15 s, got"),
+        (["+event=cut_in", f"{LEADER}.at=[20,30]"], r"leader.at=\[20.* 15 s \(scenario.hor"),
         (["+event=cut_in", f"+{LEADER}.farther=[1,2]"], r"give gap \(cut-in\) or farther"),
         (["+event=cut_in", f"{LEADER}.at=[2,3]", "+knowledge=preview"], "a preview reads the rec"),
         (

@@ -66,7 +66,7 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     sys.modules.pop("my_measures", None)
 
 
-TRUSTED = ["--trust", "my_measures"]
+TRUSTED = ["--trust", "elsewhere,my_measures"]
 
 
 @pytest.mark.usefixtures("blank_figures")
