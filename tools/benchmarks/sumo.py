@@ -44,10 +44,8 @@ def write_network(path: Path, circumference: float) -> None:
     _write(root, path)
 
 
-def write_vehicles(
-    path: Path, cfg: StudyConfig, around: float, places: Sequence[float], speed: float
-) -> None:
-    """Write vehicles at their places [m]; each follows the one of the number before."""
+def write_vehicles(path: Path, cfg: StudyConfig, around: float, places: Sequence[float]) -> None:
+    """Write the vehicles at their places; each follows the one of the number before."""
     scenario, driver = cfg.scenario, cfg.drivers.settings
     root = ElementTree.Element("routes")
     of_type = {
@@ -63,7 +61,7 @@ def write_vehicles(
     for number, place in enumerate(places):
         edges = ("east", "west") if place < 0.5 * around else ("west", "east")
         start = {"departPos": f"{place % (0.5 * around):.6f}", "depart": "0"}
-        start |= {"id": f"car{number}", "type": HUMAN, "departSpeed": str(speed)}
+        start |= {"id": f"car{number}", "type": HUMAN, "departSpeed": str(scenario.initial_speed)}
         start["insertionChecks"] = "none"  # they are where the task puts them, however near
         vehicle = ElementTree.SubElement(root, "vehicle", start)
         ElementTree.SubElement(vehicle, "route", edges=" ".join(edges), repeat=str(AROUND))
@@ -76,23 +74,16 @@ def _write(root: ElementTree.Element, path: Path) -> None:
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
 
 
-def start(
-    cfg: StudyConfig, folder: Path, around: float, places: Sequence[float] = (), speed: float = 0.0
-) -> None:
-    """Start SUMO with vehicles on a ring, evenly spread unless their places are given.
+def start(cfg: StudyConfig, folder: Path, around: float, places: Sequence[float] = ()) -> None:
+    """Start SUMO on a ring, ``around`` [m], with vehicles at places [m], by default evenly spread.
 
-    Args:
-        cfg: the vehicles and their drivers.
-        folder: where SUMO's files go.
-        around: circumference of the ring [m].
-        places: place of each vehicle, from front to back [m].
-        speed: their first speed [m/s].
+    Its files go into a folder.
     """
     count = len(parse_string(cfg.scenario.string).roles)
-    spread = [around * (1.0 - (number + 0.5) / count) for number in range(count)]
+    places = places or [around * (1.0 - (number + 0.5) / count) for number in range(count)]
     sumo, step = load_sumo(), cfg.scenario.time_step
     write_network(folder / "ring.net.xml", around)
-    write_vehicles(folder / "ring.rou.xml", cfg, around, places or spread, speed)
+    write_vehicles(folder / "ring.rou.xml", cfg, around, places)
     words = ["sumo", "-n", f"{folder}/ring.net.xml", "-r", f"{folder}/ring.rou.xml"]
     words += ["--step-length", str(step), "--step-method.ballistic", "true", "--no-step-log"]
     sumo.start([*words, "--collision.action", "warn", "--no-warnings", "true"])
