@@ -51,8 +51,8 @@ def trip_energies(
     Returns:
         A row per trip, by name: ``trip``, ``parts`` (records that holes divide it into),
         ``duration_s``, ``distance_km``, ``energy_kj`` as drawn, ``net_energy_kj``, less the gain of
-        kinetic energy; and of the energy drawn ``energy_kwh``, ``kwh_per_100km``, fuel and carbon
-        dioxide.
+        kinetic energy and height; and of the energy drawn ``energy_kwh``, ``kwh_per_100km``, fuel
+        and carbon dioxide.
     """
     for word in overrides:
         valid = top_key(word) in ("energy", "leader", "scenario", "trust")
@@ -90,10 +90,11 @@ def _energies(records: Profiles, block: slice, model: Any) -> pd.DataFrame:
     speed = records.speeds[rows]
     if records.grades is not None:
         model = model.at(records.grades[rows][:-1])
-    power = model.power(speed[:-1], speed.diff() / step).numpy()
-    power[last[:-1]] = 0.0  # from one record to the next
-    drawn = KILO * step * np.add.reduceat(power, first, dtype=np.float64)
+    rates = np.stack([model.power(speed[:-1], speed.diff() / step), model.climbing(speed[:-1])])
+    rates[:, last[:-1]] = 0.0  # from one record to the next
+    drawn, climbed = KILO * step * np.add.reduceat(rates, first, axis=1, dtype=np.float64)
     edges = speed[np.stack([first, last])].double()
+    stored = climbed + KILO * model.stored_energy(edges).diff(dim=0)[0].numpy()
     total = np.add.reduceat(speed.numpy(), first, dtype=np.float64) - 0.5 * edges.sum(0).numpy()
     return pd.DataFrame(
         {
@@ -102,7 +103,7 @@ def _energies(records: Profiles, block: slice, model: Any) -> pd.DataFrame:
             "duration_s": times(last - first, step),
             "distance_km": KILO * step * total,
             "energy_kj": drawn,
-            "net_energy_kj": drawn - KILO * model.stored_energy(edges).diff(dim=0)[0].numpy(),
+            "net_energy_kj": drawn - stored,
         }
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from copy import copy
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Self
 
 import torch
 from pydantic import Field
@@ -47,7 +47,6 @@ class EnergyModel(Settings, ABC):
     heating_value = 0.0
     density = 0.0
     carbon_dioxide = math.nan
-    climb: ClassVar[Any] = None  # acceleration by gravity against the motion on a slope [m/s²]
 
     @property
     def inertia(self) -> float:
@@ -73,7 +72,6 @@ class EnergyModel(Settings, ABC):
         )
         model = copy(self)
         model.grade = self.grade + grade  # type: ignore[attr-defined]
-        model.climb = GRAVITY * grade.sin()  # type: ignore[misc]
         model.validate()
         return model
 
@@ -94,11 +92,19 @@ class EnergyModel(Settings, ABC):
         """Return the smooth power [W] minus the change of kinetic energy and of height."""
         stored = self.inertia / self.efficiency * speed * acceleration
         net = self.smooth_power(speed, acceleration) - stored
-        return net if self.climb is None else net - self.climbing(speed)
+        return net if self.level else net - self.climbing(speed)
+
+    @property
+    def level(self) -> bool:
+        """Whether the road is level: a model without a grade, or of grade 0."""
+        grade = getattr(self, "grade", 0.0)
+        return not isinstance(grade, Tensor) and grade == 0.0
 
     def climbing(self, speed: Tensor) -> Tensor:
-        """Return the power that becomes height on a slope, divided by efficiency [W]."""
-        return self.mass / self.efficiency * speed * (0.0 if self.climb is None else self.climb)
+        """Return the power that becomes height, divided by efficiency [W]; 0 on a level road."""
+        grade = getattr(self, "grade", 0.0)
+        sine = grade.sin() if isinstance(grade, Tensor) else math.sin(grade)
+        return self.mass / self.efficiency * speed * (GRAVITY * sine)
 
     def stored_energy(self, speed: Tensor) -> Tensor:
         """Return kinetic energy divided by efficiency [J], same shape."""

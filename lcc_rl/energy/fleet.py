@@ -150,6 +150,11 @@ class Fleet:
         return found
 
     @property
+    def level(self) -> bool:
+        """Whether the road is level for all classes."""
+        return all(model.level for model in self.models)
+
+    @property
     def limited(self) -> bool:
         """Whether a class has limits."""
         return any(one.bounded or one.speed_limit for one in self.classes.values())

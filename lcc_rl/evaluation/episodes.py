@@ -212,6 +212,7 @@ class Episodes:
         braked = of_rows.brakings(record, alive, self.cfg.scenario.vehicles)
         driven = alive[self.begun - self.warm_up :]  # from a handover on, also uncounted steps
         speed = record["vehicles", "speed"][-len(driven) :]
+        ahead = of_rows.highest(record)
         record, alive = {key: x[self.begun :] for key, x in record.items()}, alive[self.begun :]
         if self.cfg.scenario.fleet:
             record["vehicles", "length"] = self.energy.lengths(record[CLASS])
@@ -227,13 +228,14 @@ class Episodes:
         desired = of_rows.desired_speeds(self.strategy, described)
         described[FASTER] = of_rows.leader_faster(inputs.evaluation, profile, desired, self.warm_up)
         time_step = self.cfg.scenario.time_step
-        args = inputs.evaluation, profile, self.energy, self.warm_up, self.slope
-        leader = of_rows.leader_measures(*args)
+        given = inputs.evaluation, profile, self.energy, self.warm_up, self.slope
+        leader = of_rows.leader_measures(*given)
         if self.cfg.scenario.road == RING:  # it has no leader
             leader[:] = np.nan
         # The noise of sensors adds energy to the motion of recorded drivers.
         recorded = RECORDED in self.cfg.evaluation.baselines
-        measured = of_rows.measures(groups, alive, time_step, self.energy, recorded, self.second)
+        args = groups, alive, time_step, self.energy, recorded, self.second, ahead
+        measured = of_rows.measures(*args)
         length, free = self.cfg.scenario.vehicle_length, inputs.population.desired_speed[driver]
         measured |= of_rows.traffic(record, alive, length, time_step, free, self.energy)
         for term in self.terms:  # means of a step, sums over vehicles

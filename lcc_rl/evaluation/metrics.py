@@ -71,7 +71,7 @@ def energy_measures(
     steps = alive.sum(0, keepdim=True).long().expand(1, *speed.shape[1:])
     last = speed.gather(0, steps).squeeze(0)
     stored = (energy.stored_energy(last, kind) - energy.stored_energy(speed[0], kind)) * KILO
-    if grade is not None:
+    if not energy.level:
         stored = stored + total(energy.climbing(speed[:-1], kind)) * KILO
     lost = energy.acceleration_loss(*motion, kind)
     measures = {
@@ -242,8 +242,8 @@ METRICS: dict[str, Metric] = {
     "standstill_s": lambda over, speed: over.first(
         (speed[1:] < STANDSTILL) & (speed[:-1] >= STANDSTILL)
     ),
-    "speed_overshoot_mps": lambda over, speed, leader_speed: _extreme(
-        over.highest((speed - leader_speed.cummax(0).values)[1:]).clamp(min=0.0)
+    "speed_overshoot_mps": lambda over, speed, leader_highest: _extreme(
+        over.highest((speed - leader_highest)[1:]).clamp(min=0.0)
     ),
     "duration_s": lambda over: over.steps * over.time_step,
     "share_filter_acts": lambda over, command, wanted: over.mean((command - wanted).abs() > ACTS),
@@ -256,6 +256,8 @@ METRICS: dict[str, Metric] = {
         _turned(over, safe) & (promised > 0.0)
     ),
 }
+# Of one vehicle; that of a string is among :func:`string_measures`.
+MEAN_SPEED: dict[str, Metric] = {"mean_speed_mps": lambda over, speed: over.mean(speed[1:])}
 # Measures of all vehicles of a string, likewise; ``free`` is v0 [m/s].
 ROAD_METRICS: dict[str, Metric] = {
     "brakings_below_2": lambda over, acceleration: over.begun(acceleration < -2.0),
@@ -330,10 +332,10 @@ def safety_measures(
 
     Args:
         series: ``ttc`` [s], ``time_gap`` [s], ``gap`` [m], ``jerk`` [m/s³] after every step,
-            each ``[time, *batch, A, 1]``; ``speed`` [m/s], also before the first step; and with a
-            safety filter ``promised``, 1 for steps that the guarantee covers, ``safe``, 1 for
-            steps that begin safe, ``wanted`` and ``command``, the desired and the commanded
-            acceleration [m/s²].
+            each ``[time, *batch, A, 1]``; ``speed`` and ``leader_highest``, the leader's highest
+            speed until then [m/s], also before the first step; and with a safety filter
+            ``promised``, 1 for steps that the guarantee covers, ``safe``, 1 for steps that begin
+            safe, ``wanted`` and ``command``, the desired and the commanded acceleration [m/s²].
         alive: whether the episode was still running, ``[time, *batch, 1, 1]``.
         time_step: duration of a step [s].
         metrics: the measures, such as :data:`ROAD_METRICS` of all vehicles; by default

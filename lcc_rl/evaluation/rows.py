@@ -6,7 +6,7 @@ and distances are summed over them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pandas as pd
@@ -97,6 +97,12 @@ def _slice(places: list[int]) -> slice | list[int]:
     return slice(first, end) if len(places) == end - first else places
 
 
+def highest(record: Record) -> dict[str, Tensor]:
+    """Return the leader's highest speed until each time [m/s], by name; none on a ring."""
+    speed = record.get(("leader", "speed"))
+    return {} if speed is None else {"leader_highest": speed.cummax(0).values.unsqueeze(-2)}
+
+
 def measures(
     groups: Groups,
     alive: Tensor,
@@ -104,6 +110,7 @@ def measures(
     energy: Fleet | None = None,
     averaged: bool = True,
     second: Fleet | None = None,
+    ahead: Mapping[str, Tensor] | None = None,
 ) -> dict[str, Tensor]:
     """Return the measures of a batch, each ``[batch, 1]``; energies are sums over vehicles (A20).
 
@@ -114,6 +121,7 @@ def measures(
         energy: the energy models; None: that of the ALCC paper.
         averaged: include energies of averaged speeds.
         second: a further energy model, for :data:`lcc_rl.energy.SECOND`.
+        ahead: see :func:`highest`, may begin before the counted time.
     """
     columns: dict[str, Tensor] = {}
     for group in ("cav", "hdv"):
@@ -135,8 +143,8 @@ def measures(
             columns[f"{group}_{name}"] = added
     cav = groups["cav"]
     if "gap" in cav:
-        ahead = {f"leader_{name}": x for name, x in groups["leader"].items()}
-        columns |= metrics.safety_measures({**cav, **ahead}, alive.unsqueeze(-2), time_step)
+        counted = {name: x[-len(alive) - 1 :] for name, x in (ahead or {}).items()}
+        columns |= metrics.safety_measures({**cav, **counted}, alive.unsqueeze(-2), time_step)
         for name in SUMMED:
             keys = [f"{group}_{name}" for group in ("cav", "hdv")]
             terms = [columns[key] for key in keys if key in columns]

@@ -27,6 +27,7 @@ from lcc_rl.errors import ConfigError, in_short, raised_as, require
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.metrics import (
+    MEAN_SPEED,
     METRICS,
     ROAD_METRICS,
     SERIES,
@@ -35,7 +36,7 @@ from lcc_rl.evaluation.metrics import (
 )
 from lcc_rl.evaluation.named import controller_of, is_policy, setting_of
 from lcc_rl.evaluation.rollout import Player, Record, reset_options
-from lcc_rl.evaluation.rows import INDEX
+from lcc_rl.evaluation.rows import INDEX, highest
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.pieces.base import Key, State
@@ -75,8 +76,8 @@ class Simulation:
         steps: a row per episode, time and vehicle; vehicle 0 is the leader, the others are from
             front to back. ``acceleration_mps2`` and ``power_w`` are those of the step that ends at
             ``time_s``. An episode ends with its first collision, a gap of 0 m or less.
-        vehicles: a row per episode and vehicle: ``mean_speed_mps`` (of the rows of ``steps``),
-            ``collided``, distance and energies of
+        vehicles: a row per episode and vehicle: ``collided``, ``mean_speed_mps`` (of the speeds
+            after each step, as in evaluations), distance and energies of
             :func:`lcc_rl.evaluation.metrics.energy_measures`, and the measures of
             :data:`lcc_rl.evaluation.metrics.METRICS` and ``ROAD_METRICS``, those of
             ``measures=[…]`` included, each of one vehicle; NaN where it has none.
@@ -266,13 +267,12 @@ class _Motion:
         lengths, roles = running.sum(1), self._roles()
         parts = [slice(x - y, x) for x, y in zip(lengths.cumsum(), lengths, strict=True)]
         motion = {MOTION[name]: self._rows(name, parts) for name in self.names}
-        speed, shape = motion[MOTION["speed"]], (len(time), len(self.vehicles))
+        shape = len(time), len(self.vehicles)
         summary = pd.DataFrame(
             {
                 "episode": np.repeat(np.arange(len(roles)), shape[1]),
                 "vehicle": np.tile(self.vehicles, len(roles)),
                 "role": roles.flatten(),
-                "mean_speed_mps": np.concatenate([_mean(speed[x]) for x in parts]),
             }
         )
         place = episode[:, None] * shape[1] + np.arange(shape[1])  # of the summary's rows
@@ -327,17 +327,18 @@ class _Motion:
     def _measured(self, block: slice) -> dict[str, Tensor]:
         """Return energies and measures of the vehicles of some episodes, ``[episodes, n, 1]``."""
         found, metrics, alive = [], {**METRICS, **ROAD_METRICS}, self.alive[:, block]
-        ahead = {"leader_speed": self.record[LEADER][:, block]} if LEADER in self.record else {}
+        ahead = {x: y[:, block].unsqueeze(-2) for x, y in highest(self.record).items()}
         for whole, kinds in zip(self.groups, self.kinds, strict=True):
             group = {name: x[:, block] for name, x in whole.items()}
             kind = None if kinds is None else kinds[block]
             args = (self.time_step, self.energy, kind, _after(group.get(GRADE)))
             known = energy_measures(group["power"], group["speed"], alive.unsqueeze(-2), *args)
             series = {x: group[x].unsqueeze(-2) for x in SERIES if x in group}
-            series |= {name: x[-len(alive) :] for name, x in series.items() if name in AT_START}
-            series |= {name: x[..., None, None] for name, x in ahead.items()}
+            late = {name: x[-len(alive) :] for name, x in series.items() if name in AT_START}
+            series |= late | ahead
             running = alive[..., None, None].expand_as(series["acceleration"])
-            found.append(known | safety_measures(series, running, self.time_step, metrics))
+            mean = safety_measures(series, running, self.time_step, MEAN_SPEED)
+            found.append(mean | known | safety_measures(series, running, self.time_step, metrics))
         lacking = [torch.full_like(known["distance_m"], torch.nan) for known in found]
         return {
             name: torch.cat([x.get(name, y) for x, y in zip(found, lacking, strict=True)], -2)
@@ -352,8 +353,3 @@ def _after(entry: Tensor | None) -> Tensor | None:
 
 def _column(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return np.broadcast_to(values, shape).reshape(-1)
-
-
-def _mean(rows: np.ndarray) -> np.ndarray:
-    """Return the mean of every column, summed in double precision."""
-    return rows.mean(0, np.float64).astype(rows.dtype)

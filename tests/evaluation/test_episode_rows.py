@@ -120,6 +120,7 @@ def test_a_warm_up_is_driven_and_not_counted() -> None:
         assert (late[name] + first[name]).to_numpy() == pytest.approx(whole[name], rel=1e-4)
     assert (late["steps"] == 60).all()
     assert (late["min_gap_m"] >= whole["min_gap_m"]).all()
+    assert (late["speed_overshoot_mps"] <= whole["speed_overshoot_mps"]).all()
     assert len(steps) == 60
     assert late["leader_speed_mps"].iloc[0] == pytest.approx(float(PROFILES.record(0)[40:].mean()))
 

@@ -110,8 +110,8 @@ def test_braking_and_overshoot_as_standards_name_them() -> None:
     leader = (9.0 - 0.1 * time).view(81, 1, 1, 1).expand(81, 2, 1, 1)
     alive = torch.ones(80, 2, 1, 1, dtype=torch.bool)
     alive[9:, 1] = False
-    series = {"speed": speed, "acceleration": acceleration, "jerk": jerk, "leader_speed": leader}
-    series["gap"] = gap
+    series = {"speed": speed, "acceleration": acceleration, "jerk": jerk, "gap": gap}
+    series["leader_highest"] = leader.cummax(0).values
     found = safety_measures(series, alive, 0.1)
     expected = {
         "max_deceleration_mps2": [5.0, 0.0],

@@ -45,6 +45,8 @@ def test_the_rows_are_those_of_an_evaluation(policy) -> None:
         own = found.vehicles[found.vehicles["role"] == role].groupby("episode")
         for key, unit in (("path_energy_kj", 1e-4), ("distance_m", 1e-5)):
             np.testing.assert_allclose(own[key].sum(), rows[f"{group}_{key}"], rtol=unit)
+    mean = found.vehicles[found.vehicles["vehicle"] > 0].groupby("episode")["mean_speed_mps"].mean()
+    np.testing.assert_allclose(mean, rows["mean_speed_mps"], rtol=1e-6)
     own = found.vehicles[found.vehicles["vehicle"] == 1]
     shared = [key for key in METRICS if key in rows]
     assert {"min_gap_m", "min_ttc_s", "max_jerk_1s_mps3", "standstill_s"} <= {*shared}

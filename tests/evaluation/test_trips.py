@@ -68,9 +68,15 @@ def test_a_grade_by_sample_is_that_of_the_model(path, subtests) -> None:
                 lcc_rl.trip_energies(path, [f"energy={energy}", f"energy.grade={x}", COLUMNS])
                 for x in (0.0, np.arctan(0.03))
             )
-            found = lcc_rl.trip_energies(path, [f"energy={energy}", *GRADED])["energy_kj"]
-            expected = [flat["energy_kj"][0], steep["energy_kj"][1]]
-            np.testing.assert_allclose(found, expected, rtol=1e-6)
+            found = lcc_rl.trip_energies(path, [f"energy={energy}", *GRADED])
+            for column in ("energy_kj", "net_energy_kj"):
+                expected = [flat[column][0], steep[column][1]]
+                np.testing.assert_allclose(found[column], expected, rtol=1e-6)
+            model = build_energy(load("evaluate", ["variant=direct", f"energy={energy}"])).models[0]
+            drawn, net = (steep[x] - flat[x] for x in ("energy_kj", "net_energy_kj"))
+            height = 1e3 * flat["distance_km"] * np.sin(np.arctan(0.03))
+            work = model.mass * 9.81 * height / model.efficiency / 1e3
+            np.testing.assert_allclose(drawn - net, work, rtol=5e-3)  # speeds at the steps' starts
 
 
 def test_trips_of_files_rates_and_with_holes(tmp_path, path, subtests) -> None:
