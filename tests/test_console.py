@@ -75,6 +75,11 @@ QUICK_TO_START = [  # what is done, what is not loaded for it, and what is print
     (["lcc_rl.cli.train", "-h", "agent=td3"], HEAVY | TABLES, "td3             analytic, ddpg"),
     (["lcc_rl.cli.status", "."], HEAVY | TABLES, "1 finished"),
     (["from lcc_rl import results; print(results.load('.')['seed'].tolist())"], HEAVY, "[3]"),
+    (
+        ["from lcc_rl import simulate; print(len(simulate([12.0] * 11, 'human').steps))"],
+        {"lcc_rl.agents", "scipy.special", "numba", "matplotlib"},
+        "22",
+    ),
 ]
 
 

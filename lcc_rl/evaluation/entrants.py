@@ -65,7 +65,7 @@ class Entrants:
             raise ConfigError(f"variant {cfg.variant} has no agent: remove policy={cfg.policy}")
         only_named = bool(cfg.compare) and cfg.policy is None and cfg.learns
         self.own = own and not only_named
-        if self.own:
+        if self.own and cfg.automated:
             check_variant(cfg)
         self.rivals, self.paths = self._compared()
         self._check_used(typed)

@@ -51,6 +51,7 @@ log = logging.getLogger("lcc_rl")
 # Machine code, which takes seconds to compile once, pays from so many steps on; translating more
 # vehicles takes longer than their steps.
 LONG, SHORT_STRING = 2_000, 40
+BLOCK = 2**20  # numbers of each entry that are measured at a time
 LEADER: Key = ("leader", "speed")
 SCENE = {f"scenario.{name}" for name in ("string", "time_step", "horizon")}
 OF_ARGUMENTS = SCENE | {"leader", "data", "split", "compare", "policy", "seed", "evaluation"}
@@ -253,30 +254,47 @@ class _Motion:
         """Return a row per time and vehicle, and a row per vehicle."""
         running = torch.cat([self.alive[:1], self.alive]).squeeze(-1).T.numpy()
         episode, time = np.nonzero(running)  # in this order
-        count = len(self.vehicles)
+        lengths, roles = running.sum(1), self._roles()
+        parts = [slice(x - y, x) for x, y in zip(lengths.cumsum(), lengths, strict=True)]
+        motion = {MOTION[name]: self._rows(name, parts) for name in self.names}
+        shape = len(time), len(self.vehicles)
+        summary = pd.DataFrame(
+            {
+                "episode": np.repeat(np.arange(len(roles)), shape[1]),
+                "vehicle": np.tile(self.vehicles, len(roles)),
+                "role": roles.flatten(),
+            }
+        )
+        place = episode[:, None] * shape[1] + np.arange(shape[1])  # of the summary's rows
         columns = {
-            "episode": np.repeat(episode, count),
-            "time_s": np.repeat(times(time, self.time_step), count),
-            "vehicle": np.tile(self.vehicles, len(time)),
-            "role": self._roles()[episode].flatten(),
+            "episode": _column(episode[:, None], shape),
+            "time_s": _column(times(time, self.time_step)[:, None], shape),
+            "vehicle": _column(self.vehicles, shape),
+            "role": summary["role"].array.take(place.reshape(-1)),
+            **{name: _column(rows, shape) for name, rows in motion.items()},
         }
-        for name in self.names:
-            columns[MOTION[name]] = self._whole(name)[time, episode].flatten()
-        steps = pd.DataFrame(columns)
-        by_vehicle = steps.groupby(["episode", "vehicle"], sort=False)
-        summary = by_vehicle.agg(role=("role", "first")).reset_index()
         measured = self._measures()
-        collided = measured["min_gap_m"] <= 0.0
-        return Simulation(steps, summary.assign(collided=collided, **measured))
+        summary = summary.assign(collided=measured["min_gap_m"] <= 0.0, **measured)
+        return Simulation(pd.DataFrame(columns, copy=False), summary)
 
-    def _whole(self, name: str) -> np.ndarray:
-        """Return a quantity of all vehicles, ``[steps + 1, episodes, n]``; NaN where unknown."""
-        lacking = [torch.full_like(group["speed"], torch.nan) for group in self.groups]
-        groups = [group.get(name, y) for group, y in zip(self.groups, lacking, strict=True)]
-        values = torch.cat(groups, -2).squeeze(-1).numpy()
-        if len(values) == len(self.alive):  # of a step: none before the first one
-            values = np.concatenate([np.full_like(values[:1], np.nan), values])
-        return values
+    def _rows(self, name: str, parts: Sequence[slice]) -> np.ndarray:
+        """Return a quantity of all vehicles, ``[rows, n]``, NaN where unknown.
+
+        Args:
+            name: the quantity.
+            parts: the rows of each episode.
+        """
+        found = np.empty((parts[-1].stop, len(self.vehicles)), np.float32)
+        first = 0
+        for group in self.groups:
+            last = first + group["speed"].shape[-2]
+            values = group.get(name, group["speed"][:0]).squeeze(-1).numpy()
+            late = len(self.alive) + 1 - len(values)  # of a step: none before the first one
+            for episode, part in enumerate(parts):
+                rows = found[part, first:last]
+                rows[:late], rows[late:] = np.nan, values[: max(0, len(rows) - late), episode]
+            first = last
+        return found
 
     def _roles(self) -> np.ndarray:
         """Return the role of each vehicle in each episode, ``[episodes, n]``."""
@@ -290,24 +308,38 @@ class _Motion:
 
     def _measures(self) -> dict[str, np.ndarray]:
         """Return energies and measures of every vehicle, episode by episode; NaN without one."""
-        found, steps, metrics = [], len(self.alive), {**METRICS, **ROAD_METRICS}
-        ahead = {name: x.unsqueeze(-2) for name, x in highest(self.record).items()}
-        for group, kind in zip(self.groups, self.kinds, strict=True):
+        # By blocks of episodes, so that what lies between stays in the processor's caches.
+        size = max(1, BLOCK // (len(self.alive) * len(self.vehicles)))
+        blocks = [slice(x, x + size) for x in range(0, self.alive.shape[1], size)]
+        found = [self._measured(block) for block in blocks]
+        return {name: torch.cat([x[name] for x in found]).flatten().numpy() for name in found[0]}
+
+    def _measured(self, block: slice) -> dict[str, Tensor]:
+        """Return energies and measures of the vehicles of some episodes, ``[episodes, n, 1]``."""
+        found, metrics, alive = [], {**METRICS, **ROAD_METRICS}, self.alive[:, block]
+        ahead = {x: y[:, block].unsqueeze(-2) for x, y in highest(self.record).items()}
+        for whole, kinds in zip(self.groups, self.kinds, strict=True):
+            group = {name: x[:, block] for name, x in whole.items()}
+            kind = None if kinds is None else kinds[block]
             args = (self.time_step, self.energy, kind, _after(group.get(GRADE)))
-            known = energy_measures(group["power"], group["speed"], self.alive.unsqueeze(-2), *args)
+            known = energy_measures(group["power"], group["speed"], alive.unsqueeze(-2), *args)
             series = {x: group[x].unsqueeze(-2) for x in SERIES if x in group}
-            series |= {name: x[-steps:] for name, x in series.items() if name in AT_START} | ahead
-            alive = self.alive[..., None, None].expand_as(series["acceleration"])
-            mean = safety_measures(series, alive, self.time_step, MEAN_SPEED)
-            found.append(mean | known | safety_measures(series, alive, self.time_step, metrics))
+            late = {name: x[-len(alive) :] for name, x in series.items() if name in AT_START}
+            series |= late | ahead
+            running = alive[..., None, None].expand_as(series["acceleration"])
+            mean = safety_measures(series, running, self.time_step, MEAN_SPEED)
+            found.append(mean | known | safety_measures(series, running, self.time_step, metrics))
         lacking = [torch.full_like(known["distance_m"], torch.nan) for known in found]
-        columns = {
-            name: [x.get(name, y) for x, y in zip(found, lacking, strict=True)]
+        return {
+            name: torch.cat([x.get(name, y) for x, y in zip(found, lacking, strict=True)], -2)
             for name in found[-1]
         }
-        return {name: torch.cat(x, -2).flatten().numpy() for name, x in columns.items()}
 
 
 def _after(entry: Tensor | None) -> Tensor | None:
     """Return the values after each step of an entry that is known before the first one, too."""
     return None if entry is None else entry[1:]
+
+
+def _column(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    return np.broadcast_to(values, shape).reshape(-1)

@@ -11,8 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from lcc_rl.agents.actor import shared_policy
-from lcc_rl.agents.factory import build_agent
 from lcc_rl.config import load
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import StudyConfig
@@ -270,6 +268,10 @@ def with_weights(
     Raises:
         ResultsError: if the agent cannot be built, or the weights do not fit its network.
     """
+    # Here, since a simulation of rules needs no agents.
+    from lcc_rl.agents.actor import shared_policy
+    from lcc_rl.agents.factory import build_agent
+
     with raised_as(ResultsError, f"{path}: its agent cannot be built", ConfigError):
         agent = build_agent(cfg, population, cfg.device)
     check_width(agent.policy, weights, path)

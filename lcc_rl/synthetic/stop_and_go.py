@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import ndtri
+import scipy  # loads special where it is used
 
 from lcc_rl.arrays import Floats
 from lcc_rl.settings import NonNegative, Positive, Settings, Share
@@ -63,7 +63,7 @@ class StopAndGo(Settings):
         traffic = level + self.wave_spread_mps * wave
         if self.free_speed_mps is not None:
             traffic = np.minimum(traffic, self.free_speed_mps)
-        target = np.where(wave < ndtri(self.stop_share), 0.0, traffic + ripple)
+        target = np.where(wave < scipy.special.ndtri(self.stop_share), 0.0, traffic + ripple)
         return self._track(np.maximum(target, 0.0), time_step), level
 
     def _track(self, target: Floats, time_step: float) -> Floats:
@@ -106,4 +106,4 @@ def stratified_normal(count: int, generator: np.random.Generator) -> Floats:
     """Return shuffled standard normal numbers, one from each of ``count`` equiprobable ranges."""
     place = generator.permutation(count) + generator.random(count)
     # The first range begins at probability 0, with the quantile −∞.
-    return ndtri(np.clip(place / count, 0.01 / count, 1.0 - 0.01 / count))
+    return scipy.special.ndtri(np.clip(place / count, 0.01 / count, 1.0 - 0.01 / count))

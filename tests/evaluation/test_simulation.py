@@ -29,7 +29,8 @@ QUICK = ["scenario.horizon=200", "evaluation.baselines=[]", "evaluation.warm_up=
 
 
 @pytest.mark.parametrize("policy", [None, "pretrained/alcc"])
-def test_the_rows_are_those_of_an_evaluation(policy) -> None:
+def test_the_rows_are_those_of_an_evaluation(policy, monkeypatch) -> None:
+    monkeypatch.setattr("lcc_rl.evaluation.simulation.BLOCK", 1)  # episode by episode
     string = "automated human*2"
     found = lcc_rl.simulate([WAVE, WAVE + 2.0], string, policy, repeats=3, seed=5)
     words = [f"variant={'idm' if policy is None else 'alcc'}", *QUICK, f"scenario.string={string}"]

@@ -25,6 +25,7 @@ from benchmarks.gym import gym
 from benchmarks.harness import EXTRA, Row, installed, page, table
 from benchmarks.jobs import analytic, evaluate, train
 from benchmarks.read import loading, read, start
+from benchmarks.simulate import simulate
 from benchmarks.string import string
 from benchmarks.update import update
 from lcc_rl.data.tables import TableFile
@@ -35,7 +36,7 @@ from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.settings import Million, Parallel
 
 LISTED = (
-    *(read, loading, start, env, string, gym, collect, update, train, analytic),
+    *(read, loading, start, env, string, simulate, gym, collect, update, train, analytic),
     *(calibrate, evaluate),
 )
 BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {

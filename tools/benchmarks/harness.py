@@ -25,14 +25,15 @@ Run = Callable[[], Any]
 Against = Mapping[str, Sequence[str]]  # names of a case's alternatives
 
 
-def alternate(runs: Mapping[str, Run], repeats: int) -> dict[str, np.ndarray]:
+def alternate(runs: Mapping[str, Run], repeats: int, clock: str = "") -> dict[str, np.ndarray]:
     """Return the seconds of every run, ``repeats`` times in turn; once before that, untimed."""
+    read = TIMERS[clock or timer]
     spent: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(repeats + 1):
         for name, run in runs.items():
-            begun = TIMERS[timer]()
+            begun = read()
             run()
-            spent[name].append(TIMERS[timer]() - begun)
+            spent[name].append(read() - begun)
     return {name: np.array(each[1:]) for name, each in spent.items()}
 
 

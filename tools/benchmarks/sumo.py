@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,7 +15,7 @@ from lcc_rl.interfaces.sumo import load_sumo
 from lcc_rl.io.atomic import atomic_path
 
 HUMAN = "human"
-SPEED_LIMIT, CORNERS, AROUND = 40.0, 32, 10_000  # of the road [m/s]; of a half; rounds of a route
+SPEED_LIMIT, CORNERS, AROUND = 40.0, 32, 100  # of the road [m/s]; of a half; rounds of a route
 HALVES = {"east": ("south", "north", -0.5), "west": ("north", "south", 0.5)}
 
 
@@ -43,10 +44,9 @@ def write_network(path: Path, circumference: float) -> None:
     _write(root, path)
 
 
-def write_vehicles(path: Path, cfg: StudyConfig, around: float) -> None:
-    """Write the vehicles, evenly spread; each follows the one of the number before."""
+def write_vehicles(path: Path, cfg: StudyConfig, around: float, places: Sequence[float]) -> None:
+    """Write the vehicles at their places; each follows the one of the number before."""
     scenario, driver = cfg.scenario, cfg.drivers.settings
-    count = len(parse_string(scenario.string).roles)
     root = ElementTree.Element("routes")
     of_type = {
         "carFollowModel": "IDM",
@@ -58,8 +58,7 @@ def write_vehicles(path: Path, cfg: StudyConfig, around: float) -> None:
     fixed = {"id": HUMAN, "speedFactor": "1", "speedDev": "0"}
     text = {key: str(value) for key, value in of_type.items()}
     ElementTree.SubElement(root, "vType", fixed | text)
-    for number in range(count):
-        place = around * (1.0 - (number + 0.5) / count)
+    for number, place in enumerate(places):
         edges = ("east", "west") if place < 0.5 * around else ("west", "east")
         start = {"departPos": f"{place % (0.5 * around):.6f}", "depart": "0"}
         start |= {"id": f"car{number}", "type": HUMAN, "departSpeed": str(scenario.initial_speed)}
@@ -75,11 +74,16 @@ def _write(root: ElementTree.Element, path: Path) -> None:
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
 
 
-def start(cfg: StudyConfig, folder: Path, around: float) -> None:
-    """Start SUMO with all vehicles on the ring, ``around`` [m]; its files go into a folder."""
+def start(cfg: StudyConfig, folder: Path, around: float, places: Sequence[float] = ()) -> None:
+    """Start SUMO on a ring, ``around`` [m], with vehicles at places [m], by default evenly spread.
+
+    Its files go into a folder.
+    """
+    count = len(parse_string(cfg.scenario.string).roles)
+    places = places or [around * (1.0 - (number + 0.5) / count) for number in range(count)]
     sumo, step = load_sumo(), cfg.scenario.time_step
     write_network(folder / "ring.net.xml", around)
-    write_vehicles(folder / "ring.rou.xml", cfg, around)
+    write_vehicles(folder / "ring.rou.xml", cfg, around, places)
     words = ["sumo", "-n", f"{folder}/ring.net.xml", "-r", f"{folder}/ring.rou.xml"]
     words += ["--step-length", str(step), "--step-method.ballistic", "true", "--no-step-log"]
     sumo.start([*words, "--collision.action", "warn", "--no-warnings", "true"])
