@@ -99,7 +99,7 @@ def _derived(rows: pd.DataFrame) -> pd.DataFrame:
     if "collided" in rows:
         added |= dict.fromkeys(("collisions", "collided"), rows["collided"].astype(float))
     if distances := [name for name in WAYS if name in rows]:
-        added[DISTANCE] = rows[distances].sum(axis=1)
+        added[DISTANCE] = rows[distances].sum(axis=1, min_count=1)  # NaN as the energies are
     for name in ENERGIES:  # without automated vehicles, those of the others
         energies = [rows[f"{x}_{name}"] for x in ("total", "hdv") if f"{x}_{name}" in rows]
         if energies:

@@ -58,6 +58,10 @@ def test_summary_by_hand() -> None:
     assert alcc["kj_per_km"] == pytest.approx(137.5)
     assert table.loc["direct", "kj_per_km"] == pytest.approx(100.0)
     assert np.isnan(table.loc["idm", "drawn_saving"])
+    unmeasured = episodes()  # a collision in the warm-up leaves no measures
+    unmeasured.loc[7, [x for x in unmeasured if x.endswith(("_kj", "_m"))]] = np.nan
+    table = summary(windows_for(unmeasured)).set_index("strategy")
+    assert table.loc["alcc", "kj_per_km"] == pytest.approx(145.0)
 
 
 def test_of_two_windows_one_is_drawn() -> None:
