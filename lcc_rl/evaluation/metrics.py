@@ -207,6 +207,12 @@ def _turned(over: Reductions, safe: Tensor) -> Tensor:
     return turned
 
 
+def _stops(speed: Tensor) -> Tensor:
+    """Return whether a vehicle comes to a standstill in each step."""
+    stands = speed < STANDSTILL
+    return stands[1:] & ~stands[:-1]
+
+
 def _extreme(value: Tensor) -> Tensor:
     """Return a largest value; NaN for an episode without one."""
     return torch.where(value.isfinite(), value, torch.nan)
@@ -237,11 +243,11 @@ METRICS: dict[str, Metric] = {
     "max_deceleration_mps2": lambda over, acceleration: over.highest(-acceleration),
     "max_deceleration_1s_mps2": lambda over, speed: _extreme(over.highest(-over.slope(speed))),
     "standstill_gap_m": lambda over, gap, speed: _extreme(
-        over.lowest(torch.where(speed[1:] < STANDSTILL, gap, torch.inf))
+        over.lowest(
+            torch.where((speed[1:] < STANDSTILL) & (_stops(speed).cumsum(0) > 0), gap, torch.inf)
+        )
     ),
-    "standstill_s": lambda over, speed: over.first(
-        (speed[1:] < STANDSTILL) & (speed[:-1] >= STANDSTILL)
-    ),
+    "standstill_s": lambda over, speed: over.first(_stops(speed)),
     "speed_overshoot_mps": lambda over, speed, leader_highest: _extreme(
         over.highest((speed - leader_highest)[1:]).clamp(min=0.0)
     ),

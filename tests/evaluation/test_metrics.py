@@ -127,7 +127,9 @@ def test_braking_and_overshoot_as_standards_name_them() -> None:
         torch.testing.assert_close(found[name].flatten(), torch.tensor(values), **close)
     standing = {name: entry[70:] for name, entry in series.items()}
     assert (standing["speed"] == 0.0).all()
-    assert safety_measures(standing, alive[70:], 0.1)["standstill_s"].isnan().all()
+    found = safety_measures(standing, alive[70:], 0.1)
+    assert found["standstill_s"].isnan().all()
+    assert found["standstill_gap_m"].isnan().all()
 
 
 def test_safety_of_many_vehicles_is_that_of_the_worst_and_shares_are_means() -> None:
