@@ -1,11 +1,9 @@
 #!/usr/bin/env bash
-# FASTSim's car with an engine drives the UDDS at 1 Hz and refuses it at 2 and 10 Hz (fastsim 3.1.0).
-# The cycle is interpolated linearly, so that speeds, distance and accelerations are the same.
-# Guess before: energies at 0.1 s are those at 1 s within 1 %.
-# Seen: so for a battery car and a hybrid (0.3 %). For the 2012 Ford Fusion "failed to meet speed
-# trace": 75 W of 27 kW are missing after 197 s, because the engine's power rises too slowly; a step
-# of 1 s lets it rise enough at once.
-# Hurt: who prices simulated drives of 0.1 s, or compares energies of different steps.
+# FASTSim's car with an engine drives the UDDS at 1 Hz, not interpolated to 2 or 10 Hz (fastsim
+# 3.1.0). Guess before: energies at 0.1 s are those at 1 s within 1 %.
+# Seen: so for a battery car and a hybrid (0.3 %). The 2012 Ford Fusion "failed to meet speed trace":
+# 75 W of 27 kW are missing after 197 s. Its engine's power rises slowly, in a step of 1 s enough.
+# Hurt: who prices simulated drives of 0.1 s.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
