@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# lmfit gives a parameter on a bound a small standard error (lmfit 1.3.4). An IDM driver, v0 = 33 m/s,
-# in traffic of 5 to 11 m/s, gaps with errors of 0.3 m; the search allows v0 up to 20 m/s.
+# lmfit gives a parameter on a bound a small standard error (lmfit 1.3.4). An IDM driver, v0 =
+# 33 m/s, in traffic of 5 to 11 m/s, gaps with errors of 0.3 m; the search allows v0 up to 20 m/s.
 # Guess before: v0 ends on the bound, its standard error is None or large.
 # Seen: 20 m/s ± 0.01 to 2.7 m/s, "Fit succeeded.": the error is scaled by the slope of the
 # transformation that keeps a parameter inside, and on the bound there is none.
