@@ -2,7 +2,7 @@
 # FASTSim's car with an engine drives the UDDS at 1 Hz, not interpolated to 2 or 10 Hz (fastsim
 # 3.1.0). Guess before: energies at 0.1 s are those at 1 s within 1 %.
 # Seen: so for a battery car and a hybrid (0.3 %). The 2012 Ford Fusion "failed to meet speed
-# trace": 75 W of 27 kW are missing after 197 s. Its engine's power rises slowly, in a step of 1 s enough.
+# trace": 75 W of 27 kW are missing after 197 s. Its engine's power rises too slowly.
 # Hurt: who prices simulated drives of 0.1 s.
 set -euo pipefail
 folder=$(mktemp -d)

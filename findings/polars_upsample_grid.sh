@@ -2,8 +2,8 @@
 # polars `upsample(…).interpolate()` discards samples that are not on the grid (polars 1.44.2). A
 # log of 10 Hz whose clock, in ms, scatters by 10 ms: a car brakes from 20 to 8 m/s by 6 m/s².
 # Guess before: a value on the grid is interpolated between the samples on both sides of it.
-# Seen: 4 % of the samples are kept. The braking becomes 1.2 m/s², speeds are wrong by 7 m/s, only the
-# last second is missing. pandas 3.1.1 (`resample("100ms").interpolate()`) is right to 0.3 m/s.
+# Seen: 4 % of the samples are kept. The braking becomes 1.2 m/s², speeds are wrong by 7 m/s, only
+# the last second is missing. pandas 3.1.1 (`resample("100ms").interpolate()`) is right to 0.3 m/s.
 # Hurt: logs that are brought to a raster before drivers are fitted or energies are computed.
 set -euo pipefail
 folder=$(mktemp -d)
