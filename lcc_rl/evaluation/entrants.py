@@ -103,6 +103,8 @@ class Entrants:
 
     def _check_used(self, typed: Sequence[str]) -> None:
         rows = [*self.rivals, *self.cfg.evaluation.baselines]
+        if not any("${seed}" in word for word in typed):  # as in policy=<sweep>/seed${seed}
+            _refuse(typed, {"seed": "it is that of trainings; evaluation.seed draws other noise"})
         if self.own or self.further or self.cfg.variant in rows or not self.cfg.automated:
             return
         check_effective(
@@ -183,7 +185,7 @@ class Entrants:
 def check_effective(
     typed: Sequence[str], rows: Iterable[str], specs: Iterable[Any], learned: bool = False
 ) -> None:
-    """Refuse overrides of a controller or a safety filter that no row has.
+    """Refuse overrides of a training, a controller or a safety filter that no row has.
 
     Args:
         typed: the overrides.
@@ -192,10 +194,16 @@ def check_effective(
         learned: whether a row is a policy.
     """
     unused = {AUTO: "every controller is named and has its own settings"}
+    unused |= dict.fromkeys(("agent.", "training."), "a policy has the settings of its training")
     if not learned and not any(str(x).endswith(FILTERED) for x in specs):
         reason = f"nothing drives behind the filter ({', '.join(rows)}); "
         reason += f"it needs a name that ends in {FILTERED}"
         unused |= dict.fromkeys(("filter", "scenario.filters"), reason)
+    _refuse(typed, unused)
+
+
+def _refuse(typed: Sequence[str], unused: Mapping[str, str]) -> None:
+    """Refuse overrides of keys without effect, by key the reason."""
     for word in typed:
         for key in filter(key_of(word).startswith, unused):
             raise ConfigError(f"{word.removeprefix('++')} has no effect: {unused[key]}")

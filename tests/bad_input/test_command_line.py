@@ -18,7 +18,7 @@ from lcc_rl.runs.states import claim, inspect_run
 RULE = ("variant=idm", *NO_AGENT)
 COMMANDS = {
     "train": (*RULE, "seed=1"),
-    "evaluate": (*RULE, "seed=1"),
+    "evaluate": (*RULE, "evaluation.seed=1"),
     "calibrate": (*DATA, QUICK),
     "pipeline": ("variants=[alcc]", *TINY),
 }
@@ -123,7 +123,9 @@ def test_a_run_is_not_written_over_finished_or_stopped(run, tmp_path) -> None:
     held = run / "episodes.parquet"
     for kept in ("checkpoint.pt", "command.txt"):  # of a training and of a pipeline
         held = held.rename(run / kept)
-        said = refused([*RULE, "seed=3", "hydra.run.dir=run"], tmp_path, "lcc_rl.cli.evaluate")
+        said = refused(
+            [*RULE, "evaluation.seed=3", "hydra.run.dir=run"], tmp_path, "lcc_rl.cli.evaluate"
+        )
         assert f"already holds {kept} of other settings" in said
 
 

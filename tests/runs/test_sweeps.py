@@ -101,7 +101,8 @@ def test_a_sweep_is_read_as_one_table(tmp_path, capsys) -> None:
         f"alcc safety.weight={weight}" for weight in (0, 2)
     }
     assert (tmp_path / "sweep.pdf").stat().st_size > 5000
-    told = run_command("lcc_rl.cli.evaluate", *one, f"compare=[{folder}]", cwd=tmp_path, check=True)
+    alone = [*NO_AGENT, "variant=alcc", "evaluation.baselines=[human]", f"compare=[{folder}]"]
+    told = run_command("lcc_rl.cli.evaluate", *alone, cwd=tmp_path, check=True)
     assert all(told.stdout.count(f"{name}: the policy of") == 2 for name in names)
 
 
@@ -163,7 +164,14 @@ def test_cells_that_will_fail_are_named_before_the_first_run(caplog, capsys) -> 
 
 
 def test_a_run_of_a_sweep_is_refused_what_has_no_effect(tmp_path) -> None:
-    words = ("-m", "experiment=smoke", "compare=[acc]", "+filter=cbf", "seed=0", "sweep=s")
+    words = (
+        "-m",
+        "experiment=smoke",
+        "compare=[acc]",
+        "+filter=cbf",
+        "evaluation.seed=0",
+        "sweep=s",
+    )
     done = run_command("lcc_rl.cli.evaluate", *words, cwd=tmp_path)
     assert "+filter=cbf has no effect: nothing drives behind the filter (acc)" in done.stdout
 
