@@ -9,6 +9,7 @@ from pydantic import Field
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from lcc_rl.errors import require
 from lcc_rl.functional.layout import join, reverse
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.functional.sensing import Sensing
@@ -68,7 +69,13 @@ class Sensors(RoleTransform):
     def setup(self, world: World) -> None:
         role, self.time_step = self.name, world.time_step
         self.sensing = self.sensing_in(world, role)
-        self.first_lost = world.steps(self.lost_from or 0.0, f"scenario.sensors.{role}.lost_from")
+        where, end = f"scenario.sensors.{role}.lost_from", world.horizon * world.time_step
+        require(
+            (self.lost_from or 0.0) < end,
+            f"{where}={self.lost_from} must lie within the episode of {end:g} s "
+            f"(scenario.horizon); {where}=2 sets another time",
+        )
+        self.first_lost = world.steps(self.lost_from or 0.0, where)
         self.apart = max(1, world.steps(self.error_time, f"scenario.sensors.{role}.error_time"))
         drawn = ["episode.seed", "next.episode.step"]
         reads = [f"{role}.{SENSORS}", *(f"next.{name}" for name in TRUE_STATE), *drawn]

@@ -130,6 +130,10 @@ def test_what_does_not_fit_is_refused() -> None:
             ["+event=lost_target", "scenario.sensors.automated.longest_dropout=0"],
             "lost_from and longest_dropout belong together",
         ),
+        (
+            ["+event=lost_target"],
+            r"lost_from=30.0 must lie within the episode of 15 s .*lost_from=2",
+        ),
     ]
     check_refused(lambda words: built(*words), cases, ConfigError)
     with pytest.raises(ConfigError, match="must not fall"):
