@@ -23,6 +23,7 @@ from lcc_rl.io.files import Rows, read_parquet
 from lcc_rl.results import render
 from lcc_rl.results.report import Report, together
 from lcc_rl.results.runs import STEPS
+from lcc_rl.runs.output import repeated_warnings_left_out
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ def compare(
             ``outputs/evaluate``, without figures, which take seconds.
 
     Returns:
-        The run, with the rows of all strategies.
+        The run, with the rows of all strategies. Further calls do not repeat a warning.
 
     Raises:
         LccError: for any error in settings, data or files, in one line.
@@ -165,7 +166,8 @@ def compare(
     else:
         spec = [setting_of(x) for _, x in rules]
     cfg = cfg.with_(compare=spec)
-    rows = evaluation.run(cfg, target, own=False, quiet=True, policies=policies, typed=typed)
+    with repeated_warnings_left_out():
+        rows = evaluation.run(cfg, target, own=False, quiet=True, policies=policies, typed=typed)
     if folder is not None:
         evaluation.draw(rows, cfg, target)
     return Run(target, rows, cfg)

@@ -116,8 +116,12 @@ def test_a_choice_that_is_there_cannot_be_added() -> None:
         (["experiment=limits", "+experiment=smoke"], "filter is chosen twice: leave one out"),
         (["experiment=limits", "+filter=cbf"], "=cbf: filter is chosen twice"),
         (["agent=td3", "+agent=sac"], "agent is chosen twice: .* without .$"),
+        (["+agent=td3", "+agent=sac"], "agent is chosen twice: leave one out"),
+        (["+event=cut_in", "+event=cut_out"], r"list takes several, '\+event=\[cut_in,cut_out\]'"),
     ]
     check_refused(lambda words: load("train", words), cases, ConfigError)
+    both = load("train", ["+event=[cut_in,lost_target]"]).scenario
+    assert (*both.sensors, *both.pieces["leader"].settings["at"]) == ("automated", 30.0, 40.0)
     small = load("train", ["experiment=[limits,smoke]"])
     assert small.training.episodes == 24
     assert small.training.segment == small.scenario.horizon == 60  # no warning of nobody's setting

@@ -29,7 +29,7 @@ TOOLS = {
     "animate": ("lcc_rl.commands.animate", "animations of episodes: page, SVG, GIF, MP4"),
     "reproduce": ("lcc_rl.studies.reproduce", "a paper's study: tables and figures"),
     "clairvoyant": ("lcc_rl.commands.clairvoyant", "upper bound of the saving"),
-    "export": ("lcc_rl.interfaces.export", "a trained policy as ONNX, PyTorch program or page"),
+    "export": ("lcc_rl.interfaces.export", "a policy or rule as ONNX, PyTorch, C or page"),
 }
 COMMANDS = {**HYDRA_COMMANDS, **TOOLS}
 

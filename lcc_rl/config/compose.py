@@ -332,9 +332,14 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         return ConfigError(
             f"{key}={value}: several values are runs of a sweep, -m; a list is {key}=[{value}]"
         )
-    if found := re.match(r"(\w+)\S* appears more than once", str(error)):
-        twice = f"{found.group(1)} is chosen twice: leave one out, or write it without +"
-        return ConfigError(f"{' '.join(overrides)}: {twice}")
+    if found := re.match(r"(?:Multiple values for )?(\w+)\S* (?:To over|appears more)", str(error)):
+        group = found.group(1)
+        pairs = [word.partition("=")[::2] for word in overrides]
+        names = dict.fromkeys(value.strip("[]") for key, value in pairs if key == f"+{group}")
+        remedy = "leave one out, or write it without +"
+        if group in ADDED and len(names) > 1:
+            remedy = f"a list takes several, '+{group}=[{','.join(names)}]'"
+        return ConfigError(f"{' '.join(overrides)}: {group} is chosen twice: {remedy}")
     cause = error.__cause__
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)
     tokens = [*overrides, *text.partition("See https://")[0].split()]

@@ -68,7 +68,8 @@ def c_code(module: DrivingProgram, about: str) -> str:
     columns = "".join(f" * state[{k}]: {x.name} [{x.unit}]\n" for k, x in enumerate(inputs))
     tables = "".join(_table(f"t{k}", x.numpy()) for k, x in enumerate(recorder.tables))
     comment = "/* " + about.replace("*/", "* /") + f"\n *\n{columns}"
-    comment += f" * memory[{module.width}]: zeros when the car begins or its target changes\n"
+    change = ", not when" if module.observation is None else " or"  # as in simulations
+    comment += f" * memory[{module.width}]: zeros when the car begins{change} its target changes\n"
     comment += " * Returns the acceleration for the next step [m/s^2]. */\n"
     head = comment + HEAD + (LAYER if "layer(" in lines else "") + tables
     call = "float step(const float *state, float *memory) {\n    (void)memory;\n"

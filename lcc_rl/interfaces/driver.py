@@ -158,8 +158,9 @@ class Driver:
                 has no vehicle behind if none of its entries is given, or if ``"behind.present"``
                 is 0.
             cars: ids of the cars, in the order of the arrays; by default 0, 1, 2 … The memory of a
-                car starts anew if it was not in the last step, or if it measured a NaN, for which
-                it brakes behind a filter. Cars that are not in this step are forgotten.
+                car starts anew if it was not in the last step, or if it is no longer finite, as
+                after bad samples, for which the car brakes behind a filter. Cars that are not in
+                this step are forgotten.
 
         Returns:
             A number for numbers, else an array, ``[cars]``.
@@ -176,12 +177,13 @@ class Driver:
         command, *memory = self._rows(state, *[self.memory] * (self.program.width > 0))
         if not np.isfinite(command).all():
             row = int(np.isfinite(command).argmin())
-            lost = [x for x, value in zip(self.names, state[row], strict=True) if np.isnan(value)]
-            lost = [x for x in lost if x not in self.program.stand_ins]
-            fault = f"the command of {self.cars[row]} is {command[row, 0]}"
-            fault = f"{lost[0]} is nan in row {row} of the cars" if lost else fault
+            given = zip(self.names, state[row], strict=True)
+            lost = [one for one in given if not np.isfinite(one[1])]
+            lost = [one for one in lost if one[0] not in self.program.stand_ins]
+            faults = [f"{name} is {x} in row {row} of the cars" for name, x in lost]
+            faults.append(f"the command of {self.cars[row]} is {command[row, 0]}")
             self.cars, self.memory = before
-            raise Diverged(f"{self.name}: {fault}")
+            raise Diverged(f"{self.name}: {faults[0]}")
         if memory:
             (self.memory,) = memory
             if not self.memory[:, 0].all():

@@ -105,9 +105,9 @@ def _written(
     text = f"{name}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
     require(not page or (cfg is None and not (safety or limits or rule)), text)
     if cfg is None and not page and overrides:
-        text = (
-            f"{' '.join(overrides)}: a program ({path.suffix}) takes safety.… and limits.…, no road"
-        )
+        own = "settings of a controller are in its yaml file or, in Python, its object"
+        text = f"{' '.join(overrides)}: a program ({path.suffix}) takes safety.… and limits.…, "
+        text += f"no road; {own}" if rule else "no road"
         prefixes = ("safety.", "limits.")
         require(all(key_of(override).startswith(prefixes) for override in overrides), text)
         text = "overrides: safety.… and limits.… are given as arguments, too"

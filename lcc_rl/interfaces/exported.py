@@ -101,10 +101,11 @@ class DrivingProgram(nn.Module):
     """Maps measurements ``[batch, inputs]`` to accelerations ``[batch, 1]`` [m/s²].
 
     A program with a memory also reads and returns the memory, ``[batch, width]``. If its first
-    number is zero, the vehicle starts anew, as after a NaN in the memory. Inputs of ``behind.``
-    that are NaN get their stand-ins. With a safety filter, an input ahead that is not finite, or a
-    gap that is not positive, is no measurement. After one such step the last measurements are used
-    again. In further ones the filter brakes fully, and the vehicle starts anew.
+    number is zero, the vehicle starts anew, as after a memory that is not finite. Inputs of
+    ``behind.`` that are not finite get their stand-ins. With a safety filter, an input ahead that
+    is not finite, or a gap that is not positive, is no measurement. After one such step the last
+    measurements are used again. In further ones the filter brakes fully, and the vehicle starts
+    anew.
 
     Args:
         pieces: a policy's memory and observation, the controller, the safety filter, in this order

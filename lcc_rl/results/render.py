@@ -36,8 +36,8 @@ def columns(frame: pd.DataFrame) -> list[TableColumn]:
     """Return the columns of a table as text.
 
     A column's unit is the end of its name (``energy_kj``, ``saving_pct``). ``x``, ``x_low`` and
-    ``x_high`` become one column. Numbers have about four digits, or
-    ``frame.attrs["decimals"]`` decimals.
+    ``x_high`` become one column. Numbers have about four digits, per cent at most two decimals, or
+    all ``frame.attrs["decimals"]`` decimals.
     """
     bounds = {f"{name}{end}" for name in frame for end in ("_low", "_high")}
     return [
@@ -89,7 +89,8 @@ def as_latex(frame: pd.DataFrame) -> str:
 def column_cells(frame: pd.DataFrame, name: str) -> list[str]:
     """Return the cells of a column as text, with its interval if the table has one."""
     keys = [key for key in (name, f"{name}_low", f"{name}_high") if key in frame]
-    places = frame.attrs.get("decimals", min(_places(frame[key]) for key in keys))
+    most = 2 if heading(name).endswith("[%]") else 4
+    places = frame.attrs.get("decimals", min(most, *(_places(frame[key]) for key in keys)))
     cells = [_cell(value, places) for value in frame[name]]
     if f"{name}_low" not in frame:
         return cells

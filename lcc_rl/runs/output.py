@@ -23,6 +23,7 @@ PLAIN: dict[str, Any] = {"box": box.SIMPLE_HEAD, "padding": 0, "show_edge": Fals
 PLAIN |= {"caption_justify": "left"}
 
 log = logging.getLogger("lcc_rl")
+_warned: set[str] = set()
 
 
 class ShortFormatter(logging.Formatter):
@@ -61,6 +62,24 @@ def headlines() -> Iterator[None]:
         for handler, level, formatter in changed:
             handler.setLevel(level)
             handler.setFormatter(formatter)
+
+
+@contextmanager
+def repeated_warnings_left_out() -> Iterator[None]:
+    """Log a warning of the same text once in all such contexts of a process, as in a loop."""
+    log.addFilter(_is_new)
+    try:
+        yield
+    finally:
+        log.removeFilter(_is_new)
+
+
+def _is_new(record: logging.LogRecord) -> bool:
+    if record.levelno != logging.WARNING:
+        return True
+    before = len(_warned)
+    _warned.add(record.getMessage())
+    return len(_warned) > before
 
 
 class Unbroken:

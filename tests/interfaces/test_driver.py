@@ -330,9 +330,12 @@ def test_no_driver_takes_a_measurement_that_is_no_number() -> None:
             with pytest.raises(Diverged, match=f"{re.escape(entry)} is nan in row 1 of the cars"):
                 driver.step(bad)
             assert len(driver.cars) == len(driver.memory) == 0
+    with pytest.raises(Diverged, match=r"alcc: self\.gap is inf in row 1 of the cars"):
+        driver.step({**given, "self.gap": np.array([12.0, np.inf])})
     for name in (POLICY, "idm_acc_filtered", "pretrained/i80-follow"):
-        for entry in Driver(name, 0.1).names:
-            found = Driver(name, 0.1).step({**given, entry: np.array([12.0, np.nan])})
+        for k, entry in enumerate(Driver(name, 0.1).names):
+            bad = (np.nan, np.inf, -np.inf)[k % 3]
+            found = Driver(name, 0.1).step({**given, entry: np.array([12.0, bad])})
             rear = entry.startswith("behind.")
             assert found[1] == pytest.approx(found[0] if rear else -3.0), (name, entry)
             assert found[0] > -3.0
@@ -349,12 +352,24 @@ class Careful(Controller):
         return wanted, wanted
 
 
+class Mean(Careful):
+    """Keeps a mean of its gaps, which an infinite gap spoils."""
+
+    def command(self, gap, last):
+        mean = 0.5 * (gap + last)
+        return 0.1 * (mean - 30.0), mean
+
+
 def test_a_controller_of_ones_own_handles_a_nan_as_in_the_exported_program() -> None:
-    driver, program, memory = Driver(Careful, 0.1), Driver(Careful, 0.1).program, torch.zeros(1, 2)
-    gaps = [20.0, np.nan, np.nan, 40.0]
-    for gap, wanted in zip(gaps, [-1.0, -1.0, -1.0, 1.0], strict=True):
-        command, memory = program(torch.tensor([[gap]]), memory)
-        assert driver.step({"self.gap": gap}) == pytest.approx(float(command)) == wanted
+    cases = [
+        (Careful, [20.0, np.nan, np.nan, 40.0], [-1.0, -1.0, -1.0, 1.0]),
+        (Mean, [20.0, np.inf, 40.0, -np.inf, 40.0], [-2.0, 3.0, -1.0, -3.0, -1.0]),  # begins anew
+    ]
+    for rule, gaps, commands in cases:
+        driver, program, memory = Driver(rule, 0.1), Driver(rule, 0.1).program, torch.zeros(1, 2)
+        for gap, wanted in zip(gaps, commands, strict=True):
+            command, memory = program(torch.tensor([[gap]]), memory)
+            assert driver.step({"self.gap": gap}) == pytest.approx(float(command)) == wanted
 
 
 def test_a_bridge_names_the_time_of_a_measurement_or_command_that_is_no_number(monkeypatch) -> None:

@@ -155,16 +155,20 @@ def test_c_code_computes_the_same(name, tmp_path) -> None:
         seen = state.copy()
         if memory and k in (20, 30, 31, 32):
             seen[0, k % width] = np.nan
+        if memory and k in (40, 50, 51, 52):
+            seen[0, k % width] = np.inf if k % 2 else -np.inf
         expected, *memory = (
             module(torch.from_numpy(seen), *memory) if memory else [module(torch.from_numpy(seen))]
         )
         found = step(*(x.ctypes.data_as(ctypes.POINTER(ctypes.c_float)) for x in (seen, kept)))
         assert found == pytest.approx(expected.item(), abs=2e-6, nan_ok=True), k
-        assert np.isfinite(found) or np.isnan(seen).any()  # memories do not keep a NaN
+        assert np.isfinite(found) or np.isnan(seen).any()  # memories stay finite
         for one in memory:
             np.testing.assert_allclose(kept, one.numpy(), rtol=1e-6, atol=1e-6)
     head = path.read_text(encoding="utf-8")
     assert all(f": {column} [" in head for column in module.names)
+    change = " or" if name.startswith("pretrained") else ", not when"
+    assert f"]: zeros when the car begins{change} its target changes\n" in head
 
 
 def test_a_measurement_that_is_no_number_brakes_or_shows(exported, tmp_path) -> None:
@@ -188,7 +192,7 @@ def test_a_measurement_that_is_no_number_brakes_or_shows(exported, tmp_path) -> 
         for rows in (1, 5):
             for column in range(widths[0]):
                 state = torch.full((rows, widths[0]), 12.0)
-                state[0, column] = torch.nan
+                state[0, column] = torch.inf if wanted < 0.0 and rows > 1 else torch.nan
                 entries = [state, *(torch.zeros(rows, width) for width in widths[1:])]
                 feed = {name: x.numpy() for name, x in zip(given, entries, strict=True)}
                 found = makes(*entries)
@@ -209,7 +213,7 @@ def test_bad_input_is_one_clear_error() -> None:
         (["idm_acc", "x.c", "limits.max_braking=0"], "limits.max_braking must be greater than 0"),
         (
             ["idm_acc", "x.c", "scenario.max_braking=6"],
-            r"a program \(.c\) takes safety.… and limits.…",
+            r"a program \(.c\) takes safety.… and limits.…, no road; .* yaml file",
         ),
         (["idm_ac", "x.onnx"], "idm_acc"),
         (["idm_acc", "x.html"], r"idm_acc: a page \(.html\) needs a run or a policy file"),

@@ -290,7 +290,7 @@ def test_signs_of_a_name_stay_in_its_cell() -> None:
     assert r"a|b\_c \& 5 \%" in as_latex(table)
 
 
-def test_no_table_has_a_negative_zero() -> None:
+def test_no_table_has_a_negative_zero_or_thousandths_of_a_per_cent() -> None:
     table = pd.DataFrame({"saved_pct": [-0.0, -1e-9], "n": [0, 1]})
     for text in (
         as_markdown(table),
@@ -299,5 +299,7 @@ def test_no_table_has_a_negative_zero() -> None:
         saved_text(-0.04, -0.04, 0),
     ):
         assert not re.search(r"[-−]\$?0\.?0*\b", text), text
+    small = pd.DataFrame({"flow_pct": [0.0, 0.033], "flow\n[%]": [0.0, 0.033]})
+    assert as_markdown(small).endswith("| 0.03 | 0.03 |")
     assert saved_text(-0.04, -0.06, 0.0) == "0.0 (−0.1 … 0.0)"
     assert as_csv(pd.DataFrame({"x": [-0.0, 1.5]}), "comma").split() == ["x", "0,0", "1,5"]
