@@ -107,6 +107,9 @@ class Entrants:
             _refuse(typed, {"seed": "it is that of trainings; evaluation.seed draws other noise"})
         if self.own or self.further or self.cfg.variant in rows or not self.cfg.automated:
             return
+        if not self.paths and self.cfg.evaluation.rows == "episodes":
+            changed = [word for word in typed if not word.startswith("~")]
+            _refuse(changed, {"reward.terms.": "rows of policies have a reward, no others"})
         check_effective(
             typed, self.rivals or rows, [*rows, *self.rivals.values()], bool(self.paths)
         )

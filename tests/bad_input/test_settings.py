@@ -144,7 +144,8 @@ def test_options_without_effect_are_refused() -> None:
     cases += [(lambda: lcc_rl.simulate([9.0] * 9, "automated", "acc", overrides=own), named)]
     idle = r"\+filter=cbf has no effect: nothing drives behind the filter \(acc\)"
     cases += [(lambda: lcc_rl.compare("acc", overrides="+filter=cbf"), idle)]
-    for typed, why in {"agent.gamma=0.5": "of its training", "seed=3": "evaluation.seed"}.items():
+    idle = {"agent.gamma=0.5": "of its training", "seed=3": "evaluation.seed"}
+    for typed, why in {**idle, "reward.terms.safety.weight=0": "of policies"}.items():
         cases += [(lambda x=typed: lcc_rl.compare("acc", overrides=[x]), f"{typed} has.*{why}")]
     check_refused(lambda call: call(), cases, ConfigError)
     assert load("evaluate", [f"{AUTO}.time_gap=1.5", words[1], "variant=idm"]).compare
