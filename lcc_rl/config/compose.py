@@ -335,10 +335,10 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
     if found := re.match(r"(?:Multiple values for )?(\w+)\S* (?:To over|appears more)", str(error)):
         group = found.group(1)
         pairs = [word.partition("=")[::2] for word in overrides]
-        named = dict.fromkeys(name.strip("[]") for key, name in pairs if key == f"+{group}")
+        several = dict.fromkeys(value.strip("[]") for key, value in pairs if key == f"+{group}")
         remedy = "leave one out, or write it without +"
-        if group in ADDED and len(named) > 1:
-            remedy = f"a list takes several, '+{group}=[{','.join(named)}]'"
+        if group in ADDED and len(several) > 1:
+            remedy = f"a list takes several, '+{group}=[{','.join(several)}]'"
         return ConfigError(f"{' '.join(overrides)}: {group} is chosen twice: {remedy}")
     cause = error.__cause__
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)

@@ -158,9 +158,8 @@ class Driver:
                 has no vehicle behind if none of its entries is given, or if ``"behind.present"``
                 is 0.
             cars: ids of the cars, in the order of the arrays; by default 0, 1, 2 … The memory of a
-                car starts anew if it was not in the last step, or if it is no longer finite, as
-                after bad samples, for which the car brakes behind a filter. Cars that are not in
-                this step are forgotten.
+                car starts anew if it was not in the last step, or after bad samples, for which it
+                brakes behind a filter. Cars that are not in this step are forgotten.
 
         Returns:
             A number for numbers, else an array, ``[cars]``.

@@ -104,8 +104,7 @@ class DrivingProgram(nn.Module):
     number is zero, the vehicle starts anew, as after a memory that is not finite. Inputs of
     ``behind.`` that are not finite get their stand-ins. With a safety filter, an input ahead that
     is not finite, or a gap that is not positive, is no measurement. After one such step the last
-    measurements are used again. In further ones the filter brakes fully, and the vehicle starts
-    anew.
+    measurements are used again. In further ones the filter brakes fully, then it starts anew.
 
     Args:
         pieces: a policy's memory and observation, the controller, the safety filter, in this order
