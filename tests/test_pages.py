@@ -43,11 +43,12 @@ NOT_RUN = {
     "python tools/kill_test.py": "takes an hour",
 }
 # Settings that shrink a command, where they are settings of it.
+COUNTED = "evaluation.warm_up=0"
 LENGTH, WINDOWS = "scenario.horizon=40", ("evaluation.profiles=2", "evaluation.drivers=2")
 TRAINING = ("training.episodes=24", "training.environments=8", "training.segment=20")
 SMALL = (
     *(LENGTH, *TRAINING, *WINDOWS, QUICK, *DATA),
-    *("training.checkpoint_every=1", "evaluation.full_length=false", "evaluation.warm_up=0"),
+    *("training.checkpoint_every=1", "evaluation.full_length=false", COUNTED),
 )
 OF_TRAINING = ("agent.batch_size=64", "agent.population=4")
 # What a page asks for, and what is enough for a try.
@@ -60,14 +61,14 @@ ENOUGH = {
     "evaluation.repeats=2000": "evaluation.repeats=4",
     "evaluation.repeats=200": "evaluation.repeats=2",
     "--iterations 200": "--iterations 2",
-    '["experiment=limits"]': repr([LENGTH, *TRAINING, *WINDOWS, *DATA]),
-    '["+filter=cbf"]': repr(["+filter=cbf", LENGTH, *WINDOWS, *DATA]),
+    '["experiment=limits"]': repr([COUNTED, LENGTH, *TRAINING, *WINDOWS, *DATA]),
+    '["+filter=cbf"]': repr(["+filter=cbf", COUNTED, LENGTH, *WINDOWS, *DATA]),
     'learn("alcc", words,': f'learn("alcc", [*words, *{list(SMALL)}],',
     "n_trials=40": "n_trials=2",
     "batch_size=1024": "batch_size=4",
     "num_envs=64": "num_envs=2",
     "batch_size=64": "batch_size=4",
-    '"evaluation.drivers=24"': repr([LENGTH, *WINDOWS, *DATA])[1:-1],
+    '"evaluation.drivers=24"': repr([COUNTED, LENGTH, *WINDOWS, *DATA])[1:-1],
     '1.2]"]': f'1.2]", *{list(DATA)}]',
     "learn(300_000,": "learn(9_600,",
     "rollout(6000": "rollout(20",
@@ -198,6 +199,8 @@ class Runner(Reader):
         ends = [[one_run(word, choice) for word in typed] for choice in (0, -1)]
         sweep = ends[0] != ends[1]  # some of its runs may learn nothing
         small = [*SMALL, *(OF_TRAINING if name != "evaluate" and not sweep else ())]
+        if name == "evaluate":
+            small = [word for word in small if not word.startswith("training.")]
         fits = partial(composes, ENTRIES.get(name, name), sweep=sweep)
         return [*place, *(item for item in small if all(fits([*e, item]) for e in ends))]
 

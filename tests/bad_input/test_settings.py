@@ -35,6 +35,7 @@ WRONG = {
     "energy=[fuel,bolt]": "energy takes one choice",
     "leader=[udds,us06]": "leader takes one choice",
     "+scenario.filters.automated.margin=1": "'automated'.*valid: none; .filter=cbf adds a filter",
+    "+scenario.actuators.automated.lag=0.4": "'automated'.* .faults=all actuators and sensors",
     "+scenario.fleet.t={_target_: builtins.dict}": "scenario.fleet.t.*",
     "scenario.string='automated human*٢٥'": "expected .* at character 16",
     "agent=dddpg": "agent 'dddpg'.*'ddpg'.* agent/dddpg.yaml, needs --config-dir",
