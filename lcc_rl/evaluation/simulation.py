@@ -232,6 +232,7 @@ class _Motion:
     def __init__(self, cfg: StudyConfig, record: Record, start: State, alive: Tensor) -> None:
         self.cfg, self.record, self.alive = cfg, record, alive
         self.energy, self.time_step = build_energy(cfg), cfg.scenario.time_step
+        self.ahead = highest(record)
         self.names = [name for name in MOTION if ("vehicles", name) in record]
         spaces = ["leader"] * (LEADER in record) + ["vehicles"]
         self.groups = [self._group(space, start) for space in spaces]
@@ -317,7 +318,7 @@ class _Motion:
     def _measured(self, block: slice) -> dict[str, Tensor]:
         """Return energies and measures of the vehicles of some episodes, ``[episodes, n, 1]``."""
         found, metrics, alive = [], {**METRICS, **ROAD_METRICS}, self.alive[:, block]
-        ahead = {x: y[:, block].unsqueeze(-2) for x, y in highest(self.record).items()}
+        ahead = {name: x[:, block].unsqueeze(-2) for name, x in self.ahead.items()}
         for whole, kinds in zip(self.groups, self.kinds, strict=True):
             group = {name: x[:, block] for name, x in whole.items()}
             kind = None if kinds is None else kinds[block]
