@@ -27,7 +27,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 44_200, "code": 29_260},
+    "lcc_rl + tools": {"lines": 44_250, "code": 29_260},
     "tests": {"lines": 26_250},
     "conf": {"yaml": 164},
 }

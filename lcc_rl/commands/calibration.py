@@ -103,7 +103,8 @@ def _run(
 
 def _named(result: Calibration, vehicles: Mapping[int, str]) -> Calibration:
     names = {role: result.drivers[f"{role}_id"].map(vehicles) for role in ("follower", "leader")}
-    return replace(result, drivers=result.drivers.assign(**names))
+    known = {role: column for role, column in names.items() if column.notna().any()}
+    return replace(result, drivers=result.drivers.assign(**known))
 
 
 def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: Path) -> None:

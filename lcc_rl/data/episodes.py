@@ -170,7 +170,7 @@ def _rows(
     if numbers is None or (np.abs(numbers) >= 2**31).any():
         numbers = np.arange(len(distinct))
     recording = read.get("recording", same_text(file.label, rows))
-    before = count * bool(seen & {*recording.categories})
+    before = count * (turn is not None or bool(seen & {*recording.categories}))
     values = {
         **dict.fromkeys(SCHEMA, np.zeros(rows)),
         **{EPISODE_NAMES[key]: cells for key, cells in read.items()},
@@ -206,7 +206,8 @@ def _targets(read: dict[str, Any], file: TableFile) -> tuple[dict[str, Any], pd.
         mask &= np.isin(folded, VALID)
     if target is not None:
         mask &= ~target.isin(NO_LEADER)
-        names = np.char.add(np.asarray(cars).astype(str), " target ")
+        runs = np.asarray(cars).astype(str)
+        names = np.where(runs == "", "target ", np.char.add(runs, " target "))
         read["episode"] = pd.Categorical(np.char.add(names, np.asarray(target).astype(str)))
         read["turn"] = _turns(read, cars, ~target.isin(NO_LEADER))
     if mask.all():

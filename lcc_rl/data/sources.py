@@ -172,7 +172,10 @@ class EpisodesSource(Source):
         source += read_as(PAIR_FIELDS, named, self.units)
         units = units_of(PAIR_FIELDS, {**EPISODE_NAMES, **self.columns}, self.units)
         place = partial(places, files=files, columns=self.columns)
-        return self.select(episodes, source, lines, place=place, units=units)
+        first = episodes.drop_duplicates("leader_id")
+        cars = dict(zip(first["leader_id"], first["label"].astype(str), strict=True))
+        loaded = self.select(episodes, source, lines, place=place, units=units)
+        return replace(loaded, vehicles=cars if self.columns.get("target") else {})
 
 
 def read_as(columns: Iterable[Column], names: Names, units: Units) -> str:

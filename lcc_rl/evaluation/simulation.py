@@ -248,7 +248,10 @@ class _Motion:
         if space == "leader":
             group = {name: entry.unsqueeze(-2) for name, entry in group.items()}
             energy = self.energy.at(_after(group.get(GRADE)))
-            group["power"] = energy.power(group["speed"][:-1], group["acceleration"])
+            speed = group["speed"][:-1]
+            if self.cfg.scenario.replaced:  # that of the new vehicle in the step of the change
+                speed = group["speed"][1:] - self.time_step * group["acceleration"]
+            group["power"] = energy.power(speed, group["acceleration"])
         return group
 
     def tables(self) -> Simulation:
@@ -324,6 +327,8 @@ class _Motion:
             kind = None if kinds is None else kinds[block]
             args = (self.time_step, self.energy, kind, _after(group.get(GRADE)))
             known = energy_measures(group["power"], group["speed"], alive.unsqueeze(-2), *args)
+            if self.cfg.scenario.replaced and whole is self.groups[0]:  # of two vehicles in turn
+                known = {"distance_m": known["distance_m"]}
             series = {x: group[x].unsqueeze(-2) for x in SERIES if x in group}
             late = {name: x[-len(alive) :] for name, x in series.items() if name in AT_START}
             series |= late | ahead

@@ -406,8 +406,15 @@ def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
         note += task.measure.unit
     saved = f"{note}; " * (len(table) > 1)
     caption = f"{saved}kept: all limits, without a collision; {ALL}"
-    short = shortened(table.assign(**columns), shown)
-    return {"short": short, "caption": caption, "against": task.against, "label": task.label}
+    short, headed = shortened(table.assign(**columns), shown)
+    unit = task.unit if task.measure.per else task.measure.unit
+    short = short.assign(unit=unit)  # in CSV, where the score has no heading
+    return {
+        "short": (short, headed),
+        "caption": caption,
+        "against": task.against,
+        "label": task.label,
+    }
 
 
 def shortened(

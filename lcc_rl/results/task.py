@@ -11,7 +11,7 @@ import pandas as pd
 from pydantic import BeforeValidator
 
 from lcc_rl.config.words import RECORDED
-from lcc_rl.errors import require_known
+from lcc_rl.errors import require, require_known
 from lcc_rl.results import measures
 from lcc_rl.results.measures import Measure, heading
 from lcc_rl.results.names import HUMAN
@@ -36,7 +36,7 @@ Bound = Annotated[float | str, BeforeValidator(_bound)]
 class Task(Settings):
     """Score, baseline and limits of a task."""
 
-    name: str
+    name: str = ""  # needed
     # The score, which is minimised: energy, net_energy or path_energy of all vehicles divided by
     # their distance, or a column of episodes.parquet.
     score: str = "net_energy"
@@ -48,6 +48,7 @@ class Task(Settings):
     limits: Mapping[str, Bound] = field(default_factory=dict)
 
     def validate(self) -> None:
+        require(self.name, "task.name is required: choose a task, such as task=i24-follow5")
         require_known("score (task.score)", self.score, measures.score_measures())
         require_known("column of task.limits", self.limits, measures.limit_measures())
 

@@ -495,6 +495,8 @@ def test_the_log_of_a_car_has_relative_speeds_targets_and_a_flag(tmp_path) -> No
         assert any("left out 50 rows without a valid target" in line for line in loaded.report)
         assert found["follower_id"].nunique() == 1
         assert found["leader_id"].nunique() == 2
+        ids = [loaded.vehicles[number].split()[-1] for number in found["leader_id"].unique()]
+        assert ids == [*map(str, table["id"][table["ok"].isin([True, "yes"])].unique())]
         for _, part in found.groupby("episode"):
             time = part["time_s"]
             np.testing.assert_allclose(

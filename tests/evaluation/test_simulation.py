@@ -189,11 +189,16 @@ def test_wrong_arguments_are_named() -> None:
 def test_a_leader_that_is_replaced_does_not_jump() -> None:
     words = ["+event=cut_in", "scenario.pieces.leader.at=[3,4]"]
     words += ["scenario.pieces.leader.excess=[-5,-4]", "scenario.pieces.leader.settling=5"]
-    steps = lcc_rl.simulate([12.0] * 101, "automated", overrides=words).steps
-    leader = steps[steps["vehicle"] == 0]
+    found = lcc_rl.simulate([12.0] * 101, "automated", overrides=words)
+    leader = found.steps[found.steps["vehicle"] == 0]
     assert leader["speed_mps"].diff().min() < -3.9  # of two vehicles
     assert leader["acceleration_mps2"].abs().max() < 1.1
     assert leader["power_w"].min() > 0.0  # no braking
+    settling = leader[leader["acceleration_mps2"] > 0.5]["power_w"]
+    assert settling.diff().abs().max() < 2e3  # also from the step of the change on
+    energies = [name for name in found.vehicles if name.endswith("energy_kj")]
+    assert found.vehicles.loc[0, energies].isna().all()  # two vehicles in turn
+    assert found.vehicles.loc[1, energies].notna().all()
 
 
 def test_drivers_of_a_table_are_those_of_its_path(caplog) -> None:
