@@ -55,7 +55,7 @@ def test_who_knows_the_profile_saves() -> None:
 @pytest.mark.slow
 def test_a_fleet_saves_at_the_flow_of_the_learned_one() -> None:
     words = ["variant=alcc", "task=i24-mixed", "scenario.string={size: 6, penetration: 0.5}"]
-    cfg = load("evaluate", [*words, f"scenario.horizon={STEPS}"])
+    cfg = load("evaluate", [*words, f"scenario.horizon={STEPS}", "evaluation.warm_up=0"])
     weights = load_policy("pretrained/i24-mixed", "alcc")
     start = trained(cfg, "pretrained/i24-mixed", weights, POPULATION)
     plan = clairvoyant(start, INPUTS, 2, 1, iterations=25, compiled=False, hold=10)
@@ -84,14 +84,15 @@ def test_without_regard_the_car_alone_saves() -> None:
 def test_the_command(tmp_path, capsys) -> None:
     from lcc_rl.commands import clairvoyant as tool
 
-    short = ["scenario.horizon=30", "evaluation.profiles=1", "evaluation.drivers=2"]
+    few = ["scenario.horizon=30", "evaluation.warm_up=0", "evaluation.drivers=2"]
+    short = [*few, "evaluation.profiles=1"]
     own = ["--iterations", "2", "--no-compile", "--out"]
     assert tool.main([*own, str(tmp_path / "one"), *short]) == 0
     assert "clairvoyant" in capsys.readouterr().out
     rows = pd.read_parquet(tmp_path / "one" / "episodes.parquet")
     assert rows["strategy"].value_counts().to_dict() == {"idm": 2, "alcc": 2, "clairvoyant": 2}
     starts = ["--policy", "pretrained", "--policy", "pretrained/reference", "--regard"]
-    two = ["scenario.horizon=30", "evaluation.profiles=2", "evaluation.drivers=2"]
+    two = [*few, "evaluation.profiles=2"]
     assert tool.main([*own, str(tmp_path / "two"), *starts, *two]) == 0
     assert "lower than with plans" in capsys.readouterr().out
     rows = pd.read_parquet(tmp_path / "two" / "episodes.parquet")
