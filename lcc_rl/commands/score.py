@@ -179,8 +179,8 @@ def play_source(entrant: Scored, source: str, cfg: EvaluateConfig, folder: Path)
     save_config(cfg, folder)
     evaluate_and_write(comparison, inputs, folder, quiet=True)
     rows = read_parquet(folder / EPISODES)
-    # Further controllers do not count, and "data" is the hash of the contents of files.
-    unused = ("evaluation.behind_filter", "inputs.data", "inputs.leader")
+    # Further controllers and the size of files do not count; "data" is the hash of the leaders.
+    unused = ("evaluation.behind_filter", "evaluation.sample_mb", "inputs.data", "inputs.leader")
     settings = identity(cfg, *unused, changed=True)
     hashes = {"data": hash_of(inputs.evaluation), "settings": settings}
     windows = windows_for(rows)
