@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Strings of units per 100 km: pint 0.25.3 reads "15 kWh/100km" as 0.15 km·kWh, without an error;
-# quantities 0.16.4 leaves out the 100 of "kW*h/(100*km)"; astropy 8.0.2 refuses; unyt 3.2.0.
+# quantities 0.16.4 drops the 100 of "kW*h/(100*km)"; unyt 3.2.0 is right, astropy 8.0.2 refuses.
 # Guess before: "15 kWh/100km" is 0.15 kWh/km, or refused.
-# Seen: pint divides by 100 and multiplies by km, also with litres; quantities has 54,000, not 540 N.
+# Seen: pint divides by 100 and multiplies by km, also for litres; quantities: 54,000, not 540 N.
 # Hurt: consumption per 100 km read from tables with units in their headings.
 set -euo pipefail
 folder=$(mktemp -d)
