@@ -208,6 +208,7 @@ class Runner(Reader):
         """Put sizes of a try, and runs of this page, in place of what the page says."""
         for much, little in ENOUGH.items():
             text = text.replace(much, little)
+        text = re.sub(r",…(?=[],])", "", text)  # one run for several
         return re.sub(r"(?:outputs/(\w+)/)?<([a-z ]+)>(/\w+\.parquet)?", self.latest, text)
 
     def latest(self, found: re.Match[str]) -> str:
@@ -260,7 +261,9 @@ def settings_of(words: Sequence[str], own: Path) -> list[str]:
 
 
 def one_run(setting: str, choice: int) -> str:
-    """Return one value of a setting that may be swept."""
+    """Return one value of a setting that may be swept; runs of a sweep are none."""
+    if setting.startswith("compare=[") and "=" in setting.removeprefix("compare="):
+        return setting
     (override,) = OverridesParser.create().parse_overrides([setting])
     if not override.is_sweep_override():
         return setting
