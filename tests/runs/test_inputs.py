@@ -142,7 +142,8 @@ def test_a_changed_file_is_said_on_resume_and_seen_by_a_sweep(place, entry, anew
     drivers(place, 1.0)
     words = [*NO_AGENT, "variant=idm", "drivers=calibrated", "drivers.path=d.parquet"]
     words += ["evaluation.drivers=2"] + ["evaluation.baselines=[]"] * (entry == "evaluate")
-    sweep = (f"lcc_rl.cli.{entry}", "-m", *words, "seed=0", "sweep=s")
+    seed = "evaluation.seed=0" if entry == "evaluate" else "seed=0"
+    sweep = (f"lcc_rl.cli.{entry}", "-m", *words, seed, "sweep=s")
     run_command(*sweep, cwd=place, check=True)
     (settings,) = (place / "outputs" / entry / "s").glob("*/config.yaml")
     run, first = settings.parent, made_by(settings.parent / "episodes.parquet")
