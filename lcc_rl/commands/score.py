@@ -218,9 +218,9 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
     file = re.sub(r"\W+", "_", name)
     default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{file}"
     mine = {*choices("task"), ERROR}.issuperset  # of a killed run, which is repeated
-    folder = own_folder(options.out or default, "--out", mine)
+    folder = own_folder(options.out or default, mine)
     with claim(folder):
-        own_folder(folder, "--out", mine)  # another process may just have ended
+        own_folder(folder, mine)  # another process may just have ended
         try:
             return _run(entrant, name, folder, options, further)
         except Exception as error:
