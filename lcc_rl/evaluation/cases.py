@@ -38,13 +38,7 @@ CaseSeries = dict[str, Tensor]  # ``[time, runs, vehicles]``
 
 
 class Cases:
-    """Plays one strategy on all cases, held-out windows and whole records, in one block.
-
-    Args:
-        strategy: the strategy.
-        cfg: configuration of the evaluation.
-        inputs: cases, held-out windows and drivers.
-    """
+    """Plays one strategy on all cases, held-out windows and whole records, in one block."""
 
     def __init__(self, strategy: Strategy, cfg: StudyConfig, inputs: Inputs) -> None:
         self.strategy, self.cfg, self.inputs = strategy, cfg, inputs
@@ -97,14 +91,7 @@ class Cases:
 
 
 class CaseRuns:
-    """Drives a strategy behind all records of a case in parallel.
-
-    Args:
-        strategy: the strategy.
-        case: the records.
-        inputs: the drivers.
-        device: device of the computation.
-    """
+    """Drives a strategy behind all records of a case in parallel."""
 
     def __init__(self, strategy: Strategy, case: Case, inputs: Inputs, device: str = "cpu") -> None:
         changes: dict[str, Any] = {"horizon": case.horizon}

@@ -156,11 +156,6 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     """Return a warning if a policy was trained with other data, drivers or split; else nothing.
 
     There is no warning for a task, which defines its own, or for a shipped policy.
-
-    Args:
-        path: origin of the policy.
-        own: configuration of its training.
-        cfg: configuration under study.
     """
     if cfg.task is not None or Path(path).parts[:1] == (PRETRAINED,):
         return ""

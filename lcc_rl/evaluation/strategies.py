@@ -218,12 +218,6 @@ def hybrids(strategy: Strategy) -> list[Strategy]:
 def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Population) -> Strategy:
     """Build a trained strategy in the scenario under study.
 
-    Args:
-        cfg: the configuration under study.
-        path: origin of the policy, for messages.
-        policy: its weights and configuration.
-        population: the human drivers.
-
     Raises:
         LccError: if the policy does not fit the scenario or its own network.
     """
