@@ -18,7 +18,7 @@ from lcc_rl.io.atomic import new_file
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.motion import SampleMotion, motion_of, sample_episodes
 from lcc_rl.results.names import in_words, strategy_named
-from lcc_rl.results.runs import CONFIG, STEPS, naming_run, stored_config
+from lcc_rl.results.runs import CONFIG, STEPS, naming_run, read_settings
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.states import no_run
 from lcc_rl.settings import NonNegative, Whole
@@ -69,7 +69,7 @@ def run(
             text = f"--episode must lie from 0 to {len(episodes) - 1}, got {episode}"
             require(0 <= episode < len(episodes), text)
             label, rows = episodes[episode]
-            scenario = stored_config(folder)["scenario"]
+            scenario = read_settings(folder / CONFIG)["scenario"]
             motion = _cut(motion_of(rows, scenario), start, duration)
             # Side by side, only a short title fits.
             name = in_words(strategy) + (f": {label}" if len(named) == 1 else "")

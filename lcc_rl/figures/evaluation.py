@@ -40,7 +40,7 @@ from lcc_rl.results.motion import most_varied
 from lcc_rl.results.names import ON_FRONT, RULE, in_words, several
 from lcc_rl.results.render import column_cells
 from lcc_rl.results.report import AGAINST, COUNTS, Report
-from lcc_rl.results.runs import stored_config
+from lcc_rl.results.runs import CONFIG, read_settings
 from lcc_rl.results.windows import Means, by_driver
 
 VEHICLE_STYLES = {
@@ -71,7 +71,7 @@ def write_figures(
         ResultsError: if a table is missing or a figure cannot be written.
     """
     folder = Path(folder)
-    steps, cfg = read_parquet(folder / "steps.parquet"), stored_config(folder)
+    steps, cfg = read_parquet(folder / "steps.parquet"), read_settings(folder / CONFIG)
     found: Iterable[tuple[str, Figure]]
     if rows == "episodes":
         found = study_figures(read_parquet(folder / "episodes.parquet"), steps, cfg, reports, own)
