@@ -202,11 +202,11 @@ def recording_errors(function: Callable[[DictConfig], Any]) -> Callable[[DictCon
             if was_interrupted(error):
                 if "resume" in cfg and (folder / CONFIG).exists():
                     name = HydraConfig.get().job.config_name
-                    from lcc_rl.results.runs import stored_config
+                    from lcc_rl.results.runs import read_settings
                     from lcc_rl.results.trust import trust_option
 
                     command = f"lcc-rl {'run' if name == 'pipeline' else name} resume={folder}"
-                    command += trust_option(stored_config(folder))
+                    command += trust_option(read_settings(folder / CONFIG))
                     raise Interrupted(f"stopped; resume with: {command}") from error
                 raise
             given = isinstance(input_error(error) or error, (LccError, OSError))

@@ -43,17 +43,8 @@ def watch_folder(root: Path, console: Console) -> None:
             time.sleep(EVERY)
 
 
-def look(folder: str, console: Console, watching: bool) -> None:
-    """Show a folder once or continuously."""
-    require(folder, "the name of the folder is empty; use, e.g., outputs")
-    if watching and console.is_terminal:
-        watch_folder(Path(folder), console)
-    else:
-        show_states(Path(folder), console)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Show the folder of the command line."""
+    """Show the folder of the command line, once or continuously."""
     parser = Arguments(prog="lcc-rl status", description=__doc__)
     parser.add_argument("folder", nargs="?", default="outputs")
     parser.add_argument("--watch", action="store_true", help="update the table until all runs end")
@@ -64,7 +55,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.clean:
         for path in clean(Path(options.folder)):
             print(f"removed {path}")
-    look(options.folder, Console(highlight=False), options.watch)
+    require(options.folder, "the name of the folder is empty; use, e.g., outputs")
+    console = Console(highlight=False)
+    show = watch_folder if options.watch and console.is_terminal else show_states
+    show(Path(options.folder), console)
 
 
 if __name__ == "__main__":

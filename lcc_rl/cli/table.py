@@ -24,7 +24,6 @@ import pandas as pd
 from pydantic import Field
 
 from lcc_rl.api import Run
-from lcc_rl.cli.guard import main_guard
 from lcc_rl.io.files import Rows, as_rows, read_parquet
 from lcc_rl.results.names import rename, worded
 from lcc_rl.results.render import as_csv, as_latex, as_markdown, chosen, for_print
@@ -123,7 +122,3 @@ def read_run(folder: Path, trust: Sequence[str]) -> Run:
     cfg = load_config(folder, trust)
     with naming_run(folder / EPISODES):
         return Run(folder, as_rows(folder / EPISODES), cfg)
-
-
-if __name__ == "__main__":
-    main_guard(main)()

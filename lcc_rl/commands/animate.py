@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import pandas as pd
-
 from lcc_rl.errors import ConfigError, ResultsError, require
 from lcc_rl.figures.animation import ANIMATION_FORMATS, animate, check_ending
 from lcc_rl.figures.drawing import in_file
@@ -20,7 +18,7 @@ from lcc_rl.io.atomic import new_file
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.motion import SampleMotion, motion_of, sample_episodes
 from lcc_rl.results.names import in_words, strategy_named
-from lcc_rl.results.runs import CONFIG, STEPS, naming_run, stored_config
+from lcc_rl.results.runs import CONFIG, STEPS, naming_run, read_settings
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.states import no_run
 from lcc_rl.settings import NonNegative, Whole
@@ -67,8 +65,11 @@ def run(
         named = [name.partition(": ")[::2] for name in strategies or names[-1:]]
         for key, title in named:
             strategy = strategy_named(key, names)
-            label, rows = _episode(steps, strategy, episode)
-            scenario = stored_config(folder)["scenario"]
+            episodes = list(sample_episodes(steps, strategy).items())
+            text = f"--episode must lie from 0 to {len(episodes) - 1}, got {episode}"
+            require(0 <= episode < len(episodes), text)
+            label, rows = episodes[episode]
+            scenario = read_settings(folder / CONFIG)["scenario"]
             motion = _cut(motion_of(rows, scenario), start, duration)
             # Side by side, only a short title fits.
             name = in_words(strategy) + (f": {label}" if len(named) == 1 else "")
@@ -76,13 +77,6 @@ def run(
             motions[title or name] = motion
     default = folder / "figures" / f"animation_{in_file(named[0][0])}_{episode}.html"
     return animate(motions, out or default)
-
-
-def _episode(steps: pd.DataFrame, strategy: str, episode: int) -> tuple[str, pd.DataFrame]:
-    episodes = list(sample_episodes(steps, strategy).items())
-    if not 0 <= episode < len(episodes):
-        raise ConfigError(f"--episode must lie from 0 to {len(episodes) - 1}, got {episode}")
-    return episodes[episode]
 
 
 def _cut(motion: SampleMotion, start: float, duration: float | None) -> SampleMotion:

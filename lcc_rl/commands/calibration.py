@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -73,38 +72,29 @@ def run(
     Raises:
         LccError: for any error in settings, data or files, in one line.
     """
-    with claim(Path(folder)):
-        check_folder(cfg, Path(folder))
-        console = console or Console(highlight=False)
-        return _run(cfg, Path(folder), console, emit or partial(_print, console))
-
-
-def _run(
-    cfg: CalibrateConfig, folder: Path, console: Console, emit: Callable[[Sequence[str]], None]
-) -> pd.DataFrame:
-    device = prepare_torch(cfg)
-    # Settings are checked before the data are read, which may take a long time.
-    calibrator = cfg.calibration.made(CALLED)
-    dataset = load_episodes(cfg.data)
-    emit(dataset.report)
-    start = perf_counter()
-    with Phases("calibration", console, emit) as progress:
-        result = calibrator(dataset.episodes, seed=cfg.seed, device=device, progress=progress)
-    if dataset.vehicles:
-        result = _named(result, dataset.vehicles)
-    seconds = perf_counter() - start
-    save_config(cfg, folder)
-    emit(result.report)
-    _write(result, dataset.report, cfg, folder)
-    console.print(_summary(result.drivers))
-    emit([f"calibrated in {seconds:.1f} s; results in {folder}"])
-    return result.drivers
-
-
-def _named(result: Calibration, vehicles: Mapping[int, str]) -> Calibration:
-    names = {role: result.drivers[f"{role}_id"].map(vehicles) for role in ("follower", "leader")}
-    known = {role: column for role, column in names.items() if column.notna().any()}
-    return replace(result, drivers=result.drivers.assign(**known))
+    folder, console = Path(folder), console or Console(highlight=False)
+    emit = emit or partial(_print, console)
+    with claim(folder):
+        check_folder(cfg, folder)
+        device = prepare_torch(cfg)
+        # Settings are checked before the data are read, which may take a long time.
+        calibrator = cfg.calibration.made(CALLED)
+        dataset = load_episodes(cfg.data)
+        emit(dataset.report)
+        start = perf_counter()
+        with Phases("calibration", console, emit) as progress:
+            result = calibrator(dataset.episodes, seed=cfg.seed, device=device, progress=progress)
+        for role in ("follower", "leader"):
+            names = result.drivers[f"{role}_id"].map(dataset.vehicles)
+            if names.notna().any():
+                result.drivers[role] = names
+        seconds = perf_counter() - start
+        save_config(cfg, folder)
+        emit(result.report)
+        _write(result, dataset.report, cfg, folder)
+        console.print(_summary(result.drivers))
+        emit([f"calibrated in {seconds:.1f} s; results in {folder}"])
+        return result.drivers
 
 
 def _write(result: Calibration, read: list[str], cfg: CalibrateConfig, folder: Path) -> None:

@@ -59,12 +59,7 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
 
 
 def training_bytes(cfg: StudyConfig, env: TransformedEnv) -> dict[str, float]:
-    """Return the least memory that a training needs by option [bytes].
-
-    Args:
-        cfg: its configuration.
-        env: its environment, of any batch.
-    """
+    """Return the least memory that a training needs by option [bytes]."""
     settings, agent = cfg.training, cfg.agent.settings
     count, moment = settings.environments, moment_bytes(pieces_of(env))
     vehicles, width = env.observation_spec[OBSERVATION].shape[-2:]

@@ -177,7 +177,7 @@ def main(arguments: list[str]) -> int:
     cfg = cfg.with_(evaluation={"drivers": cfg.evaluation.drivers or DRIVER_COUNT})
     require(cfg.device == "cpu", "lcc-rl clairvoyant runs on device=cpu")
     require(cfg.scenario.slope is None, "lcc-rl clairvoyant: plans know no slopes")
-    folder = own_folder(options.out, "--out", {PROGRESS}.issuperset)
+    folder = own_folder(options.out, {PROGRESS}.issuperset)
     prepare_torch(cfg)
     with claim(folder):
         inputs = load_inputs(cfg)

@@ -72,10 +72,26 @@ def run(
         folder, cfg = Path(cfg.resume), resumed_config(cfg.resume, cfg.trust)
     else:
         cfg = with_inputs(cfg)
+    given = policies or {}
     with claim(folder):
         if not replace:
             check_folder(cfg, folder)
-        return _run(cfg, folder, own, quiet, replace, policies or {}, typed)
+        prepare_torch(cfg)
+        check_measured(cfg)
+        entrants = Entrants(cfg, own, given, typed)
+        inputs = load_inputs(cfg)
+        for line in filter(None, [*inputs.report, other_drivers(cfg), classes(cfg)]):
+            log.info(line)
+        comparison = Comparison(cfg, inputs, entrants.strategies(inputs))
+        if replace:  # rows of other settings must not be in a folder with this configuration
+            (folder / EPISODES).unlink(missing_ok=True)
+        save_config(cfg, folder)
+        rows = evaluate_and_write(comparison, inputs, folder, quiet)
+        for message in filter(None, (policy.clipped() for policy in given.values())):
+            log.warning(message)
+        if not quiet:
+            draw(rows, cfg, folder)
+        return rows
 
 
 def made_by(table: Path) -> str | None:
@@ -92,33 +108,6 @@ def complete(cfg: EvaluateConfig, folder: Path, typed: Sequence[str] = ()) -> No
     check_folder(cfg, folder, "inputs")  # with other files it is repeated
     run(cfg, folder, quiet=cfg.evaluation.shards > 1, replace=True, typed=typed)
     forget(folder)
-
-
-def _run(
-    cfg: EvaluateConfig,
-    folder: Path,
-    own: bool,
-    quiet: bool,
-    replace: bool,
-    policies: Mapping[str, GivenPolicy],
-    typed: Sequence[str],
-) -> Rows:
-    prepare_torch(cfg)
-    check_measured(cfg)
-    entrants = Entrants(cfg, own, policies, typed)
-    inputs = load_inputs(cfg)
-    for line in filter(None, [*inputs.report, other_drivers(cfg), classes(cfg)]):
-        log.info(line)
-    comparison = Comparison(cfg, inputs, entrants.strategies(inputs))
-    if replace:  # rows of other settings must not be in a folder with this configuration
-        (folder / EPISODES).unlink(missing_ok=True)
-    save_config(cfg, folder)
-    rows = evaluate_and_write(comparison, inputs, folder, quiet)
-    for message in filter(None, (policy.clipped() for policy in policies.values())):
-        log.warning(message)
-    if not quiet:
-        draw(rows, cfg, folder)
-    return rows
 
 
 def draw(rows: Rows, cfg: EvaluateConfig, folder: Path) -> None:

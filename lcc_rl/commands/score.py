@@ -114,15 +114,6 @@ class Scored(NamedTuple):
         build_env(entry.cfg.for_any_leader(), road, population, 1, nominal=True)
         return entry
 
-    def files(self) -> list[Path]:
-        """Return its files; none for a controller of the package.
-
-        These are a policy or a program; or a yaml file, and the module of a user's class.
-        """
-        if self.policy is not None:
-            return [policy_file(self.spec)]
-        return list(compared_files(self.spec))
-
 
 def scored(spec: str, trust: Sequence[str] = ()) -> Scored:
     """Read a policy, or find a controller.
@@ -200,8 +191,13 @@ def hash_of(windows: Profiles) -> str:
 
 
 def about(entrant: Scored) -> dict[str, Any]:
-    """Return the hash of the scored policy's files, and versions."""
-    contents = [file.read_bytes() for file in entrant.files()]
+    """Return the hash of the scored policy's or controller's files, and versions.
+
+    A controller of the package has no file, one of the user's a yaml file or a module.
+    """
+    learned, spec = entrant.policy is not None, entrant.spec
+    files = [policy_file(spec)] if learned else compared_files(spec)
+    contents = [file.read_bytes() for file in files]
     installed: dict[str, str | None] = {}
     for name in ("lcc_rl", *SCORED_WITH):
         try:
@@ -222,9 +218,9 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
     file = re.sub(r"\W+", "_", name)
     default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{file}"
     mine = {*choices("task"), ERROR}.issuperset  # of a killed run, which is repeated
-    folder = own_folder(options.out or default, "--out", mine)
+    folder = own_folder(options.out or default, mine)
     with claim(folder):
-        own_folder(folder, "--out", mine)  # another process may just have ended
+        own_folder(folder, mine)  # another process may just have ended
         try:
             return _run(entrant, name, folder, options, further)
         except Exception as error:

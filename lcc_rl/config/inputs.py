@@ -64,18 +64,14 @@ def inputs_of(content: Mapping[str, Any]) -> FileHashes:
 def _files(key: str, named: bool, holder: Any, name: str) -> Iterator[Path]:
     """Yield the files that a setting names."""
     path, last = Path(expanduser(name)), key.rpartition(".")[2]
+    target = holder.get(TARGET, OURS) if isinstance(holder, Mapping) else OURS
+    own = not str(target).startswith(OURS)  # the node of a user's class or function
     if module := module_named(key, name):
         yield from _own_files(module)
     elif named:
         yield from compared_files(name)
-    elif last == "path" or not _ours(holder):
+    elif last == "path" or own:
         yield from map(Path, matching(str(path), deep=last == "path"))
-
-
-def _ours(holder: Any) -> bool:
-    """Whether the holder of a setting is not the node of a user's class or function."""
-    target = holder.get(TARGET, OURS) if isinstance(holder, Mapping) else OURS
-    return str(target).startswith(OURS)
 
 
 def compared_files(name: str) -> Iterator[Path]:

@@ -349,9 +349,10 @@ def parse_config(content: Mapping[str, Any], kind: type[BaseConfig] | None = Non
     Raises:
         ConfigError: naming the first unknown or wrong setting.
     """
-    kind = kind or _kind_of(content)
+    given = {kind: {x.name for x in dataclasses.fields(kind)} for kind in KINDS.values()}
+    kind = kind or min(given, key=lambda x: len(given[x] ^ content.keys()))
     check_numbers(content, "")
-    nodes, names = as_nodes(content), {field.name for field in dataclasses.fields(kind)}
+    nodes, names = as_nodes(content), given[kind]
     check_nodes(nodes)
     for name, section in SECTIONS.items():
         if name in nodes and name in names:
@@ -359,13 +360,6 @@ def parse_config(content: Mapping[str, Any], kind: type[BaseConfig] | None = Non
                 raise ConfigError(f"{name} must be a mapping of settings, got {nodes[name]!r}")
             nodes[name] = parse(section, nodes[name], name)
     return parse(kind, nodes, "")
-
-
-def _kind_of(content: Mapping[str, Any]) -> type[BaseConfig]:
-    def misses(kind: type[BaseConfig]) -> int:
-        return len({item.name for item in dataclasses.fields(kind)} ^ set(content))
-
-    return min(KINDS.values(), key=misses)
 
 
 def as_text(cfg: Settings) -> str:

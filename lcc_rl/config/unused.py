@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import Any
 
@@ -35,7 +35,6 @@ def check_used(
     if not isinstance(cfg, StudyConfig):
         return
     reasons = dict(_of_road(cfg))
-    typed = {option: typed_keys(option) for option in overrides}
     if not sweep:
         reasons |= dict(_of_roles(cfg)) | dict(_of_agent(cfg))
         observation = cfg.observation.settings
@@ -47,12 +46,18 @@ def check_used(
             reasons[BASELINES] = "a training evaluates its own policy; lcc-rl evaluate compares"
         reasons["sweep"] = "it names the folder of a sweep, -m"
     if written is not None and cfg.agent is not None and "surrogates" in cfg.agent.settings:
-        reasons |= dict(_of_objective(cfg, written["agent"], set().union(*typed.values())))
-    for option, keys in typed.items():
+        typed = set().union(*map(typed_keys, overrides))
+        reasons |= dict(_of_objective(cfg, written["agent"], typed))
+    refuse((option for option in overrides if option not in NO_AGENT), reasons)
+
+
+def refuse(overrides: Iterable[str], reasons: Mapping[str, str]) -> None:
+    """Refuse overrides of keys that have a reason, or of keys below them; ``key.``: below only."""
+    for option in overrides:
         for unused, reason in reasons.items():
-            used = (key != unused and not key.startswith(f"{unused}.") for key in keys)
-            if not all(used) and option not in NO_AGENT:
-                raise ConfigError(f"{option.removeprefix('++')} has no effect: {reason}")
+            for key in typed_keys(option):
+                if key == unused or key.startswith(f"{unused.removesuffix('.')}."):
+                    raise ConfigError(f"{option.removeprefix('++')} has no effect: {reason}")
 
 
 def _of_road(cfg: StudyConfig) -> Iterator[tuple[str, str]]:

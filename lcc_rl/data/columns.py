@@ -46,6 +46,7 @@ class Column:
     Args:
         key: its name in the program.
         quantity: ``time``, ``speed``, ``length``, ``number`` or ``text``.
+        name: its usual name in a file.
         least, most: range of its numbers, in SI.
         whole: whether its numbers are whole.
         blank: whether cells may be blank: NaN, or ``""`` of text.
@@ -54,6 +55,7 @@ class Column:
 
     key: str
     quantity: str = "number"
+    name: str | None = None
     least: float = -LARGEST_CELL
     most: float = LARGEST_CELL
     whole: bool = False

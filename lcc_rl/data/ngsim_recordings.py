@@ -69,7 +69,9 @@ def name_recordings(rows: Counter[Group]) -> tuple[dict[Group, str], list[str]]:
             for group in cluster:
                 counts[group.start] += rows[group]
             start = min(counts, key=lambda start: (-counts[start], start))
-            named.update(dict.fromkeys(cluster, _time_name(location, start)))
+            seconds = start if start < SECONDS_BELOW else start // 1000
+            time = f"{datetime.fromtimestamp(seconds, tz=UTC):%Y-%m-%dT%H:%M:%SZ}"
+            named.update(dict.fromkeys(cluster, f"{location}@{time}" if location else time))
     return named, _name_by_file(named, rows)
 
 
@@ -82,12 +84,6 @@ def _clusters(groups: Iterable[Group]) -> list[list[Group]]:
         else:
             clusters.append([group])
     return clusters
-
-
-def _time_name(location: str, start: int) -> str:
-    seconds = start if start < SECONDS_BELOW else start // 1000
-    time = datetime.fromtimestamp(seconds, tz=UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-    return f"{location}@{time}" if location else time
 
 
 def _name_by_file(named: dict[Group, str], rows: Counter[Group]) -> list[str]:

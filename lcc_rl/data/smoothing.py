@@ -27,7 +27,7 @@ from pydantic import Field
 from lcc_rl.arrays import Floats
 from lcc_rl.data.episodes import MOTION_COLUMNS
 from lcc_rl.data.grid import stretches
-from lcc_rl.data.trajectories import FRAME, Trajectories, find_leaders
+from lcc_rl.data.trajectories import FRAME, SAMPLE_KEYS, Trajectories, find_leaders
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Settings
 
@@ -73,12 +73,8 @@ class SavitzkyGolay(Settings):
             samples[name] = smoothed[inner].astype(np.float32)
         backward = samples["speed_mps"] < 0.0
         samples.loc[backward, "speed_mps"] = 0.0
-        leader = find_leaders(
-            samples["recording"].cat.codes.to_numpy(),
-            samples["vehicle"].to_numpy(),
-            samples["frame"].to_numpy(),
-            samples["preceding"].to_numpy(),
-        )
+        codes, *keys = (samples[key] for key in SAMPLE_KEYS)
+        leader = find_leaders(codes.cat.codes.to_numpy(), *(key.to_numpy() for key in keys))
         position = samples["position_m"].to_numpy()
         headway = np.where(leader >= 0, position[leader] - position, samples["space_headway_m"])
         samples["space_headway_m"] = headway.astype(np.float32)

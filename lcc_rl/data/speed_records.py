@@ -28,16 +28,12 @@ from lcc_rl.errors import DataError
 TIME_COLUMN, SPEED_COLUMN = "time_s", "speed_mps"
 # Columns of a table of drives, and their default names.
 DRIVE_FIELDS = (
-    Column("drive", "text", required=False),
-    Column("time", "time", blank=True),
-    Column("speed", "speed", blank=True),
+    Column("drive", "text", "drive", required=False),
+    Column("time", "time", TIME_COLUMN, blank=True),
+    Column("speed", "speed", SPEED_COLUMN, blank=True),
     Column("grade", "grade", least=-0.3, most=0.3, required=False),  # of lcc-rl energy
 )
-DRIVE_COLUMNS: dict[str, str | None] = {
-    "drive": "drive",
-    "time": TIME_COLUMN,
-    "speed": SPEED_COLUMN,
-}
+DRIVE_COLUMNS = {column.key: column.name for column in DRIVE_FIELDS if column.name}
 
 
 def read_speed_record(

@@ -43,9 +43,9 @@ from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Positive
 
 TABLE_FIELDS = (
-    Column("vehicle", "text", blank=True),
-    Column("time", "time", blank=True),
-    Column("speed", "speed", blank=True),
+    Column("vehicle", "text", "vehicle", blank=True),
+    Column("time", "time", "time_s", blank=True),
+    Column("speed", "speed", "speed_mps", blank=True),
     Column("position", "length", blank=True, required=False),
     Column("lane", "text", blank=True, required=False),
     Column("leader", "text", blank=True, required=False),
@@ -53,11 +53,7 @@ TABLE_FIELDS = (
     Column("length", "length", least=0.0, blank=True, required=False),
     Column("recording", "text", blank=True, required=False),
 )
-TABLE_COLUMNS: dict[str, str | None] = {
-    "vehicle": "vehicle",
-    "time": "time_s",
-    "speed": "speed_mps",
-}
+TABLE_COLUMNS = {column.key: column.name for column in TABLE_FIELDS if column.name}
 TABLE_MEASURED = ("time", "speed", "position")  # rows with a blank cell are left out
 IDENTIFYING = ("vehicle", "lane", "recording")  # must not be blank in the other rows
 AGREE = (0.8, 1.25)  # range of distance by positions divided by distance by speeds

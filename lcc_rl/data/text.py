@@ -172,8 +172,8 @@ def labels(files: Sequence[str]) -> list[str]:
     ]
 
 
-def alike(lines: Iterable[str], files: Iterable[str], most: int = 3) -> list[str]:
-    """Return distinct lines, one for more than ``most`` that differ by file and numbers only."""
+def alike(lines: Iterable[str], files: Iterable[str]) -> list[str]:
+    """Return distinct lines, one for more than three that differ by file and numbers only."""
     lines, names = list(dict.fromkeys(lines)), {*files}
 
     def kind(line: str) -> str:
@@ -184,7 +184,7 @@ def alike(lines: Iterable[str], files: Iterable[str], most: int = 3) -> list[str
     counts, first = Counter(kinds), dict(zip(kinds[::-1], lines[::-1], strict=True))
     merged = []
     for line, pattern in zip(lines, kinds, strict=True):
-        if counts[pattern] <= most:
+        if counts[pattern] <= 3:
             merged.append(line)
         elif first[pattern] is line:
             merged.append(type(line)(f"{line} (and {counts[pattern] - 1:,} lines alike)"))

@@ -103,16 +103,16 @@ class ReadReport:
         ]
 
 
-def listed(names: Sequence[str], most: int = 3) -> str:
+def listed(names: Sequence[str]) -> str:
     """Return a list of names, only the first and last ones of many.
 
     Examples:
         >>> listed(["a", "b", "c", "d", "e"])
         'a, b … e'
     """
-    if len(names) <= most:
+    if len(names) <= 3:
         return ", ".join(names)
-    return f"{', '.join(names[: most - 1])} … {names[-1]}"
+    return f"{names[0]}, {names[1]} … {names[-1]}"
 
 
 @dataclass

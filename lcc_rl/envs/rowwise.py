@@ -28,12 +28,7 @@ TensorFunction = Callable[..., Sequence[Tensor]]
 
 
 class Rows:
-    """Entries of a state, ``[n, …]``, as rows of double precision, which represent any seed.
-
-    Args:
-        state: a state of the episodes.
-        keys: the entries.
-    """
+    """Entries of a state, ``[n, …]``, as rows of double precision, which represent any seed."""
 
     def __init__(self, state: State, keys: list[Key]) -> None:
         self.keys = keys

@@ -38,13 +38,7 @@ CaseSeries = dict[str, Tensor]  # ``[time, runs, vehicles]``
 
 
 class Cases:
-    """Plays one strategy on all cases, held-out windows and whole records, in one block.
-
-    Args:
-        strategy: the strategy.
-        cfg: configuration of the evaluation.
-        inputs: cases, held-out windows and drivers.
-    """
+    """Plays one strategy on all cases, held-out windows and whole records, in one block."""
 
     def __init__(self, strategy: Strategy, cfg: StudyConfig, inputs: Inputs) -> None:
         self.strategy, self.cfg, self.inputs = strategy, cfg, inputs
@@ -96,26 +90,14 @@ class Cases:
         return frame
 
 
-def of_case(cfg: StudyConfig, case: Case) -> StudyConfig:
-    """Return the configuration of a case; a platoon has the case's number of vehicles."""
-    changes: dict[str, Any] = {"horizon": case.horizon}
-    if set(cfg.scenario.vehicles.names) == {AUTOMATED}:
-        changes["string"] = f"{AUTOMATED}*{case.followers}"
-    return cfg.with_(scenario=changes)
-
-
 class CaseRuns:
-    """Drives a strategy behind all records of a case in parallel.
-
-    Args:
-        strategy: the strategy.
-        case: the records.
-        inputs: the drivers.
-        device: device of the computation.
-    """
+    """Drives a strategy behind all records of a case in parallel."""
 
     def __init__(self, strategy: Strategy, case: Case, inputs: Inputs, device: str = "cpu") -> None:
-        self.case, self.cfg = case, of_case(strategy.cfg, case)
+        changes: dict[str, Any] = {"horizon": case.horizon}
+        if set(strategy.cfg.scenario.vehicles.names) == {AUTOMATED}:  # a platoon: the case's number
+            changes["string"] = f"{AUTOMATED}*{case.followers}"
+        self.case, self.cfg = case, strategy.cfg.with_(scenario=changes)
         self.drivers, self.runs = len(inputs.population.time_gap), len(case.profile)
         env = build_env(self.cfg, case.profile, inputs.population, self.runs, 0, device, True)
         self.player = Player(env, strategy.policy, CASE_KEYS, strategy.title)

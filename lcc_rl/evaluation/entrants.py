@@ -11,7 +11,8 @@ from typing import Any
 
 from lcc_rl.config.nodes import Node, nodes_in
 from lcc_rl.config.schemas import AUTO, EvaluateConfig, StudyConfig
-from lcc_rl.config.words import FILTERED, RECORDED, key_of
+from lcc_rl.config.unused import refuse
+from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.fit import check_policy, check_variant, other_traffic, task_of
@@ -25,7 +26,6 @@ from lcc_rl.evaluation.strategies import (
     baselines,
     beside_filtered,
     front_of,
-    no_policy,
     studied,
     trained,
 )
@@ -75,7 +75,11 @@ class Entrants:
         for asked in [] if recorded else self._limits_of_record():
             raise ConfigError(f"{asked}: add {RECORDED} to evaluation.baselines")
         if self.own and cfg.learns and cfg.policy is None:
-            raise no_policy(cfg)
+            raise ConfigError(
+                f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
+                f"(of lcc-rl train variant={cfg.variant}) or policy=pretrained, or compare others "
+                "only: compare=[human]"
+            )
 
     def _compared(self) -> tuple[dict[str, Any], list[tuple[str, str]]]:
         """Return the controllers of ``compare`` by name, and its policies with name, if given."""
@@ -104,12 +108,12 @@ class Entrants:
     def _check_used(self, typed: Sequence[str]) -> None:
         rows = [*self.rivals, *self.cfg.evaluation.baselines]
         if not any("${seed}" in word for word in typed):  # as in policy=<sweep>/seed${seed}
-            _refuse(typed, {"seed": "it is that of trainings; evaluation.seed draws other noise"})
+            refuse(typed, {"seed": "it is that of trainings; evaluation.seed draws other noise"})
         if self.own or self.further or self.cfg.variant in rows or not self.cfg.automated:
             return
         if not self.paths and self.cfg.evaluation.rows == "episodes":
             changed = [word for word in typed if not word.startswith("~")]
-            _refuse(changed, {"reward.terms.": "rows of policies have a reward, no others"})
+            refuse(changed, {"reward.terms.": "rows of policies have a reward, no others"})
         check_effective(
             typed, self.rivals or rows, [*rows, *self.rivals.values()], bool(self.paths)
         )
@@ -202,14 +206,7 @@ def check_effective(
         reason = f"nothing drives behind the filter ({', '.join(rows)}); "
         reason += f"it needs a name that ends in {FILTERED}"
         unused |= dict.fromkeys(("filter", "scenario.filters"), reason)
-    _refuse(typed, unused)
-
-
-def _refuse(typed: Sequence[str], unused: Mapping[str, str]) -> None:
-    """Refuse overrides of keys without effect, by key the reason."""
-    for word in typed:
-        for key in filter(key_of(word).startswith, unused):
-            raise ConfigError(f"{word.removeprefix('++')} has no effect: {unused[key]}")
+    refuse(typed, unused)
 
 
 def _by_label(named: Sequence[Any] | Mapping[str, Any]) -> Mapping[str, Any]:

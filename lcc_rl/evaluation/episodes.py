@@ -260,7 +260,6 @@ def evaluate(
     batch_size: int,
     seed: int,
     sample_episodes: int = 0,
-    device: str = "cpu",
     repeats: int = 1,
     compiled: bool | None = None,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -276,6 +275,6 @@ def evaluate(
     """
     people = len(inputs.population.time_gap)
     plan = Plan(len(inputs.evaluation), people, drivers, batch_size, repeats)
-    episodes = Episodes(strategy, inputs, plan, seed, sample_episodes, device, compiled)
+    episodes = Episodes(strategy, inputs, plan, seed, sample_episodes, compiled=compiled)
     rows, steps = zip(*map(episodes.play, plan.own), strict=True)
     return pd.concat(rows, ignore_index=True), pd.concat(steps, ignore_index=True)

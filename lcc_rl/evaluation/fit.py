@@ -58,17 +58,13 @@ def check_variant(cfg: StudyConfig) -> None:
         )
     if cfg.learns and not variant.learns:  # the variant has no automated vehicle, the task has
         raise ConfigError(f"variant={cfg.variant} has no agent: use compare=[{cfg.variant}]")
-    if variant.learns and not cfg.learns and _is_driven_as(cfg, variant):
-        raise ConfigError(
+    if variant.learns and not cfg.learns and cfg.automated:
+        one, other = (x.scenario.controllers[AUTOMATED].kind for x in (cfg, variant))
+        require(
+            one is not other,
             f"variant={cfg.variant} is a learned controller, but there is no agent; for a human "
-            "driver use variant=idm"
+            "driver use variant=idm",
         )
-
-
-def _is_driven_as(cfg: StudyConfig, other: StudyConfig) -> bool:
-    """Whether automated vehicles have the same kind of controller in two configurations."""
-    kinds = [x.scenario.controllers[AUTOMATED].kind for x in (cfg, other)]
-    return cfg.automated > 0 and kinds[0] is kinds[1]
 
 
 def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
@@ -160,11 +156,6 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     """Return a warning if a policy was trained with other data, drivers or split; else nothing.
 
     There is no warning for a task, which defines its own, or for a shipped policy.
-
-    Args:
-        path: origin of the policy.
-        own: configuration of its training.
-        cfg: configuration under study.
     """
     if cfg.task is not None or Path(path).parts[:1] == (PRETRAINED,):
         return ""

@@ -34,10 +34,6 @@ class GivenPolicy(TensorDictModuleBase):
     Transforms at the head of a sequence, such as ``CatFrames``, work as in an environment; the
     statistics of ``VecNorm`` and ``VecNormV2`` are those of the moment at which this is made.
 
-    Args:
-        module: a TensorDict module.
-        name: its name in messages.
-
     Raises:
         ConfigError: if it reads or writes other entries.
     """

@@ -262,8 +262,6 @@ METRICS: dict[str, Metric] = {
         _turned(over, safe) & (promised > 0.0)
     ),
 }
-# Of one vehicle; that of a string is among :func:`string_measures`.
-MEAN_SPEED: dict[str, Metric] = {"mean_speed_mps": lambda over, speed: over.mean(speed[1:])}
 # Measures of all vehicles of a string, likewise; ``free`` is v0 [m/s].
 ROAD_METRICS: dict[str, Metric] = {
     "brakings_below_2": lambda over, acceleration: over.begun(acceleration < -2.0),

@@ -14,12 +14,12 @@ from lcc_rl.envs.clock import option_specs
 from lcc_rl.envs.compiled import Traced
 from lcc_rl.envs.rowwise import Rows, Rowwise
 from lcc_rl.envs.step import TERMINATED, Step, closure, entries_of, pieces_of, read_before, written
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import require
 from lcc_rl.functional.finite import require_finite
 from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.functional.random import LOW_BITS, STREAM_INCREMENT, hash_bits
-from lcc_rl.pieces.base import ACTION, SEED, STEP, Key, Piece, State, as_key
+from lcc_rl.pieces.base import ACTION, SEED, STEP, Key, State, as_key
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.leader import PROFILE, PROFILE_START
 from lcc_rl.pieces.string import COMMAND, WANTED
@@ -62,7 +62,12 @@ class Player:
         self.machine: tuple[Rows, Rowwise, State] | None = None  # made at the first play
         self.env, self.policy, self.label, self.horizon = env, policy, label, env.base_env.horizon
         self.pieces = pieces_of(env)
-        _check_driven(policy, self.pieces)
+        acts = any(key == ACTION for piece in self.pieces for _, key in piece.needs)
+        require(
+            policy is not None or not acts,
+            "scenario.controllers.automated needs the action of a policy, but there is none: "
+            "choose an agent or another controller",
+        )
         outputs = written(self.pieces)
         self.kept = [key for key in keys if key in outputs]
         self.reads = [as_key(key) for key in getattr(policy, "in_keys", [])]
@@ -204,14 +209,6 @@ class Player:
             if key in state:
                 td.set(key, state[key])
         return {ACTION: self.policy(td).get(ACTION)}
-
-
-def _check_driven(policy: Policy | None, pieces: Sequence[Piece]) -> None:
-    if policy is None and any(key == ACTION for piece in pieces for _, key in piece.needs):
-        raise ConfigError(
-            "scenario.controllers.automated needs the action of a policy, but there is none: "
-            "choose an agent or another controller"
-        )
 
 
 def reset_options(

@@ -27,10 +27,10 @@ from lcc_rl.errors import ConfigError, in_short, raised_as, require
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.metrics import (
-    MEAN_SPEED,
     METRICS,
     ROAD_METRICS,
     SERIES,
+    Reductions,
     energy_measures,
     safety_measures,
 )
@@ -333,8 +333,9 @@ class _Motion:
             late = {name: x[-len(alive) :] for name, x in series.items() if name in AT_START}
             series |= late | ahead
             running = alive[..., None, None].expand_as(series["acceleration"])
-            mean = safety_measures(series, running, self.time_step, MEAN_SPEED)
-            found.append(mean | known | safety_measures(series, running, self.time_step, metrics))
+            mean = Reductions(running, self.time_step).mean(series["speed"][1:])
+            measured = safety_measures(series, running, self.time_step, metrics)
+            found.append({"mean_speed_mps": mean} | known | measured)
         lacking = [torch.full_like(known["distance_m"], torch.nan) for known in found]
         return {
             name: torch.cat([x.get(name, y) for x, y in zip(found, lacking, strict=True)], -2)

@@ -165,15 +165,6 @@ def _baseline_controllers(cfg: StudyConfig) -> list[Any]:
     return [s.cfg.scenario.controllers[AUTOMATED] for s in automated]
 
 
-def no_policy(cfg: StudyConfig) -> ConfigError:
-    """Return the error for a learned variant without a policy."""
-    return ConfigError(
-        f"variant {cfg.variant} is learned: give policy=<run folder or policy.pt> "
-        f"(of lcc-rl train variant={cfg.variant}) or policy=pretrained, or compare others only: "
-        "compare=[human]"
-    )
-
-
 def studied(
     cfg: StudyConfig, policy: TrainedPolicy | None, population: Population
 ) -> list[Strategy]:
@@ -183,18 +174,13 @@ def studied(
         cfg: configuration of the entry point ``evaluate``.
         policy: the policy read from ``cfg.policy``, if there is one.
         population: the human drivers.
-
-    Raises:
-        ConfigError: if the variant needs a policy that is not given.
     """
-    if not cfg.learns:
+    if policy is None:
         strategy = rule(cfg)
         listed = cfg.scenario.controllers[AUTOMATED] in _baseline_controllers(cfg)
         repeats = listed and cfg.scenario.filters.get(AUTOMATED) is None and strategy.name != DIRECT
         named = strategy.name in cfg.evaluation.baselines
         return [] if repeats or named else [strategy]
-    if policy is None:
-        raise no_policy(cfg)
     weights, own_cfg = policy
     cfg = _of_training(cfg, own_cfg)
     strategy = with_weights(cfg, weights, own_cfg.seed, str(cfg.policy), population)
@@ -231,12 +217,6 @@ def hybrids(strategy: Strategy) -> list[Strategy]:
 
 def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Population) -> Strategy:
     """Build a trained strategy in the scenario under study.
-
-    Args:
-        cfg: the configuration under study.
-        path: origin of the policy, for messages.
-        policy: its weights and configuration.
-        population: the human drivers.
 
     Raises:
         LccError: if the policy does not fit the scenario or its own network.

@@ -40,7 +40,7 @@ from lcc_rl.results.motion import most_varied
 from lcc_rl.results.names import ON_FRONT, RULE, in_words, several
 from lcc_rl.results.render import column_cells
 from lcc_rl.results.report import AGAINST, COUNTS, Report
-from lcc_rl.results.runs import stored_config
+from lcc_rl.results.runs import CONFIG, read_settings
 from lcc_rl.results.windows import Means, by_driver
 
 VEHICLE_STYLES = {
@@ -71,7 +71,7 @@ def write_figures(
         ResultsError: if a table is missing or a figure cannot be written.
     """
     folder = Path(folder)
-    steps, cfg = read_parquet(folder / "steps.parquet"), stored_config(folder)
+    steps, cfg = read_parquet(folder / "steps.parquet"), read_settings(folder / CONFIG)
     found: Iterable[tuple[str, Figure]]
     if rows == "episodes":
         found = study_figures(read_parquet(folder / "episodes.parquet"), steps, cfg, reports, own)
@@ -275,20 +275,15 @@ def _by_driver(means: Means, column: str, names: dict[str, str], owner: str) -> 
     left.yaxis.set_major_locator(MaxNLocator(integer=True))
     legend_above(left, 1)
     saving = share_saved(energy[strategy], energy[baseline])
-    _sorted_bars(right, saving, colour(strategy))
+    ordered = 100 * np.sort(saving.to_numpy())  # a bar per driver; negative values are losses
+    right.bar(np.arange(1, len(ordered) + 1), ordered, width=1.0, color=colour(strategy), alpha=0.8)
+    right.axhline(0.0, color=INK, lw=0.6)
+    right.xaxis.set_major_locator(MaxNLocator(5, integer=True, min_n_ticks=1))
     found = means.saving(column, strategy, baseline)
     _mean_line(right, found, means.windows.loc[means.windows["strategy"] == strategy])
     worse = f"{int((saving < 0).sum())} of {len(saving)} drivers worse off"
     right.set(xlabel=f"drivers, sorted ({worse})", ylabel=f"path energy saved\nper {means.per} [%]")
     return figure
-
-
-def _sorted_bars(axis: Axes, saving: pd.Series, hue: str) -> None:
-    """Draw one sorted bar per driver; negative values are losses."""
-    ordered = 100 * np.sort(saving.to_numpy())
-    axis.bar(np.arange(1, len(ordered) + 1), ordered, width=1.0, color=hue, alpha=0.8)
-    axis.axhline(0.0, color=INK, lw=0.6)
-    axis.xaxis.set_major_locator(MaxNLocator(5, integer=True, min_n_ticks=1))
 
 
 def _mean_line(axis: Axes, found: Estimate, rows: pd.DataFrame) -> None:

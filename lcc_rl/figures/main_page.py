@@ -38,11 +38,7 @@ DRIVER_FIGURES = {
 
 
 def held_to(trainings: Iterable[StudyConfig]) -> str:
-    """Return a sentence on the limit of the trainings; empty without one.
-
-    Args:
-        trainings: configurations of the trainings.
-    """
+    """Return a sentence on the limit of the trainings; empty without one."""
     agents = [cfg.agent.settings for cfg in trainings if cfg.agent is not None]
     found = [(agent.get("limits") or {}).get(LIMIT) for agent in agents]
     terms = [(agent.get("surrogates") or {}).get(LIMIT) for agent in agents]

@@ -112,19 +112,6 @@ def least_room_held(
     return least
 
 
-def least_room_late(motion: PairState, response: Response, braking: Braking) -> Tensor:
-    """Return a lower bound of the room to come while a vehicle with a lag brakes fully.
-
-    See :attr:`lcc_rl.functional.actuation.Response.hold`.
-
-    Args:
-        motion: the state, with the gap minus the margin.
-        response: how commands become accelerations.
-        braking: how hard both brake, and τ.
-    """
-    return least_room_held(motion, motion.acceleration, response.hold, braking)
-
-
 def least_room_to_come(
     now: PairState, pending: Tensor, response: Response, braking: Braking
 ) -> Tensor:
@@ -140,7 +127,8 @@ def least_room_to_come(
     """
     path = predicted(now, pending, -braking.ahead, response)
     rooms = [x.gap - braking.time_to_collision * (x.speed - x.ahead) for x in path]
-    return torch.stack([*rooms, least_room_late(path[-1], response, braking)]).amin(0)
+    last = least_room_held(path[-1], path[-1].acceleration, response.hold, braking)
+    return torch.stack([*rooms, last]).amin(0)
 
 
 def safe_command(motion: PairState, response: Response, braking: Braking) -> Tensor:

@@ -109,7 +109,7 @@ class Gains:
     k3: float
     k4: float
 
-    def check_stable(self, time_step: float, where: str = "gains") -> None:
+    def check_stable(self, time_step: float) -> None:
         """Check that the closed loop is stable: kx > 0 and T·kx/2 < kv < 2.
 
         kx = k1 + k3 and kv = k2 + k4. By the Jury criterion for
@@ -127,7 +127,7 @@ class Gains:
             f"kv = k2 + k4 = {kv:g} must be below 2": kv < 2,
         }
         failed = [text for text, holds in conditions.items() if not holds]
-        require(not failed, f"{where}: this CACC is unstable: {'; '.join(failed)}")
+        require(not failed, f"gains: this CACC is unstable: {'; '.join(failed)}")
 
 
 def cacc_acceleration(

@@ -18,12 +18,7 @@ from lcc_rl.results.motion import SampleMotion
 
 
 class Film:
-    """Records the states of the present episode in one place of a batch.
-
-    Args:
-        episodes: the batch.
-        place: the place.
-    """
+    """Records the states of the present episode in one place of a batch."""
 
     def __init__(self, episodes: ArrayEpisodes, place: int) -> None:
         self.episodes, self.place = episodes, place

@@ -32,12 +32,11 @@ def new_file(path: str | Path, option: str, own: Callable[[Path], bool] | None =
     return path
 
 
-def own_folder(path: str | Path, option: str, own: Callable[[set[str]], bool]) -> Path:
+def own_folder(path: str | Path, own: Callable[[set[str]], bool]) -> Path:
     """Return the checked path of a folder that a command is to write into.
 
     Args:
-        path: the given path.
-        option: its option, for the message.
+        path: the given path, of the option ``--out``.
         own: whether the names in it, without hidden ones, belong to this command.
 
     Raises:
@@ -46,12 +45,12 @@ def own_folder(path: str | Path, option: str, own: Callable[[set[str]], bool]) -
     path = _spelled(path)
     if os.path.lexists(path):
         if not path.is_dir():
-            raise ResultsError(f"{path} is no folder; choose another {option}")
+            raise ResultsError(f"{path} is no folder; choose another --out")
         names = {item.name for item in path.iterdir() if not item.name.startswith(".")}
         if names and not own(names):
             raise ResultsError(
                 f"{path} already holds {min(names)}, which is not this command's; choose another "
-                f"{option}"
+                "--out"
             )
     return path
 

@@ -225,7 +225,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
             reached: entries of the state after the step, to which the written ones are added.
             detached: cut the gradient of the written entries.
         """
-        values = self._entries(before, reached)
+        values = [(reached if late else before)[key] for late, key in self.needs]
         if detached:
             values = [value.detach() for value in values]
         self._write(self.computed(values), reached)
@@ -246,9 +246,6 @@ class Piece(Part, TensorDictModuleBase, Transform):
         missing = [x for x, entry in zip(self.read_names, entries, strict=True) if entry is None]
         require(not missing, f"{self.title} reads {', '.join(missing)}, which nothing has written")
         return [entry for entry in entries if entry is not None]
-
-    def _entries(self, before: State, reached: State) -> list[Tensor]:
-        return [(reached if late else before)[key] for late, key in self.needs]
 
     def _write(self, values: Tensor | Sequence[Tensor], reached: State) -> None:
         values = (values,) if isinstance(values, Tensor) else values

@@ -17,7 +17,6 @@ from lcc_rl.functional.braking import Braking, safe_acceleration
 from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.hcfs import (
     Choice,
-    Decision,
     PlatoonPlace,
     PlatoonReward,
     hybrid_decision,
@@ -107,29 +106,16 @@ class HCFS(Controller):
         """Return the commands, the winners and the counters."""
         motion, leader, rule = entries[:5], entries[5:8], entries[8:-4]
         winner, *counts = entries[-4:]
-        decision = self.decide(action, motion, leader, winner, self.rule.command(*rule))
-        flags = (decision.switched, decision.clamped, decision.capped)
-        counted = [count + flag for count, flag in zip(counts, flags, strict=True)]
-        return (decision.acceleration, decision.winner, *counted)
-
-    def decide(
-        self,
-        action: Tensor,
-        motion: tuple[Tensor, ...],
-        leader: tuple[Tensor, ...],
-        last_winner: Tensor,
-        rule: Tensor,
-    ) -> Decision:
         speed, last, gap, speed_error, leader_gap = motion
         interval = jerk_interval(last, self.jerk_bound, self.time_step, self.max_acceleration)
         ahead, time_step = speed + speed_error, self.time_step
         cap = safe_acceleration(speed, gap - self.margin, ahead, self.both_brake, time_step)
-        return hybrid_decision(
-            rule,
+        decision = hybrid_decision(
+            self.rule.command(*rule),
             action * self.max_acceleration,
             speed,
             last,
-            last_winner,
+            winner,
             next_leader_speed(leader, self.lookahead, self.time_step),
             interval if self.clamp else None,
             cap if self.safe_cap else None,
@@ -139,6 +125,9 @@ class HCFS(Controller):
             PlatoonPlace(leader_gap, leader[0]),
             self.choice,
         )
+        flags = (decision.switched, decision.clamped, decision.capped)
+        counted = [count + flag for count, flag in zip(counts, flags, strict=True)]
+        return (decision.acceleration, decision.winner, *counted)
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         super().begin(given, start)

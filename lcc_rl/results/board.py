@@ -39,8 +39,6 @@ HEAD = ["leaders", "driven by", "saved [%]", "flow [1/h]", "flow [%]", "limits n
 SAVED_SHARE = ("saving", "saving_low", "saving_high")
 OF_HEADING, OF_PLACE = ("measure", "unit", "against"), ("data", "settings", "baseline")
 COPIED = ("score", *SAVED_SHARE, "distance_lost", FLOW, FLOW_LOST, "string_ratio", FINAL_SPREAD)
-
-
 CELL = r"[^\r\n|`]{1,200}"  # a text in a cell of a table
 Name = Annotated[str, Field(pattern=f"^{CELL}$")]
 Missing = Number | None
@@ -167,10 +165,11 @@ def leaderboard(documents: Mapping[str, Mapping[str, Any]]) -> str:
     for task in dict.fromkeys(row["task"] for row in every):
         rows = [row for row in every if row["task"] == task]
         sources = list(dict.fromkeys(row["source"] for row in rows))
-        lines = [
-            [f"{row['source']}, {_sample(row)}", f"`{row['by']}`", *_markdown(row)]
-            for row in sorted(rows, key=lambda x: sources.index(x["source"]))
-        ]
+        lines = []
+        for row in sorted(rows, key=lambda x: sources.index(x["source"])):
+            sample = "drives" if row["drives"] >= LEAST_DRIVES else "windows"
+            place = f"{row['source']}, {row[sample]} {sample}"
+            lines.append([place, f"`{row['by']}`", *_markdown(row)])
         text = markdown_table(HEAD, lines)
         sections.append(f"### {task}\n\nAgainst {in_words(rows[0]['against'])}.\n\n{text}\n")
     return "\n".join(sections)
@@ -235,12 +234,6 @@ def check_row(row: BoardRow, where: str) -> None:
     require(
         row["kept"] is (not wrong),
         f"{where}: kept is {row['kept']}, but limits are not kept: {', '.join(wrong) or 'none'}",
-    )
-
-
-def _sample(row: BoardRow) -> str:
-    return (
-        f"{row['drives']} drives" if row["drives"] >= LEAST_DRIVES else f"{row['windows']} windows"
     )
 
 

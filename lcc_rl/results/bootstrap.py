@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -144,16 +145,12 @@ def bounds(values: Floats) -> Floats:
 def mean(values: ArrayLike) -> Estimate:
     """Return the mean of one number per seed with its interval over seeds."""
     numbers = np.asarray(values, dtype=np.float64).reshape(1, -1)
-    return estimate(_only, {"": numbers}, alone=True) if numbers.size else NOTHING
+    return estimate(itemgetter(""), {"": numbers}, alone=True) if numbers.size else NOTHING
 
 
 def crossed(values: ArrayLike, drives: Sequence[object] | None = None) -> Estimate:
     """Return the mean of ``[windows, seeds]`` with its interval, see :func:`estimate`."""
-    return estimate(_only, {"": np.asarray(values, dtype=np.float64)}, drives=drives)
-
-
-def _only(side: Side) -> Any:
-    return side[""]
+    return estimate(itemgetter(""), {"": np.asarray(values, dtype=np.float64)}, drives=drives)
 
 
 def band(curves: Floats) -> Floats:

@@ -105,13 +105,8 @@ def load_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:
     return cfg
 
 
-def stored_config(folder: Path) -> dict[str, Any]:
-    """Read the configuration of a run for figures; nothing is built from it."""
-    return read_settings(folder / CONFIG)
-
-
 def read_settings(path: Path) -> dict[str, Any]:
-    """Read a stored configuration as plain containers.
+    """Read a stored configuration as plain containers; nothing is built from it.
 
     Raises:
         ResultsError: if it is missing or damaged.

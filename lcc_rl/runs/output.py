@@ -87,9 +87,6 @@ class Unbroken:
 
     ``lcc-rl train … | head -1`` thus trains to the end.
 
-    Args:
-        stream: the stream.
-
     Attributes:
         failure: the first error other than a closed pipe, or None.
     """

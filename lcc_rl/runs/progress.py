@@ -21,6 +21,8 @@ from lcc_rl.runs.states import PROGRESS, check_present, read_progress
 
 log = logging.getLogger("lcc_rl")
 
+BETWEEN_LINES = 20.0  # seconds, without a terminal
+
 
 def clock(seconds: float) -> str:
     """Return a duration as ``m:ss``."""
@@ -92,7 +94,7 @@ class ProgressReporter:
     """Reports rate, ETA and current values of a long job.
 
     A terminal shows a live bar, except in a sweep (:mod:`lcc_rl.runs.sweeps` draws one table); else
-    a line is written at most every ``every`` seconds. The log file always gets the lines, and
+    a line is written at most every 20 s. The log file always gets the lines, and
     ``folder/progress.json`` holds the latest state.
 
     Args:
@@ -101,7 +103,6 @@ class ProgressReporter:
         unit: name of a unit.
         start: units already done (after resuming).
         folder: folder of ``progress.json``; None: none is written.
-        every: seconds between lines.
         console: console of the bar; standard error by default.
     """
 
@@ -112,11 +113,10 @@ class ProgressReporter:
         unit: str = "iteration",
         start: int = 0,
         folder: Path | None = None,
-        every: float = 20.0,
         console: Console | None = None,
     ) -> None:
         self.title, self.total, self.unit, self.start = title, total, unit, start
-        self.folder, self.every = folder, every
+        self.folder = folder
         self.console = console or Console(stderr=True)
         # Trainings of the main job have the bar of their parent.
         alone = not is_sweep() and parent_process() is None
@@ -148,7 +148,7 @@ class ProgressReporter:
         if len(self.marks) < 2 and done < self.total:
             return  # the first unit compiles and fills buffers
         self._write_state(done, remaining, values)
-        if time.monotonic() - self.last_line >= self.every or done >= self.total:
+        if time.monotonic() - self.last_line >= BETWEEN_LINES or done >= self.total:
             self.last_line = time.monotonic()
             note = f"{shown}  {rate:.2f} {self.unit}s/s  {eta}"
             self._line(f"{self.title}: {self.unit} {done}/{self.total}  {note}")
@@ -183,12 +183,11 @@ class ProgressReporter:
             temporary.write_text(json.dumps(state), encoding="utf-8")
 
 
-def watch_jobs(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0) -> None:
+def watch_jobs(jobs: Mapping[str, tuple[Path, Future[Any]]]) -> None:
     """Show the progress of jobs in other processes until all are done or one fails.
 
     Args:
         jobs: folder of ``progress.json`` and future of each job.
-        every: seconds between lines without a terminal.
     """
     console = Console(stderr=True)
     last = time.monotonic()
@@ -198,7 +197,7 @@ def watch_jobs(jobs: Mapping[str, tuple[Path, Future[Any]]], every: float = 20.0
         running = True
         while running:
             running = bool(wait(futures, 1.0, FIRST_EXCEPTION).not_done)
-            due = not console.is_terminal and time.monotonic() - last >= every
+            due = not console.is_terminal and time.monotonic() - last >= BETWEEN_LINES
             last = time.monotonic() if due else last
             parts = []
             for name, (folder, future) in jobs.items():

@@ -50,16 +50,6 @@ SILENT = logging.CRITICAL + 1
 ROUNDED = re.compile(r"\d*\.\d{15,}(?:e-?\d+)?")  # 0.8999999999999999 of Hydra's range(0,0.9,0.3)
 
 
-def register_resolvers() -> None:
-    """Register the OmegaConf resolvers for folders of runs and sweeps and for parallel jobs."""
-    OmegaConf.register_new_resolver("lcc.folder", chosen_folder, replace=True)
-    OmegaConf.register_new_resolver("lcc.hydra", hydra_folder, replace=True)
-    # Cached, so that every job gets the folder of the whole command.
-    OmegaConf.register_new_resolver("lcc.sweep", sweep_name, use_cache=True, replace=True)
-    OmegaConf.register_new_resolver("lcc.run", run_name, replace=True)
-    OmegaConf.register_new_resolver("lcc.jobs", parallel_jobs, replace=True)
-
-
 def sweep_name(given: str | None, typed: Sequence[str]) -> str:
     """Return the given name of a sweep's folder, or a hash of its overrides in any order."""
     if given:
@@ -123,7 +113,12 @@ def parallel_jobs(threads: int) -> int:
     return max(1, cores // max(1, int(threads)))
 
 
-register_resolvers()
+OmegaConf.register_new_resolver("lcc.folder", chosen_folder, replace=True)
+OmegaConf.register_new_resolver("lcc.hydra", hydra_folder, replace=True)
+# Cached, so that every job gets the folder of the whole command.
+OmegaConf.register_new_resolver("lcc.sweep", sweep_name, use_cache=True, replace=True)
+OmegaConf.register_new_resolver("lcc.run", run_name, replace=True)
+OmegaConf.register_new_resolver("lcc.jobs", parallel_jobs, replace=True)
 
 
 class SweepCallback(Callback):

@@ -124,7 +124,7 @@ def main(words: list[str]) -> int:
     check_overrides(overrides, SET_BY_STUDY, OWN_FOLDER_WORDS)
     arguments.overrides = overrides
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S")
-    arguments.out = own_folder(arguments.out, "--out", MADE.issuperset)
+    arguments.out = own_folder(arguments.out, MADE.issuperset)
     with claim(arguments.out):
         run(arguments)
         STUDY_RESULTS[arguments.study](arguments.out, arguments.formats)

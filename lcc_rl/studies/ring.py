@@ -17,7 +17,7 @@ from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.measures import signed
 from lcc_rl.results.names import in_words
-from lcc_rl.results.runs import EPISODES, STEPS, stored_config
+from lcc_rl.results.runs import CONFIG, EPISODES, STEPS, read_settings
 from lcc_rl.studies.results import StudyResults
 
 RING_EVALUATION = "evaluation"
@@ -59,7 +59,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     """
     source = folder / RING_EVALUATION
     rows, steps = (read_parquet(source / name) for name in (EPISODES, STEPS))
-    cfg, study = stored_config(source), StudyResults(folder, formats)
+    cfg, study = read_settings(source / CONFIG), StudyResults(folder, formats)
     first = cfg["evaluation"]["humans_first"]
     lasting = cfg["scenario"]["horizon"] * cfg["scenario"]["time_step"]
     caption = f"{lasting:g} s after {first:g} s in which humans drive all cars: means over episodes"

@@ -27,7 +27,7 @@ from lcc_rl.results.measures import MEASURES, Shown
 from lcc_rl.results.names import in_words, several
 from lcc_rl.results.remarks import crashes
 from lcc_rl.results.report import Report, windows_for
-from lcc_rl.results.runs import EPISODES, stored_config
+from lcc_rl.results.runs import CONFIG, EPISODES, read_settings
 from lcc_rl.results.windows import DRIVE, savings
 from lcc_rl.studies.alcc.study import DRIVERS_FILE
 from lcc_rl.studies.results import StudyResults
@@ -156,7 +156,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     by_share = {path.name: windows_for(read_parquet(path / EPISODES)) for path in places}
     table = pd.DataFrame(row for share, group in by_share.items() for row in rows_of(share, group))
     table = table.astype(dict.fromkeys(COUNTED[:2], int))
-    windows, cfg = by_share[places[0].name], stored_config(places[0])
+    windows, cfg = by_share[places[0].name], read_settings(places[0] / CONFIG)
     drives, scenario, settings = windows[DRIVE].nunique(), cfg["scenario"], cfg["evaluation"]
     few = ", by t since these are few (of one recording over its windows)" * (drives < LEAST_DRIVES)
     study.table(

@@ -8,7 +8,7 @@ from test_braking import draw
 from torch import Tensor
 
 from lcc_rl.functional.actuation import PairState, Response, predicted
-from lcc_rl.functional.braking import Braking, least_room_late
+from lcc_rl.functional.braking import Braking, least_room_held
 
 BRAKING = Braking(3.0, 2.6, 4.0)
 STEP = 0.1
@@ -51,6 +51,7 @@ def test_the_least_room_is_never_more_than_that_of_braking(lag) -> None:
         draw(count, chance, 40.0).double().unsqueeze(-1),
         (6.0 * draw(count, chance) - 3.0).double().unsqueeze(-1),
     )
-    bound, found = least_room_late(motion, response, BRAKING), braked(motion, response, BRAKING)
+    bound = least_room_held(motion, motion.acceleration, response.hold, BRAKING)
+    found = braked(motion, response, BRAKING)
     assert (bound <= found + 0.02).all()
     assert (found - bound).median() < 2.0 * lag + 0.1  # and not by far

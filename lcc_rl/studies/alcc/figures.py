@@ -217,11 +217,7 @@ def comparison_figure(windows: pd.DataFrame) -> Figure:
     rows_of(axes[0], [str(name).replace("_", " ") for name in names])
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=3)
-    seeds = _how_many(table["seeds"])
+    counts = sorted({int(count) for count in table["seeds"] if str(count).isdigit()})
+    seeds = f"{' or '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"
     footnote(figure, f"n = {seeds}; lines: 95 % interval; dashed: the study's limit")
     return figure
-
-
-def _how_many(seeds: pd.Series) -> str:
-    counts = sorted({int(count) for count in seeds if str(count).isdigit()})
-    return f"{' or '.join(map(str, counts))} {'seed' if counts == [1] else 'seeds'}"

@@ -134,7 +134,11 @@ def run(study: Study, parts: Sequence[str] = STUDY_PARTS, ablations: Sequence[st
         folder: (change, alcc_trainings(study, change))
         for folder, change in _series(study, parts, ablations).items()
     }
-    calibration = _calibration(study, next(iter(series.values()))[1])
+    shared = [item for item in study.overrides if top_key(item) not in OF_TRAINING]
+    calibration: PipelineConfig = load("pipeline", ["~experiment", "calibration=both", *shared])
+    (_, runs), *_ = series.values()
+    first, *_ = runs.values()
+    calibration = calibration.with_(split=first.split, scenario=first.scenario)
     read_once(calibration, study.folder)
     calibrate_once(calibration, study.folder)
     for folder, (change, runs) in series.items():
@@ -158,10 +162,3 @@ def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dic
         named = map(chosen_ablation, chosen)
         series |= {study.folder / "ablations" / name: change for name, change in named}
     return series
-
-
-def _calibration(study: Study, runs: dict[str, TrainConfig]) -> PipelineConfig:
-    shared = [item for item in study.overrides if top_key(item) not in OF_TRAINING]
-    cfg: PipelineConfig = load("pipeline", ["~experiment", "calibration=both", *shared])
-    first = next(iter(runs.values()))
-    return cfg.with_(split=first.split, scenario=first.scenario)

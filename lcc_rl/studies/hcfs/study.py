@@ -58,9 +58,6 @@ def evaluation(study: Study, *own: str) -> StudyConfig:
 def run(study: Study) -> None:
     """Train the DDPG parents and evaluate all strategies; finished runs are skipped.
 
-    Args:
-        study: the settings.
-
     Raises:
         LccError: for any error in settings or files, in one line.
     """
