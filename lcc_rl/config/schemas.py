@@ -53,7 +53,7 @@ def _described(node: Any) -> Any:
 def _all_described(nodes: dict[str, Any]) -> Mapping[str, Any]:
     for name, node in nodes.items():
         if isinstance(node, Mapping):
-            added = "none; +filter=cbf adds a filter, +faults=all actuators and sensors"
+            added = "none; +filter=cbf or a task adds a filter, +faults=all actuators and sensors"
             known = ", ".join(x for x in nodes if x != name) or added
             raise ValueError(f"unknown name {name!r}, which has no {TARGET}; valid: {known}")
         if node is not None and not isinstance(node, Node):

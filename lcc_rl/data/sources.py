@@ -166,7 +166,7 @@ class EpisodesSource(Source):
         files = find_files(self.path)
         episodes, notes = read_episodes(files, self.columns, self.units, self.bridge_s)
         count, source = episodes["episode"].nunique(), listed(files)
-        lines = [f"read {count:,} episodes, {len(episodes):,} rows, {source}", *notes]
+        lines = [f"read {count:,} episodes, {len(episodes):,} rows of 0.1 s, {source}", *notes]
         usual = {key: name for key, name in EPISODE_NAMES.items() if key in self.units}
         named = {**usual, **self.columns}
         source += read_as(PAIR_FIELDS, named, self.units)

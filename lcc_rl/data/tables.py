@@ -133,6 +133,11 @@ class TableFile:
         missing = [name for name in self.names.values() if name not in self.header]
         if missing:
             raise lacking(str(self.path), missing, self.header, option)
+        for column in columns:
+            unit = (units or {}).get(column.key, SI.get(column.quantity))
+            if column.key not in self.names and unit != SI.get(column.quantity):
+                at = f"{option.removesuffix('columns')}units.{column.key}={unit}"
+                raise DataError(f"{self.path}: {at} has no effect: no column is {column.key}")
         for key in (c.key for c in columns if c.key in self.header and c.key not in names):
             if key not in self.names.values():
                 message = f"column {key!r} is not read unless {option}.{key} names it"

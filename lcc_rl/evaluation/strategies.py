@@ -194,9 +194,20 @@ def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
     piece = own.observation.made(Piece)
     if isinstance(piece, Observation) and piece.shows_presence(own.scenario.vehicles):
         changes["observation"] = cfg.observation.changed(presence=True)
-    if cfg.scenario.filters.get(AUTOMATED) is None and own.scenario.filters.get(AUTOMATED):
+    given, trained = (one.scenario.filters.get(AUTOMATED) for one in (cfg, own))
+    if given is None and trained is not None:
         log.info("the policy of variant %s keeps the filter of its training", own.variant)
-        changes["scenario"] = {"filters": {AUTOMATED: own.scenario.filters[AUTOMATED]}}
+        changes["scenario"] = {"filters": {AUTOMATED: trained}}
+    elif given is not None and trained is not None:
+        other = [
+            key for key in trained.settings if trained.settings[key] != given.settings.get(key)
+        ]
+        text = (
+            "the policy of variant %s drives behind the given filter, not that of its training: %s"
+        )
+        if other:
+            words = (f"{key}={trained.settings[key]}" for key in other)
+            log.warning(text, own.variant, ", ".join(words))
     return cfg.with_(**changes)
 
 

@@ -236,7 +236,7 @@ MEASURES = [
         column="long_time_gap_pct",
     ),
     _share("share_time_gap_short", "time with time gap < 1 s, all", limit="gap\n< 1 s"),
-    _braking("max_braking_mps2", "hardest braking"),
+    _braking("max_braking_mps2", "hardest braking, with warm-up"),
     _braking("max_leader_braking_mps2", "  of the leader"),
     _per_100km("brakings_below_2_per_100km", "brakings < −2 m/s²", of="brakings_below_2"),
     _per_100km("brakings_below_3_per_100km", "  < −3 m/s²", of="brakings_below_3"),

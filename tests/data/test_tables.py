@@ -470,6 +470,7 @@ def test_lengths_in_feet_and_gaps_that_jump_are_named_in_tables(tmp_path) -> Non
 SPEEDS = ["leader_speed_mps", "follower_speed_mps"]
 LOG = {"time": "t", "follower_speed": "v", "gap": "range", "relative_speed": "range_rate"}
 LOG |= {"valid": "ok", "target": "id", "leader_speed": None}
+KMH = {"leader_speed": "km/h"}
 
 
 def car_log() -> pd.DataFrame:
@@ -507,6 +508,8 @@ def test_the_log_of_a_car_has_relative_speeds_targets_and_a_flag(tmp_path) -> No
     units = {"relative_speed": "km/h"}
     fast = EpisodesSource(path=str(tmp_path / "fast.csv"), columns=LOG, units=units).load()
     np.testing.assert_allclose(fast.episodes[SPEEDS], found[SPEEDS], atol=1e-4)
+    with pytest.raises(DataError, match=r"data.units.leader_speed=km/h has no effect: no column"):
+        EpisodesSource(path=str(tmp_path / "log.csv"), columns=LOG, units=KMH).load()
     bad = other.assign(ok="maybe")
     bad.to_csv(tmp_path / "bad.csv", index=False)
     with pytest.raises(DataError, match="data row 1, column 'ok' is 'maybe'; expected 1 or 0"):
