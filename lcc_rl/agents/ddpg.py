@@ -66,8 +66,8 @@ class DDPG(OffPolicy):
         action = raw.tanh()
         space.data.place(seen, batch.get("action"))
         space.own.place(seen, action)
-        networks.evaluate(space.both)
-        loss_actor = -space.own.values[0].mean()
-        loss_value = networks.critic_step(space.data, wanted)
-        networks.actor_step(seen, space, raw, action)
+        values = networks.evaluate(space.both)
+        loss_actor = -values[0][space.own.part].mean()
+        loss_value = networks.critic_step(space.data, values, wanted)
+        networks.actor_step(space, raw, action)
         return loss_actor, loss_value

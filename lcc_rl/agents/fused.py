@@ -15,17 +15,31 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-Layers = list[tuple[Tensor, Tensor, Tensor]]  # weights, transposed weights, biases
+ALL = slice(None)  # rows
+Layers = list[tuple[Tensor, Tensor]]  # weights and biases
+
+LEAST_ENTRIES = 2**15  # of a layer's output from which idle units are looked for
+MOST_ACTIVE = 0.8  # share of a layer's units up to which the idle ones are left out
 
 
 def layers(tensors: Sequence[Tensor]) -> Layers:
     """Group the weights and biases of a network, given in order."""
-    pairs = zip(tensors[::2], tensors[1::2], strict=True)
-    return [(weight, weight.t(), bias) for weight, bias in pairs]
+    return list(zip(tensors[::2], tensors[1::2], strict=True))
+
+
+def active(output: Tensor) -> Tensor | None:
+    """Return the units that are not zero in all rows of a ReLU layer; None: most of them."""
+    if output.numel() < LEAST_ENTRIES:
+        return None
+    found = output.sum(0).nonzero().flatten()  # NaN counts as active
+    return found if 0 < len(found) <= MOST_ACTIVE * output.shape[1] else None
 
 
 class Network:
     """A ReLU network with a backward pass that writes into the gradients of its weights.
+
+    A unit that is zero in all rows of a batch adds zeros to every sum of the next layer and to its
+    gradient. These units are left out, which changes results by rounding only.
 
     Args:
         tensors: weights and biases in order, with their gradients if the network learns.
@@ -36,67 +50,83 @@ class Network:
         part = ... if number is None else number
         self.layers = layers([tensor.data[part] for tensor in tensors])
         self.slopes = layers([x.grad[part] for x in tensors if x.grad is not None])
-        self.rooms: dict[int, tuple[list[Tensor], list[Tensor]]] = {}
+        self.rooms: dict[int, list[Tensor]] = {}
+        # Of the last forward pass: input and weights of every layer, and its active units.
+        self.inputs: list[Tensor] = []
+        self.weights: list[Tensor] = []
+        self.units: list[Tensor | None] = []
 
-    def room(self, rows: int) -> tuple[list[Tensor], list[Tensor]]:
-        """Return tensors for the output of every layer and for the derivatives by it."""
+    def forward(self, x: Tensor) -> Tensor:
+        """Apply the network; return its output, which is valid until the next call."""
+        rows = len(x)
         if rows not in self.rooms:
-            weights = [weight for weight, _, _ in self.layers]
-            outputs, slopes = ([w.new_empty(rows, len(w)) for w in weights] for _ in range(2))
-            self.rooms[rows] = outputs, slopes
-        return self.rooms[rows]
+            self.rooms[rows] = [bias.new_empty(rows, len(bias)) for _, bias in self.layers]
+        self.inputs, self.weights, self.units = [], [], [None]
+        for (weight, bias), output in zip(self.layers, self.rooms[rows], strict=True):
+            if (columns := self.units[-1]) is not None:
+                x, weight = x.index_select(1, columns), weight.index_select(1, columns)
+            self.inputs.append(x)
+            self.weights.append(weight)
+            x = torch.addmm(bias, x, weight.t(), out=output)
+            if len(self.weights) < len(self.layers):
+                self.units.append(active(x.relu_()))
+        self.units.append(None)
+        return x
 
-    def forward(self, x: Tensor, into: list[Tensor] | None = None) -> Tensor:
-        """Apply the network, writing each layer's output to ``into``; return the last one."""
-        into = into or self.room(len(x))[0]
-        for (_, weight, bias), output in zip(self.layers[:-1], into, strict=False):
-            x = torch.addmm(bias, x, weight, out=output).relu_()
-        _, weight, bias = self.layers[-1]
-        return torch.addmm(bias, x, weight, out=into[-1])
-
-    def backward(
-        self, x: Tensor, slope: Tensor, outputs: list[Tensor] | None = None, learn: bool = True
-    ) -> Tensor:
-        """Propagate the slope of a loss from the output to the first layer's.
+    def backward(self, slope: Tensor, part: slice = ALL, learn: bool = True) -> Tensor:
+        """Propagate the slope of a loss from the output of the last forward pass.
 
         Args:
-            x: input of the network, ``[batch, inputs]``.
             slope: derivative by the output, ``[batch, outputs]``.
-            outputs: the outputs that :meth:`forward` wrote; None: the network's own tensors.
+            part: rows of the forward pass, ``batch`` of them.
             learn: write the derivatives by weights and biases.
 
         Returns:
-            The derivative by the first layer's output before its ReLU.
+            The derivative by the output of the first layer's active units before their ReLU.
         """
-        own, spare = self.room(len(x))
-        inputs = [x, *(outputs or own)]
         for place in range(len(self.layers) - 1, -1, -1):
-            x = inputs[place]
+            x, units = self.inputs[place][part], self.units[place + 1]
             if learn:
-                torch.mm(slope.t(), x, out=self.slopes[place][0])
-                torch.sum(slope, 0, out=self.slopes[place][2])
+                self._learn(place, slope, x)
             if place:
+                weight = self.weights[place]
+                weight = weight if units is None else weight.index_select(0, units)
                 # ReLU passes the slope where its output is positive.
-                below = torch.mm(slope, self.layers[place][0], out=spare[place - 1])
+                below = torch.mm(slope, weight)
                 slope = torch.ops.aten.threshold_backward.grad_input(below, x, 0, grad_input=below)
         return slope
 
+    def _learn(self, place: int, slope: Tensor, x: Tensor) -> None:
+        """Write the derivatives by the weights and biases of a layer."""
+        (weight, bias), columns, units = self.slopes[place], *self.units[place : place + 2]
+        if columns is None and units is None:
+            torch.mm(slope.t(), x, out=weight)
+            torch.sum(slope, 0, out=bias)
+            return
+        columns, units = (
+            torch.arange(size, device=x.device) if chosen is None else chosen
+            for chosen, size in zip((columns, units), reversed(weight.shape), strict=True)
+        )
+        weight.zero_()[units.unsqueeze(1), columns] = torch.mm(slope.t(), x)
+        bias.zero_()[units] = slope.sum(0)
+
+    def by_inputs(self, slope: Tensor, part: slice, count: int) -> Tensor:
+        """Return the derivative by the last ``count`` inputs; arguments as :meth:`backward`."""
+        below, units = self.backward(slope, part, learn=False), self.units[1]
+        weight = self.layers[0][0][:, -count:]
+        return torch.mm(below, weight if units is None else weight.index_select(0, units))
+
 
 class CriticBatch(NamedTuple):
-    """Concatenated observations and actions, and the outputs of each layer of each critic."""
+    """Concatenated observations and actions, and their rows in a pass through the critics."""
 
     input: Tensor
-    outputs: list[list[Tensor]]
+    part: slice = ALL
 
     def place(self, observation: Tensor, action: Tensor) -> CriticBatch:
         """Write observation and action."""
         torch.cat([observation, action], -1, out=self.input)
         return self
-
-    @property
-    def values(self) -> list[Tensor]:
-        """The values of each critic, ``[batch, 1]``."""
-        return [output[-1] for output in self.outputs]
 
 
 class Workspace(NamedTuple):
@@ -140,12 +170,10 @@ class ActorCritic:
         """Return the tensors for a batch size."""
         if rows not in self.spaces:
             first = self.critics[0].layers[0][0]
-            outputs = [critic.room(2 * rows)[0] for critic in self.critics]
-            both = CriticBatch(first.new_empty(2 * rows, first.shape[1]), outputs)
-            data, own = (
-                CriticBatch(both.input[part], [[x[part] for x in output] for output in outputs])
-                for part in (slice(rows), slice(rows, None))
-            )
+            both = CriticBatch(first.new_empty(2 * rows, first.shape[1]))
+            # Parts of a pass with both, or with one of them alone.
+            parts = slice(rows), slice(-rows, None)
+            data, own = (CriticBatch(both.input[part], part) for part in parts)
             slope = first.new_full((rows, 1), -1.0 / rows)
             self.spaces[rows] = Workspace(both, data, own, slope)
         return self.spaces[rows]
@@ -153,8 +181,7 @@ class ActorCritic:
     def future(self, reached: Tensor, action: Tensor, into: CriticBatch) -> Tensor:
         """Return the least value of actions by the target networks, ``[batch, 1]``."""
         into.place(reached, action)
-        pairs = zip(self.target_critics, into.outputs, strict=True)
-        return reduce(torch.minimum, [critic.forward(into.input, out) for critic, out in pairs])
+        return reduce(torch.minimum, [x.forward(into.input) for x in self.target_critics])
 
     def wanted(self, after: TensorDictBase, future: Tensor) -> Tensor:
         """Return the TD target, ``[batch, 1]``."""
@@ -164,32 +191,25 @@ class ActorCritic:
 
     def evaluate(self, what: CriticBatch, count: int | None = None) -> list[Tensor]:
         """Return the values by the first ``count`` critics, by default by all."""
-        pairs = zip(self.critics[:count], what.outputs, strict=False)
-        return [critic.forward(what.input, out) for critic, out in pairs]
+        return [critic.forward(what.input) for critic in self.critics[:count]]
 
-    def critic_step(self, data: CriticBatch, wanted: Tensor) -> Tensor:
+    def critic_step(self, data: CriticBatch, values: Sequence[Tensor], wanted: Tensor) -> Tensor:
         """Write the gradient of the critics' mean squared errors; return the loss."""
-        errors = [value.sub_(wanted) for value in data.values]
+        errors = [value[data.part].sub_(wanted) for value in values]
         loss = reduce(torch.add, [error.square().mean() for error in errors])
-        for critic, error, outputs in zip(self.critics, errors, data.outputs, strict=True):
-            critic.backward(data.input, error.mul_(2.0 / len(error)), outputs)
+        for critic, error in zip(self.critics, errors, strict=True):
+            critic.backward(error.mul_(2.0 / len(error)), data.part)
         return loss
 
     def through_critics(self, own: CriticBatch, slopes: Sequence[Tensor], count: int) -> Tensor:
         """Return the derivative by the actions, ``count`` inputs, from that by the values."""
-        found = []
-        for critic, slope, outputs in zip(self.critics, slopes, own.outputs, strict=False):
-            below = critic.backward(own.input, slope, outputs, learn=False)
-            found.append(torch.mm(below, critic.layers[0][0][:, -count:]))
-        return reduce(Tensor.add_, found)
+        pairs = zip(self.critics, slopes, strict=False)
+        return reduce(Tensor.add_, [x.by_inputs(slope, own.part, count) for x, slope in pairs])
 
-    def actor_step(
-        self, observation: Tensor, space: Workspace, raw: Tensor, action: Tensor
-    ) -> None:
+    def actor_step(self, space: Workspace, raw: Tensor, action: Tensor) -> None:
         """Write the gradient of the deterministic actor's loss: value by one critic, and penalty.
 
         Args:
-            observation: input of the actor, ``[batch, …]``.
             space: its ``own`` actions have been evaluated by the first critic.
             raw: the actor's output before the tanh, ``[batch, actions]``.
             action: tanh of ``raw``; it is overwritten.
@@ -197,4 +217,4 @@ class ActorCritic:
         slope = self.through_critics(space.own, [space.slope], action.shape[-1])
         slope.mul_(action.square_().neg_().add_(1.0))
         slope.add_(raw, alpha=2.0 * self.saturation / len(raw))
-        self.actor.backward(observation, slope)
+        self.actor.backward(slope)

@@ -152,14 +152,14 @@ class SAC(OffPolicy):
         now = self._sample(seen, noise[1], networks)
         space.data.place(seen, batch.get("action"))
         space.own.place(seen, now.action)
-        networks.evaluate(space.both)
-        first, second = space.own.values
+        values = networks.evaluate(space.both)
+        first, second = (value[space.own.part] for value in values)
         loss_actor = (now.log_prob * alpha).sub_(torch.minimum(first, second)).mean()
-        loss_value = networks.critic_step(space.data, wanted)
+        loss_value = networks.critic_step(space.data, values, wanted)
         # The value of an action is the smaller one of both critics.
         chosen = space.slope * (first <= second)
         slope = networks.through_critics(space.own, [chosen, space.slope - chosen], 1)
-        self._learn_policy(seen, now, slope, alpha, networks)
+        self._learn_policy(now, slope, alpha, networks)
         entropy = now.log_prob.mean().add_(self.loss.target_entropy)
         self.log_alpha.grad.copy_(entropy.neg_())
         return loss_actor, loss_value
@@ -177,14 +177,14 @@ class SAC(OffPolicy):
         return Sample(mean, bend, push, action, log_prob.sub_(log_slope))
 
     def _learn_policy(
-        self, seen: Tensor, now: Sample, slope: Tensor, alpha: Tensor, networks: ActorCritic
+        self, now: Sample, slope: Tensor, alpha: Tensor, networks: ActorCritic
     ) -> None:
         """Write the gradient of the policy from the derivative by its actions."""
-        rows = len(seen)
+        rows = len(slope)
         slope.mul_(now.action.square().neg_().add_(1.0))
         slope.addcmul_(now.action, alpha, value=2.0 / rows)
         spread = (slope * now.push).sub_(alpha, alpha=1.0 / rows)
         spread.mul_(now.bend.square().neg_().add_(1.0).mul_(3.0))
-        self.spread.backward(seen, spread)
+        self.spread.backward(spread)
         slope.add_(now.mean, alpha=2.0 * self.saturation / rows)
-        networks.actor.backward(seen, slope)
+        networks.actor.backward(slope)

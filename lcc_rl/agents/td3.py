@@ -72,8 +72,8 @@ class TD3(OffPolicy):
         noise.mul_(self.policy_noise).clamp_(-self.noise_clip, self.noise_clip)
         action.add_(noise).clamp_(-1.0, 1.0)
         wanted = networks.wanted(after, networks.future(reached, action, data))
-        networks.evaluate(data.place(batch.get("observation"), batch.get("action")))
-        return networks.critic_step(data, wanted)
+        values = networks.evaluate(data.place(batch.get("observation"), batch.get("action")))
+        return networks.critic_step(data, values, wanted)
 
     @torch.no_grad()
     def _actor(self, batch: TensorDictBase, networks: ActorCritic) -> Tensor:
@@ -82,7 +82,7 @@ class TD3(OffPolicy):
         raw = networks.actor.forward(seen)
         action = raw.tanh()
         (value,) = networks.evaluate(space.own.place(seen, action), 1)
-        networks.actor_step(seen, space, raw, action)
+        networks.actor_step(space, raw, action)
         return -value.mean()
 
     def state_dict(self) -> dict[str, object]:
