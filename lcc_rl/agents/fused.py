@@ -50,7 +50,7 @@ class Network:
         part = ... if number is None else number
         self.layers = layers([tensor.data[part] for tensor in tensors])
         self.slopes = layers([x.grad[part] for x in tensors if x.grad is not None])
-        self.rooms: dict[int, list[Tensor]] = {}
+        self.rooms: list[Tensor] = []  # for the outputs of the layers
         # Of the last forward pass: input and weights of every layer, and its active units.
         self.inputs: list[Tensor] = []
         self.weights: list[Tensor] = []
@@ -59,15 +59,15 @@ class Network:
     def forward(self, x: Tensor) -> Tensor:
         """Apply the network; return its output, which is valid until the next call."""
         rows = len(x)
-        if rows not in self.rooms:
-            self.rooms[rows] = [bias.new_empty(rows, len(bias)) for _, bias in self.layers]
+        if not self.rooms or len(self.rooms[0]) < rows:
+            self.rooms = [bias.new_empty(rows, len(bias)) for _, bias in self.layers]
         self.inputs, self.weights, self.units = [], [], [None]
-        for (weight, bias), output in zip(self.layers, self.rooms[rows], strict=True):
+        for (weight, bias), room in zip(self.layers, self.rooms, strict=True):
             if (columns := self.units[-1]) is not None:
                 x, weight = x.index_select(1, columns), weight.index_select(1, columns)
             self.inputs.append(x)
             self.weights.append(weight)
-            x = torch.addmm(bias, x, weight.t(), out=output)
+            x = torch.addmm(bias, x, weight.t(), out=room[:rows])
             if len(self.weights) < len(self.layers):
                 self.units.append(active(x.relu_()))
         self.units.append(None)
@@ -99,15 +99,18 @@ class Network:
     def _learn(self, place: int, slope: Tensor, x: Tensor) -> None:
         """Write the derivatives by the weights and biases of a layer."""
         (weight, bias), columns, units = self.slopes[place], *self.units[place : place + 2]
+        # For fewer inputs than outputs the transposed product takes a fifth of the time.
+        wide = x.shape[1] < slope.shape[1]
+        found = torch.mm(x.t(), slope).t() if wide else torch.mm(slope.t(), x)
         if columns is None and units is None:
-            torch.mm(slope.t(), x, out=weight)
+            weight.copy_(found)
             torch.sum(slope, 0, out=bias)
             return
         columns, units = (
             torch.arange(size, device=x.device) if chosen is None else chosen
             for chosen, size in zip((columns, units), reversed(weight.shape), strict=True)
         )
-        weight.zero_()[units.unsqueeze(1), columns] = torch.mm(slope.t(), x)
+        weight.zero_()[units.unsqueeze(1), columns] = found
         bias.zero_()[units] = slope.sum(0)
 
     def by_inputs(self, slope: Tensor, part: slice, count: int) -> Tensor:
@@ -178,10 +181,10 @@ class ActorCritic:
             self.spaces[rows] = Workspace(both, data, own, slope)
         return self.spaces[rows]
 
-    def future(self, reached: Tensor, action: Tensor, into: CriticBatch) -> Tensor:
+    def future(self, reached: Tensor, action: Tensor) -> Tensor:
         """Return the least value of actions by the target networks, ``[batch, 1]``."""
-        into.place(reached, action)
-        return reduce(torch.minimum, [x.forward(into.input) for x in self.target_critics])
+        both = torch.cat([reached, action], -1)
+        return reduce(torch.minimum, [critic.forward(both) for critic in self.target_critics])
 
     def wanted(self, after: TensorDictBase, future: Tensor) -> Tensor:
         """Return the TD target, ``[batch, 1]``."""

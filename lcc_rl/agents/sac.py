@@ -147,7 +147,7 @@ class SAC(OffPolicy):
         reached, alpha = after.get("observation"), self.log_alpha.exp()
         noise = self._noise(space.slope, 2)
         then = self._sample(reached, noise[0], networks)
-        future = networks.future(reached, then.action, space.data)
+        future = networks.future(reached, then.action)
         wanted = networks.wanted(after, future.sub_(then.log_prob.mul_(alpha)))
         now = self._sample(seen, noise[1], networks)
         space.data.place(seen, batch.get("action"))

@@ -19,7 +19,7 @@ from torchrl.objectives import SoftUpdate
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.off_policy import leaves
-from lcc_rl.agents.replay import draws
+from lcc_rl.agents.replay import Replay
 from lcc_rl.envs import build_env
 
 SMALL = (
@@ -99,8 +99,11 @@ def test_batches_are_drawn_as_torchrls_buffer_draws_them(filled) -> None:
     buffer.extend(batch(filled))
     generator.manual_seed(3)
     expected = [buffer.sample() for _ in range(3)]
-    generator.manual_seed(3)
-    for one, found in zip(expected, draws(buffer, generator), strict=False):
+    ours = Replay(100, 32, generator.manual_seed(3))
+    for part in batch(filled).split(25):
+        ours.extend(part)
+    for one in expected:
+        found = ours.draw()
         for key in found.keys(True, True):
             assert torch.equal(found.get(key), one.get(key)), key
 
