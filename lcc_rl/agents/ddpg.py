@@ -75,8 +75,8 @@ class DDPG(OffPolicy):
         Values of earlier draws are used if no target network has moved since.
         """
         reached, known = batch.get(("next", "observation")), batch.get(KNOWN, None)
-        moves = sum((self.count - 1) // every for every in self.target_every.values())
         if known is not None:
+            moves = sum((self.count - 1) // every for every in self.target_every.values())
             places = (known[:, 1] != moves).nonzero().flatten()
             reached = reached[places]
         future = networks.future(reached, networks.target_actor.forward(reached).tanh_())

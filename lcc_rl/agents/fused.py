@@ -16,23 +16,33 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 ALL = slice(None)  # rows
-Layers = list[tuple[Tensor, Tensor]]  # weights and biases
+Layers = list[tuple[Tensor, Tensor, Tensor]]  # weights, transposed weights, biases
 
-LEAST_ENTRIES = 2**15  # of a layer's output from which idle units are looked for
+LEAST_ROWS = 1000  # of a batch, from which its products are worth other operations
 MOST_ACTIVE = 0.8  # share of a layer's units up to which the idle ones are left out
 
 
 def layers(tensors: Sequence[Tensor]) -> Layers:
     """Group the weights and biases of a network, given in order."""
-    return list(zip(tensors[::2], tensors[1::2], strict=True))
+    pairs = zip(tensors[::2], tensors[1::2], strict=True)
+    return [(weight, weight.t(), bias) for weight, bias in pairs]
 
 
-def active(output: Tensor) -> Tensor | None:
+def _active(output: Tensor) -> Tensor | None:
     """Return the units that are not zero in all rows of a ReLU layer; None: most of them."""
-    if output.numel() < LEAST_ENTRIES:
+    if len(output) < LEAST_ROWS:
         return None
     found = output.sum(0).nonzero().flatten()  # NaN counts as active
     return found if 0 < len(found) <= MOST_ACTIVE * output.shape[1] else None
+
+
+def _widened(values: Tensor, dim: int, places: Tensor | None, like: Tensor) -> Tensor:
+    """Return values at these places of a dimension, and zeros at the others."""
+    if places is None:
+        return values
+    shape = [*values.shape]
+    shape[dim] = like.shape[dim]
+    return values.new_zeros(shape).index_copy_(dim, places, values)
 
 
 class Network:
@@ -60,17 +70,18 @@ class Network:
         """Apply the network; return its output, which is valid until the next call."""
         rows = len(x)
         if not self.rooms or len(self.rooms[0]) < rows:
-            self.rooms = [bias.new_empty(rows, len(bias)) for _, bias in self.layers]
+            self.rooms = [bias.new_empty(rows, len(bias)) for _, _, bias in self.layers]
         self.inputs, self.weights, self.units = [], [], [None]
-        for (weight, bias), room in zip(self.layers, self.rooms, strict=True):
+        for (weight, transposed, bias), room in zip(self.layers, self.rooms, strict=True):
             if (columns := self.units[-1]) is not None:
                 x, weight = x.index_select(1, columns), weight.index_select(1, columns)
+                transposed = weight.t()
             self.inputs.append(x)
             self.weights.append(weight)
-            x = torch.addmm(bias, x, weight.t(), out=room[:rows])
-            if len(self.weights) < len(self.layers):
-                self.units.append(active(x.relu_()))
-        self.units.append(None)
+            room = room if len(room) == rows else room[:rows]
+            x = torch.addmm(bias, x, transposed, out=room)
+            last = len(self.inputs) == len(self.layers)
+            self.units.append(None if last else _active(x.relu_()))
         return x
 
     def backward(self, slope: Tensor, part: slice = ALL, learn: bool = True) -> Tensor:
@@ -85,7 +96,8 @@ class Network:
             The derivative by the output of the first layer's active units before their ReLU.
         """
         for place in range(len(self.layers) - 1, -1, -1):
-            x, units = self.inputs[place][part], self.units[place + 1]
+            x, units = self.inputs[place], self.units[place + 1]
+            x = x if part is ALL else x[part]
             if learn:
                 self._learn(place, slope, x)
             if place:
@@ -98,20 +110,16 @@ class Network:
 
     def _learn(self, place: int, slope: Tensor, x: Tensor) -> None:
         """Write the derivatives by the weights and biases of a layer."""
-        (weight, bias), columns, units = self.slopes[place], *self.units[place : place + 2]
+        (weight, _, bias), columns, units = self.slopes[place], *self.units[place : place + 2]
         # For fewer inputs than outputs the transposed product takes a fifth of the time.
-        wide = x.shape[1] < slope.shape[1]
-        found = torch.mm(x.t(), slope).t() if wide else torch.mm(slope.t(), x)
-        if columns is None and units is None:
-            weight.copy_(found)
+        turned = len(x) >= LEAST_ROWS and x.shape[1] < slope.shape[1]
+        if columns is units is None and not turned:
+            torch.mm(slope.t(), x, out=weight)
             torch.sum(slope, 0, out=bias)
             return
-        columns, units = (
-            torch.arange(size, device=x.device) if chosen is None else chosen
-            for chosen, size in zip((columns, units), reversed(weight.shape), strict=True)
-        )
-        weight.zero_()[units.unsqueeze(1), columns] = found
-        bias.zero_()[units] = slope.sum(0)
+        found = torch.mm(x.t(), slope).t() if turned else torch.mm(slope.t(), x)
+        weight.copy_(_widened(_widened(found, 1, columns, weight), 0, units, weight))
+        bias.copy_(_widened(slope.sum(0), 0, units, bias))
 
     def by_inputs(self, slope: Tensor, part: slice, count: int) -> Tensor:
         """Return the derivative by the last ``count`` inputs; arguments as :meth:`backward`."""

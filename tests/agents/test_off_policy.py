@@ -67,7 +67,7 @@ def test_updates_equal_torchrls_loss_torchs_adam_and_torchrls_soft_update(
     agent, hidden, monkeypatch
 ) -> None:
     idle = len(set(hidden)) == 2
-    monkeypatch.setattr(fused, "LEAST_ENTRIES", 0 if idle else 10**9)
+    monkeypatch.setattr(fused, "LEAST_ROWS", 0 if idle else 10**9)
     settings = (*SMALL, "agent.tau=0.05", "agent.critic_lr=0.002", f"agent.hidden={hidden}")
     made, plain = (
         make_agent(compose("alcc", f"agent={agent}", *settings, f"agent.fused={by_hand}"))
