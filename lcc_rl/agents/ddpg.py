@@ -57,16 +57,14 @@ class DDPG(OffPolicy):
     @torch.no_grad()
     def _by_hand(self, batch: TensorDictBase, networks: ActorCritic) -> tuple[Tensor, Tensor]:
         """Compute the gradient explicitly (A8–A9, H7–H8); the actor uses the old critic."""
-        space, seen = networks.space(len(batch)), batch.get("observation")
+        seen = batch.get("observation")
         wanted = networks.wanted(batch.get("next"), self._future(batch, networks))
         raw = networks.actor.forward(seen)
         action = raw.tanh()
-        space.data.place(seen, batch.get("action"))
-        space.own.place(seen, action)
-        values = networks.evaluate(space.both)
-        loss_actor = -values[0][space.own.part].mean()
-        loss_value = networks.critic_step(space.data, values, wanted)
-        networks.actor_step(space, raw, action)
+        values = networks.evaluate(seen, batch.get("action"), action)
+        loss_actor = -values[0][len(seen) :].mean()
+        loss_value = networks.critic_step(values, wanted)
+        networks.actor_step(raw, action)
         return loss_actor, loss_value
 
     def _future(self, batch: TensorDictBase, networks: ActorCritic) -> Tensor:

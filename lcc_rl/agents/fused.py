@@ -9,13 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import reduce
-from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-ALL = slice(None)  # rows
 Layers = list[tuple[Tensor, Tensor, Tensor]]  # weights, transposed weights, biases
 
 LEAST_ROWS = 1000  # of a batch, from which its products are worth other operations
@@ -84,12 +82,12 @@ class Network:
             self.units.append(None if last else _active(x.relu_()))
         return x
 
-    def backward(self, slope: Tensor, part: slice = ALL, learn: bool = True) -> Tensor:
+    def backward(self, slope: Tensor, part: slice | None = None, learn: bool = True) -> Tensor:
         """Propagate the slope of a loss from the output of the last forward pass.
 
         Args:
             slope: derivative by the output, ``[batch, outputs]``.
-            part: rows of the forward pass, ``batch`` of them.
+            part: rows of the forward pass, ``batch`` of them; None: all.
             learn: write the derivatives by weights and biases.
 
         Returns:
@@ -97,7 +95,7 @@ class Network:
         """
         for place in range(len(self.layers) - 1, -1, -1):
             x, units = self.inputs[place], self.units[place + 1]
-            x = x if part is ALL else x[part]
+            x = x if part is None else x[part]
             if learn:
                 self._learn(place, slope, x)
             if place:
@@ -121,32 +119,11 @@ class Network:
         weight.copy_(_widened(_widened(found, 1, columns, weight), 0, units, weight))
         bias.copy_(_widened(slope.sum(0), 0, units, bias))
 
-    def by_inputs(self, slope: Tensor, part: slice, count: int) -> Tensor:
-        """Return the derivative by the last ``count`` inputs; arguments as :meth:`backward`."""
-        below, units = self.backward(slope, part, learn=False), self.units[1]
+    def by_inputs(self, slope: Tensor, count: int) -> Tensor:
+        """Return the derivative by the last inputs of the last rows from that by their outputs."""
+        below, units = self.backward(slope, slice(-len(slope), None), learn=False), self.units[1]
         weight = self.layers[0][0][:, -count:]
         return torch.mm(below, weight if units is None else weight.index_select(0, units))
-
-
-class CriticBatch(NamedTuple):
-    """Concatenated observations and actions, and their rows in a pass through the critics."""
-
-    input: Tensor
-    part: slice = ALL
-
-    def place(self, observation: Tensor, action: Tensor) -> CriticBatch:
-        """Write observation and action."""
-        torch.cat([observation, action], -1, out=self.input)
-        return self
-
-
-class Workspace(NamedTuple):
-    """Actions for the critics: those of the data, followed by those of the actor."""
-
-    both: CriticBatch
-    data: CriticBatch
-    own: CriticBatch
-    slope: Tensor  # slope of the negative mean value of the actor's actions
 
 
 class ActorCritic:
@@ -175,19 +152,6 @@ class ActorCritic:
         self.target_actor = Network(targets["actor"]) if "actor" in targets else self.actor
         self.critics = [Network(networks["value"], number) for number in numbers]
         self.target_critics = [Network(targets["value"], number) for number in numbers]
-        self.spaces: dict[int, Workspace] = {}
-
-    def space(self, rows: int) -> Workspace:
-        """Return the tensors for a batch size."""
-        if rows not in self.spaces:
-            first = self.critics[0].layers[0][0]
-            both = CriticBatch(first.new_empty(2 * rows, first.shape[1]))
-            # Parts of a pass with both, or with one of them alone.
-            parts = slice(rows), slice(-rows, None)
-            data, own = (CriticBatch(both.input[part], part) for part in parts)
-            slope = first.new_full((rows, 1), -1.0 / rows)
-            self.spaces[rows] = Workspace(both, data, own, slope)
-        return self.spaces[rows]
 
     def future(self, reached: Tensor, action: Tensor) -> Tensor:
         """Return the least value of actions by the target networks, ``[batch, 1]``."""
@@ -200,32 +164,37 @@ class ActorCritic:
         future = future.masked_fill(after.get("terminated"), 0.0)
         return future.mul_(self.gamma).add_(after.get("reward"))
 
-    def evaluate(self, what: CriticBatch, count: int | None = None) -> list[Tensor]:
-        """Return the values by the first ``count`` critics, by default by all."""
-        return [critic.forward(what.input) for critic in self.critics[:count]]
+    def evaluate(self, seen: Tensor, *actions: Tensor, count: int | None = None) -> list[Tensor]:
+        """Return the values of actions by the first ``count`` critics; None: by all.
 
-    def critic_step(self, data: CriticBatch, values: Sequence[Tensor], wanted: Tensor) -> Tensor:
+        Each is ``[kinds × batch, 1]``: the actions of the data come first, the actor's last.
+        """
+        rows = torch.cat([torch.cat([seen, action], -1) for action in actions])
+        return [critic.forward(rows) for critic in self.critics[:count]]
+
+    def critic_step(self, values: Sequence[Tensor], wanted: Tensor) -> Tensor:
         """Write the gradient of the critics' mean squared errors; return the loss."""
-        errors = [value[data.part].sub_(wanted) for value in values]
+        part = slice(len(wanted))
+        errors = [value[part].sub_(wanted) for value in values]
         loss = reduce(torch.add, [error.square().mean() for error in errors])
         for critic, error in zip(self.critics, errors, strict=True):
-            critic.backward(error.mul_(2.0 / len(error)), data.part)
+            critic.backward(error.mul_(2.0 / len(error)), part)
         return loss
 
-    def through_critics(self, own: CriticBatch, slopes: Sequence[Tensor], count: int) -> Tensor:
-        """Return the derivative by the actions, ``count`` inputs, from that by the values."""
+    def through_critics(self, slopes: Sequence[Tensor], count: int) -> Tensor:
+        """Return the derivative by the actor's ``count`` actions from those by their values."""
         pairs = zip(self.critics, slopes, strict=False)
-        return reduce(Tensor.add_, [x.by_inputs(slope, own.part, count) for x, slope in pairs])
+        return reduce(Tensor.add_, [critic.by_inputs(slope, count) for critic, slope in pairs])
 
-    def actor_step(self, space: Workspace, raw: Tensor, action: Tensor) -> None:
+    def actor_step(self, raw: Tensor, action: Tensor) -> None:
         """Write the gradient of the deterministic actor's loss: value by one critic, and penalty.
 
         Args:
-            space: its ``own`` actions have been evaluated by the first critic.
             raw: the actor's output before the tanh, ``[batch, actions]``.
-            action: tanh of ``raw``; it is overwritten.
+            action: tanh of ``raw``, evaluated by the first critic; it is overwritten.
         """
-        slope = self.through_critics(space.own, [space.slope], action.shape[-1])
+        value = torch.full_like(raw[:, :1], -1.0 / len(raw))
+        slope = self.through_critics([value], action.shape[-1])
         slope.mul_(action.square_().neg_().add_(1.0))
         slope.add_(raw, alpha=2.0 * self.saturation / len(raw))
         self.actor.backward(slope)

@@ -93,19 +93,17 @@ class Replay:
 
     Args:
         size: number of transitions that it holds.
-        batch_size: transitions of a batch.
+        batch: transitions of a draw.
         generator: generator of the draws.
         device: device of the transitions.
     """
 
-    def __init__(
-        self, size: int, batch_size: int, generator: torch.Generator, device: Any = "cpu"
-    ) -> None:
+    def __init__(self, size: int, batch: int, generator: torch.Generator, device: Any) -> None:
         self.size, self.generator, self.device = size, generator, device
         self.count = 0  # transitions that were added, also those replaced since
-        self.index = torch.empty(batch_size, dtype=torch.long, device=generator.device)
+        self.index = torch.empty(batch, dtype=torch.long, device=generator.device)
         self.places = self.index
-        self.drawn = TensorDict(batch_size=[batch_size])
+        self.drawn = TensorDict(batch_size=[batch])
         self.columns: dict[Key, tuple[Tensor, Tensor]] = {}  # all rows, and those of a batch
 
     def __len__(self) -> int:
@@ -130,7 +128,7 @@ class Replay:
             self.drawn.set(key, drawn)
 
     def draw(self) -> TensorDictBase:
-        """Return a batch, ``[batch_size]``, which is valid until the next draw."""
+        """Return transitions, ``[batch]``, which is valid until the next draw."""
         torch.randint(len(self), self.index.shape, generator=self.generator, out=self.index)
         self.places = self.index.to(self.device)
         for column, drawn in self.columns.values():

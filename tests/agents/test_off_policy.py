@@ -107,7 +107,7 @@ def test_target_values_that_are_kept_equal_those_computed_anew() -> None:
     every = "agent.target_every={actor: 2, critic: 3}"
     made = [make_agent(compose("alcc", "agent=ddpg", *SMALL, "agent.tau=1", every)) for _ in "ab"]
     rows = batch(40)
-    buffer = Replay(50, 32, torch.Generator().manual_seed(0))
+    buffer = Replay(50, 32, torch.Generator().manual_seed(0), "cpu")
     buffer.extend(rows.clone().set(KNOWN, torch.full((40, 2), -1.0)))
     for number in range(12):
         drawn = buffer.draw()
@@ -126,7 +126,7 @@ def test_batches_are_drawn_as_torchrls_buffer_draws_them(filled) -> None:
     buffer.extend(batch(filled))
     generator.manual_seed(3)
     expected = [buffer.sample() for _ in range(3)]
-    ours = Replay(100, 32, generator.manual_seed(3))
+    ours = Replay(100, 32, generator.manual_seed(3), "cpu")
     for part in batch(filled).split(25):
         ours.extend(part)
     for one in expected:
