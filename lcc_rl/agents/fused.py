@@ -28,8 +28,6 @@ def layers(tensors: Sequence[Tensor]) -> Layers:
 
 def _active(output: Tensor) -> Tensor | None:
     """Return the units that are not zero in all rows of a ReLU layer; None: most of them."""
-    if len(output) < LEAST_ROWS:
-        return None
     found = output.sum(0).nonzero().flatten()  # NaN counts as active
     return found if 0 < len(found) <= MOST_ACTIVE * output.shape[1] else None
 
@@ -59,27 +57,26 @@ class Network:
         self.layers = layers([tensor.data[part] for tensor in tensors])
         self.slopes = layers([x.grad[part] for x in tensors if x.grad is not None])
         self.rooms: list[Tensor] = []  # for the outputs of the layers
-        # Of the last forward pass: input and weights of every layer, and its active units.
-        self.inputs: list[Tensor] = []
-        self.weights: list[Tensor] = []
-        self.units: list[Tensor | None] = []
+        # Of the last forward pass: every layer's input, weights and active units before it.
+        self.passed: list[tuple[Tensor, Tensor, Tensor | None]] = []
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the network; return its output, which is valid until the next call."""
-        rows = len(x)
+        rows, units = len(x), None
         if not self.rooms or len(self.rooms[0]) < rows:
             self.rooms = [bias.new_empty(rows, len(bias)) for _, _, bias in self.layers]
-        self.inputs, self.weights, self.units = [], [], [None]
-        for (weight, transposed, bias), room in zip(self.layers, self.rooms, strict=True):
-            if (columns := self.units[-1]) is not None:
-                x, weight = x.index_select(1, columns), weight.index_select(1, columns)
+        whole = len(self.rooms[0]) == rows
+        rooms = self.rooms if whole else [room[:rows] for room in self.rooms]
+        self.passed, last = [], len(self.layers) - 1
+        for (weight, transposed, bias), room in zip(self.layers, rooms, strict=True):
+            if units is not None:
+                x, weight = x.index_select(1, units), weight.index_select(1, units)
                 transposed = weight.t()
-            self.inputs.append(x)
-            self.weights.append(weight)
-            room = room if len(room) == rows else room[:rows]
+            self.passed.append((x, weight, units))
             x = torch.addmm(bias, x, transposed, out=room)
-            last = len(self.inputs) == len(self.layers)
-            self.units.append(None if last else _active(x.relu_()))
+            if len(self.passed) <= last:
+                x.relu_()
+                units = _active(x) if rows >= LEAST_ROWS else None
         return x
 
     def backward(self, slope: Tensor, part: slice | None = None, learn: bool = True) -> Tensor:
@@ -93,36 +90,36 @@ class Network:
         Returns:
             The derivative by the output of the first layer's active units before their ReLU.
         """
+        units = None
         for place in range(len(self.layers) - 1, -1, -1):
-            x, units = self.inputs[place], self.units[place + 1]
+            x, weight, columns = self.passed[place]
             x = x if part is None else x[part]
-            if learn:
-                self._learn(place, slope, x)
+            if learn and columns is units is None and len(x) < LEAST_ROWS:
+                torch.mm(slope.t(), x, out=self.slopes[place][0])
+                torch.sum(slope, 0, out=self.slopes[place][2])
+            elif learn:
+                self._learn(place, slope, x, units)
             if place:
-                weight = self.weights[place]
                 weight = weight if units is None else weight.index_select(0, units)
                 # ReLU passes the slope where its output is positive.
                 below = torch.mm(slope, weight)
                 slope = torch.ops.aten.threshold_backward.grad_input(below, x, 0, grad_input=below)
+            units = columns
         return slope
 
-    def _learn(self, place: int, slope: Tensor, x: Tensor) -> None:
-        """Write the derivatives by the weights and biases of a layer."""
-        (weight, _, bias), columns, units = self.slopes[place], *self.units[place : place + 2]
+    def _learn(self, place: int, slope: Tensor, x: Tensor, units: Tensor | None) -> None:
+        """Write the derivatives by weights and biases, of a layer's active units behind it."""
+        (weight, _, bias), columns = self.slopes[place], self.passed[place][2]
         # For fewer inputs than outputs the transposed product takes a fifth of the time.
-        turned = len(x) >= LEAST_ROWS and x.shape[1] < slope.shape[1]
-        if columns is units is None and not turned:
-            torch.mm(slope.t(), x, out=weight)
-            torch.sum(slope, 0, out=bias)
-            return
+        turned = x.shape[1] < slope.shape[1]
         found = torch.mm(x.t(), slope).t() if turned else torch.mm(slope.t(), x)
         weight.copy_(_widened(_widened(found, 1, columns, weight), 0, units, weight))
         bias.copy_(_widened(slope.sum(0), 0, units, bias))
 
     def by_inputs(self, slope: Tensor, count: int) -> Tensor:
         """Return the derivative by the last inputs of the last rows from that by their outputs."""
-        below, units = self.backward(slope, slice(-len(slope), None), learn=False), self.units[1]
-        weight = self.layers[0][0][:, -count:]
+        below = self.backward(slope, slice(-len(slope), None), learn=False)
+        weight, units = self.layers[0][0][:, -count:], [*self.passed, (None, None, None)][1][2]
         return torch.mm(below, weight if units is None else weight.index_select(0, units))
 
 
