@@ -56,17 +56,17 @@ class Network:
         part = ... if number is None else number
         self.layers = layers([tensor.data[part] for tensor in tensors])
         self.slopes = layers([x.grad[part] for x in tensors if x.grad is not None])
-        self.rooms: list[Tensor] = []  # for the outputs of the layers
+        self.rows, self.rooms = -1, list[Tensor]()  # for the outputs of the layers
         # Of the last forward pass: every layer's input, weights and active units before it.
         self.passed: list[tuple[Tensor, Tensor, Tensor | None]] = []
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the network; return its output, which is valid until the next call."""
         rows, units = len(x), None
-        if not self.rooms or len(self.rooms[0]) < rows:
+        if rows > self.rows:
             self.rooms = [bias.new_empty(rows, len(bias)) for _, _, bias in self.layers]
-        whole = len(self.rooms[0]) == rows
-        rooms = self.rooms if whole else [room[:rows] for room in self.rooms]
+            self.rows = rows
+        rooms = self.rooms if rows == self.rows else [room[:rows] for room in self.rooms]
         self.passed, last = [], len(self.layers) - 1
         for (weight, transposed, bias), room in zip(self.layers, rooms, strict=True):
             if units is not None:
@@ -90,11 +90,11 @@ class Network:
         Returns:
             The derivative by the output of the first layer's active units before their ReLU.
         """
-        units = None
+        units, few = None, len(slope) < LEAST_ROWS
         for place in range(len(self.layers) - 1, -1, -1):
             x, weight, columns = self.passed[place]
             x = x if part is None else x[part]
-            if learn and columns is units is None and len(x) < LEAST_ROWS:
+            if learn and few and columns is units is None:
                 torch.mm(slope.t(), x, out=self.slopes[place][0])
                 torch.sum(slope, 0, out=self.slopes[place][2])
             elif learn:
