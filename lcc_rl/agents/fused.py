@@ -7,6 +7,7 @@ batch size. DDPG, TD3 and SAC share these parts.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import reduce
 
@@ -56,6 +57,8 @@ class Network:
         part = ... if number is None else number
         self.layers = layers([tensor.data[part] for tensor in tensors])
         self.slopes = layers([x.grad[part] for x in tensors if x.grad is not None])
+        # On a GPU, to look for idle units takes longer than products with them.
+        self.least = LEAST_ROWS if tensors[0].device.type == "cpu" else math.inf
         self.rows, self.rooms = -1, list[Tensor]()  # for the outputs of the layers
         # Of the last forward pass: every layer's input, weights and active units before it.
         self.passed: list[tuple[Tensor, Tensor, Tensor | None]] = []
@@ -76,7 +79,7 @@ class Network:
             x = torch.addmm(bias, x, transposed, out=room)
             if len(self.passed) <= last:
                 x.relu_()
-                units = _active(x) if rows >= LEAST_ROWS else None
+                units = _active(x) if rows >= self.least else None
         return x
 
     def backward(self, slope: Tensor, part: slice | None = None, learn: bool = True) -> Tensor:
@@ -90,7 +93,7 @@ class Network:
         Returns:
             The derivative by the output of the first layer's active units before their ReLU.
         """
-        units, few = None, len(slope) < LEAST_ROWS
+        units, few = None, len(slope) < self.least
         for place in range(len(self.layers) - 1, -1, -1):
             x, weight, columns = self.passed[place]
             x = x if part is None else x[part]
