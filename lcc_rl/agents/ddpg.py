@@ -61,9 +61,9 @@ class DDPG(OffPolicy):
         wanted = networks.wanted(batch.get("next"), self._future(batch, networks))
         raw = networks.actor.forward(seen)
         action = raw.tanh()
-        values = networks.evaluate(seen, batch.get("action"), action)
-        loss_actor = -values[0][len(seen) :].mean()
+        values = networks.evaluate(seen, batch.get("action"))
         loss_value = networks.critic_step(values, wanted)
+        loss_actor = -networks.evaluate(seen, action, 1)[0].mean()
         networks.actor_step(raw, action)
         return loss_actor, loss_value
 

@@ -82,12 +82,11 @@ class Network:
                 units = _active(x) if rows >= self.least else None
         return x
 
-    def backward(self, slope: Tensor, part: slice | None = None, learn: bool = True) -> Tensor:
+    def backward(self, slope: Tensor, learn: bool = True) -> Tensor:
         """Propagate the slope of a loss from the output of the last forward pass.
 
         Args:
             slope: derivative by the output, ``[batch, outputs]``.
-            part: rows of the forward pass, ``batch`` of them; None: all.
             learn: write the derivatives by weights and biases.
 
         Returns:
@@ -96,7 +95,6 @@ class Network:
         units, few = None, len(slope) < self.least
         for place in range(len(self.layers) - 1, -1, -1):
             x, weight, columns = self.passed[place]
-            x = x if part is None else x[part]
             if learn and few and columns is units is None:
                 torch.mm(slope.t(), x, out=self.slopes[place][0])
                 torch.sum(slope, 0, out=self.slopes[place][2])
@@ -120,8 +118,8 @@ class Network:
         bias.copy_(_widened(slope.sum(0), 0, units, bias))
 
     def by_inputs(self, slope: Tensor, count: int) -> Tensor:
-        """Return the derivative by the last inputs of the last rows from that by their outputs."""
-        below = self.backward(slope, slice(-len(slope), None), learn=False)
+        """Return the derivative by the last inputs from that by the output."""
+        below = self.backward(slope, learn=False)
         weight, units = self.layers[0][0][:, -count:], [*self.passed, (None, None, None)][1][2]
         return torch.mm(below, weight if units is None else weight.index_select(0, units))
 
@@ -164,21 +162,22 @@ class ActorCritic:
         future = future.masked_fill(after.get("terminated"), 0.0)
         return future.mul_(self.gamma).add_(after.get("reward"))
 
-    def evaluate(self, seen: Tensor, *actions: Tensor, count: int | None = None) -> list[Tensor]:
-        """Return the values of actions by the first ``count`` critics; None: by all.
-
-        Each is ``[kinds × batch, 1]``: the actions of the data come first, the actor's last.
-        """
-        rows = torch.cat([torch.cat([seen, action], -1) for action in actions])
+    def evaluate(self, seen: Tensor, action: Tensor, count: int | None = None) -> list[Tensor]:
+        """Return the values of actions by the first ``count`` critics; None: by all."""
+        rows = torch.cat([seen, action], -1)
         return [critic.forward(rows) for critic in self.critics[:count]]
 
     def critic_step(self, values: Sequence[Tensor], wanted: Tensor) -> Tensor:
-        """Write the gradient of the critics' mean squared errors; return the loss."""
-        part = slice(len(wanted))
-        errors = [value[part].sub_(wanted) for value in values]
+        """Write the gradient of the critics' mean squared errors; return the loss.
+
+        Args:
+            values: values of the data, of the critics' last pass; they are overwritten.
+            wanted: the TD target, ``[batch, 1]``.
+        """
+        errors = [value.sub_(wanted) for value in values]
         loss = reduce(torch.add, [error.square().mean() for error in errors])
         for critic, error in zip(self.critics, errors, strict=True):
-            critic.backward(error.mul_(2.0 / len(error)), part)
+            critic.backward(error.mul_(2.0 / len(error)))
         return loss
 
     def through_critics(self, slopes: Sequence[Tensor], count: int) -> Tensor:

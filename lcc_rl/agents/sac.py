@@ -150,10 +150,10 @@ class SAC(OffPolicy):
         future = networks.future(reached, then.action)
         wanted = networks.wanted(after, future.sub_(then.log_prob.mul_(alpha)))
         now = self._sample(seen, noise[1], networks)
-        values = networks.evaluate(seen, batch.get("action"), now.action)
-        first, second = (value[len(seen) :] for value in values)
-        loss_actor = (now.log_prob * alpha).sub_(torch.minimum(first, second)).mean()
+        values = networks.evaluate(seen, batch.get("action"))
         loss_value = networks.critic_step(values, wanted)
+        first, second = networks.evaluate(seen, now.action)
+        loss_actor = (now.log_prob * alpha).sub_(torch.minimum(first, second)).mean()
         # The value of an action is the smaller one of both critics.
         chosen = whole * (first <= second)
         slope = networks.through_critics([chosen, whole - chosen], 1)

@@ -81,7 +81,7 @@ class TD3(OffPolicy):
         seen = batch.get("observation")
         raw = networks.actor.forward(seen)
         action = raw.tanh()
-        (value,) = networks.evaluate(seen, action, count=1)
+        (value,) = networks.evaluate(seen, action, 1)
         networks.actor_step(raw, action)
         return -value.mean()
 
