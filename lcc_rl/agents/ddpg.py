@@ -13,6 +13,7 @@ from torchrl.objectives import DDPGLoss
 from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.fused import ActorCritic
 from lcc_rl.agents.off_policy import OffPolicy
+from lcc_rl.agents.replay import KNOWN
 from lcc_rl.settings import Count
 
 
@@ -27,6 +28,7 @@ class DDPG(OffPolicy):
 
     def setup(self, scene: Scene) -> None:
         super().setup(scene)
+        self.lasting = min(self.target_every.values()) > 1
         loss = DDPGLoss(
             self.actor, self.values[0], loss_function="l2", delay_actor=True, delay_value=True
         )
@@ -55,19 +57,28 @@ class DDPG(OffPolicy):
     @torch.no_grad()
     def _by_hand(self, batch: TensorDictBase, networks: ActorCritic) -> tuple[Tensor, Tensor]:
         """Compute the gradient explicitly (A8–A9, H7–H8); the actor uses the old critic."""
-        space = networks.space(len(batch))
-        seen, after = batch.get("observation"), batch.get("next")
-        reached = after.get("observation")
-        future = networks.future(
-            reached, networks.target_actor.forward(reached).tanh_(), space.data
-        )
-        wanted = networks.wanted(after, future)
+        seen = batch.get("observation")
+        wanted = networks.wanted(batch.get("next"), self._future(batch, networks))
         raw = networks.actor.forward(seen)
         action = raw.tanh()
-        space.data.place(seen, batch.get("action"))
-        space.own.place(seen, action)
-        networks.evaluate(space.both)
-        loss_actor = -space.own.values[0].mean()
-        loss_value = networks.critic_step(space.data, wanted)
-        networks.actor_step(seen, space, raw, action)
+        values = networks.evaluate(seen, batch.get("action"))
+        loss_value = networks.critic_step(values, wanted)
+        loss_actor = -networks.evaluate(seen, action, 1)[0].mean()
+        networks.actor_step(raw, action)
         return loss_actor, loss_value
+
+    def _future(self, batch: TensorDictBase, networks: ActorCritic) -> Tensor:
+        """Return the values of the next states by the target networks, ``[batch, 1]``.
+
+        Values of earlier draws are used if no target network has moved since.
+        """
+        reached, known = batch.get(("next", "observation")), batch.get(KNOWN, None)
+        if known is not None:
+            moves = sum((self.count - 1) // every for every in self.target_every.values())
+            places = (known[:, 1] != moves).nonzero().flatten()
+            reached = reached[places]
+        future = networks.future(reached, networks.target_actor.forward(reached).tanh_())
+        if known is None:
+            return future
+        known[places] = torch.cat([future, torch.full_like(future, moves)], 1)
+        return known[:, :1]

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import islice
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.collectors import BaseCollector
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.collecting import CollectingLoop, of_decisions, transitions
 from lcc_rl.io.tensors import check_like
+from lcc_rl.pieces.base import Key, as_key
+
+KNOWN: Key = ("known",)  # value of the next state, and the number of moves of the target networks
 
 
 class ReplayLoop(CollectingLoop[Any]):
@@ -27,11 +28,8 @@ class ReplayLoop(CollectingLoop[Any]):
     def _prepare(self) -> None:
         super()._prepare()
         self.sampler = torch.Generator()
-        self.buffer = ReplayBuffer(
-            storage=LazyTensorStorage(self.agent.buffer_size, device=self.env.device or "cpu"),
-            batch_size=self.agent.batch_size,
-            generator=self.sampler,
-        )
+        sizes = self.agent.buffer_size, self.agent.batch_size
+        self.buffer = Replay(*sizes, self.sampler, self.env.device or "cpu")
 
     def explore(self, share: float) -> float:
         sigma = self.agent.exploration.sigma(share, self.updates)
@@ -59,15 +57,20 @@ class ReplayLoop(CollectingLoop[Any]):
     def learn(self, batch: TensorDictBase, before: int) -> dict[str, float]:
         """Make the updates that are due after a segment."""
         new, settings = transitions(batch), self.agent
-        self.buffer.extend(of_decisions(new))
+        kept = of_decisions(new)
+        if settings.lasting:
+            kept.set(KNOWN, torch.full((len(kept), 2), -1.0, device=kept.device))
+        self.buffer.extend(kept)
         ratio = settings.updates_per_transition
         ready = len(self.buffer) >= max(settings.batch_size, settings.learning_starts)
         count = int((before + len(new)) * ratio) - int(before * ratio) if ready else 0
         sums = {"loss_actor": torch.zeros(()), "loss_value": torch.zeros(())}
-        for drawn in islice(draws(self.buffer, self.sampler), count):
+        for _ in range(count):
+            drawn = self.buffer.draw()
             if settings.scale_rewards:
                 drawn.set_(("next", "reward"), settings.scaled(drawn.get(("next", "reward"))))
             losses = settings.update(drawn)
+            self.buffer.note()
             sums = {name: total + losses[name] for name, total in sums.items()}
         self.updates += count
         return {name: float(total) / max(count, 1) for name, total in sums.items()}
@@ -80,28 +83,72 @@ class ReplayLoop(CollectingLoop[Any]):
         if self.best is not None:
             check_like(self.best["weights"], self.agent.policy.state_dict(), "best")
         self.buffer.load_state_dict(memory["buffer"])
-        self.buffer.set_rng(self.sampler)  # loading replaces the buffer's generator
 
 
-def draws(buffer: ReplayBuffer, generator: torch.Generator) -> Iterator[TensorDictBase]:
-    """Draw batches of a replay buffer as its ``sample()`` does, all into the same tensors.
+class Replay:
+    """The latest transitions, from which batches are drawn uniformly with replacement.
 
-    A batch is valid until the next one is drawn; the buffer must not grow meanwhile.
+    The draws equal those of TorchRL's ``ReplayBuffer`` with the same generator. All are written
+    into the same tensors.
 
     Args:
-        buffer: a buffer that draws uniformly with replacement.
-        generator: the buffer's generator; the draws equal those of ``sample()``.
-
-    Yields:
-        Transitions, ``[batch_size]``.
+        size: number of transitions that it holds.
+        batch: transitions of a draw.
+        generator: generator of the draws.
+        device: device of the transitions.
     """
-    rows, size = buffer.storage[:], buffer.batch_size
-    batch = rows[:size].clone()
-    columns = [(rows.get(key), batch.get(key)) for key in rows.keys(True, True)]
-    index = torch.empty(size, dtype=torch.long, device=generator.device)
-    while True:
-        torch.randint(len(rows), (size,), generator=generator, out=index)
-        places = index.to(rows.device or "cpu")
-        for source, target in columns:
-            torch.index_select(source, 0, places, out=target)
-        yield batch
+
+    def __init__(self, size: int, batch: int, generator: torch.Generator, device: Any) -> None:
+        self.size, self.generator, self.device = size, generator, device
+        self.count = 0  # transitions that were added, also those replaced since
+        self.index = torch.empty(batch, dtype=torch.long, device=generator.device)
+        self.places = self.index
+        self.drawn = TensorDict(batch_size=[batch])
+        self.columns: dict[Key, tuple[Tensor, Tensor]] = {}  # all rows, and those of a batch
+
+    def __len__(self) -> int:
+        return min(self.count, self.size)
+
+    def extend(self, new: TensorDictBase) -> None:
+        """Add transitions, ``[rows]``; the oldest ones are replaced."""
+        added = {as_key(key): value[-self.size :] for key, value in new.items(True, True)}
+        if not self.columns:
+            self._make({key: x.new_zeros(self.size, *x.shape[1:]) for key, x in added.items()})
+        self.count += len(new)
+        places = torch.arange(max(self.count - self.size, self.count - len(new)), self.count)
+        places = (places % self.size).to(self.device)
+        for key, value in added.items():
+            self.columns[key][0].index_copy_(0, places, value)
+
+    def _make(self, columns: dict[Key, Tensor]) -> None:
+        for key, rows in columns.items():
+            column = rows.to(self.device)
+            drawn = column.new_empty(len(self.index), *column.shape[1:])
+            self.columns[key] = column, drawn
+            self.drawn.set(key, drawn)
+
+    def draw(self) -> TensorDictBase:
+        """Return transitions, ``[batch]``, which is valid until the next draw."""
+        torch.randint(len(self), self.index.shape, generator=self.generator, out=self.index)
+        self.places = self.index.to(self.device)
+        for column, drawn in self.columns.values():
+            torch.index_select(column, 0, self.places, out=drawn)
+        return self.drawn
+
+    def note(self) -> None:
+        """Keep what the last batch contains under :data:`KNOWN`, if there is such an entry."""
+        if KNOWN in self.columns:
+            column, drawn = self.columns[KNOWN]
+            column.index_copy_(0, self.places, drawn)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the rows by their keys, joined by dots, and the number of transitions."""
+        rows = {".".join(key): column for key, (column, _) in self.columns.items()}
+        return {"count": self.count, "rows": rows}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        rows = state["rows"]
+        if not all(len(column) == self.size for column in rows.values()):
+            raise ValueError(f"the buffer does not hold {self.size} transitions")
+        self.count, self.columns = state["count"], {}
+        self._make({tuple(key.split(".")): column for key, column in rows.items()})

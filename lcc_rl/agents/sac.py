@@ -142,24 +142,22 @@ class SAC(OffPolicy):
     @torch.no_grad()
     def _by_hand(self, batch: TensorDictBase, networks: ActorCritic) -> tuple[Tensor, Tensor]:
         """Compute the gradient explicitly; policy and temperature use the old Q networks."""
-        rows = len(batch)
-        space, seen, after = networks.space(rows), batch.get("observation"), batch.get("next")
+        seen, after = batch.get("observation"), batch.get("next")
         reached, alpha = after.get("observation"), self.log_alpha.exp()
-        noise = self._noise(space.slope, 2)
+        whole = torch.full_like(after.get("reward"), -1.0 / len(seen))
+        noise = self._noise(whole, 2)
         then = self._sample(reached, noise[0], networks)
-        future = networks.future(reached, then.action, space.data)
+        future = networks.future(reached, then.action)
         wanted = networks.wanted(after, future.sub_(then.log_prob.mul_(alpha)))
         now = self._sample(seen, noise[1], networks)
-        space.data.place(seen, batch.get("action"))
-        space.own.place(seen, now.action)
-        networks.evaluate(space.both)
-        first, second = space.own.values
+        values = networks.evaluate(seen, batch.get("action"))
+        loss_value = networks.critic_step(values, wanted)
+        first, second = networks.evaluate(seen, now.action)
         loss_actor = (now.log_prob * alpha).sub_(torch.minimum(first, second)).mean()
-        loss_value = networks.critic_step(space.data, wanted)
         # The value of an action is the smaller one of both critics.
-        chosen = space.slope * (first <= second)
-        slope = networks.through_critics(space.own, [chosen, space.slope - chosen], 1)
-        self._learn_policy(seen, now, slope, alpha, networks)
+        chosen = whole * (first <= second)
+        slope = networks.through_critics([chosen, whole - chosen], 1)
+        self._learn_policy(now, slope, alpha, networks)
         entropy = now.log_prob.mean().add_(self.loss.target_entropy)
         self.log_alpha.grad.copy_(entropy.neg_())
         return loss_actor, loss_value
@@ -177,14 +175,14 @@ class SAC(OffPolicy):
         return Sample(mean, bend, push, action, log_prob.sub_(log_slope))
 
     def _learn_policy(
-        self, seen: Tensor, now: Sample, slope: Tensor, alpha: Tensor, networks: ActorCritic
+        self, now: Sample, slope: Tensor, alpha: Tensor, networks: ActorCritic
     ) -> None:
         """Write the gradient of the policy from the derivative by its actions."""
-        rows = len(seen)
+        rows = len(slope)
         slope.mul_(now.action.square().neg_().add_(1.0))
         slope.addcmul_(now.action, alpha, value=2.0 / rows)
         spread = (slope * now.push).sub_(alpha, alpha=1.0 / rows)
         spread.mul_(now.bend.square().neg_().add_(1.0).mul_(3.0))
-        self.spread.backward(seen, spread)
+        self.spread.backward(spread)
         slope.add_(now.mean, alpha=2.0 * self.saturation / rows)
-        networks.actor.backward(seen, slope)
+        networks.actor.backward(slope)

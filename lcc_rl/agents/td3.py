@@ -65,24 +65,24 @@ class TD3(OffPolicy):
     @torch.no_grad()
     def _value(self, batch: TensorDictBase, networks: ActorCritic) -> Tensor:
         """Write the gradient of the Q networks' loss; return the loss."""
-        data, after = networks.space(len(batch)).data, batch.get("next")
+        after = batch.get("next")
         reached = after.get("observation")
         action = networks.target_actor.forward(reached).tanh_()
         (noise,) = self._noise(action, 1)
         noise.mul_(self.policy_noise).clamp_(-self.noise_clip, self.noise_clip)
         action.add_(noise).clamp_(-1.0, 1.0)
-        wanted = networks.wanted(after, networks.future(reached, action, data))
-        networks.evaluate(data.place(batch.get("observation"), batch.get("action")))
-        return networks.critic_step(data, wanted)
+        wanted = networks.wanted(after, networks.future(reached, action))
+        values = networks.evaluate(batch.get("observation"), batch.get("action"))
+        return networks.critic_step(values, wanted)
 
     @torch.no_grad()
     def _actor(self, batch: TensorDictBase, networks: ActorCritic) -> Tensor:
         """Write the gradient of the policy's loss, by the first Q network; return the loss."""
-        space, seen = networks.space(len(batch)), batch.get("observation")
+        seen = batch.get("observation")
         raw = networks.actor.forward(seen)
         action = raw.tanh()
-        (value,) = networks.evaluate(space.own.place(seen, action), 1)
-        networks.actor_step(seen, space, raw, action)
+        (value,) = networks.evaluate(seen, action, 1)
+        networks.actor_step(raw, action)
         return -value.mean()
 
     def state_dict(self) -> dict[str, object]:

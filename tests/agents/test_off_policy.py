@@ -17,9 +17,10 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import SoftUpdate
 
+from lcc_rl.agents import fused
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.off_policy import leaves
-from lcc_rl.agents.replay import draws
+from lcc_rl.agents.replay import KNOWN, Replay
 from lcc_rl.envs import build_env
 
 SMALL = (
@@ -60,15 +61,23 @@ def batch(size: int = 64, seed: int = 0) -> TensorDict:
 
 
 @pytest.mark.usefixtures("double")  # in which kernels of processors agree
-@pytest.mark.parametrize("hidden", [[200, 100, 50], [16]])
+@pytest.mark.parametrize("hidden", [[200, 100, 50], [16], [200, 40, 40]])
 @pytest.mark.parametrize("agent", ["ddpg", "td3", "sac"])
-def test_updates_equal_torchrls_loss_torchs_adam_and_torchrls_soft_update(agent, hidden) -> None:
+def test_updates_equal_torchrls_loss_torchs_adam_and_torchrls_soft_update(
+    agent, hidden, monkeypatch
+) -> None:
+    idle = len(set(hidden)) == 2
+    monkeypatch.setattr(fused, "LEAST_ROWS", 0 if idle else 10**9)
     settings = (*SMALL, "agent.tau=0.05", "agent.critic_lr=0.002", f"agent.hidden={hidden}")
     made, plain = (
-        make_agent(compose("alcc", f"agent={agent}", *settings, f"agent.fused={fused}"))
-        for fused in ("true", "false")
+        make_agent(compose("alcc", f"agent={agent}", *settings, f"agent.fused={by_hand}"))
+        for by_hand in ("true", "false")
     )
     loss = plain.loss
+    for weights in (made.loss, plain.loss) if idle else ():
+        for name, value in weights.state_dict().items():
+            if name.endswith("bias") and value.shape[-1] > 1:
+                value[..., ::2] -= 100.0  # these units are zero in all rows
     values = getattr(loss, f"{'value' if agent == 'ddpg' else 'qvalue'}_network_params")
     own = {
         "actor": torch.optim.Adam(leaves(loss.actor_network_params), lr=1e-3),
@@ -87,9 +96,27 @@ def test_updates_equal_torchrls_loss_torchs_adam_and_torchrls_soft_update(agent,
         found, expected = made.update(data.clone()), plain.update(data.clone())
         for name in expected:
             torch.testing.assert_close(found[name], expected[name], rtol=1e-7, atol=1e-7)
+    assert not idle or all(len(x) < 101 for *_, x in made.written.actor.passed[1:])
     state = plain.loss.state_dict()
     for name, value in made.loss.state_dict().items():
         torch.testing.assert_close(value, state[name], rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.usefixtures("double")
+def test_target_values_that_are_kept_equal_those_computed_anew() -> None:
+    every = "agent.target_every={actor: 2, critic: 3}"
+    made = [make_agent(compose("alcc", "agent=ddpg", *SMALL, "agent.tau=1", every)) for _ in "ab"]
+    rows = batch(40)
+    buffer = Replay(50, 32, torch.Generator().manual_seed(0), "cpu")
+    buffer.extend(rows.clone().set(KNOWN, torch.full((40, 2), -1.0)))
+    for number in range(12):
+        drawn = buffer.draw()
+        data = drawn, drawn.exclude(KNOWN)
+        losses = [agent.update(x) for agent, x in zip(made, data, strict=True)]
+        buffer.note()
+        assert (buffer.columns[KNOWN][0][:, 1] == number // 2 + number // 3).sum() >= 10
+        for name, value in losses[1].items():
+            torch.testing.assert_close(losses[0][name], value, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("filled", [40, 100, 130])
@@ -99,8 +126,11 @@ def test_batches_are_drawn_as_torchrls_buffer_draws_them(filled) -> None:
     buffer.extend(batch(filled))
     generator.manual_seed(3)
     expected = [buffer.sample() for _ in range(3)]
-    generator.manual_seed(3)
-    for one, found in zip(expected, draws(buffer, generator), strict=False):
+    ours = Replay(100, 32, generator.manual_seed(3), "cpu")
+    for part in batch(filled).split(25):
+        ours.extend(part)
+    for one in expected:
+        found = ours.draw()
         for key in found.keys(True, True):
             assert torch.equal(found.get(key), one.get(key)), key
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from benchmarks.collect import OTHER
 from benchmarks.harness import Row, Run, installed, rates
@@ -18,7 +17,7 @@ from lcc_rl.agents import DDPG, SAC, TD3
 from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.collecting import LEARNED_FROM, transitions
 from lcc_rl.agents.off_policy import OffPolicy
-from lcc_rl.agents.replay import draws
+from lcc_rl.agents.replay import Replay
 
 AGENTS: tuple[type[OffPolicy], ...] = (DDPG, TD3, SAC)
 SIZES = ((64, 60), (256, 40), (1024, 20))  # batch, updates of a repeat
@@ -47,11 +46,10 @@ def update(options: Namespace) -> list[Row]:
 
 def own_updates(agent: OffPolicy, played: TensorDictBase, count: int) -> Run:
     """Return so many of the agent's updates with batches from a buffer of its size."""
-    storage = LazyTensorStorage(agent.buffer_size, device=agent.device)
-    buffer = ReplayBuffer(storage=storage, batch_size=agent.batch_size)
+    generator = torch.Generator().manual_seed(0)
+    buffer = Replay(agent.buffer_size, agent.batch_size, generator, agent.device)
     buffer.extend(played)
-    draw = draws(buffer, torch.Generator().manual_seed(0))
-    return lambda: [agent.update(next(draw)) for _ in range(count)]
+    return lambda: [agent.update(buffer.draw()) for _ in range(count)]
 
 
 def their_update(options: Namespace, agent: OffPolicy, played: TensorDictBase) -> Any:
