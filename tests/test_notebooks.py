@@ -9,10 +9,8 @@ import matplotlib as mpl
 import pytest
 
 FOLDER = Path(__file__).parents[1] / "docs" / "notebooks"
-TRY = (
-    *("scenario.horizon=60", "training.episodes=24", "training.environments=8"),
-    *("training.segment=60", "evaluation.profiles=2", "evaluation.drivers=3"),
-)
+SIZE = ["training.episodes=24", "training.environments=8", "training.segment=40"]
+FEW = ["scenario.horizon=240", "evaluation.profiles=2", "evaluation.drivers=3"]
 
 
 @pytest.mark.slow
@@ -30,4 +28,4 @@ def test_a_notebook_runs(path, tmp_path, monkeypatch) -> None:
             text = "".join(cell["source"]).replace("UPDATES = 100, 60", "UPDATES = 20, 5")
             exec(compile(text, str(path), "exec"), space)
             if "SIZE" in space:
-                space["SIZE"] = list(TRY)
+                space |= {"SIZE": SIZE, "FEW": FEW}

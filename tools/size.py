@@ -28,7 +28,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
     "lcc_rl + tools": {"lines": 44_250, "code": 29_260},
-    "tests": {"lines": 26_250},
+    "tests": {"lines": 26_280},
     "conf": {"yaml": 164},
 }
 CASES = 1_290  # ceiling of all quick tests, see tests/tools/test_size.py

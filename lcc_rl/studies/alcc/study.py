@@ -96,8 +96,11 @@ def settings_of_run(study: Study, entry: str, variant: str, change: Change, *own
         users = [x for x in users if x not in moved]
         changed = (*changed, *(x.replace("split.", "split.held_out.", 1) for x in moved))
     drivers = ("drivers=calibrated", f"drivers.path={quoted(study.folder / DRIVERS_FILE)}")
+    # A recipe of RECIPES replaces the study's; Hydra does not merge one file twice as a whole.
+    own_recipe = [] if {*RECIPES} & {*change.recipes} else [study.recipe]
+    recipes = [*filter(None, own_recipe), *change.recipes]
     options = [
-        f"experiment=[{','.join([*filter(None, [study.recipe]), *change.recipes])}]",
+        f"experiment=[{','.join(recipes)}]",
         f"variant={variant}",
         "data=episodes",
         f"data.path={quoted(study.folder / TRAJECTORIES)}",
