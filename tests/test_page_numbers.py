@@ -61,11 +61,11 @@ def findings() -> list[str]:
     energy = driven["energy_1.1s_j"] / driven["distance_1.1s_m"]
     net, columns = "total_net_energy_kj", ["variant", "limit"]
     fleets = pd.read_parquet(REFERENCE / "tasks" / "fleets_fronts.parquet")
-    fleets = fleets[fleets["setting"] == "drives_taught"]
+    fleets = fleets[fleets["setting"] == "drives_metres"]
     fleets = fleets.groupby(columns)[[net, "distance_m", FLOW]].mean().reset_index(level=1)
     fleets["e"] = fleets[net] / fleets["distance_m"]
     rule, (own, humans) = (
-        fleets.loc[["idm_acc"]].sort_values(FLOW),
+        fleets.loc[["idm_fleet"]].sort_values(FLOW),
         (fleets.loc[[x]].mean() for x in ("learned", "human")),
     )
     at_its_flow = np.interp(own[FLOW], rule[FLOW], rule["e"])

@@ -28,12 +28,14 @@ from lcc_rl.results.render import markdown_table
 
 SHARE, LEARNED = "penetration", "learned"
 SHOWN = {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"}
-HUMAN, RULE = "human", "idm_acc"
+HUMAN, RULES = "human", ("idm_fleet", "idm_acc")  # the rule is the first that was evaluated
 SETTINGS = {  # labels of the stored fronts
     "drives": "I-24, whole drives",
     "drives_taught": "I-24, whole drives, trained over 400 s",
+    "drives_metres": "I-24, whole drives, trained with a price per metre",
     "drives_wavy": "I-24, wavy half of the drives",
     "drives_wavy_taught": "I-24, wavy half of the drives, trained over 400 s",
+    "drives_wavy_metres": "I-24, wavy half of the drives, trained with a price per metre",
     "front": "I-24, 100 s",
     "free": "free driving, 100 s",
     "long": "I-24, 400 s",
@@ -58,12 +60,13 @@ def fronts(rows: pd.DataFrame) -> str:
     ]
     lines = []
     for setting, share, part in by_setting(rows):
-        saving, flow = curve(part, RULE)
+        rule = rule_of(part)
+        saving, flow = curve(part, rule)
         own, best = curve(part, LEARNED)[1].iloc[0], saving.index.to_numpy(float)[saving.argmax()]
         gap = np.interp(own, flow.to_numpy()[::-1], flow.index.to_numpy()[::-1])
         cells = [setting, f"{share:.0f} %", percent(against(part, HUMAN, fleet_saved))]
         cells.append(f"{own:,.0f}: {percent(against(part, HUMAN, flow_gained))}")
-        cells.append(f"{percent(against(part, RULE, saved_at_flow))}; T = {gap:.2f} s")
+        cells.append(f"{percent(against(part, rule, saved_at_flow))}; T = {gap:.2f} s")
         cells.append(f"{saving[best]:.1f} %; T = {best:.1f} s, {flow[best]:,.0f}")
         lines.append(cells)
     return markdown_table(head, lines)
@@ -75,6 +78,11 @@ def by_setting(rows: pd.DataFrame) -> Iterator[tuple[str, float, pd.DataFrame]]:
     rows = rows.assign(setting=names)
     for (setting, share), part in rows.groupby(["setting", SHARE], observed=True):
         yield str(setting), 100.0 * float(str(share)), part
+
+
+def rule_of(part: pd.DataFrame) -> str:
+    """Return the name of the rule with which the learned fleet is compared."""
+    return next(name for name in RULES if name in set(part["variant"]))
 
 
 def curve(part: pd.DataFrame, name: str) -> tuple[pd.Series, pd.Series]:
@@ -110,7 +118,7 @@ def drawn_fronts(rows: pd.DataFrame) -> Figure:
         axis, hue = axes[setting.partition(TAUGHT)[0]], hues[round(share)]
         look = {"marker": "D"} if TAUGHT in setting else {"label": f"{share:g} % automated"}
         people = curve(part, HUMAN)[1].iloc[0]
-        (saving, flow), (own, point) = curve(part, RULE), curve(part, LEARNED)
+        (saving, flow), (own, point) = curve(part, rule_of(part)), curve(part, LEARNED)
         axis.plot(100.0 * (flow / people - 1.0), saving, ".-", color=hue)
         x, found = 100.0 * (point / people - 1.0), against(part, HUMAN, fleet_saved)
         axis.vlines(x, 100.0 * found.low, 100.0 * found.high, color=hue, **drawing.INTERVAL)

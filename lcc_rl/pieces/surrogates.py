@@ -133,6 +133,9 @@ class ExcessSpacing(RewardTerm):
     standstill_gap: Positive = 2.0  # of the human driver [m]
     time_gap: NonNegative = 1.05  # of the human driver at equilibrium [s]
     vehicle_length: Positive = 5.0  # [m]
+    # Spacing of which the excess is a share [m]; None: the human driver's at the present speed, by
+    # which a metre costs more in a jam. The flow of a drive counts every metre alike.
+    spacing: Positive | None = None
 
     reads = ("self.gap", "self.speed")
     limit_width: ClassVar = 0.1  # least miss of a limit at which its price changes fastest
@@ -143,7 +146,7 @@ class ExcessSpacing(RewardTerm):
     def missed(self, gap: Tensor, speed: Tensor) -> Tensor:
         """Return the share, ``[*batch, A, 1]``; negative for gaps shorter than a human driver's."""
         desired = self.standstill_gap + self.time_gap * speed
-        return (gap - desired) / (desired + self.vehicle_length)
+        return (gap - desired) / (self.spacing or desired + self.vehicle_length)
 
 
 class PathEnergy(RewardTerm):

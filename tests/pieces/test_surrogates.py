@@ -48,3 +48,6 @@ def test_excess_spacing_is_the_share_of_the_lane_that_a_human_would_not_take() -
     gap, speed = column(22.0, 49.0, 8.5), column(20.0, 20.0, 20.0)  # a human keeps 22 m, takes 27 m
     assert term.missed(gap, speed).squeeze(-1).tolist() == pytest.approx([0.0, 1.0, -0.5])
     assert torch.equal(term.reward(gap, speed), -term.missed(gap, speed))
+    # As shares of one spacing, ten metres cost the same at every speed.
+    term, slow = ExcessSpacing(standstill_gap=2.0, time_gap=1.0, spacing=40.0), column(5.0, 20.0)
+    assert term.missed(slow + 12.0, slow).squeeze(-1).tolist() == [0.25, 0.25]
