@@ -29,7 +29,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 CEILINGS = {
     "lcc_rl + tools": {"lines": 44_250, "code": 29_260},
     "tests": {"lines": 26_280},
-    "conf": {"yaml": 164},
+    "conf": {"yaml": 165},
 }
 CASES = 1_290  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {

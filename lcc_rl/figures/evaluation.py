@@ -235,7 +235,8 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
         rows = rows[rows["training_seed"] == rows["training_seed"].min()]
     # Of several vehicles, the first automated one and the human driver behind it.
     rows = rows.rename(columns=lambda name: re.sub(r"^cav1_", "cav_", name))
-    behind = 1 + int(rows["cav_place"].iloc[0] if "cav_place" in rows else 0)
+    # None of a strategy that collided in the uncounted time.
+    behind = 1 + int(rows["cav_place"].iloc[0] if "cav_place" in rows and len(rows) else 0)
     return rows.rename(columns=lambda name: re.sub(f"^hdv{behind}_", "hdv_", name))
 
 
