@@ -109,7 +109,9 @@ def study_figures(
     episodes = episodes[~episodes["strategy"].str.contains(ON_FRONT)]
     means, names = Means.of(episodes).per_km(), list(dict.fromkeys(episodes["strategy"]))
     many = episodes["driver_id"].nunique() > 2
-    cars = [name for name in names if name != "direct"]
+    # One that collides in all its episodes before the counted time has nothing to show.
+    measured = {*episodes.dropna(subset="total_path_energy_kj")["strategy"]}
+    cars = [name for name in names if name != "direct" and name in measured]
     seeds = episodes.groupby("strategy")["training_seed"].count()
     shown = [name for name in cars if name != RULE and (seeds[name] or name in own)]
     # Human drivers, networks, the user's controllers, others; filtered strategies last.

@@ -286,6 +286,15 @@ def test_networks_and_own_controllers_have_figures_and_those_of_the_package_none
     assert {"episode_mine", "human_energy_mine", "improvement_mine_vs_idm_acc"} <= drawn
 
 
+def test_a_strategy_without_measures_has_no_figure() -> None:
+    frame = episodes()
+    energies = frame.columns[frame.columns.str.endswith("_kj")]
+    frame.loc[frame["strategy"] == "reference", energies] = np.nan  # collisions in the warm-up
+    found = [name for name, _ in run_figures.study_figures(frame, steps()[:0], {})]
+    assert any("alcc" in name for name in found)
+    assert not any("reference" in name for name in found)
+
+
 def test_drivers_that_are_alike_make_a_histogram() -> None:
     alike = episodes()
     column = "hdv_path_energy_kj"
