@@ -131,7 +131,7 @@ def study_figures(
         # After a collision the rest of an episode is not driven, which is no saving.
         whole = not episodes.loc[episodes["strategy"] == name, "collided"].any()
         for baseline in AGAINST if many and whole else ():
-            if baseline in names and baseline != name:
+            if baseline in measured and baseline != name:
                 figure = paired_improvement(means, name, baseline)
                 yield f"improvement {name} vs {baseline}", figure
 
