@@ -2,7 +2,7 @@
 # Hydra 1.3.8: `recipe=[short,long]`, where short.yaml is built on long.yaml (its defaults list), is
 # a mixture of both recipes, not what long.yaml says; no warning.
 # Guess before: the last choice has the last word, so the settings are those of the long recipe.
-# Seen: batch 1024 of long, exploration 0.7 of short, which changed it in a node that only long adds.
+# Seen: batch 1024 of long, exploration 0.7 of short, which changed it in a node of long alone.
 # Hurt: ablations that put one recipe after another.
 set -euo pipefail
 folder=$(mktemp -d)
