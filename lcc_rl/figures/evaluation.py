@@ -110,7 +110,8 @@ def study_figures(
     means, names = Means.of(episodes).per_km(), list(dict.fromkeys(episodes["strategy"]))
     many = episodes["driver_id"].nunique() > 2
     # One that collides in all its episodes before the counted time has nothing to show.
-    measured = {*episodes.dropna(subset="total_path_energy_kj")["strategy"]}
+    known = episodes.filter(regex="^(cav|hdv)_path_energy_kj$").notna().any(axis=1)
+    measured = {*episodes.loc[known, "strategy"]}
     cars = [name for name in names if name != "direct" and name in measured]
     seeds = episodes.groupby("strategy")["training_seed"].count()
     shown = [name for name in cars if name != RULE and (seeds[name] or name in own)]

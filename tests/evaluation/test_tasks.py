@@ -88,7 +88,10 @@ def test_mistakes_are_named_before_the_data_are_read(tmp_path, monkeypatch) -> N
     monkeypatch.setattr(evaluation, "load_inputs", lambda cfg: pytest.fail("data were read"))
     cases = [
         ("task=i80-follow compare=[idm] task.unit=mpg", "unit=mpg"),
-        ("task.unit=kWh/100km compare=[idm]", "task.name is required: choose one, such as task="),
+        (
+            "task.unit=kWh/100km compare=[idm]",
+            "task.name is required: choose a task, such as task=",
+        ),
         ("task=i80-follow compare=[idm] +task.limits.gap=3", "task.limits 'gap'"),
         (
             "task=i80-follow compare=[idm] +task.limits.flow_vph=recorded",
