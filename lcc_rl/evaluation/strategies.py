@@ -199,15 +199,11 @@ def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
         log.info("the policy of variant %s keeps the filter of its training", own.variant)
         changes["scenario"] = {"filters": {AUTOMATED: trained}}
     elif given is not None and trained is not None:
-        other = [
-            key for key in trained.settings if trained.settings[key] != given.settings.get(key)
-        ]
-        text = (
-            "the policy of variant %s drives behind the given filter, not that of its training: %s"
-        )
+        mine = given.settings
+        other = [f"{key}={x}" for key, x in trained.settings.items() if x != mine.get(key)]
+        text = "the policy of variant %s drives behind the given filter, not that of its training"
         if other:
-            words = (f"{key}={trained.settings[key]}" for key in other)
-            log.warning(text, own.variant, ", ".join(words))
+            log.warning(f"{text}: %s", own.variant, ", ".join(other))
     return cfg.with_(**changes)
 
 

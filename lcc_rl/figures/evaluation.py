@@ -122,10 +122,13 @@ def study_figures(
     diagram = space_time(steps, order, cfg) if len(steps) else None
     if diagram is not None:
         yield "space_time", diagram
-    if len(steps) and cars and len(reports) == 1 and "saved_pct" in reports[0].short:
-        yield "overview", overview(episodes, steps, (shown or cars)[-1], reports[0])
+    # Those of the episode that is drawn; one may have collided there before the counted time.
+    sampled = {*most_varied(steps)["strategy"]} if len(steps) else set()
+    seen = [name for name in shown or cars if name in sampled]
+    if seen and len(reports) == 1 and "saved_pct" in reports[0].short:
+        yield "overview", overview(episodes, steps, seen[-1], reports[0])
     for name in shown:
-        if len(steps) and (steps["strategy"] == name).any():
+        if name in sampled:
             yield f"episode {name}", sample_episode(steps, name)
         if "direct" in names:
             yield f"human_energy {name}", human_energy_figure(means, name)
@@ -238,8 +241,7 @@ def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
         rows = rows[rows["training_seed"] == rows["training_seed"].min()]
     # Of several vehicles, the first automated one and the human driver behind it.
     rows = rows.rename(columns=lambda name: re.sub(r"^cav1_", "cav_", name))
-    # None of a strategy that collided in the uncounted time.
-    behind = 1 + int(rows["cav_place"].iloc[0] if "cav_place" in rows and len(rows) else 0)
+    behind = 1 + int(rows["cav_place"].iloc[0] if "cav_place" in rows else 0)
     return rows.rename(columns=lambda name: re.sub(f"^hdv{behind}_", "hdv_", name))
 
 
