@@ -32,6 +32,12 @@ def work_that_all_tests_share() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True)
+def the_same_draws_in_any_order() -> None:
+    """Begin torch's own generator anew: what a test draws does not depend on those before it."""
+    torch.manual_seed(0)
+
+
 @pytest.fixture
 def double() -> Iterator[None]:
     """Compute in double precision, in which ways and kernels differ by less than any fault."""

@@ -26,13 +26,6 @@ from lcc_rl.evaluation.foreign import as_given
 FRAMES, ITERATIONS = 80, 3
 
 
-@pytest.fixture(autouse=True)
-def _seeded():
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        yield
-
-
 def mlp(inputs: int, outputs: int, *more: nn.Module) -> nn.Module:
     return nn.Sequential(nn.Linear(inputs, 32), nn.Tanh(), nn.Linear(32, outputs), *more)
 

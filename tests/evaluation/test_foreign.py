@@ -146,7 +146,6 @@ def test_actions_beyond_their_range_are_named(caplog) -> None:
 
 
 def test_a_recurrent_policy_of_torchrl_drives() -> None:
-    torch.manual_seed(0)
     keys = {"in_keys": ["observation", "rs"], "out_keys": ["seen", ("next", "rs")]}
     policy = TensorDictSequential(
         GRUModule(input_size=WIDTH, hidden_size=4, **keys),
