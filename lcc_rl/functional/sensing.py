@@ -100,7 +100,7 @@ class Agreement:
 
 def brought_up(
     measured: PairState,
-    age: Tensor,
+    ages: Tensor,
     past: Tensor,
     ahead_acceleration: Tensor | float,
     time_step: float,
@@ -109,14 +109,20 @@ def brought_up(
 
     Args:
         measured: the measured state, entries ``[…, 1]``; its acceleration is the present one.
-        age: age of the measurement in steps, ``[…, 1]``.
+        ages: ages of the target's measurement and of the own speed's, not older, in steps,
+            ``[…, 2]``.
         past: own accelerations of the last steps, latest first, ``[…, oldest]`` [m/s²].
         ahead_acceleration: of the vehicle ahead since then [m/s²].
         time_step: T [s].
     """
-    found = measured
-    for number in reversed(range(past.shape[-1])):
-        then = found.after(past[..., number : number + 1], ahead_acceleration, time_step)
+    driven = list(past.split(1, -1)) if past.shape[-1] else []
+    speed, age = measured.speed, ages[..., :1]
+    for number, acceleration in enumerate(driven):  # back to the speed at the target's measurement
+        since = (ages[..., 1:] <= number) & (number < age)
+        speed = torch.where(since, speed - time_step * acceleration, speed)
+    found = replace(measured, speed=speed.clamp(min=0.0))
+    for number, acceleration in reversed([*enumerate(driven)]):
+        then = found.after(acceleration, ahead_acceleration, time_step)
         passed = number < age
         speed, gap, ahead = (
             torch.where(passed, getattr(then, name), getattr(found, name))

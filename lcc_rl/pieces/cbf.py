@@ -23,7 +23,7 @@ from lcc_rl.functional.pattern import MAX_ACCELERATION
 from lcc_rl.functional.sensing import Agreement, brought_up
 from lcc_rl.pieces.actuation import ACTUATION, Actuation
 from lcc_rl.pieces.base import Entry, RoleTransform
-from lcc_rl.pieces.sensors import SENSORS, Sensors, frames_of
+from lcc_rl.pieces.sensors import AGES, SENSORS, Sensors, frames_of
 from lcc_rl.pieces.string import COMMANDED, WANTED
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
@@ -169,7 +169,7 @@ class CBFFilter(RoleTransform):
     ) -> PairState:
         """Return the state when the command begins to act from the measured state."""
         past = frames_of(sensors, "self.acceleration")[..., : self.sensing.oldest]
-        now = brought_up(motion, sensors[..., :1], past, acceleration, self.time_step)
+        now = brought_up(motion, sensors[..., :AGES], past, acceleration, self.time_step)
         return predicted(now, actuation[..., 1:], acceleration, self.response)[-1]
 
     def filtered(

@@ -21,6 +21,7 @@ from lcc_rl.settings import NonNegative, Share
 SENSORS = "sensors"
 # Measured entries, the columns of a frame of the memory.
 TRUE_STATE = ("self.gap", "self.speed", "ahead.speed", "ahead.acceleration", "self.acceleration")
+AGES = 2  # numbers of the memory before its frames: ages of the target and of the own speed
 
 
 class Sensors(RoleTransform):
@@ -32,8 +33,10 @@ class Sensors(RoleTransform):
     vehicles behind and messages are exact. Errors are drawn uniformly within their bounds by the
     episode's seed, for each measurement or every ``error_time`` with linear interpolation.
 
-    The memory holds the age of the measurement in steps, then the entries of :data:`TRUE_STATE` at
-    present and in the steps before. Speeds before the episode are those of its start.
+    A drop-out keeps all of a measurement, a lost target gap, speed and acceleration ahead: the own
+    speed is measured at the wheels. The memory holds the ages of the target's measurement and of
+    the own speed's in steps, then the entries of :data:`TRUE_STATE` at present and in the steps
+    before. Speeds before the episode are those of its start.
     """
 
     gap_error: NonNegative = 0.0  # largest error of the gap [m]
@@ -56,7 +59,7 @@ class Sensors(RoleTransform):
         Entry("role.sensed_ahead_speed", "m/s", "speed of the vehicle ahead as measured"),
         Entry("role.sensed_ahead_acceleration", "m/s²", "acceleration ahead as measured"),
     )
-    kept = Entry("role.sensors", "–", "age of the measurement [steps], and true states to measure")
+    kept = Entry("role.sensors", "–", "ages of target and own speed [steps], and true states to measure")
     index: ClassVar[Tensor]
 
     def validate(self) -> None:
@@ -79,7 +82,7 @@ class Sensors(RoleTransform):
         self.apart = max(1, world.steps(self.error_time, f"scenario.sensors.{role}.error_time"))
         drawn = ["episode.seed", "next.episode.step"]
         reads = [f"{role}.{SENSORS}", *(f"next.{name}" for name in TRUE_STATE), *drawn]
-        width = 1 + len(TRUE_STATE) * (self.sensing.oldest + 1)
+        width = AGES + len(TRUE_STATE) * (self.sensing.oldest + 1)
         self.declare(world, reads, [*self.measured, self.kept.wide(width)])
         # The same entries at reset, which has no previous step.
         self.first = Views(world.string, role, [*TRUE_STATE, "episode.seed", "episode.step"])
@@ -103,28 +106,32 @@ class Sensors(RoleTransform):
 
     def compute(self, memory: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
         *now, seed, step = inputs
-        frames = join([*now, memory[..., 1 : -len(TRUE_STATE)]], -1)
-        dropped = memory[..., :1] - self.sensing.late
-        missing = uniform(seed, step, self.missing + self.index) < self.dropouts
+        frames = join([*now, memory[..., AGES : -len(TRUE_STATE)]], -1)
+        own = lost = uniform(seed, step, self.missing + self.index) < self.dropouts
         if self.lost_from is not None:
-            missing = missing | (
+            lost = lost | (
                 (step > self.first_lost) & (step <= self.first_lost + self.sensing.longest)
             )
-        dropped = torch.where(missing & (dropped < self.sensing.longest), dropped + 1.0, 0.0)
-        return self._measured(frames, self.sensing.late + dropped, seed, step)
+        ages = memory[..., :AGES]
+        kept = join([lost, own], -1) & (ages < self.sensing.oldest)
+        ages = torch.where(kept, ages + 1.0, float(self.sensing.late))
+        return self._measured(frames, ages, seed, step)
 
     def _measured(
-        self, frames: Tensor, age: Tensor, seed: Tensor, step: Tensor
+        self, frames: Tensor, ages: Tensor, seed: Tensor, step: Tensor
     ) -> tuple[Tensor, ...]:
         """Return the measurements from frames, latest first, and the memory."""
-        number = age.long()
-        columns = len(TRUE_STATE) * number + torch.arange(len(TRUE_STATE), device=frames.device)
+        target, own_age = ages.long().split(1, -1)
+        of_column = join([target, own_age, *[target] * (len(TRUE_STATE) - 2)], -1)
+        columns = len(TRUE_STATE) * of_column + torch.arange(len(TRUE_STATE), device=frames.device)
         chosen = reverse(reverse(frames).gather(0, reverse(columns)))
         gap, speed, ahead, acceleration, _ = chosen.split(1, -1)
         bounds = (self.sensing.gap, self.sensing.speed, self.sensing.ahead)
         gap_error, speed_error, ahead_error = (
-            bound * self._error(seed, step - number, stream)
-            for bound, stream in zip(bounds, self.streams, strict=True)
+            bound * self._error(seed, step - age, stream)
+            for bound, age, stream in zip(
+                bounds, (target, own_age, target), self.streams, strict=True
+            )
         )
         own, other = (
             1.0 + self.sensing.scale * (2.0 * uniform(seed, 0, stream + self.index) - 1.0)
@@ -132,7 +139,7 @@ class Sensors(RoleTransform):
         )
         speed = (own * speed + speed_error).clamp(min=0.0)
         ahead = (other * ahead + ahead_error).clamp(min=0.0)
-        memory = join([age, frames], -1)
+        memory = join([ages, frames], -1)
         return gap + gap_error, speed, ahead - speed, ahead, acceleration, memory
 
     def _error(self, seed: Tensor, step: Tensor, stream: int) -> Tensor:
@@ -151,11 +158,11 @@ class Sensors(RoleTransform):
             for number in range(self.sensing.oldest + 1)
         ]
         age = torch.full_like(closing, self.sensing.late)
-        values = self._measured(join(frames, -1), age, seed, step)
+        values = self._measured(join(frames, -1), join([age] * AGES, -1), seed, step)
         for key, value in zip(self.targets, values, strict=True):
             start.set(key, value)
 
 
 def frames_of(memory: Tensor, name: str) -> Tensor:
     """Return one of :data:`TRUE_STATE` in all frames, latest first, ``[*batch, n, frames]``."""
-    return memory[..., 1 + TRUE_STATE.index(name) :: len(TRUE_STATE)]
+    return memory[..., AGES + TRUE_STATE.index(name) :: len(TRUE_STATE)]

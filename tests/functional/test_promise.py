@@ -81,6 +81,9 @@ class Road:
         age, stack = bounds.late + self.dropped, torch.stack(self.frames, -2)
         seen = stack.gather(-2, age.unsqueeze(-1).expand(-1, -1, 5)).squeeze(-2)
         gap, speed, ahead, acceleration, _ = seen.split(1, -1)
+        # Every other car loses its target only, and measures its own speed at the wheels.
+        own = torch.where(torch.arange(count).unsqueeze(-1) % 2 == 0, age, bounds.late)
+        speed = stack[..., 1].gather(-1, own)
         turns = 2.0 * torch.randint(0, 2, (count, 1), generator=self.chance) - 1.0
         drawn = 2.0 * draw(count, self.chance).unsqueeze(-1) - 1.0
         sign = torch.where(self.errs == 0, 1.0, torch.where(self.errs == 1, turns, drawn))
@@ -89,7 +92,7 @@ class Road:
         ahead = ((1.0 + factor) * ahead + sign * bounds.ahead).clamp(min=0.0)
         memories = {
             "automated.actuation": torch.cat([self.obeyed, self.pending], -1),
-            "automated.sensors": torch.cat([age.float(), stack.flatten(-2)], -1),
+            "automated.sensors": torch.cat([age, own, stack.flatten(-2)], -1),
         }
         kept = (memories[name] for name in self.filter.memories)
         return [speed, gap + sign * bounds.gap, ahead, acceleration, self.agreed, *kept]

@@ -142,7 +142,7 @@ def test_held_values_of_a_lost_target_drive_as_an_evaluation_whose_filter_trusts
         held = 50 if 50 < step <= 70 else step
         found = driver.step(
             {
-                "self.speed": own["speed_mps"][held],
+                "self.speed": own["speed_mps"][step],
                 "self.gap": own["gap_m"][held],
                 "ahead.speed": ahead["speed_mps"][held],
                 "ahead.acceleration": ahead["acceleration_mps2"].fillna(0.0)[held],

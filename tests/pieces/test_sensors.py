@@ -31,7 +31,8 @@ def record(*overrides: str) -> dict[tuple[str, ...], torch.Tensor]:
 
 def test_measurements_lie_within_the_bounds_of_the_state_of_their_age() -> None:
     found = record()
-    age = found[ROLE, "sensors"][..., :1].long()
+    age, own_age = found[ROLE, "sensors"][..., :2].long().split(1, -1)
+    assert torch.equal(age, own_age)  # a drop-out keeps all of a measurement
     assert age.unique().tolist() == [2, 3, 4, 5, 6]
     own = [0, 2]  # the automated vehicles' places
     speed, leader = found["vehicles", "speed"], found["leader", "speed"].unsqueeze(-2)
