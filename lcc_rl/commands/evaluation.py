@@ -22,7 +22,6 @@ from lcc_rl.evaluation.episodes import plan_of
 from lcc_rl.evaluation.fit import classes, other_drivers, task_of
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import is_shipped
-from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import FEW, Rows, parquet_metadata
 from lcc_rl.results.names import counted_windows, several
 from lcc_rl.results.platoons import case_report
@@ -149,7 +148,6 @@ def reports(
             for case in dict.fromkeys(group["case"]):
                 yield case_report(group, case, f"{of}{case}")
         return
-    filtered = cfg.scenario.filters.get(AUTOMATED) is not None
     notes = list(filter(None, [other_drivers(cfg), classes(cfg)]))
     of_sweep = rows.attrs.get("remarks", ()) if isinstance(rows, pd.DataFrame) else ()
     for source, group in by_source(windows_for(rows)):
@@ -157,7 +155,6 @@ def reports(
             group,
             task_of(cfg),
             build_energy(cfg),
-            filtered,
             source,
             against=against,
             second=second_energy(cfg),

@@ -40,7 +40,6 @@ from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
 from lcc_rl.figures.main_page import held_to, write_page
 from lcc_rl.figures.training import training_figure
-from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows, parquet_metadata, write_parquet
 from lcc_rl.io.settings import read_text
@@ -166,9 +165,8 @@ def _run(
         save(curve, path, formats=cfg.figure_formats)
     if paged and isinstance(rows, pd.DataFrame):
         size = sample_of(rows)
-        filtered = final.scenario.filters.get(AUTOMATED) is not None
         models = build_energy(final), second_energy(final)
-        one = report(windows_for(rows), None, models[0], filtered, few=True, second=models[1])
+        one = report(windows_for(rows), None, models[0], few=True, second=models[1])
         one = replace(one, remarks=[*filter(None, [held_to(trainings.values())]), *one.remarks])
         write_figures(folder / runs.FINAL, reports=[one])
         page = write_page(folder, [command], one, size)

@@ -59,7 +59,9 @@ class Sensors(RoleTransform):
         Entry("role.sensed_ahead_speed", "m/s", "speed of the vehicle ahead as measured"),
         Entry("role.sensed_ahead_acceleration", "m/s²", "acceleration ahead as measured"),
     )
-    kept = Entry("role.sensors", "–", "ages of target and own speed [steps], and true states to measure")
+    kept = Entry(
+        "role.sensors", "–", "ages of target and own speed [steps], true states to measure"
+    )
     index: ClassVar[Tensor]
 
     def validate(self) -> None:

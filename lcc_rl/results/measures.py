@@ -26,6 +26,7 @@ REACH = ("cav_share_infeasible", "hdv_share_infeasible")
 FLOW = "flow_vph"
 TTC, LONG_GAPS = "share_ttc_unsafe", "share_time_gap_long_moving"
 BARE, TURNED = "share_ttc_unpromised", "share_turned_unsafe"
+FILTER_ACTS = "share_filter_acts"  # NaN without a safety filter
 SPEED_STD, FINAL_SPREAD = "speed_std_mps", "final_speed_spread_mps"
 CALM = 0.5  # spread of speeds below which a wave counts as damped [m/s]
 AGGREGATES = ("mean", "sum", "min", "max")
@@ -226,7 +227,7 @@ MEASURES = [
     _share(BARE, "  of it outside the filter's guarantee", limit="TTC\nbare"),
     _share(TURNED, "steps that turn unsafe", limit="turned\nunsafe"),
     Measure(BROKEN, "  of them covered by the guarantee", unit=SHARE),
-    Measure("share_filter_acts", "time in which the filter acts", unit=SHARE, form="{:.1%}"),
+    Measure(FILTER_ACTS, "time in which the filter acts", unit=SHARE, form="{:.1%}"),
     _share("share_time_gap_long", "time with time gap > 2.5 s", limit="long\ngaps"),
     _share(
         LONG_GAPS,
@@ -242,7 +243,7 @@ MEASURES = [
     _per_100km("brakings_below_3_per_100km", "  < −3 m/s²", of="brakings_below_3"),
     _largest("max_deceleration_mps2", "largest deceleration", unit="m/s²", limit="braking"),
     _largest("max_deceleration_1s_mps2", "  mean of 1 s", unit="m/s²", limit="braking\n1 s"),
-    Measure("rms_jerk_mps3", "RMS jerk", unit="m/s³"),
+    Measure("rms_jerk_mps3", "RMS jerk of an episode, mean", unit="m/s³"),
     _largest("max_jerk_mps3", "  largest jerk", unit="m/s³", limit="jerk"),
     _largest("max_jerk_1s_mps3", "  largest mean of 1 s", unit="m/s³", limit="jerk\n1 s"),
     _least("standstill_gap_m", "smallest gap at standstill", unit="m", limit="gap\nat rest"),

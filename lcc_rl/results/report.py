@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lcc_rl.config.words import RECORDED
+from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.energy import SECOND, Fleet
 from lcc_rl.errors import require, require_known
 from lcc_rl.io.files import Rows
@@ -18,6 +18,7 @@ from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING
 from lcc_rl.results.fronts import at_equal_flow
 from lcc_rl.results.measures import (
     DISTANCE,
+    FILTER_ACTS,
     FLOW,
     MEASURES,
     PATH,
@@ -79,8 +80,8 @@ COLLISIONS, KEEPS = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
 COUNTS = {"windows": "windows", "drives": "drives", "drivers": "drivers", "seeds": "training seeds"}
 ALL = "all measures: table=all or --all."
 CAPTION = f"Path energy per vehicle and km; {{}}{ALL}"
+CALLED = "strategies called filtered"
 SHARES = "shares of the time: TTC < 4 s; time gap > 2.5 s above 1 m/s; "
-BEHIND_FILTER = "networks and strategies called filtered drive behind the safety filter; "
 FULL = (
     "energies: mean per episode; path energy: of the speeds without acceleration, and the loss by "
     "accelerating; saved: of path energy per km, or of a task's score; intervals: over held-out "
@@ -262,7 +263,6 @@ def report(
     windows: pd.DataFrame,
     task: Task | None = None,
     energy: Fleet | None = None,
-    filtered: bool = False,
     of: str = "",
     few: bool = False,
     against: str | None = None,
@@ -275,7 +275,6 @@ def report(
         windows: result of :func:`windows_for` for one source of leaders.
         task: the task, if any.
         energy: the energy models, for units; if all burn one fuel, tables include it in g/km.
-        filtered: whether there is a safety filter, for the caption.
         of: name of the source.
         few: whether the verdict mentions too few windows.
         against: the baseline; by default that of the task, or the first of :data:`AGAINST`.
@@ -300,7 +299,7 @@ def report(
     }
     percent["distance_pct"] = -100.0 * table["distance_lost"]
     every = pd.concat([table, pd.DataFrame(percent)], axis=1)  # in few blocks, for more columns
-    fields = _of_task(every, task) if task else _of_energy(every, energy, filtered, second, unit)
+    fields = _of_task(every, task) if task else _of_energy(every, energy, second, unit)
     short, shown = fields.pop("short")
     rows = _rows(task, table["against"].iloc[0])
     text = "" if task else verdict(windows, table, few)
@@ -346,7 +345,6 @@ def _rows(task: Task | None, against: str | None) -> list[Measure]:
 def _of_energy(
     table: pd.DataFrame,
     energy: Fleet | None,
-    filtered: bool,
     second: Fleet | None,
     unit: str | None,
 ) -> dict[str, Any]:
@@ -363,7 +361,7 @@ def _of_energy(
     short = [one for one in MEASURES if one.short]
     columns = {f"energy_kj_per_km{end}": cars.get(f"{PATH_PER_KM}{end}") for end in ends}
     columns[FLOW_SHARE.key] = flow
-    columns |= {one.shown.key: (one.scale * cars[one.key]).round(2) for one in short}
+    columns |= {one.shown.key: one.scale * cars[one.key] for one in short}
     shown = [Shown("energy_kj_per_km", "energy\n[kJ/km]")] * (unit is None)
     if energy is not None and (unit or burns_one_fuel(energy)):
         unit = unit or "g/km"
@@ -380,11 +378,23 @@ def _of_energy(
     note += SHARES * (not fronts)
     return {
         "short": shortened(cars.assign(**columns), shown),
-        "caption": CAPTION.format(note + BEHIND_FILTER * filtered),
+        "caption": CAPTION.format(note + behind_filter(cars)),
         "against": against,
         "score": "energy_kj_per_km",
         "label": "path energy per km [kJ/km]",
     }
+
+
+def behind_filter(found: pd.DataFrame) -> str:
+    """Return the caption on the strategies behind the safety filter; empty without any."""
+    behind = found[FILTER_ACTS].notna()
+    others, names, words = behind, found["strategy"], list[str]()
+    groups = {"networks": found["seeds"] > 0, CALLED: names.str.endswith(FILTERED)}
+    for group, rows in groups.items():
+        if rows.any() and behind[rows].all():
+            words, others = [*words, group], others & ~rows
+    words += map(in_words, names[others])
+    return f"behind the safety filter: {', '.join(words)}; " if words else ""
 
 
 def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
