@@ -159,6 +159,8 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
             raise ConfigError(
                 f"{item}: {group} takes one choice; for a run of each: -m {key}={value.strip('[]')}"
             )
+        if group == "experiment" and value.startswith("["):
+            check_recipes(item, [name.strip() for name in value.strip("[]").split(",")])
         if key.lstrip("+") in ("variant", "variants"):
             converted.append(f"{key}{equals}{value.lower()}")
         elif key in ("compare", "policy", "resume"):  # folders of a sweep: seed=0_…
@@ -168,6 +170,24 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
             setting = key.partition(".")[0] in _top_level() and not _is_choice(item)
             converted.append(f"++{item}" if equals and setting else item)
     return converted
+
+
+def check_recipes(word: str, names: Sequence[str]) -> None:
+    """Refuse a recipe after one that is built on it, of which Hydra makes a mixture of both."""
+    for place, name in enumerate(names):
+        for other in {*names[place + 1 :]} & _built_on(name):
+            raise ConfigError(
+                f"{word}: {name} is built on {other}, so that both would mix: write "
+                f"experiment={name} or experiment={other}, and single settings of the other"
+            )
+
+
+def _built_on(recipe: str) -> set[str]:
+    """Return the shipped recipes that a shipped recipe is built on."""
+    path = Path(str(files(CONF))) / "experiment" / f"{recipe}.yaml"
+    listed = OmegaConf.load(path).get("defaults", ()) if path.is_file() else ()
+    names = {name for name in listed if isinstance(name, str)}
+    return names.union(*map(_built_on, names))
 
 
 def _is_choice(override: str) -> bool:

@@ -106,7 +106,7 @@ def continuous(
     same = np.append(False, np.diff(samples["episode"]) == 0)
     if not same.any():
         raise DataError(f"{report.source}: no {what} has two samples: {place(samples)(0, what)}")
-    usual, longest = _usual_steps(samples, same, what, report.source)
+    usual, longest = _usual_steps(samples, same, what, report.source, bridge)
     steps = np.diff(samples["time_s"], prepend=0.0)
     hole = same & (steps > longest)
     bridged = hole & bridges(steps, bridge)
@@ -176,21 +176,23 @@ def _first_of_moments(
 
 
 def _usual_steps(
-    samples: pd.DataFrame, same: Mask, what: str, source: str
+    samples: pd.DataFrame, same: Mask, what: str, source: str, bridge: float
 ) -> tuple[Floats, Floats]:
     """Return the usual step of each row's record, and the longest that is no hole [s].
 
-    ``same``: whether the row before is of the same record.
+    ``same``: whether the row before is of the same record. With an infinite ``bridge`` units are
+    fixed.
     """
     steps = samples["time_s"].diff().where(same)
     step = float(steps.median())
     if not SHORTEST_STEP <= step < LONGEST_STEP:
         unit = "ms" if step < 1e3 * LONGEST_STEP else "us" if step < 1e6 * LONGEST_STEP else "ns"
         unit = "s" if step < SHORTEST_STEP else unit
+        fix = f"{_node(what)}.units.time={unit}" if bridge < np.inf else "convert it"
         span = "from {:.15g} to {:.15g}".format(*samples["time_s"].agg(["min", "max"]))
         raise DataError(
             f"{source}: samples of a {what} are {step:g} s apart; expected {SHORTEST_STEP:g} to "
-            f"{LONGEST_STEP:g} s; is the time, {span}, in {unit} ({_node(what)}.units.time={unit})"
+            f"{LONGEST_STEP:g} s; is the time, {span}, in {unit} ({fix})"
             f"{', or are rows missing' * (unit != 's')}?"
         )
     if not ((steps - step).abs() > UNEVEN * step).any():

@@ -129,7 +129,8 @@ def simulate(
     table = isinstance(drivers, (str, PathLike))
     chosen = {"drivers.path"} if table else {"drivers"} if drivers is not None else set()
     fixed = OF_ARGUMENTS | {"reward"} | chosen
-    check_overrides(overrides, fixed, "has no effect in simulate: see the arguments")
+    reason = "has no effect in simulate: see the arguments; files have time_s [s], speed_mps [m/s]"
+    check_overrides(overrides, fixed, reason)
     profiles = _profiles(leader, time_step, seconds)
     name, spec = ("", None) if controller is None else one_of(controller)
     reads = () if spec is None or is_policy(spec) else controller_of(spec).kind.reads

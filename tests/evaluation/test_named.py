@@ -85,8 +85,11 @@ def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None
     both = {"full": full, "full_filtered": full}
     words = [*SMALL, "+filter=cbf"]
     named = {"mine": "constant_filtered"}  # full throttle
-    rows = lcc_rl.compare(both | named, overrides=words, folder=tmp_path / "a").rows
-    found = energies(rows)
+    run = lcc_rl.compare(both | named, overrides=words, folder=tmp_path / "a")
+    assert (
+        "; behind the safety filter: strategies called filtered, mine; " in run.reports()[0].caption
+    )
+    found = energies(rows := run.rows)
     assert found["full"] != found["full_filtered"] == found["mine"]
     acts = rows.groupby("strategy")["share_filter_acts"].mean()  # nobody obeys full throttle
     assert (acts[["full_filtered", "mine"]] > 0.5).all()

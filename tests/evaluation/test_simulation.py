@@ -141,8 +141,18 @@ def test_controllers_with_messages_and_other_scenarios_need_no_reward() -> None:
             pd.testing.assert_frame_equal(found, same)
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_wrong_arguments_are_named(tmp_path) -> None:
+    for name, scale in (("late", 1e4), ("fast_kmh", 1.0)):
+        speed = "speed_kmh" if name == "fast_kmh" else "speed_mps"
+        table = pd.DataFrame({"time_s": scale * np.arange(len(WAVE)), speed: WAVE})
+        table.to_csv(tmp_path / f"{name}.csv", index=False)
     cases = [
+        ({"leader": tmp_path / "late.csv"}, r"10000 s apart; .*, in ms \(convert it\), or"),
+        ({"leader": tmp_path / "fast_kmh.csv"}, "it has time_s, speed_kmh .*convert them to SI"),
+        (
+            {"leader": "udds", "overrides": ["leader.units.speed=km/h"]},
+            r"no effect in simulate: .*; files have time_s \[s\], speed_mps \[m/s\]",
+        ),
         ({"leader": None}, "leader=None needs scenario=ring and sec"),
         ({"leader": None, "seconds": 5.0}, "a ring .*has leader=None, an open road has a leader"),
         ({"leader": WAVE, "overrides": ["scenario=ring"]}, "an open road has a leader"),

@@ -302,4 +302,6 @@ def test_no_table_has_a_negative_zero_or_thousandths_of_a_per_cent() -> None:
     small = pd.DataFrame({"flow_pct": [0.0, 0.033], "flow\n[%]": [0.0, 0.033]})
     assert as_markdown(small).endswith("| 0.03 | 0.03 |")
     assert saved_text(-0.04, -0.06, 0.0) == "0.0 (−0.1 … 0.0)"
+    shares = report(windows_for(episodes().assign(share_ttc_unsafe=1.0 / 3.0))).short
+    assert shares["unsafe_ttc_pct"].iloc[0] == pytest.approx(100.0 / 3.0, rel=1e-12)
     assert as_csv(pd.DataFrame({"x": [-0.0, 1.5]}), "comma").split() == ["x", "0,0", "1,5"]
