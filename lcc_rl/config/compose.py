@@ -185,8 +185,8 @@ def check_recipes(word: str, names: Sequence[str]) -> None:
 def _built_on(recipe: str) -> set[str]:
     """Return the shipped recipes that a shipped recipe is built on."""
     path = Path(str(files(CONF))) / "experiment" / f"{recipe}.yaml"
-    listed = OmegaConf.load(path).get("defaults", ()) if path.is_file() else ()
-    names = {name for name in listed if isinstance(name, str)}
+    content: Any = OmegaConf.load(path) if path.is_file() else {}
+    names = {name for name in content.get("defaults", ()) if isinstance(name, str)}
     return names.union(*map(_built_on, names))
 
 

@@ -80,7 +80,6 @@ COLLISIONS, KEEPS = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
 COUNTS = {"windows": "windows", "drives": "drives", "drivers": "drivers", "seeds": "training seeds"}
 ALL = "all measures: table=all or --all."
 CAPTION = f"Path energy per vehicle and km; {{}}{ALL}"
-CALLED = "strategies called filtered"
 SHARES = "shares of the time: TTC < 4 s; time gap > 2.5 s above 1 m/s; "
 FULL = (
     "energies: mean per episode; path energy: of the speeds without acceleration, and the loss by "
@@ -389,7 +388,10 @@ def behind_filter(found: pd.DataFrame) -> str:
     """Return the caption on the strategies behind the safety filter; empty without any."""
     behind = found[FILTER_ACTS].notna()
     others, names, words = behind, found["strategy"], list[str]()
-    groups = {"networks": found["seeds"] > 0, CALLED: names.str.endswith(FILTERED)}
+    groups = {
+        "networks": found["seeds"] > 0,
+        "strategies called filtered": names.str.endswith(FILTERED),
+    }
     for group, rows in groups.items():
         if rows.any() and behind[rows].all():
             words, others = [*words, group], others & ~rows

@@ -293,7 +293,6 @@ def test_a_strategy_without_measures_has_no_figure() -> None:
     found = [name for name, _ in run_figures.study_figures(frame, steps()[:0], {})]
     assert any("alcc" in name for name in found)
     assert not any("reference" in name for name in found)
-    # One with samples, but none of the episode that is drawn, of the leader that varies most.
     calm = steps().assign(strategy="reference", profile="calm", leader_speed=5.0)
     shown = run_figures.study_figures(episodes(), pd.concat([steps(), calm]), {})
     assert {name for name, _ in shown if name.startswith("episode")} == {"episode alcc"}
