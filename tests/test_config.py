@@ -117,10 +117,7 @@ def test_a_choice_that_is_there_cannot_be_added() -> None:
         (["experiment=limits", "+filter=cbf"], "=cbf: filter is chosen twice"),
         (["agent=td3", "+agent=sac"], "agent is chosen twice: .* without .$"),
         (["+agent=td3", "+agent=sac"], "agent is chosen twice: leave one out"),
-        (
-            ["experiment=[quickstart,smoke,paper_windows]"],
-            "quickstart is built on paper_windows, so",
-        ),
+        (["experiment=[quickstart,smoke,paper_windows]"], "quickstart is built on paper_wind"),
         (["+event=cut_in", "+event=cut_out"], r"list takes several, '\+event=\[cut_in,cut_out\]'"),
     ]
     check_refused(lambda words: load("train", words), cases, ConfigError)

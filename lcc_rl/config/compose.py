@@ -12,6 +12,7 @@ from copy import deepcopy
 from functools import cache, lru_cache
 from importlib.resources import files
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -174,12 +175,11 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
 
 def check_recipes(word: str, names: Sequence[str]) -> None:
     """Refuse a recipe after one that is built on it, of which Hydra makes a mixture of both."""
-    for place, name in enumerate(names):
-        for other in {*names[place + 1 :]} & _built_on(name):
-            raise ConfigError(
-                f"{word}: {name} is built on {other}, so that both would mix: write "
-                f"experiment={name} or experiment={other}, and single settings of the other"
-            )
+    for name, other in combinations(names, 2):
+        message = (
+            f"{word}: {name} is built on {other}: choose one, and single settings of the other"
+        )
+        require(other not in _built_on(name), message)
 
 
 def _built_on(recipe: str) -> set[str]:

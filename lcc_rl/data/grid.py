@@ -180,8 +180,7 @@ def _usual_steps(
 ) -> tuple[Floats, Floats]:
     """Return the usual step of each row's record, and the longest that is no hole [s].
 
-    ``same``: whether the row before is of the same record. With an infinite ``bridge`` units are
-    fixed.
+    ``same``: whether the row before is of the same record; ``bridge``: infinite for fixed units.
     """
     steps = samples["time_s"].diff().where(same)
     step = float(steps.median())

@@ -278,11 +278,7 @@ def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: 
     folded = {name.lower(): name for name in header}
     near = get_close_matches(missing[0].lower(), folded, n=1)
     hint = f" (is it {folded[near[0]]!r}?)" if near else ""
-    fix = (
-        f"; name the columns by {option}={{…}}"
-        if option
-        else "; convert them to SI units and rename them"
-    )
+    fix = f"; name the columns by {option}={{…}}" if option else "; convert them to SI, rename them"
     if relative := next(filter(is_relative, header), None) if "speed" in missing[0] else None:
         hint = f" ({relative!r} is relative: add the follower's speed)"
         if missing[0] == "leader_speed_mps":

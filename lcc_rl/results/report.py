@@ -386,17 +386,13 @@ def _of_energy(
 
 def behind_filter(found: pd.DataFrame) -> str:
     """Return the caption on the strategies behind the safety filter; empty without any."""
-    behind = found[FILTER_ACTS].notna()
-    others, names, words = behind, found["strategy"], list[str]()
-    groups = {
-        "networks": found["seeds"] > 0,
-        "strategies called filtered": names.str.endswith(FILTERED),
-    }
-    for group, rows in groups.items():
+    behind, words = found[FILTER_ACTS].notna(), list[str]()
+    others, called = behind, found["strategy"].str.endswith(FILTERED)
+    for group, rows in (("trained ones", found["seeds"] > 0), ("those called filtered", called)):
         if rows.any() and behind[rows].all():
             words, others = [*words, group], others & ~rows
-    words += map(in_words, names[others])
-    return f"behind the safety filter: {', '.join(words)}; " if words else ""
+    words += map(in_words, found["strategy"][others])
+    return f"strategies behind the safety filter: {', '.join(words)}; " if words else ""
 
 
 def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:

@@ -86,7 +86,7 @@ def test_a_name_that_ends_in_filtered_drives_behind_the_filter(tmp_path) -> None
     words = [*SMALL, "+filter=cbf"]
     named = {"mine": "constant_filtered"}  # full throttle
     run = lcc_rl.compare(both | named, overrides=words, folder=tmp_path / "a")
-    assert "filter: strategies called filtered, mine; all" in run.reports()[0].caption
+    assert "filter: those called filtered, mine; all" in run.reports()[0].caption
     found = energies(rows := run.rows)
     assert found["full"] != found["full_filtered"] == found["mine"]
     acts = rows.groupby("strategy")["share_filter_acts"].mean()  # nobody obeys full throttle
