@@ -294,7 +294,8 @@ def test_a_strategy_without_measures_has_no_figure() -> None:
     assert any("alcc" in name for name in found)
     assert not any("reference" in name for name in found)
     calm = steps().assign(strategy="reference", profile="calm", leader_speed=5.0)
-    shown = run_figures.study_figures(episodes(), pd.concat([steps(), calm]), {})
+    cfg = {"scenario": {**RING, "road": "open", "string": "automated human"}}
+    shown = run_figures.study_figures(episodes(), pd.concat([steps(), calm]), cfg)
     assert {name for name, _ in shown if name.startswith("episode")} == {"episode alcc"}
 
 
