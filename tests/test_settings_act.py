@@ -35,7 +35,7 @@ TRAININGS = {
     "analytic": ("variant=alcc", "agent=analytic", SMOKE, NETWORK, "training.segment=10"),
     "limits": ("variant=alcc", "experiment=[limits,smoke]", NETWORK, "training.segment=20"),
     "ddpg": ("variant=alcc", *OFF_POLICY),
-    "ppo": ("variant=alcc", "agent=ppo", SMOKE, BATCH, NETWORK),
+    "ppo": ("variant=alcc", "agent=ppo", SMOKE, "agent.batch_size=8", NETWORK),
     "rule": ("variant=rule", SMOKE, "training.segment=20"),
 }
 # Settings that are no part of a training: how it is run, evaluated and written.

@@ -92,6 +92,8 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
 def _of_agent(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
     """Yield settings of learning without effect, and why."""
     if cfg.agent is not None:
+        if horizon := cfg.agent.settings.get("horizon"):
+            yield "agent.gamma", f"agent.horizon={horizon:g} sets it; agent.horizon=null does not"
         return
     driver = cfg.scenario.controllers.get(AUTOMATED)
     reason = f"variant {cfg.variant} has no agent"

@@ -86,6 +86,7 @@ IGNORED = {
     "variant=alcc scenario.string=human*3 training.episodes=20": "no vehicle .* is automated",
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",
     "evaluation.baselines=[human]": "a training evaluates its own policy",
+    "variant=alcc agent=ppo agent.gamma=0.9": "agent.horizon=30 sets it",
     "sweep=mine": "names the folder of a sweep, -m",
     "variant=own_energy observation.visible=2": "scales names no vehicle behind",
 }
