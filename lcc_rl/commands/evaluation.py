@@ -22,7 +22,7 @@ from lcc_rl.evaluation.episodes import plan_of
 from lcc_rl.evaluation.fit import classes, other_drivers, task_of
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import is_shipped
-from lcc_rl.io.files import FEW, Rows, parquet_metadata
+from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata
 from lcc_rl.results.names import counted_windows, several
 from lcc_rl.results.platoons import case_report
 from lcc_rl.results.remarks import few_windows, leader_too_fast, remarks
@@ -31,7 +31,7 @@ from lcc_rl.results.report import Report, report, windows_for
 from lcc_rl.results.runs import EPISODES, check_folder, resumed_config, save_config
 from lcc_rl.results.windows import by_source
 from lcc_rl.runs.precision import prepare_torch
-from lcc_rl.runs.states import claim, forget
+from lcc_rl.runs.states import UNDRAWN, claim, forget
 
 log = logging.getLogger("lcc_rl")
 
@@ -85,6 +85,8 @@ def run(
         if replace:  # rows of other settings must not be in a folder with this configuration
             (folder / EPISODES).unlink(missing_ok=True)
         save_config(cfg, folder)
+        if not quiet:
+            (folder / UNDRAWN).touch()
         rows = evaluate_and_write(comparison, inputs, folder, quiet)
         for message in filter(None, (policy.clipped() for policy in given.values())):
             log.warning(message)
@@ -103,6 +105,9 @@ def complete(cfg: EvaluateConfig, folder: Path, typed: Sequence[str] = ()) -> No
     table = folder / EPISODES
     if made_by(table) == identity(cfg):
         log.info("%s: finished before", folder.name)
+        if (folder / UNDRAWN).exists():
+            with claim(folder):
+                draw(as_rows(table), cfg, folder)
         return
     check_folder(cfg, folder, "inputs")  # with other files it is repeated
     run(cfg, folder, quiet=cfg.evaluation.shards > 1, replace=True, typed=typed)
@@ -111,14 +116,15 @@ def complete(cfg: EvaluateConfig, folder: Path, typed: Sequence[str] = ()) -> No
 
 def draw(rows: Rows, cfg: EvaluateConfig, folder: Path) -> None:
     """Draw the figures of an evaluation into its folder, unless it has too many rows."""
-    if not isinstance(rows, pd.DataFrame):
-        log.info("no figures: there are more than %d rows", FEW)
-        return
-    # Here, because a training draws nothing and need not load matplotlib.
-    from lcc_rl.figures.evaluation import write_figures
+    if isinstance(rows, pd.DataFrame):
+        # Here, because a training draws nothing and need not load matplotlib.
+        from lcc_rl.figures.evaluation import write_figures
 
-    names = [name for name in rows["strategy"].unique() if not is_shipped(name)]
-    write_figures(folder, cfg.evaluation.rows, list(reports(rows, cfg)), names)
+        names = [name for name in rows["strategy"].unique() if not is_shipped(name)]
+        write_figures(folder, cfg.evaluation.rows, list(reports(rows, cfg)), names)
+    else:
+        log.info("no figures: there are more than %d rows", FEW)
+    (folder / UNDRAWN).unlink(missing_ok=True)
 
 
 def evaluate_and_write(comparison: Comparison, inputs: Inputs, folder: Path, quiet: bool) -> Rows:

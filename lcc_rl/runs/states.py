@@ -22,6 +22,7 @@ from lcc_rl.io.settings import read_json, read_text
 from lcc_rl.runs.interrupts import was_interrupted
 
 LOCK, ERROR, PROGRESS, HYDRA_FOLDER = ".lock", "error.txt", "progress.json", ".hydra"
+UNDRAWN = "undrawn"  # marks an evaluation whose figures are not drawn yet
 # The last table of a run: of a training or evaluation, of a calibration.
 RESULT_TABLES = ("episodes.parquet", "drivers.parquet")
 PARQUET = b"PAR1"  # last bytes of a parquet file
@@ -147,7 +148,9 @@ def clean(root: Path) -> list[Path]:
     """Remove the folders of failed runs without rows and states; return them."""
     failed = [root / run.name for run in survey(root) if run.state == "failed"]
     empty = [
-        run for run in failed if _holds_only(run, {HYDRA_FOLDER, ERROR, LOCK, CONFIG, PROGRESS})
+        run
+        for run in failed
+        if _holds_only(run, {HYDRA_FOLDER, ERROR, LOCK, CONFIG, PROGRESS, UNDRAWN})
     ]
     for folder in empty:
         shutil.rmtree(folder)

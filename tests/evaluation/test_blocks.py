@@ -21,6 +21,7 @@ from lcc_rl.errors import ResultsError
 from lcc_rl.evaluation.blocks import BLOCKS, Store
 from lcc_rl.evaluation.episodes import Episodes, Plan, evaluate
 from lcc_rl.evaluation.strategies import Strategy
+from lcc_rl.figures import evaluation as figures
 from lcc_rl.io.files import read_parquet, write_parquet
 
 PROFILES = wavy_profiles().windows(100)
@@ -148,6 +149,22 @@ def test_a_damaged_block_and_one_of_other_weights_are_played_again(
     write_parquet(read_parquet(kept[1]).assign(collided=True), kept[1], {"lcc_rl.block": "other"})
     evaluation.run(settings(BLOCK), tmp_path, quiet=True)
     same(tmp_path, whole)
+
+
+def test_figures_that_were_cut_short_are_drawn_by_the_same_command(tmp_path, monkeypatch) -> None:
+    def cut(*args: object, **named: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(figures, "save", cut)
+    with pytest.raises(KeyboardInterrupt):
+        evaluation.complete(settings(), tmp_path)
+    before = (tmp_path / "episodes.parquet").stat().st_mtime_ns
+    monkeypatch.undo()
+    evaluation.complete(settings(), tmp_path)
+    assert (tmp_path / "figures" / "overview.png").is_file()
+    monkeypatch.setattr(figures, "save", cut)
+    evaluation.complete(settings(), tmp_path)  # nothing is drawn twice, and nothing played
+    assert (tmp_path / "episodes.parquet").stat().st_mtime_ns == before
 
 
 # -- shards ---------------------------------------------------------------------------------------
