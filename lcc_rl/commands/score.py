@@ -248,6 +248,7 @@ def _run(
         if not chosen:
             left_out.append(f"{task}: no such source, only {', '.join(sources)}")
         for source in chosen:
+            show_headline(f"{task}, {source}")
             with leaving_out(f"{task}, {source}", left_out):
                 scores.append(play_source(entrant, source, sources[source], folder / task / source))
     why = "; ".join(left_out) or f"no such source, only {', '.join(offered)}"

@@ -54,7 +54,10 @@ def test_an_exported_policy_scores_as_the_policy_itself(tmp_path, capsys) -> Non
     assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
 
 
-def test_a_controller_is_played_where_it_fits_and_the_rest_is_named(tmp_path, capsys) -> None:
+def test_a_controller_is_played_where_it_fits_and_the_rest_is_named(
+    tmp_path, capsys, caplog
+) -> None:
+    caplog.set_level("INFO")
     tasks = ("--task", "i80-follow", "--task", "platoon-highway")
     source = ("--source", "mine", "leader=everyday", "leader.evaluation_share=0.6")
     found = scores(tmp_path / "a", "deadbeat", *tasks, "--on", "everyday", *SMALL, *source)
@@ -63,6 +66,7 @@ def test_a_controller_is_played_where_it_fits_and_the_rest_is_named(tmp_path, ca
     one, other = found["results"]
     assert (one["data"], one["settings"]) != (other["data"], other["settings"])
     assert "left out: i80-follow: " in capsys.readouterr().out
+    assert "platoon-highway, mine" in caplog.messages
 
 
 def test_the_hash_is_of_the_code_of_an_own_controller(tmp_path, monkeypatch) -> None:
