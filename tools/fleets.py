@@ -42,8 +42,11 @@ SETTINGS = {  # labels of the stored fronts
     "long_taught": "I-24, 400 s, trained over 400 s",
     "true": "drivers with reaction, I-24, 100 s",
     "true_taught": "drivers with reaction, I-24, 100 s, trained with them",
+    "metres": "whole drives",
+    "metres_200": "200 s after 100 s",
+    "metres_400": "whole drives after 100 s",
 }
-DRIVES, PANELS = "drives", ("front", "free", "long", "true")
+PANELS = ("front", "free", "long", "true")
 TAUGHT = ", trained "  # part of the label of a setting with fleets trained in it
 RIVALS = ("idm_acc", "idm_acc_filtered", "acc", "follower_stopper", "pi_saturation")
 
@@ -110,7 +113,7 @@ def drawn_fronts(rows: pd.DataFrame) -> Figure:
     """Draw, for each setting, the learned fleets and the rule's fronts, a colour per share."""
     figure = drawing.new_figure(drawing.PAGE_WIDTH, 5.4)
     titles = [SETTINGS[name] for name in PANELS]
-    rows = rows[~rows["setting"].str.startswith(DRIVES)]
+    rows = rows[rows["setting"].str.startswith(PANELS)]
     axes = dict(zip(titles, figure.subplots(2, 2).flat, strict=True))
     shares = 100.0 * np.sort(rows[SHARE].unique())
     hues = dict(zip(shares.round(), drawing.SERIES, strict=False))

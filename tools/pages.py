@@ -113,8 +113,8 @@ def tasks(reference: Path, docs: Path) -> None:
     tables = {path.stem: read_parquet(path) for path in sorted((reference / "tasks").glob("*"))}
     parts = [task_table(name, tables[name]) for name in TASKS_SHOWN]
     rows = tables["fleets_fronts"]
-    drives = rows["setting"].str.startswith(fleets.DRIVES)
-    found = {"drives": fleets.fronts(rows[drives]), "fleets": fleets.fronts(rows[~drives])}
+    kinds = rows["setting"].str.extract("^(drives|metres)", expand=False).fillna("fleets")
+    found = {str(name): fleets.fronts(part) for name, part in rows.groupby(kinds)}
     fill(docs / "fleets.md", found)
     files = sorted((reference / "scores").glob("*.json"))
     documents = {path.name: read_json(path) for path in files}
