@@ -160,6 +160,7 @@ def learners(reference: Path, docs: Path) -> None:
     how |= {name: (name, "mean") for name in rows.columns[4:]}
     table = rows.groupby(["task", "strategy"], sort=False).agg(**how).reset_index()
     table.loc[table["score_low"] == table["score_high"], ["score_low", "score_high"]] = np.nan
+    table.attrs["decimals"] = 2
     chosen = table["task"].str.contains("training")  # where settings were chosen
     for page, own in (("learners.md", table[~chosen]), ("notes/agents.md", table[chosen])):
         fill(docs / page, {"learners": as_markdown(own.dropna(axis=1, how="all"))})
