@@ -20,11 +20,12 @@ import pyarrow as pa
 from pandas.api.types import is_numeric_dtype
 from pyarrow.dataset import Dataset
 
+from lcc_rl.config import NOT_IDENTITY
 from lcc_rl.errors import ResultsError, require_known, unknown_name
 from lcc_rl.io.atomic import SUBFOLDERS
 from lcc_rl.io.files import Rows, as_dataset, read_table, schema_of, texts_of, unified
 from lcc_rl.results.runs import CONFIG, FINAL, PARTS, flat_settings
-from lcc_rl.runs.plans import unfinished
+from lcc_rl.runs.plans import choices_of, unfinished
 
 log = logging.getLogger("lcc_rl")
 
@@ -117,7 +118,8 @@ def load(
         table: ``"episodes"``, ``"training"``, ``"timing"``, ``"steps"`` or ``"drivers"``.
         settings: settings that become columns, by dotted keys (``"seed"``, ``"agent.gamma"``) or
             patterns (``"reward.*"``, ``"*"``); by default ``"variant"``, ``"seed"`` and those in
-            which the runs differ.
+            which the runs differ. Settings that become others (``"reward.without"``) are text, as
+            in the command of the run.
         strict: raise for a damaged or unfinished run or a missing shard.
         lazy: return a pyarrow dataset, which reads rows on demand, for tables that do not fit into
             memory.
@@ -137,7 +139,7 @@ def load(
     if strict and states:
         raise ResultsError(f"{root}: not finished: {listed(states)}")
     runs, schema = _surveyed(root, table, damaged, states)
-    constants = _chosen(runs, settings, schema.names)
+    constants = _chosen(_with_typed(runs), settings, schema.names)
     tables = {}
     if not lazy:
         for path in runs:
@@ -196,6 +198,15 @@ def _surveyed(
     if not paths:
         raise _nothing(root, table, {**states, **damaged})
     return {path: runs[path] for path in sorted(paths)}, columns
+
+
+def _with_typed(runs: Runs) -> Runs:
+    """Add the words of each run's command that became other settings."""
+    words = ((path, stored, choices_of(path.parent)) for path, stored in runs.items())
+    return {
+        path: stored | {k: typed[k] for k in typed if k not in (*stored, *NOT_IDENTITY)}
+        for path, stored, typed in words
+    }
 
 
 def _chosen(runs: Runs, names: Sequence[str] | None, columns: Sequence[str]) -> Runs:

@@ -104,6 +104,7 @@ class Report:
         label: its name with unit.
         verdict: sentences on the result; may be empty.
         remarks: sentences on limitations of the numbers.
+        size: numbers of windows, drivers and steps in words; empty for a case.
     """
 
     of: str
@@ -118,6 +119,7 @@ class Report:
     label: str = SCORE
     verdict: str = ""
     remarks: Sequence[str] = ()
+    size: str = ""
 
     @property
     def note(self) -> str:
@@ -136,7 +138,9 @@ def together(reports: Sequence[Report]) -> Report:
     )
     shown = (Shown("of", "of"), *first.shown)
     caption = first.note if {one.note for one in rest} == {first.note} else ""
-    return replace(first, table=table, short=short, shown=shown, caption=caption, remarks=())
+    size = "; ".join(f"{one.of}: {one.size}" for one in reports if one.size)
+    changes = {"table": table, "short": short, "shown": shown, "caption": caption, "size": size}
+    return replace(first, remarks=(), **changes)
 
 
 def windows_for(rows: Rows) -> pd.DataFrame:

@@ -71,13 +71,20 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
 def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str, str]]:
     """Return for each run the words by which it differs, ``efficiency.weight=0.5``, by key.
 
-    They are on what the commands varied; or on stored settings, if no command started the runs or
-    that does not tell them apart.
+    They are on what the commands varied and what only some of them set; or on stored settings, if
+    a run has no command or that does not tell them apart.
     """
     typed = [_own(choices_of(folder)) for folder in folders]
     kinds = {(str(one), str(other)) for one, other in zip(typed, stored, strict=True)}
     exact = len(kinds) == len(set(map(str, typed))) == len(set(map(str, stored)))
-    return differences(typed if exact and len(set(map(tuple, typed))) == 1 else stored)
+    if not exact or not all(typed):
+        return differences(stored)
+    kept = sorted(set().union(*typed).difference(set(typed[0]).intersection(*typed)))
+    named = [
+        {**{key: whole[key] for key in kept if key in whole}, **one}
+        for whole, one in zip(stored, typed, strict=True)
+    ]
+    return differences(named, kept)
 
 
 def _own(settings: Choices) -> Choices:
