@@ -149,7 +149,7 @@ def after_uncounted(cfg: StudyConfig) -> tuple[StudyConfig, int, int]:
 
 
 def warm_up_steps(scenario: ScenarioConfig, seconds: float, name: str) -> int:
-    """Return the steps of a warm-up, which must end before the episode."""
+    """Return the steps of a warm-up; one as long as the episode is refused."""
     steps = World(time_step=scenario.time_step).steps(seconds, name)
     require(
         steps < scenario.horizon,

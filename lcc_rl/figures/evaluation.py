@@ -209,9 +209,9 @@ def measures_of(report: Report, seeds: Sequence[Report] = ()) -> Figure:
     shown = [one for one in report.shown if is_numeric_dtype(table[one.key])]
     shown = [one for one in shown if one.key not in COUNTS]
     shown = [one for one in shown if table[one.key].any()] or shown
-    size = LINES.format(report.size) if report.size else ""
-    lines = filter(None, [size, report.caption.removesuffix(ALL), *report.remarks])
-    note = "\n".join(fill(line, 120) for line in lines)
+    size = LINES.format(report.size) * bool(report.size)
+    lines = [size, report.caption.removesuffix(ALL), *report.remarks]
+    note = "\n".join(fill(line, 120) for line in lines if line)
     height = 0.17 * len("\n".join(labels).splitlines()) + 0.12 * len(note.splitlines())
     figure = new_figure(PAGE_WIDTH, 1.0 + height)
     figure.supxlabel(note, x=0.01, ha="left", fontsize=6)

@@ -20,7 +20,6 @@ import pyarrow as pa
 from pandas.api.types import is_numeric_dtype
 from pyarrow.dataset import Dataset
 
-from lcc_rl.config import NOT_IDENTITY
 from lcc_rl.errors import ResultsError, require_known, unknown_name
 from lcc_rl.io.atomic import SUBFOLDERS
 from lcc_rl.io.files import Rows, as_dataset, read_table, schema_of, texts_of, unified
@@ -118,8 +117,7 @@ def load(
         table: ``"episodes"``, ``"training"``, ``"timing"``, ``"steps"`` or ``"drivers"``.
         settings: settings that become columns, by dotted keys (``"seed"``, ``"agent.gamma"``) or
             patterns (``"reward.*"``, ``"*"``); by default ``"variant"``, ``"seed"`` and those in
-            which the runs differ. Settings that become others (``"reward.without"``) are text, as
-            in the command of the run.
+            which the runs differ, also as typed in their commands (``"reward.without"``).
         strict: raise for a damaged or unfinished run or a missing shard.
         lazy: return a pyarrow dataset, which reads rows on demand, for tables that do not fit into
             memory.
@@ -139,7 +137,7 @@ def load(
     if strict and states:
         raise ResultsError(f"{root}: not finished: {listed(states)}")
     runs, schema = _surveyed(root, table, damaged, states)
-    constants = _chosen(_with_typed(runs), settings, schema.names)
+    constants = _chosen(runs, settings, schema.names)
     tables = {}
     if not lazy:
         for path in runs:
@@ -200,17 +198,9 @@ def _surveyed(
     return {path: runs[path] for path in sorted(paths)}, columns
 
 
-def _with_typed(runs: Runs) -> Runs:
-    """Add the words of each run's command that became other settings."""
-    words = ((path, stored, choices_of(path.parent)) for path, stored in runs.items())
-    return {
-        path: stored | {k: typed[k] for k in typed if k not in (*stored, *NOT_IDENTITY)}
-        for path, stored, typed in words
-    }
-
-
 def _chosen(runs: Runs, names: Sequence[str] | None, columns: Sequence[str]) -> Runs:
-    """Return the settings that become columns."""
+    """Return the settings that become columns, also those that became others, as typed."""
+    runs = {path: x | {**choices_of(path.parent), **x} for path, x in runs.items()}
     every = dict.fromkeys(key for settings in runs.values() for key in settings)
     for name in names or ():
         if not any(fnmatchcase(key, name) for key in every):

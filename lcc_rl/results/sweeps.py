@@ -72,19 +72,17 @@ def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str,
     """Return for each run the words by which it differs, ``efficiency.weight=0.5``, by key.
 
     They are on what the commands varied and what only some of them set; or on stored settings, if
-    a run has no command or that does not tell them apart.
+    a run has no command or that does not tell them apart. Runs of equal settings share their words.
     """
     typed = [_own(choices_of(folder)) for folder in folders]
     kinds = {(str(one), str(other)) for one, other in zip(typed, stored, strict=True)}
-    exact = len(kinds) == len(set(map(str, typed))) == len(set(map(str, stored)))
-    if not exact or not all(typed):
+    if len(kinds) > len(set(map(str, typed))) or not all(typed):
         return differences(stored)
-    kept = sorted(set().union(*typed).difference(set(typed[0]).intersection(*typed)))
-    named = [
-        {**{key: whole[key] for key in kept if key in whole}, **one}
-        for whole, one in zip(stored, typed, strict=True)
-    ]
-    return differences(named, kept)
+    first = {str(own): words for own, words in reversed([*zip(stored, typed, strict=True)])}
+    each = first.values()
+    kept = [key for one in each for key in one if not all(key in other for other in each)]
+    whole = [{k: x for k, x in own.items() if k in kept} | first[str(own)] for own in stored]
+    return differences(whole, kept)
 
 
 def _own(settings: Choices) -> Choices:
