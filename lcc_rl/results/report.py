@@ -138,9 +138,8 @@ def together(reports: Sequence[Report]) -> Report:
     )
     shown = (Shown("of", "of"), *first.shown)
     caption = first.note if {one.note for one in rest} == {first.note} else ""
-    size = "; ".join(f"{one.of}: {one.size}" for one in reports if one.size)
-    changes = {"table": table, "short": short, "shown": shown, "caption": caption, "size": size}
-    return replace(first, remarks=(), **changes)
+    first = replace(first, size="; ".join(f"{x.of}: {x.size}" for x in reports if x.size))
+    return replace(first, table=table, short=short, shown=shown, caption=caption, remarks=())
 
 
 def windows_for(rows: Rows) -> pd.DataFrame:

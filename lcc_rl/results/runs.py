@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
@@ -171,9 +171,7 @@ def flatten(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield name, str(value) if isinstance(value, list) else value
 
 
-def differences(
-    settings: Sequence[Mapping[str, Any]], kept: Collection[str] = ()
-) -> list[dict[str, str]]:
+def differences(settings: Sequence[Mapping[str, Any]], *kept: str) -> list[dict[str, str]]:
     """Return for each flat mapping the values by which it differs, ``key=value``, by key.
 
     As few keys as possible are used besides the kept ones, each with its last words:

@@ -81,8 +81,8 @@ def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str,
     first = {str(own): words for own, words in reversed([*zip(stored, typed, strict=True)])}
     each = first.values()
     kept = [key for one in each for key in one if not all(key in other for other in each)]
-    whole = [{k: x for k, x in own.items() if k in kept} | first[str(own)] for own in stored]
-    return differences(whole, kept)
+    whole = [{**{k: own[k] for k in kept if k in own}, **first[str(own)]} for own in stored]
+    return differences(whole, *kept)
 
 
 def _own(settings: Choices) -> Choices:
