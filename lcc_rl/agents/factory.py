@@ -17,7 +17,7 @@ from lcc_rl.config import identity
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
-from lcc_rl.envs.factory import after_humans, world_of
+from lcc_rl.envs.factory import after_humans, warm_up_steps, world_of
 from lcc_rl.errors import ConfigError, raised_as, require
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import Observation
@@ -88,10 +88,11 @@ def check_lengths(cfg: StudyConfig) -> None:
         ConfigError: naming two that are not.
     """
     settings, horizon = cfg.training, cfg.scenario.horizon
+    warm_up_steps(cfg.scenario, cfg.evaluation.warm_up, "evaluation.warm_up")
     warm_up = cfg.agent.settings.get("warm_up") or 0.0
-    counted = horizon - round(warm_up / cfg.scenario.time_step)
+    counted = horizon - warm_up_steps(cfg.scenario, warm_up, "agent.warm_up")
     require(
-        counted > 0 and counted % settings.segment == 0,
+        counted % settings.segment == 0,
         f"training.segment ({settings.segment}) must divide scenario.horizon ({horizon})"
         + f" without the steps of agent.warm_up ({counted})" * (counted < horizon),
     )

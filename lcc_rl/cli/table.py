@@ -83,8 +83,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if options.all:
             table = chosen(worded(report.table), names)
         else:
-            note = "" if csv else report.note
+            note = report.note
             table = chosen(report.short, names) if csv else for_print(report, names)
+        note = "" if csv else ". ".join(filter(None, [report.size, note]))
     print(TABLE_FORMATS[options.format](table, *[options.decimal] * csv))
     if note:
         lines = fill(note, 98, initial_indent="% ", subsequent_indent="% ")

@@ -166,25 +166,30 @@ def reports(
             second=second_energy(cfg),
             unit=unit,
         )
-        yield dataclasses.replace(result, remarks=[*result.remarks, *notes, *of_sweep])
+        windows, drivers = group["profile_id"].nunique(), int(group["drivers"].max())
+        size = size_of(cfg, counted_windows(windows), drivers)
+        yield dataclasses.replace(result, remarks=[*result.remarks, *notes, *of_sweep], size=size)
+
+
+def size_of(cfg: StudyConfig, windows: str, drivers: int) -> str:
+    """Return the numbers of windows, drivers, repeats and counted steps in words."""
+    settings, size = cfg.evaluation, f"{windows} × {several(drivers, 'driver')}"
+    size += f" × {settings.repeats} repeats" if settings.repeats > 1 else ""
+    size += f", shard {settings.shard} of {settings.shards}" if settings.shards > 1 else ""
+    size += f", {cfg.scenario.horizon} steps"
+    return size + (f", after {settings.warm_up:g} s" if settings.warm_up else "")
 
 
 def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
     """Print the tables of an evaluation, short or, with ``table=all``, full."""
     plan = plan_of(cfg, inputs)
-    drivers = several(len(plan.chosen), "driver")
-    drivers += f" × {plan.repeats} repeats" if plan.repeats > 1 else ""
-    drivers += f", shard {plan.shard} of {plan.shards}" if plan.shards > 1 else ""
     counts = Counter(inputs.evaluation.sources or [""] * plan.profiles)
     for result in reports(rows, cfg):
         title = result.of
         if result.of in counts:
             of = [x for x in (cfg.task and str(cfg.task["name"]), result.of) if x]
             windows = counted_windows(counts[result.of], "held-out " * bool(len(inputs.training)))
-            warm_up = cfg.evaluation.warm_up
-            size = f"{windows} × {drivers}, {cfg.scenario.horizon} steps"
-            size += f", after {warm_up:g} s" if warm_up else ""
-            title = ": ".join([*of, size])
+            title = ": ".join([*of, size_of(cfg, windows, len(plan.chosen))])
         print_table(terminal(result, title, cfg.table == "all"))
     seconds = cfg.scenario.horizon * cfg.scenario.time_step
     if warning := few_windows(plan.profiles, seconds):

@@ -143,14 +143,20 @@ def after_uncounted(cfg: StudyConfig) -> tuple[StudyConfig, int, int]:
         ConfigError: if a duration is no multiple of the time step, or the warm-up is too long.
     """
     settings, scenario = cfg.evaluation, cfg.scenario
-    warm = World(time_step=scenario.time_step).steps(settings.warm_up, "evaluation.warm_up")
-    require(
-        warm < scenario.horizon,
-        f"evaluation.warm_up must be below the {scenario.horizon * scenario.time_step:g} s of an "
-        f"episode (scenario.horizon), got {settings.warm_up:g} s",
-    )
+    warm = warm_up_steps(scenario, settings.warm_up, "evaluation.warm_up")
     driven = after_humans(cfg, settings.humans_first)
     return driven, driven.scenario.horizon - scenario.horizon, warm
+
+
+def warm_up_steps(scenario: ScenarioConfig, seconds: float, name: str) -> int:
+    """Return the steps of a warm-up; one as long as the episode is refused."""
+    steps = World(time_step=scenario.time_step).steps(seconds, name)
+    require(
+        steps < scenario.horizon,
+        f"{name} must be below the {scenario.horizon * scenario.time_step:g} s of an episode "
+        f"(scenario.horizon), got {seconds:g} s",
+    )
+    return steps
 
 
 def _by_role(scenario: ScenarioConfig, group: str) -> list[tuple[str, Node]]:

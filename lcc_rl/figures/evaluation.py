@@ -39,10 +39,11 @@ from lcc_rl.results.measures import between, signed
 from lcc_rl.results.motion import most_varied
 from lcc_rl.results.names import ON_FRONT, RULE, in_words, several
 from lcc_rl.results.render import column_cells
-from lcc_rl.results.report import AGAINST, COUNTS, Report
+from lcc_rl.results.report import AGAINST, ALL, COUNTS, Report
 from lcc_rl.results.runs import CONFIG, read_settings
 from lcc_rl.results.windows import Means, by_driver
 
+LINES = "{}; lines: 95 % intervals"  # of a figure, after its numbers of windows and drivers
 VEHICLE_STYLES = {
     "leader": ("leader", INK),
     "cav": ("controlled car", "#0072b2"),
@@ -187,7 +188,7 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, report:
     sizes = (episodes[name].nunique() for name in ("profile_id", "driver_id"))
     right.set(xlabel=f"{what} saved\nagainst {in_words(against)} [%]")
     size = " × ".join(map(several, sizes, ("window", "driver")))
-    right.set_title(f"{size}; lines: 95 % intervals", pad=16)
+    right.set_title(LINES.format(size), pad=16)
     return figure
 
 
@@ -208,7 +209,9 @@ def measures_of(report: Report, seeds: Sequence[Report] = ()) -> Figure:
     shown = [one for one in report.shown if is_numeric_dtype(table[one.key])]
     shown = [one for one in shown if one.key not in COUNTS]
     shown = [one for one in shown if table[one.key].any()] or shown
-    note = "\n".join(fill(line, 120) for line in report.remarks)
+    size = LINES.format(report.size) * bool(report.size)
+    lines = [size, report.caption.removesuffix(ALL).rstrip("; "), *report.remarks]
+    note = "\n".join(fill(line, 120) for line in lines if line)
     height = 0.17 * len("\n".join(labels).splitlines()) + 0.12 * len(note.splitlines())
     figure = new_figure(PAGE_WIDTH, 1.0 + height)
     figure.supxlabel(note, x=0.01, ha="left", fontsize=6)

@@ -24,7 +24,7 @@ from lcc_rl.errors import ResultsError, require_known, unknown_name
 from lcc_rl.io.atomic import SUBFOLDERS
 from lcc_rl.io.files import Rows, as_dataset, read_table, schema_of, texts_of, unified
 from lcc_rl.results.runs import CONFIG, FINAL, PARTS, flat_settings
-from lcc_rl.runs.plans import unfinished
+from lcc_rl.runs.plans import choices_of, unfinished
 
 log = logging.getLogger("lcc_rl")
 
@@ -117,7 +117,7 @@ def load(
         table: ``"episodes"``, ``"training"``, ``"timing"``, ``"steps"`` or ``"drivers"``.
         settings: settings that become columns, by dotted keys (``"seed"``, ``"agent.gamma"``) or
             patterns (``"reward.*"``, ``"*"``); by default ``"variant"``, ``"seed"`` and those in
-            which the runs differ.
+            which the runs differ, also as typed in their commands (``"reward.without"``).
         strict: raise for a damaged or unfinished run or a missing shard.
         lazy: return a pyarrow dataset, which reads rows on demand, for tables that do not fit into
             memory.
@@ -199,7 +199,8 @@ def _surveyed(
 
 
 def _chosen(runs: Runs, names: Sequence[str] | None, columns: Sequence[str]) -> Runs:
-    """Return the settings that become columns."""
+    """Return the settings that become columns, also those that became others, as typed."""
+    runs = {path: x | {**choices_of(path.parent), **x} for path, x in runs.items()}
     every = dict.fromkeys(key for settings in runs.values() for key in settings)
     for name in names or ():
         if not any(fnmatchcase(key, name) for key in every):

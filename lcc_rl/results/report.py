@@ -104,6 +104,7 @@ class Report:
         label: its name with unit.
         verdict: sentences on the result; may be empty.
         remarks: sentences on limitations of the numbers.
+        size: numbers of windows, drivers and steps in words; empty for a case.
     """
 
     of: str
@@ -118,6 +119,7 @@ class Report:
     label: str = SCORE
     verdict: str = ""
     remarks: Sequence[str] = ()
+    size: str = ""
 
     @property
     def note(self) -> str:
@@ -136,6 +138,7 @@ def together(reports: Sequence[Report]) -> Report:
     )
     shown = (Shown("of", "of"), *first.shown)
     caption = first.note if {one.note for one in rest} == {first.note} else ""
+    first = replace(first, size="; ".join(f"{x.of}: {x.size}" for x in reports if x.size))
     return replace(first, table=table, short=short, shown=shown, caption=caption, remarks=())
 
 

@@ -171,11 +171,11 @@ def flatten(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield name, str(value) if isinstance(value, list) else value
 
 
-def differences(settings: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+def differences(settings: Sequence[Mapping[str, Any]], *kept: str) -> list[dict[str, str]]:
     """Return for each flat mapping the values by which it differs, ``key=value``, by key.
 
-    As few keys as possible are used, each with its last words: ``safety.weight=0.5``. Hashes of
-    files are used only if no setting differs.
+    As few keys as possible are used besides the kept ones, each with its last words:
+    ``safety.weight=0.5``. Hashes of files are used only if no setting differs.
     """
     every = list(dict.fromkeys(key for one in settings for key in one))
 
@@ -185,7 +185,7 @@ def differences(settings: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     chosen = [key for key in every if kinds([key]) > 1]
     for key in sorted(chosen, key=lambda key: (not key.startswith("inputs."), kinds([key]))):
         rest = [x for x in chosen if x != key]
-        chosen = rest if kinds(rest) == kinds(chosen) else chosen
+        chosen = rest if key not in kept and kinds(rest) == kinds(chosen) else chosen
     names = {key: _last_words(key, chosen) for key in chosen}
     return [{k: f"{names[k]}={one[k]}" for k in chosen if k in one} for one in settings]
 

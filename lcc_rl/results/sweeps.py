@@ -71,13 +71,18 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
 def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str, str]]:
     """Return for each run the words by which it differs, ``efficiency.weight=0.5``, by key.
 
-    They are on what the commands varied; or on stored settings, if no command started the runs or
-    that does not tell them apart.
+    They are on what the commands varied and what only some of them set; or on stored settings, if
+    a run has no command or that does not tell them apart. Runs of equal settings share their words.
     """
     typed = [_own(choices_of(folder)) for folder in folders]
     kinds = {(str(one), str(other)) for one, other in zip(typed, stored, strict=True)}
-    exact = len(kinds) == len(set(map(str, typed))) == len(set(map(str, stored)))
-    return differences(typed if exact and len(set(map(tuple, typed))) == 1 else stored)
+    if len(kinds) > len(set(map(str, typed))) or not all(typed):
+        return differences(stored)
+    first = {str(own): words for own, words in reversed([*zip(stored, typed, strict=True)])}
+    each = first.values()
+    kept = [key for one in each for key in one if not all(key in other for other in each)]
+    whole = [{**{k: own[k] for k in kept if k in own}, **first[str(own)]} for own in stored]
+    return differences(whole, *kept)
 
 
 def _own(settings: Choices) -> Choices:

@@ -155,6 +155,7 @@ def test_what_does_not_fit_is_refused() -> None:
         ("agent.policy=residual_none", "agent.policy"),
         ("agent.hold=0.15", "agent.hold"),
         ("agent.hold=0.3", r"agent.hold \(3 steps\) must divide training.segment \(20\)"),
+        ("evaluation.warm_up=60", "evaluation.warm_up must be below the 2 s of an episode"),
         ("agent.limits.jerk=0.1", "agent.limits.jerk=0.1 has no effect: the reward has no term"),
     )
     check_refused(built, cases)

@@ -124,7 +124,12 @@ def test_the_runs_of_a_sweep_are_read_as_one_evaluation(tmp_path) -> None:
 
 
 def test_an_unknown_setting_is_refused_with_the_nearest(tmp_path) -> None:
-    made(tmp_path / "a")
+    hydra = made(tmp_path / "a") / ".hydra"
+    hydra.mkdir()
+    (hydra / "overrides.yaml").write_text("- ++reward.without=safety\n- ++seed=9")
+    frame = results.load(tmp_path, settings=["seed", "reward.*"])  # stored and only typed ones
+    found = frame.groupby(["reward.without", "seed"], observed=True).size()
+    assert found.to_dict() == {("safety", 0): 6}
     with pytest.raises(ConfigError, match=r"'agent.gama'.*Did you mean 'agent.gamma'"):
         results.load(tmp_path, settings=["seed", "agent.gama"])
 

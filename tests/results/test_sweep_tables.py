@@ -119,9 +119,11 @@ def test_runs_without_rows_are_listed_wherever_a_sweep_is_read(root, capsys, cap
         printed = words_of(capsys.readouterr().out)
         if words != ["--all"]:
             assert all(one in printed for one in MISSING), printed
-    one = report_of(root)
+    one = report_of(root, "alcc efficiency.weight=4")
     figure = measures_of(one, [replace(one, short=one.short.drop(columns=one.shown[-2].key))])
-    assert all(one in words_of(figure._supxlabel.get_text()) for one in MISSING)
+    noted = words_of(figure._supxlabel.get_text())
+    assert noted.startswith("6 windows × 3 drivers, 600 steps, after 20 s; lines: 95 % intervals ")
+    assert all(one in noted for one in ("saved: against", *MISSING))
     # A folder of failed runs only is one line.
     for run in root.glob("*=1_*"):
         with pytest.raises(ResultsError, match="failed: must be a number"):
@@ -195,6 +197,12 @@ def test_runs_are_named_by_what_their_commands_varied(tmp_path) -> None:
         (["a=1", "a=1"], plain, ["a.x=1", "a.x=2"]),
         (["a=1", ""], plain, ["a.x=1", "a.x=2"]),
         (["a=1", "a=2"], [plain[0], plain[0]], ["", ""]),
+        # Each run has the words that not all commands have, with the stored values of others.
+        (
+            ["a=1 no=b", "a=1 agent=x agent.tau=2"],
+            plain,
+            ["agent.tau=1, no=b", "agent.tau=2, agent=x"],
+        ),
     ):
         folders = [tmp_path / f"{len([*tmp_path.iterdir()])} {place}" for place in (0, 1)]
         for folder, words in zip(folders, typed, strict=True):
