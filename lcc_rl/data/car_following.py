@@ -204,11 +204,13 @@ def _pairs(
         visible &= in_lane
     follower = np.flatnonzero(visible)
     if len(follower) == 0:
+        named = int(follows.sum())
+        cause = f"{named:,} name a preceding vehicle, and none of these has a row"
         raise DataError(
             f"no vehicle follows another in the same lane and frame: of {len(lane):,} samples "
-            f"{int(follows.sum()):,} name a preceding vehicle, and none of these has a row; "
-            "expected a Preceding column that names vehicles in the file; data=episodes reads "
-            "tables of pairs, with a follower and its leader in each row"
+            f"{cause if named else 'none has a preceding vehicle other than itself'}; see "
+            f"{report.place(0, 'preceding')}; data=episodes reads tables of pairs, with a follower "
+            "and its leader in each row"
         )
     return follower, ahead[follower]
 

@@ -104,8 +104,9 @@ class TableSource(TrajectorySource):
         layout = TABLE_FIELDS, self.columns, self.units
         report = ReadReport(find_files(self.path), read_as(*layout), units_of(*layout))
         rows = self._rows(report)
-        names = {**self.columns, "preceding": self.columns.get("leader")}
-        names["gap"] = names.get("gap") or names.get("position")
+        names = {**self.columns}
+        for key, own in (("preceding", "leader"), ("gap", "gap")):  # else known by positions
+            names[key] = names.get(own) or names.get("position")
         place = partial(places, files=report.files, columns=names, vehicles=report.names)
         if self.columns.get("recording") is None:
             report.notes += cut_by_files(rows, "vehicle", report.files)
@@ -189,6 +190,8 @@ def _vehicles(
     if leader is None:
         return {"vehicle": ids}
     front = leaders[ahead.codes].astype(np.int64)
+    if count := int((front == ids).sum()):
+        report.notes.append(f"{count:,} samples name the vehicle itself as its leader: no leader")
     return {"vehicle": ids, "leader": np.where((front < 0) | (front == ids), 0, front)}
 
 

@@ -219,7 +219,8 @@ class _Fit:
         drivers = self.table(found.best.to("cpu", torch.float64), constants)
         if falling := int((~found.converged).sum()):
             line = f"{falling} of {len(drivers)} records have not converged: more generations?"
-            lines.append(Concern(f"{line} (calibration.{self.mode}_genetic)"))
+            more = f"{self.mode}_genetic.generations={3 * genetic.generations}"
+            lines.append(Concern(f"{line} (calibration.{more})"))
         what = self.names, self.limits, self.table_of, self.settings.objective
         return drivers, lines + _findings(drivers, *what)
 

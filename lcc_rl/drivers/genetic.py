@@ -19,6 +19,8 @@ Progress = Callable[[int, int, str], None]
 
 Individuals = Annotated[int, Field(ge=1, le=100_000)]
 LATE, STEADY = 0.75, (0.99, 1e-3)  # see Evolution.converged
+# Least patience, as a share of the generations: earlier, the mutation is too wide to improve a fit.
+LEAST_PATIENCE = 1 / 3
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
@@ -36,7 +38,8 @@ class GeneticSettings(Settings):
     mutation_rate: Probability = 0.3  # probability of Gaussian noise on a gene
     mutation_start: Positive = 0.1  # standard deviation of that noise, as a share of the bounds
     mutation_end: Positive = 1e-4  # that in the last generation; geometric in between
-    patience: Individuals = 20  # generations without improvement after which a problem stops
+    # Generations without improvement after which a problem stops; at least a third of all.
+    patience: Individuals = 20
     tolerance: NonNegative = 1e-5  # least relative improvement of the best fitness
 
 
@@ -105,10 +108,11 @@ def _evolve(
     genes, fitness = _fittest(genes, evaluate(genes), settings.population)
     best = late = fitness[:, 0]
     stale = torch.zeros_like(best)
+    patience = max(settings.patience, LEAST_PATIENCE * settings.generations)
     for generation in range(1, settings.generations + 1):
         children = _children(genes, fitness, random, settings, generation)
         evolved = _survivors(genes, fitness, children, evaluate(children), settings)
-        stopped = (stale >= settings.patience).unsqueeze(-1)
+        stopped = (stale >= patience).unsqueeze(-1)
         genes = torch.where(stopped.unsqueeze(-1), genes, evolved[0])
         fitness = torch.where(stopped, fitness, evolved[1])
         stale = torch.where(fitness[:, 0] < best * (1.0 - settings.tolerance), 0.0, stale + 1.0)
@@ -116,7 +120,7 @@ def _evolve(
         late = best if generation <= LATE * settings.generations else late
         if progress is not None:
             progress(generation, settings.generations, f"mean best {best.mean().item():.5g}")
-        if bool((stale >= settings.patience).all()):
+        if bool((stale >= patience).all()):
             break
     least = torch.minimum(late * STEADY[0], late - STEADY[1])
     return Evolution(genes[:, 0], best, best >= least)

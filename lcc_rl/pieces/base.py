@@ -247,8 +247,8 @@ class Piece(Part, TensorDictModuleBase, Transform):
         require(not missing, f"{self.title} reads {', '.join(missing)}, which nothing has written")
         return [entry for entry in entries if entry is not None]
 
-    def _write(self, values: Tensor | Sequence[Tensor], reached: State) -> None:
-        values = (values,) if isinstance(values, Tensor) else values
+    def _write(self, values: Any, reached: State) -> None:
+        values = returned(values)
         if len(values) != len(self.targets):
             raise ValueError(f"it returned {len(values)} instead of {len(self.targets)} entries")
         reached.update(zip(self.targets, values, strict=True))
@@ -258,8 +258,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
         """Apply the piece to any TensorDict that holds its ``in_keys``."""
         reads = self.in_keys if self.needs else ()  # an unbound piece raises here
         inputs = self._present([tensordict.get(key, None) for key in reads])
-        values = self.computed(inputs)
-        values = (values,) if isinstance(values, Tensor) else values
+        values = returned(self.computed(inputs))
         for key, value in zip(self.out_keys, values, strict=True):
             tensordict.set(key, value)
         return tensordict
@@ -280,6 +279,15 @@ class Piece(Part, TensorDictModuleBase, Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         return add_specs(self, observation_spec)
+
+
+def returned(values: Any) -> Sequence[Tensor]:
+    """Return the results of a piece as a sequence; a TypeError names one that is no tensor."""
+    values = values if isinstance(values, (tuple, list)) else (values,)
+    for value in values:
+        if not isinstance(value, Tensor):
+            raise TypeError(f"it returned {value!r}, not a tensor")
+    return values
 
 
 def add_specs(piece: Piece, spec: Composite, keys: Sequence[Key] | None = None) -> Composite:

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, MAX_ACCELERATION, VehicleString
-from lcc_rl.pieces.base import ACTION, ROLE, Entry, RoleTransform, as_key
+from lcc_rl.pieces.base import ACTION, ROLE, Entry, RoleTransform, as_key, returned
 from lcc_rl.pieces.string import COMMANDED, WISHED
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF
 from lcc_rl.pieces.world import World
@@ -117,7 +117,7 @@ class Controller(RoleTransform):
             return results
         if isinstance(results, Tensor):
             return results.clamp(*self.limits)
-        command, *rest = results
+        command, *rest = returned(results)
         return (command.clamp(*self.limits), *rest)
 
 

@@ -182,6 +182,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ),
     ("table", csv(TABLE.assign(t=0.0)), "data row 2, vehicle 1, column 't' repeats a time of"),
     ("leaders", RECORD + "0,1\n1,2\n2,1\n", r"covers 0–2 s, not the stretch 0–9 s"),
+    ("table", csv(TABLE.assign(ahead=TABLE["id"])), "none .* other than itself; .* column 'ahead'"),
     # Values that are implausible, and units.
     ("ngsim", csv_text(pair(v_Length=4.5, Preceding=0)[:20]), "is 4.5 feet; .*data.units=metres"),
     ("source", csv_text(pair(range(200), v_Vel=400)), "holds 121.92 m/s .*max_speed=70"),

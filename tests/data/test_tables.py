@@ -200,6 +200,7 @@ def test_a_leader_that_is_not_there_and_duplicates_are_counted(tmp_path) -> None
     frame = long_table()
     frame = pd.concat([frame, frame.iloc[[5, 6]]])
     frame.loc[frame["id"] == 2, "ahead"] = 77
+    frame.loc[frame["id"] == 1, "ahead"] = 1
     frame.loc[20, "v"] = np.nan
     loaded = TableSource(path=written(tmp_path, frame), columns=BY_GAP).load()
     words = "dropped 2 rows: rows that repeat a time of their vehicle, 0 of them with"
@@ -208,6 +209,7 @@ def test_a_leader_that_is_not_there_and_duplicates_are_counted(tmp_path) -> None
     assert loaded.episodes["follower_id"].unique().tolist() == [3]
     unseen = "left out 400 samples: the preceding vehicle is not seen in that frame, the first: "
     assert any(x.startswith(unseen) for x in loaded.report)
+    assert any("samples name the vehicle itself as its leader" in x for x in loaded.report)
 
 
 def test_the_first_sample_left_out_is_named_by_file_row_and_column(tmp_path) -> None:

@@ -15,6 +15,7 @@ from table_text import long_table
 from lcc_rl.commands import calibration, repeat
 from lcc_rl.config import load
 from lcc_rl.drivers.population import bootstrap
+from lcc_rl.envs.inputs import described
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import parquet_metadata
 from lcc_rl.pieces import CalibratedDrivers
@@ -146,6 +147,8 @@ def test_the_report_counts_records_and_drivers(cfg, source, tmp_path):
     assert len(drivers) == 4
     assert any(line.startswith("local: RMSPE of 4 records of 3 drivers: ") for line in lines)
     assert "4 records of 3 drivers" in out.getvalue()
+    people = bootstrap(tmp_path / "run" / "drivers.parquet")
+    assert "4 human drivers, one per record of 3 vehicle" in described(people, load("evaluate", []))
 
 
 def test_phases_report_lines_with_the_time_left_where_there_is_no_terminal():

@@ -208,7 +208,8 @@ def test_gaps_that_speeds_do_not_tell_are_named(make_episodes):
 def test_rows_keep_the_order_and_identity_of_the_input(uneven_lengths):
     both = Calibrator(modes=["local", "global"], local_genetic=QUICK, global_genetic=QUICK)
     seen: list[tuple[int, int]] = []
-    drivers = both(uneven_lengths, progress=lambda *state: seen.append(state[:2])).drivers
+    found = both(uneven_lengths, progress=lambda *state: seen.append(state[:2]))
+    drivers = found.drivers
     assert drivers["mode"].tolist() == ["local"] * 3 + ["global"] * 3
     assert drivers["episode"].tolist() == [0, 1, 2] * 2
     assert drivers["follower_id"].tolist() == [100, 101, 102] * 2
@@ -224,6 +225,7 @@ def test_rows_keep_the_order_and_identity_of_the_input(uneven_lengths):
         *(f"{PARAMETERS[x].column}_{end}" for end in ("low", "high") for x in fitted("global")[2:]),
     ]
     assert seen == [(1, 2), (2, 2)] * 2
+    assert "more generations? (calibration.global_genetic.generations=6)" in " ".join(found.report)
     renamed = uneven_lengths.rename(columns={"episode": "event", "recording": "period"})
     pd.testing.assert_frame_equal(both(renamed).drivers, drivers)
 

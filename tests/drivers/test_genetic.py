@@ -35,6 +35,10 @@ def test_spheres_with_a_centre_each_are_all_solved():
 def test_rosenbrock_valley_is_followed_to_its_end(seed):
     found = solve(rosenbrock, 1, seed=seed)
     torch.testing.assert_close(found.best[0], torch.ones(2).double(), atol=0.02, rtol=0.0)
+    # A search of more generations does not stop while its mutation is wide.
+    assert (
+        solve(rosenbrock, 1, seed=seed, settings=GeneticSettings(generations=1000)).fitness < 1e-9
+    )
 
 
 def test_optimum_on_a_bound_is_reached_exactly():

@@ -233,7 +233,7 @@ class Unwritten(Steady):
 def test_a_controller_that_does_not_fit_is_named_and_leaves_no_folder(tmp_path) -> None:
     cases = [
         (unknown, r"\.unknown reads vehicles.velocity, .* only .*vehicles.gap, .*vehicles.speed"),
-        (plain_number, r"\.plain_number .* float .* must return automated.command as tensors \["),
+        (plain_number, r"\.plain_number .* returned 0.5, not a tensor; it must return automated"),
         (Wide, r"Wide writes automated.command as \[1, 2\]"),
         (Forgetful, r"returned 1 instead of 2 .* automated.command and automated.integral as"),
         (Talkative, r"returned 2 instead of 1 .* must return automated.command as tensors"),
