@@ -25,7 +25,7 @@ from pydantic import Field
 
 from lcc_rl.api import Run
 from lcc_rl.io.files import Rows, as_rows, read_parquet
-from lcc_rl.results.names import rename, worded
+from lcc_rl.results.names import MARKS, rename, worded
 from lcc_rl.results.render import as_csv, as_latex, as_markdown, chosen, for_print
 from lcc_rl.results.report import together
 from lcc_rl.results.runs import EPISODES, FINAL, PARTS, load_config, naming_run
@@ -84,7 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             table = chosen(worded(report.table), names)
         else:
             note = report.note
-            table = chosen(report.short, names) if csv else for_print(report, names)
+            # A CSV has no footnotes.
+            data = report.short.replace({"driver": f" [{MARKS}]"}, "", regex=True)
+            table = chosen(data, names) if csv else for_print(report, names)
         note = "" if csv else ". ".join(filter(None, [report.size, note]))
     print(TABLE_FORMATS[options.format](table, *[options.decimal] * csv))
     if note:
