@@ -84,9 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             table = chosen(worded(report.table), names)
         else:
             note = report.note
-            # A CSV has no footnotes.
-            data = report.short.replace({"driver": f" [{MARKS}]"}, "", regex=True)
-            table = chosen(data, names) if csv else for_print(report, names)
+            table = chosen(report.short, names) if csv else for_print(report, names)
+        if csv:  # has no footnotes
+            table = table.replace({"driver": f" [{MARKS}]"}, "", regex=True)
         note = "" if csv else ". ".join(filter(None, [report.size, note]))
     print(TABLE_FORMATS[options.format](table, *[options.decimal] * csv))
     if note:

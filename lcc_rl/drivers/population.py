@@ -83,6 +83,11 @@ class DriverPopulation:
         """Number of drivers."""
         return len(self.ids)
 
+    @property
+    def vehicles(self) -> int:
+        """Number of vehicles; one has several records after a hole or behind several leaders."""
+        return len({tuple(identity.rsplit("/", 2)[:2]) for identity in self.ids})
+
     def select(self, index: Tensor) -> DriverPopulation:
         """Return the drivers at ``index`` ``[chosen]``, in that order, with repetitions."""
         constants = vars(self.constants).items()

@@ -150,8 +150,7 @@ def described(population: Population, cfg: StudyConfig) -> str:
     behind = "on a ring" if cfg.scenario.road == RING else f"behind leaders of {source}"
     mode = getattr(population, "mode", None)
     suffix = f", drivers.mode={mode}" if mode else ""
-    # A vehicle has several records if its data have a hole, or it follows several leaders.
-    vehicles = len({tuple(x.rsplit("/", 2)[:2]) for x in getattr(population, "ids", ())})
+    vehicles = getattr(population, "vehicles", 0)
     records = f", one per record of {vehicles} vehicle(s)" * (0 < vehicles < len(gap))
     drivers = f"{len(gap)} human drivers{records} ({origin_of(cfg.drivers)}{suffix})"
     line = f"{drivers} {behind}: mean v0 {speed.mean():.1f} m/s, mean T {gap.mean():.2f} s"
