@@ -283,8 +283,9 @@ def on_grid(
 ) -> tuple[pd.DataFrame, Integers]:
     """Resample continuous records to samples 0.1 s apart.
 
-    Columns of motion are interpolated monotonically (PCHIP), ``gap`` linearly between two samples
-    that have one; a ``leader`` must be that of both. Other columns are those of the sample before.
+    Columns of motion are those of :func:`steps_at`, a ``gap`` is interpolated linearly between two
+    samples that have one; a ``leader`` must be that of both. Other columns are those of the sample
+    before.
 
     Args:
         samples: see :func:`continuous`.
@@ -323,8 +324,33 @@ def interpolated(samples: pd.DataFrame, step: float, skipped: bool = False) -> l
     steps -= usual
     odd = int((np.abs(steps, out=steps) > UNEVEN * usual).sum())
     irregular = f", {odd:,} of them irregular," * bool(odd)
-    line = f"samples {usual:g} s apart{irregular} were interpolated to {step:g} s"
+    how = "averaged over" if usual < (1 - UNEVEN) * step else "interpolated to"
+    line = f"samples {usual:g} s apart{irregular} were {how} {step:g} s"
     return [line] * bool(skipped or odd or abs(usual - step) > UNEVEN * step)
+
+
+def steps_at(at: Floats, step: float, time: Floats, values: Floats) -> Floats:
+    """Return values at the times ``at``, ``step`` apart: of a monotone interpolant (PCHIP).
+
+    It does not overshoot the samples. Where samples are closer than a step, the values are means
+    over a step, at the ends of the record over the shorter part with the same centre.
+
+    Args:
+        at, step: new times and their distance, in the unit of ``time``.
+        time: increasing times of the samples.
+        values: samples, ``[samples, …]``.
+    """
+    from scipy.interpolate import PchipInterpolator  # here: it loads for a second
+
+    curve, at = PchipInterpolator(time, values), at.clip(time[0], time[-1])
+    found = curve(at)
+    if np.median(np.diff(time)) >= (1 - UNEVEN) * step:
+        return found
+    half = np.minimum(step / 2, np.minimum(at - time[0], time[-1] - at))
+    inner = half > UNEVEN * step
+    begin, end, area = (at - half)[inner], (at + half)[inner], curve.antiderivative()
+    found[inner] = ((area(end) - area(begin)).T / (end - begin)).T
+    return found
 
 
 def steps_of(samples: pd.DataFrame) -> Floats:
@@ -336,8 +362,6 @@ def _interpolated(
     samples: pd.DataFrame, smooth: list[str], report: ReadReport
 ) -> tuple[pd.DataFrame, NDArray]:
     """Return samples at the whole frames of each record."""
-    from scipy.interpolate import PchipInterpolator  # here: it loads for a second
-
     at = ((samples["time_s"] - samples["origin"]) / FRAME).to_numpy()
     table, episode = samples[smooth].to_numpy(np.float64), samples["episode"].to_numpy()
     frames, before, values = [], [], []
@@ -347,8 +371,7 @@ def _interpolated(
         if len(grid) < 2:
             report.drop("stretch without two samples on the time grid", int(length))
             continue
-        motion = PchipInterpolator(sampled, table[start : start + length])
-        values.append(motion(grid.clip(sampled[0], sampled[-1])))
+        values.append(steps_at(grid, 1.0, sampled, table[start : start + length]))
         before.append(start + np.searchsorted(sampled, grid + 1e-6, side="right") - 1)
         frames.append(grid.astype(np.int32))
     if not frames:

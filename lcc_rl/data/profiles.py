@@ -12,6 +12,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from lcc_rl.data.grid import steps_at
 from lcc_rl.data.trajectories import listed
 from lcc_rl.errors import ConfigError, DataError
 from lcc_rl.settings import Settings
@@ -266,9 +267,9 @@ def resample(
     begin: float | None = None,
     end: float | None = None,
 ) -> Tensor:
-    """Interpolate a record to another step, monotonically between samples (PCHIP).
+    """Interpolate or average a record to another step (:func:`lcc_rl.data.grid.steps_at`).
 
-    The interpolant does not overshoot its samples: no speed becomes negative and no peak grows.
+    No speed becomes negative and no peak grows.
 
     Args:
         time: increasing times [s].
@@ -279,12 +280,10 @@ def resample(
     Returns:
         Speeds, ``[steps]``, float32 [m/s].
     """
-    from scipy.interpolate import PchipInterpolator  # here: it loads for a second
-
     begin, end = time[0] if begin is None else begin, time[-1] if end is None else end
-    steps = int(np.floor((end - begin) / time_step + 1e-6)) + 1
-    grid = np.minimum(begin + time_step * np.arange(steps), time[-1])
-    return torch.tensor(PchipInterpolator(time, speed)(grid).clip(min=0.0), dtype=torch.float32)
+    grid = begin + time_step * np.arange(int(np.floor((end - begin) / time_step + 1e-6)) + 1)
+    speeds = steps_at(np.asarray(grid), time_step, time, speed)
+    return torch.tensor(speeds.clip(min=0.0), dtype=torch.float32)
 
 
 def at_step(profiles: Profiles, time_step: float) -> Profiles:

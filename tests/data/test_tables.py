@@ -179,7 +179,8 @@ def test_other_steps_are_interpolated(tmp_path, step, columns) -> None:
         expected = speed(part["time_s"].to_numpy(), follower)
         np.testing.assert_allclose(part["follower_speed_mps"], expected, atol=0.06 * step + 1e-3)
         assert abs(part["gap_m"].iloc[0] - GAP) < 0.01
-    assert f"samples {step:g} s apart were interpolated to 0.1 s" in loaded.report
+    how = "averaged over" if step < 0.1 else "interpolated to"
+    assert f"samples {step:g} s apart were {how} 0.1 s" in loaded.report
 
 
 def test_jitter_is_interpolated_and_holes_divide(tmp_path) -> None:
@@ -552,3 +553,12 @@ def test_noisy_speeds_of_a_fast_raster_are_smoothed_by_the_option_of_the_message
     np.testing.assert_allclose(found, 15.0 + np.sin(time / 5.0), atol=0.2)
     with pytest.raises(DataError, match=r"no record is as long as leader\.average_s=500"):
         read("leader.average_s=500")
+    # Pairs: means of the same samples, 5 by default and 25 with the same option.
+    source = {"path": str(tmp_path / "fast.csv"), "columns": LOG}
+    for seconds, deviation in ((0.0, 0.2 / 5**0.5), (0.5, 0.2 / 25**0.5)):
+        pairs = EpisodesSource(**source, average_s=seconds).load()
+        assert any("samples 0.02 s apart were averaged over 0.1 s" in x for x in pairs.report)
+        first = pairs.episodes[pairs.episodes["episode"] == 0]
+        time = first["time_s"].to_numpy()
+        error = first["follower_speed_mps"] - 15.0 - np.sin(time / 5.0)
+        assert error.std() == pytest.approx(deviation, rel=0.2)
