@@ -58,8 +58,8 @@ class OffPolicy(Sampling):
 
     gamma: Share = 0.9  # discount
     hidden: Sequence[Count] = (200, 100, 50)  # layers of policy and Q networks
-    actor_lr: Positive = 1e-3  # learning rate of the policy
-    critic_lr: Positive = 1e-3  # learning rate of the Q networks
+    actor_lr: Fraction = 1e-3  # learning rate of the policy
+    critic_lr: Fraction = 1e-3  # learning rate of the Q networks
     batch_size: Count = 1024  # transitions per update
     buffer_size: Count = 20_000  # transitions that the replay buffer holds
     tau: Fraction = 0.005  # share of a step of the targets; not given in the paper

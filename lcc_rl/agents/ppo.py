@@ -58,7 +58,7 @@ class PPO(Sampling):
     gamma: Share = 0.99  # discount
     td_lambda: Annotated[float, Field(ge=0.0, le=1.0)] = 0.95  # weight of longer returns, per step
     hidden: Sequence[Count] = (64, 64)  # layers of policy and value
-    learning_rate: Positive = 1e-3  # of both networks at the start
+    learning_rate: Fraction = 1e-3  # of both networks at the start
     final_lr_fraction: Fraction = 0.1  # final learning rate as a fraction of the initial one
     schedule: Schedule = "cosine"  # shape of the learning rates
     clip: Fraction = 0.2  # ratios of probabilities are clipped to 1 ± clip

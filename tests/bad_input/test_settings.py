@@ -74,6 +74,7 @@ WRONG = {
     "scenario.string='automated human*100000000'": "10000 vehicles",
     "+faults=sensors scenario.sensors.automated.delay=1e9": "sensors.automated.delay must be at mo",
     "+faults=sensors scenario.sensors.automated.longest_dropout=200": "dropout must be at most 100",
+    "agent.actor_lr=1e6": "agent.actor_lr must be less than or equal to 1",
     "drivers.reaction_delay=0.25 drivers=i80_energy": "delay of drivers must be a multiple",
     f"data.platoons={HUGE}": "data.platoons must be less than or equal to 10000",
 }
