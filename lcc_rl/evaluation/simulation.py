@@ -128,9 +128,10 @@ def simulate(
     """
     table = isinstance(drivers, (str, PathLike))
     chosen = {"drivers.path"} if table else {"drivers"} if drivers is not None else set()
-    fixed = OF_ARGUMENTS | {"reward"} | chosen
-    reason = "has no effect in simulate: see the arguments; files have time_s [s], speed_mps [m/s]"
-    check_overrides(overrides, fixed, reason)
+    unused = "has no effect in simulate: see the arguments"
+    files = f"{unused}; files have time_s [s], speed_mps [m/s]"
+    check_overrides(overrides, {"leader", "data"}, files)
+    check_overrides(overrides, OF_ARGUMENTS | {"reward"} | chosen, unused)
     profiles = _profiles(leader, time_step, seconds)
     name, spec = ("", None) if controller is None else one_of(controller)
     reads = () if spec is None or is_policy(spec) else controller_of(spec).kind.reads

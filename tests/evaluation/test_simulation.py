@@ -148,6 +148,7 @@ def test_wrong_arguments_are_named(tmp_path) -> None:
         ({"leader": late}, r"5000 s apart; .*, in ms \(convert it\), or"),
         ({"leader": fast}, "it has time_s, speed_kmh .*convert them to SI"),
         ({"leader": fast, "overrides": ["leader.units.speed=km/h"]}, r"files have time_s \[s\]"),
+        ({"leader": fast, "overrides": ["seed=3"]}, "simulate: see the arguments$"),
         ({"leader": None}, "leader=None needs scenario=ring and sec"),
         ({"leader": None, "seconds": 5.0}, "a ring .*has leader=None, an open road has a leader"),
         ({"leader": WAVE, "overrides": ["scenario=ring"]}, "an open road has a leader"),
