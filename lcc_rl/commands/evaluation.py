@@ -23,7 +23,7 @@ from lcc_rl.evaluation.fit import classes, other_drivers, task_of
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import is_shipped
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata
-from lcc_rl.results.names import counted_windows, several
+from lcc_rl.results.names import size_of
 from lcc_rl.results.platoons import case_report
 from lcc_rl.results.remarks import few_windows, leader_too_fast, remarks
 from lcc_rl.results.render import print_table, terminal
@@ -167,13 +167,13 @@ def reports(
             unit=unit,
         )
         windows, drivers = group["profile_id"].nunique(), int(group["drivers"].max())
-        size = size_of(cfg, counted_windows(windows), drivers)
+        size = size_in_words(cfg, windows, drivers)
         yield dataclasses.replace(result, remarks=[*result.remarks, *notes, *of_sweep], size=size)
 
 
-def size_of(cfg: StudyConfig, windows: str, drivers: int) -> str:
+def size_in_words(cfg: StudyConfig, windows: int, drivers: int, which: str = "") -> str:
     """Return the numbers of windows, drivers, repeats and counted steps in words."""
-    settings, size = cfg.evaluation, f"{windows} × {several(drivers, 'driver')}"
+    settings, size = cfg.evaluation, size_of(windows, drivers, which)
     size += f" × {settings.repeats} repeats" if settings.repeats > 1 else ""
     size += f", shard {settings.shard} of {settings.shards}" if settings.shards > 1 else ""
     size += f", {cfg.scenario.horizon} steps"
@@ -188,8 +188,9 @@ def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
         title = result.of
         if result.of in counts:
             of = [x for x in (cfg.task and str(cfg.task["name"]), result.of) if x]
-            windows = counted_windows(counts[result.of], "held-out " * bool(len(inputs.training)))
-            title = ": ".join([*of, size_of(cfg, windows, len(plan.chosen))])
+            which = "held-out " * bool(len(inputs.training))
+            size = size_in_words(cfg, counts[result.of], len(plan.chosen), which)
+            title = ": ".join([*of, size])
         print_table(terminal(result, title, cfg.table == "all"))
     seconds = cfg.scenario.horizon * cfg.scenario.time_step
     if warning := few_windows(plan.profiles, seconds):
