@@ -89,7 +89,7 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     def make(to: Path) -> None:
         words = ("variant=idm", *NO_AGENT, f"hydra.run.dir={to}")
-        run_command("lcc_rl.cli.train", *words, cwd=to.parent, check=True)
+        run_command("train", *words, cwd=to.parent, check=True)
 
     return made_once(tmp_path_factory, "idm", make)
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from lcc_rl.cli.guard import main_guard
 from lcc_rl.errors import require
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.overview import EVERY, counts, left, live, overview_line, progress, states_table
@@ -59,7 +58,3 @@ def main(arguments: Sequence[str] | None = None) -> None:
     console = Console(highlight=False)
     show = watch_folder if options.watch and console.is_terminal else show_states
     show(Path(options.folder), console)
-
-
-if __name__ == "__main__":
-    main_guard(main)()

@@ -30,7 +30,7 @@ from lcc_rl.runs.states import (
 
 
 def status(folder: Path) -> list[str]:
-    done = run_command("lcc_rl.cli.status", str(folder), cwd=folder, check=True)
+    done = run_command("status", str(folder), cwd=folder, check=True)
     return done.stdout.splitlines()
 
 
@@ -145,7 +145,7 @@ def test_a_folder_that_is_no_run_is_refused_with_the_runs_and_tables_in_it(tmp_p
 
 def test_nothing_to_see(tmp_path) -> None:
     assert status(tmp_path)[-1].endswith("0 runs: none")
-    done = run_command("lcc_rl.cli.status", "", cwd=tmp_path)
+    done = run_command("status", "", cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "the name of the folder is empty" in done.stderr
 
