@@ -24,7 +24,7 @@ log = logging.getLogger("lcc_rl")
 
 POLICY = "policy.pt"
 EPISODES = "episodes.parquet"  # last file of a run, which shows that it is finished
-STEPS = "steps.parquet"
+STEPS, RECORD = "steps.parquet", "training.parquet"
 PARTS, FINAL = ".parts", "evaluation"  # parts' settings and last part of a job of lcc-rl run
 SECTION = re.compile(r"^(?=[a-z])", re.MULTILINE)  # before the name of a section of settings
 # Results and states of stopped runs, which commands with other settings must not replace.
