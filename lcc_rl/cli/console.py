@@ -19,7 +19,7 @@ HYDRA_COMMANDS = {
     "calibrate": "fit driver models to trajectories",
 }
 TOOLS = {  # name, module, which has a main, and description
-    "status": ("lcc_rl.cli.status", "runs that are running, waiting, finished, failed"),
+    "status": ("lcc_rl.runs.overview", "runs that are running, waiting, finished, failed"),
     "table": ("lcc_rl.cli.table", "the table of an evaluation: text, Markdown, LaTeX, CSV"),
     "repeat": ("lcc_rl.commands.repeat", "a run again, from its folder; are the rows equal?"),
     "score": ("lcc_rl.commands.score", "a policy on every task and source that it fits"),

@@ -15,12 +15,12 @@ import yaml
 from helpers import check_refused
 
 from lcc_rl import results
-from lcc_rl.cli.status import main as status
 from lcc_rl.commands import animate
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.runs import differences
 from lcc_rl.results.sweeps import load_sweep
+from lcc_rl.runs.overview import main as status
 
 TABLE = "episodes.parquet"
 

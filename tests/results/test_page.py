@@ -25,7 +25,7 @@ from lcc_rl.results.names import in_words, worded
 from lcc_rl.results.render import as_markdown, terminal
 from lcc_rl.results.report import Report, report, windows_for
 from lcc_rl.results.windows import Means, savings
-from lcc_rl.studies.results import StudyResults
+from lcc_rl.studies.study import StudyResults
 
 TABLE = pd.DataFrame(
     {

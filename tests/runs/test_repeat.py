@@ -15,7 +15,7 @@ from helpers import check_refused
 from lcc_rl.commands import repeat, training
 from lcc_rl.errors import LccError
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.runs.origin import ORIGIN, origin
+from lcc_rl.results.runs import ORIGIN, origin
 from lcc_rl.version import __version__
 
 

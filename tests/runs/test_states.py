@@ -12,10 +12,9 @@ import pytest
 from commands import run_command
 from rich.console import Console
 
-from lcc_rl.cli.status import main
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
 from lcc_rl.results.runs import load_config
-from lcc_rl.runs.overview import states_table
+from lcc_rl.runs.overview import main, states_table
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import (
     Busy,

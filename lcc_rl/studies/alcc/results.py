@@ -20,7 +20,7 @@ from lcc_rl.results.windows import LEADER_COLUMNS, WINDOWS, Means
 from lcc_rl.studies.alcc import figures, paper_tables, tables
 from lcc_rl.studies.alcc.paper_tables import PAIR
 from lcc_rl.studies.alcc.study import ABLATIONS, DRIVERS_FILE, EVALUATION_FOLDER
-from lcc_rl.studies.results import StudyResults
+from lcc_rl.studies.study import StudyResults
 
 ALCC_TITLE = "Adaptive Leading Cruise Control: the study"
 CURVES = "training.parquet"  # learning curves of the main trainings, if their folders are missing
