@@ -3,96 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime
-from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-from rich.console import Console
-
 from lcc_rl.commands import evaluation, training
+from lcc_rl.commands.evaluation import Run
 from lcc_rl.config import load, with_variant
-from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.errors import require
 from lcc_rl.evaluation.foreign import as_given
 from lcc_rl.evaluation.named import setting_of
-from lcc_rl.io.files import Rows, read_parquet
-from lcc_rl.results import render
-from lcc_rl.results.report import Report, together
-from lcc_rl.results.runs import STEPS
 from lcc_rl.runs.output import repeated_warnings_left_out
-
-
-@dataclass(frozen=True)
-class Run:
-    """The results of a training or an evaluation.
-
-    Args:
-        folder: folder of the configuration, the parquet tables, and the policy of a training.
-        rows: one row per episode, or vehicle of an episode, as in episodes.parquet; many rows as a
-            dataset, which is read on demand.
-        cfg: its configuration.
-        unit: energy per distance of its tables, ``"kWh/100km"``; by default that of the task, or
-            kJ/km, and g/km for one fuel.
-
-    ``print(run)`` shows the tables that commands print. A run stands for the path of its folder.
-    """
-
-    folder: Path
-    rows: Rows
-    cfg: StudyConfig
-    unit: str | None = None
-
-    def __fspath__(self) -> str:
-        return str(self.folder)
-
-    def __str__(self) -> str:
-        return self.printed()
-
-    def printed(self, full: bool = False, against: str | None = None) -> str:
-        """Return the tables that commands print; ``full``: with all measures."""
-        console = Console(width=render.WIDTH)
-        with console.capture() as text:
-            for report in self.reports(against):
-                console.print(render.terminal(report, report.of, full))
-        return text.get().rstrip()
-
-    def reports(self, against: str | None = None) -> list[Report]:
-        """Return the report of each source of leaders or case of a platoon.
-
-        Args:
-            against: the baseline of savings; by default that of tables.
-        """
-        return list(evaluation.reports(self.rows, self.cfg, against, self.unit))
-
-    @cached_property
-    def table(self) -> pd.DataFrame:
-        """All measures: a row per strategy with energies, savings with intervals and safety.
-
-        For a task, scores and limits come first. Several sources or cases are named in ``of``.
-        """
-        return together(self.reports()).table
-
-    @cached_property
-    def headline(self) -> pd.DataFrame:
-        """The table that commands print: energy or a task's score, distance and safety.
-
-        Several sources of leaders, or cases of a platoon, are named in ``of``.
-        """
-        return together(self.reports()).short
-
-    @cached_property
-    def training(self) -> pd.DataFrame:
-        """A row per iteration; a ResultsError without a training."""
-        return read_parquet(self.folder / training.RECORD)
-
-    @cached_property
-    def steps(self) -> pd.DataFrame:
-        """Sample episodes as time series."""
-        return read_parquet(self.folder / STEPS)
 
 
 def learn(

@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, chdir, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
-from importlib import import_module
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 
-from lcc_rl.cli.guard import main_guard
+from lcc_rl.cli.console import main
 from lcc_rl.config import load
 from lcc_rl.io.files import read_parquet
 from lcc_rl.runs.interrupts import ENDING_SIGNALS
@@ -73,13 +72,13 @@ class Done:
     stderr: str
 
 
-def run_command(module: str, *words: str, cwd: Path, check: bool = False) -> Done:
-    """Run an entry point as ``python -m`` would, without a new process, which imports for seconds.
+def run_command(*words: str, cwd: Path, check: bool = False) -> Done:
+    """Run ``lcc-rl`` with these words, without a new process, which imports for seconds.
 
     The process's state is put back afterwards. An exception that a process would end on is raised.
     """
-    main, code = main_guard(import_module(module).main), 0
-    with process_state(module, words, cwd) as (out, err):
+    code = 0
+    with process_state("lcc-rl", words, cwd) as (out, err):
         try:
             main()
         except SystemExit as stop:
@@ -101,10 +100,10 @@ def jobs_in_threads(monkeypatch: pytest.MonkeyPatch) -> None:
 # -- real processes --------------------------------------------------------------------------------
 
 
-def start(module: str, *words: str, cwd: Path) -> subprocess.Popen[str]:
-    """Start an entry point in a process, and a process group, of its own."""
+def start(*words: str, cwd: Path) -> subprocess.Popen[str]:
+    """Start ``lcc-rl`` in a process, and a process group, of its own."""
     return subprocess.Popen(
-        [sys.executable, "-m", module, *words],
+        [sys.executable, "-m", "lcc_rl", *words],
         cwd=cwd,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,

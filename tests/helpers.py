@@ -54,6 +54,11 @@ ACTION, REWARD = ("automated", "action"), ("automated", "reward")
 OBSERVATION, TERMS = ("automated", "observation"), ("automated", "reward_terms")
 
 
+def t(*values: float) -> torch.Tensor:
+    """Return numbers in double precision."""
+    return torch.tensor(values, dtype=torch.float64)
+
+
 def wavy_profiles(count: int = 4, samples: int = 400) -> Profiles:
     """Leaders between 2 and 14 m/s whose acceleration stays below 2 m/s²."""
     time = torch.arange(samples) * 0.1

@@ -17,7 +17,7 @@ from commands import run_command
 from helpers import slow_but
 
 import lcc_rl
-from lcc_rl.cli.console import COMMANDS
+from lcc_rl.cli.console import COMMANDS, TOOLS
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import write_parquet
 
@@ -27,12 +27,11 @@ TABLES = {"pandas", "pyarrow"}
 # Does what its argument says, as python -m would, then names what was loaded on the way.
 PROGRAM = """
 import runpy, sys
-task, *sys.argv[1:] = sys.argv[1:]
 try:
-    if task.startswith("from"):
-        exec(task)
+    if sys.argv[1].startswith("from"):
+        exec(sys.argv[1])
     else:
-        runpy.run_module(task, run_name="__main__", alter_sys=True)
+        runpy.run_module("lcc_rl", run_name="__main__", alter_sys=True)
 except SystemExit:
     pass
 print("loaded:", *sys.modules, file=sys.stderr)
@@ -47,33 +46,27 @@ def ran(*words: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
 
 def test_help_names_the_version_and_every_command(tmp_path) -> None:
     def said(*words: str) -> str:
-        return run_command("lcc_rl.cli.console", *words, cwd=tmp_path, check=True).stdout
+        return run_command(*words, cwd=tmp_path, check=True).stdout
 
     assert said("--version") == f"lcc-rl {lcc_rl.__version__}\n"
     assert version("lcc_rl") == lcc_rl.__version__
     assert all(f"\n  {name} " in said() for name in COMMANDS)
     assert "usage: lcc-rl status" in said("status", "-h")
-    assert all(callable(import_module(module).main) for module, _ in COMMANDS.values())
+    assert all(callable(import_module(module).main) for module, _ in TOOLS.values())
 
 
 def test_help_fits_80_columns(tmp_path, monkeypatch, subtests) -> None:
     for name in COMMANDS:
         with subtests.test(name=name):
             monkeypatch.setenv("COLUMNS", "80")
-            shown = run_command(
-                "lcc_rl.cli.console", name, "--help", cwd=tmp_path, check=True
-            ).stdout
+            shown = run_command(name, "--help", cwd=tmp_path, check=True).stdout
             assert [line for line in shown.splitlines() if len(line) > 80] == []
 
 
 QUICK_TO_START = [  # what is done, what is not loaded for it, and what is printed
-    (
-        ["lcc_rl.cli.train", "--help-all"],
-        HEAVY | TABLES,
-        "calibration: both, energy, global, local",
-    ),
-    (["lcc_rl.cli.train", "-h", "agent=td3"], HEAVY | TABLES, "td3             analytic, ddpg"),
-    (["lcc_rl.cli.status", "."], HEAVY | TABLES, "1 finished"),
+    (["train", "--help-all"], HEAVY | TABLES, "calibration: both, energy, global, local"),
+    (["train", "-h", "agent=td3"], HEAVY | TABLES, "td3             analytic, ddpg"),
+    (["status", "."], HEAVY | TABLES, "1 finished"),
     (["from lcc_rl import results; print(results.load('.')['seed'].tolist())"], HEAVY, "[3]"),
     (
         ["from lcc_rl import simulate; print(len(simulate([12.0] * 11, 'human').steps))"],

@@ -87,7 +87,7 @@ def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> 
     jobs_in_threads(monkeypatch)
     monkeypatch.setattr("lcc_rl.drivers.twins.DELAYS", (0.0, 0.2))
     words = [*TINY, QUICK, "variants=[alcc]", "hydra.run.dir=job"]
-    done = run_command("lcc_rl.cli.pipeline", *words, cwd=tmp_path, check=True)
+    done = run_command("run", *words, cwd=tmp_path, check=True)
     job = tmp_path / "job"
     lines = done.stdout.splitlines()
     assert len(lines) <= 28, done.stdout
@@ -112,7 +112,7 @@ def test_pipeline_from_data_to_figures_and_completion(tmp_path, monkeypatch) -> 
     for path in job.rglob("config.yaml"):
         path.write_text(path.read_text().replace("keep: null", "keep: x.csv"))
     assert "keep: x.csv" in (job / "config.yaml").read_text()
-    run_command("lcc_rl.cli.pipeline", "resume=job", cwd=tmp_path, check=True)
+    run_command("run", "resume=job", cwd=tmp_path, check=True)
     again = read_parquet(job / "evaluation" / "episodes.parquet")
     pd.testing.assert_frame_equal(rows, again, check_exact=True)
     assert not list(tmp_path.rglob("x.csv"))

@@ -179,7 +179,7 @@ class Runner(Reader):
                         raise RuntimeError(errors.getvalue()) from stop
             return
         rest += [] if error else self.shrunk(name, rest)
-        done = run_command("lcc_rl.cli.console", name, *rest, cwd=self.folder)
+        done = run_command(name, *rest, cwd=self.folder)
         assert done.returncode == (2 if error else 0), done.stderr[-2000:]
         assert not error or error in done.stderr, done.stderr
 

@@ -30,7 +30,7 @@ import pandas as pd
 import torch
 from matplotlib.image import imread
 
-from lcc_rl.cli import calibrate, console, evaluate, pipeline, train
+from lcc_rl.cli import console
 from lcc_rl.commands.pipeline import COMMAND_FILE
 from lcc_rl.config import load
 from lcc_rl.errors import ResultsError
@@ -59,14 +59,12 @@ class Job:
     """A command and the state of its runs.
 
     Args:
-        main: the entry point.
-        words: its settings.
+        words: its name and settings.
         where: the setting of the folder.
         share: share of the kills of this command.
         root: folder of its files.
     """
 
-    main: Callable[[], None]
     words: list[str]
     where: str
     share: float
@@ -99,11 +97,10 @@ class Job:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         words = [*self.words, f"{self.where}={folder}"]
         if (folder / COMMAND_FILE).exists():
-            words = [f"resume={folder}"]
-        sys.argv = [self.main.__module__, *words]
+            words = [self.words[0], f"resume={folder}"]
         code = 0
         try:
-            self.main()
+            console.main(words)
         except SystemExit as stop:
             code = int(stop.code or 0)
         except BaseException:
@@ -221,19 +218,20 @@ def jobs(folder: Path) -> dict[str, Job]:
     small = ["experiment=smoke", "scenario.horizon=40", "data=episodes"]
     small += [f"data.path={folder / 'pairs.parquet'}"]
     agent = ["agent.batch_size=64", "agent.hidden=[16,16]", "training.episodes=48"]
-    sweep = ["-m", *small, *agent, "seed=0,1"]
-    one = [*small, "policy=pretrained", "compare=[pretrained/reference]"]
-    whole = [*small, *agent, "calibration.local_genetic.generations=2", "jobs=1"]
+    sweep = ["train", "-m", *small, *agent, "seed=0,1"]
+    one = ["evaluate", *small, "policy=pretrained", "compare=[pretrained/reference]"]
+    whole = ["run", *small, *agent, "calibration.local_genetic.generations=2", "jobs=1"]
     whole += ["training.checkpoint_every=1"]
     fitted = ["data.platoons=4", "data.recordings=2", "calibration.local_genetic.generations=2"]
+    calibrate = ["calibrate", *fitted]
     study = ["reproduce", "alcc", "--recipe=smoke", "--seeds=1", "--parts=main", *fitted]
     study += ["training.episodes=48", "scenario.horizon=40"]
     found = {
-        "sweeps": Job(train.main, sweep, "hydra.sweep.dir", 0.4, folder / "sweep"),
-        "evaluations": Job(evaluate.main, one, "hydra.run.dir", 0.2, folder / "evaluation"),
-        "pipelines": Job(pipeline.main, whole, "hydra.run.dir", 0.2, folder / "pipeline"),
-        "calibrations": Job(calibrate.main, fitted, "hydra.run.dir", 0.1, folder / "calibration"),
-        "studies": Job(console.main, study, "--out", 0.1, folder / "study"),
+        "sweeps": Job(sweep, "hydra.sweep.dir", 0.4, folder / "sweep"),
+        "evaluations": Job(one, "hydra.run.dir", 0.2, folder / "evaluation"),
+        "pipelines": Job(whole, "hydra.run.dir", 0.2, folder / "pipeline"),
+        "calibrations": Job(calibrate, "hydra.run.dir", 0.1, folder / "calibration"),
+        "studies": Job(study, "--out", 0.1, folder / "study"),
     }
     for job in found.values():
         job.root.mkdir()

@@ -11,16 +11,15 @@ from lcc_rl.errors import unknown_name
 from lcc_rl.runs.interrupts import ending_quietly
 from lcc_rl.version import __version__
 
-# Name, module and description. Each module has a main; those of the first four, which use Hydra,
-# have no arguments.
+# Names and descriptions of the functions of lcc_rl.cli.hydra_commands.
 HYDRA_COMMANDS = {
-    "run": ("lcc_rl.cli.pipeline", "the main job: data, drivers, policies, results, one page"),
-    "train": ("lcc_rl.cli.train", "train a variant and evaluate it; -m for a sweep"),
-    "evaluate": ("lcc_rl.cli.evaluate", "compare policies, controllers and baselines"),
-    "calibrate": ("lcc_rl.cli.calibrate", "fit driver models to trajectories"),
+    "run": "the main job: data, drivers, policies, results, one page",
+    "train": "train a variant and evaluate it; -m for a sweep",
+    "evaluate": "compare policies, controllers and baselines",
+    "calibrate": "fit driver models to trajectories",
 }
-TOOLS = {
-    "status": ("lcc_rl.cli.status", "runs that are running, waiting, finished, failed"),
+TOOLS = {  # name, module, which has a main, and description
+    "status": ("lcc_rl.runs.overview", "runs that are running, waiting, finished, failed"),
     "table": ("lcc_rl.cli.table", "the table of an evaluation: text, Markdown, LaTeX, CSV"),
     "repeat": ("lcc_rl.commands.repeat", "a run again, from its folder; are the rows equal?"),
     "score": ("lcc_rl.commands.score", "a policy on every task and source that it fits"),
@@ -31,7 +30,7 @@ TOOLS = {
     "clairvoyant": ("lcc_rl.commands.clairvoyant", "upper bound of the saving"),
     "export": ("lcc_rl.interfaces.export", "a policy or rule as ONNX, PyTorch, C or page"),
 }
-COMMANDS = {**HYDRA_COMMANDS, **TOOLS}
+COMMANDS = HYDRA_COMMANDS | {name: text for name, (_, text) in TOOLS.items()}
 
 
 @main_guard
@@ -54,7 +53,7 @@ def main(words: Sequence[str] | None = None) -> None:
 
 def _help() -> str:
     width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {text}" for name, (_, text) in COMMANDS.items()]
+    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
     return "\n".join(
         [
             f"lcc-rl {__version__}: learn and compare car-following controllers in mixed traffic",
@@ -71,13 +70,10 @@ def _help() -> str:
 def _run(name: str, words: list[str]) -> None:
     """Run a command with the following words as this process's arguments."""
     sys.argv = [f"lcc-rl {name}", *words]
+    hydra = name in HYDRA_COMMANDS
     with ending_quietly():
-        module = import_module(COMMANDS[name][0])
-    if name in HYDRA_COMMANDS:
-        module.main()
+        module = import_module("lcc_rl.cli.hydra_commands" if hydra else TOOLS[name][0])
+    if hydra:
+        getattr(module, name)()
     else:
         sys.exit(module.main(words))
-
-
-if __name__ == "__main__":
-    main()

@@ -71,7 +71,7 @@ def text(entry: str, overrides: Sequence[str] = ()) -> str:
     with initialize_config_module(CONF, version_base="1.3"):
         cfg = compose(entry, overrides=as_meant(typed), return_hydra_config=True)
     wide = max(len(command) for command, _ in EXAMPLES[entry])
-    lines = [f"lcc-rl {name}: {HYDRA_COMMANDS[name][1]}", ""]
+    lines = [f"lcc-rl {name}: {HYDRA_COMMANDS[name]}", ""]
     lines += [f"  {command:<{wide}}  # {what}" for command, what in EXAMPLES[entry]]
     lines += ["", f"{'option=…':<{NAME_WIDTH}}{'default':<{DEFAULT_WIDTH}}choices or meaning"]
     for key in OPTIONS[entry]:

@@ -23,7 +23,7 @@ from typing import Annotated
 import pandas as pd
 from pydantic import Field
 
-from lcc_rl.api import Run
+from lcc_rl.commands.evaluation import Run
 from lcc_rl.io.files import Rows, as_rows, read_parquet
 from lcc_rl.results.names import MARKS, rename, worded
 from lcc_rl.results.render import as_csv, as_latex, as_markdown, chosen, for_print
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for row, label in options.rename or ():
             rename(row, label, names_of(run.rows))
         if options.figure:
-            draw(run, options.against, options.figure)
+            draw_table(run, options.against, options.figure)
         with naming_run(run.folder / EPISODES):
             if options.format == "text" and not names:
                 print(run.printed(options.all, options.against))
@@ -100,7 +100,7 @@ def names_of(rows: Rows) -> list[object]:
     return list(table["strategy"].unique())
 
 
-def draw(run: Run, against: str | None, path: str) -> None:
+def draw_table(run: Run, against: str | None, path: str) -> None:
     """Draw the table of a run with grey dots for training seeds."""
     # Here, because tables need no matplotlib.
     from lcc_rl.figures.drawing import save

@@ -19,7 +19,6 @@ import pandas as pd
 import torch
 
 from lcc_rl.arrays import times
-from lcc_rl.cli.guard import main_guard
 from lcc_rl.config import load, quoted, top_key
 from lcc_rl.data.leaders import DriveLeaders
 from lcc_rl.data.profiles import Profiles
@@ -124,7 +123,3 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"{len(trips):,} trips: {totals}")
     if out:
         write_table(trips, out)
-
-
-if __name__ == "__main__":
-    main_guard(main)()

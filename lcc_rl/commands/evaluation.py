@@ -6,9 +6,11 @@ import dataclasses
 import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import pandas as pd
+from rich.console import Console
 
 from lcc_rl.commands.checks import check_measured
 from lcc_rl.config import identity, with_inputs
@@ -22,13 +24,20 @@ from lcc_rl.evaluation.episodes import plan_of
 from lcc_rl.evaluation.fit import classes, other_drivers, task_of
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import is_shipped
-from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata
-from lcc_rl.results.names import counted_windows, several
+from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, read_parquet
+from lcc_rl.results.names import size_of
 from lcc_rl.results.platoons import case_report
 from lcc_rl.results.remarks import few_windows, leader_too_fast, remarks
-from lcc_rl.results.render import print_table, terminal
-from lcc_rl.results.report import Report, report, windows_for
-from lcc_rl.results.runs import EPISODES, check_folder, resumed_config, save_config
+from lcc_rl.results.render import WIDTH, print_table, terminal
+from lcc_rl.results.report import Report, report, together, windows_for
+from lcc_rl.results.runs import (
+    EPISODES,
+    RECORD,
+    STEPS,
+    check_folder,
+    resumed_config,
+    save_config,
+)
 from lcc_rl.results.windows import by_source
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import UNDRAWN, claim, forget
@@ -167,13 +176,13 @@ def reports(
             unit=unit,
         )
         windows, drivers = group["profile_id"].nunique(), int(group["drivers"].max())
-        size = size_of(cfg, counted_windows(windows), drivers)
+        size = size_in_words(cfg, windows, drivers)
         yield dataclasses.replace(result, remarks=[*result.remarks, *notes, *of_sweep], size=size)
 
 
-def size_of(cfg: StudyConfig, windows: str, drivers: int) -> str:
+def size_in_words(cfg: StudyConfig, windows: int, drivers: int, which: str = "") -> str:
     """Return the numbers of windows, drivers, repeats and counted steps in words."""
-    settings, size = cfg.evaluation, f"{windows} × {several(drivers, 'driver')}"
+    settings, size = cfg.evaluation, size_of(windows, drivers, which)
     size += f" × {settings.repeats} repeats" if settings.repeats > 1 else ""
     size += f", shard {settings.shard} of {settings.shards}" if settings.shards > 1 else ""
     size += f", {cfg.scenario.horizon} steps"
@@ -188,9 +197,79 @@ def show_tables(rows: Rows, cfg: StudyConfig, inputs: Inputs) -> None:
         title = result.of
         if result.of in counts:
             of = [x for x in (cfg.task and str(cfg.task["name"]), result.of) if x]
-            windows = counted_windows(counts[result.of], "held-out " * bool(len(inputs.training)))
-            title = ": ".join([*of, size_of(cfg, windows, len(plan.chosen))])
+            which = "held-out " * bool(len(inputs.training))
+            size = size_in_words(cfg, counts[result.of], len(plan.chosen), which)
+            title = ": ".join([*of, size])
         print_table(terminal(result, title, cfg.table == "all"))
     seconds = cfg.scenario.horizon * cfg.scenario.time_step
     if warning := few_windows(plan.profiles, seconds):
         log.info(warning)
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """The results of a training or an evaluation.
+
+    Args:
+        folder: folder of the configuration, the parquet tables, and the policy of a training.
+        rows: one row per episode, or vehicle of an episode, as in episodes.parquet; many rows as a
+            dataset, which is read on demand.
+        cfg: its configuration.
+        unit: energy per distance of its tables, ``"kWh/100km"``; by default that of the task, or
+            kJ/km, and g/km for one fuel.
+
+    ``print(run)`` shows the tables that commands print. A run stands for the path of its folder.
+    """
+
+    folder: Path
+    rows: Rows
+    cfg: StudyConfig
+    unit: str | None = None
+
+    def __fspath__(self) -> str:
+        return str(self.folder)
+
+    def __str__(self) -> str:
+        return self.printed()
+
+    def printed(self, full: bool = False, against: str | None = None) -> str:
+        """Return the tables that commands print; ``full``: with all measures."""
+        console = Console(width=WIDTH)
+        with console.capture() as text:
+            for report in self.reports(against):
+                console.print(terminal(report, report.of, full))
+        return text.get().rstrip()
+
+    def reports(self, against: str | None = None) -> list[Report]:
+        """Return the report of each source of leaders or case of a platoon.
+
+        Args:
+            against: the baseline of savings; by default that of tables.
+        """
+        return list(reports(self.rows, self.cfg, against, self.unit))
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """All measures: a row per strategy with energies, savings with intervals and safety.
+
+        For a task, scores and limits come first. Several sources or cases are named in ``of``.
+        """
+        return together(self.reports()).table
+
+    @cached_property
+    def headline(self) -> pd.DataFrame:
+        """The table that commands print: energy or a task's score, distance and safety.
+
+        Several sources of leaders, or cases of a platoon, are named in ``of``.
+        """
+        return together(self.reports()).short
+
+    @cached_property
+    def training(self) -> pd.DataFrame:
+        """A row per iteration; a ResultsError without a training."""
+        return read_parquet(self.folder / RECORD)
+
+    @cached_property
+    def steps(self) -> pd.DataFrame:
+        """Sample episodes as time series."""
+        return read_parquet(self.folder / STEPS)

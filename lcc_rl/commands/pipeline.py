@@ -44,8 +44,7 @@ from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows, parquet_metadata, write_parquet
 from lcc_rl.io.settings import read_text
 from lcc_rl.results import runs
-from lcc_rl.results.names import RULE
-from lcc_rl.results.remarks import sample_of
+from lcc_rl.results.names import RULE, size_of
 from lcc_rl.results.render import print_table, terminal
 from lcc_rl.results.report import report, windows_for
 from lcc_rl.results.trust import own_modules, trust_option
@@ -164,7 +163,7 @@ def _run(
         path = folder / runs.FINAL / "figures" / "learning_curve.png"
         save(curve, path, formats=cfg.figure_formats)
     if paged and isinstance(rows, pd.DataFrame):
-        size = sample_of(rows)
+        size = size_of(rows["profile_id"].nunique(), rows["driver_id"].nunique())
         models = build_energy(final), second_energy(final)
         one = report(windows_for(rows), None, models[0], few=True, second=models[1])
         one = replace(one, remarks=[*filter(None, [held_to(trainings.values())]), *one.remarks])

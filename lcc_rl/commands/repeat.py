@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lcc_rl.cli.guard import main_guard
 from lcc_rl.commands import calibration, evaluation, pipeline, training
 from lcc_rl.config.schemas import CalibrateConfig, EvaluateConfig, PipelineConfig
 from lcc_rl.errors import require
@@ -107,7 +106,3 @@ def main(arguments: Sequence[str] | None = None) -> Any:
     equal = bool(tables) and all(alike for _, alike in tables)
     print(f"{target}: {'all rows are equal' if equal else 'rows differ'}")
     return int(not equal)
-
-
-if __name__ == "__main__":
-    main_guard(main)()

@@ -14,7 +14,6 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from lcc_rl.cli.guard import main_guard
 from lcc_rl.config.schemas import TimeStep
 from lcc_rl.evaluation.simulation import simulate
 from lcc_rl.io.atomic import new_file
@@ -53,7 +52,3 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(shown.to_string(index=False, float_format="{:,.4g}".format))
     for name, path in written.items():
         write_table(getattr(found, name), path)
-
-
-if __name__ == "__main__":
-    main_guard(main)()

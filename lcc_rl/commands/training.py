@@ -26,7 +26,7 @@ from lcc_rl.io.files import Rows, as_rows
 from lcc_rl.results.platoons import case_table
 from lcc_rl.results.policies import load_policy, save_policy
 from lcc_rl.results.report import summary, windows_for
-from lcc_rl.results.runs import EPISODES, POLICY, check_folder, resumed_config, save_config
+from lcc_rl.results.runs import EPISODES, POLICY, RECORD, check_folder, resumed_config, save_config
 from lcc_rl.results.trust import trust_option
 from lcc_rl.runs.loggers import RowLogger, Silent
 from lcc_rl.runs.precision import prepare_torch
@@ -35,7 +35,6 @@ from lcc_rl.runs.states import working
 log = logging.getLogger("lcc_rl")
 
 POLICIES, LAST, CHECKPOINT = "policies", "policy_last.pt", "checkpoint.pt"
-RECORD = "training.parquet"
 
 
 def run(cfg: TrainConfig, folder: str | Path, quiet: bool = False, resume: bool = False) -> Rows:

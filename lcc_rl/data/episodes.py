@@ -134,7 +134,7 @@ def _table(
         if names.get(name) is None:
             notes.append(note)
     report = ReadReport([str(file.path)])
-    table = continuous(table, "episode", place, report, bridge)
+    table = continuous(table, "episode", place, report, "data", bridge)
     first, lengths = stretches(table["episode"].to_numpy())
     start = np.repeat(table["time_s"].to_numpy()[first], lengths)
     table, _ = on_grid(table, start, MOTION_COLUMNS, place, report)

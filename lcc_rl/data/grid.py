@@ -84,7 +84,12 @@ def places(
 
 
 def continuous(
-    samples: pd.DataFrame, what: str, place: Places, report: ReadReport, bridge: float
+    samples: pd.DataFrame,
+    what: str,
+    place: Places,
+    report: ReadReport,
+    node: str,
+    bridge: float = np.inf,
 ) -> pd.DataFrame:
     """Sort records by time, keep the first row of each time, and divide records at holes.
 
@@ -94,6 +99,7 @@ def continuous(
         what: key of the column that identifies records: vehicle, episode or drive.
         place: returns for a table the function that describes its rows.
         report: counts the rows left out and the holes.
+        node: section of the settings that messages recommend; empty without settings.
         bridge: longest hole that does not divide a record [s].
 
     Returns:
@@ -106,12 +112,12 @@ def continuous(
     same = np.append(False, np.diff(samples["episode"]) == 0)
     if not same.any():
         raise DataError(f"{report.source}: no {what} has two samples: {place(samples)(0, what)}")
-    usual, longest = _usual_steps(samples, same, what, report.source, bridge)
+    usual, longest = _usual_steps(samples, same, what, report.source, node)
     steps = np.diff(samples["time_s"], prepend=0.0)
     hole = same & (steps > longest)
     bridged = hole & bridges(steps, bridge)
     hole &= ~bridged
-    setting, other = f"{_node(what)}.bridge_s={bridge:g}", ""
+    setting, other = f"{node}.bridge_s={bridge:g}", ""
     if "turn" in samples:
         other = " or with another target"
         turns = same & (np.diff(samples["turn"], prepend=0) != 0)
@@ -136,10 +142,6 @@ def continuous(
 def bridges(steps: Floats, bridge: float) -> Mask:
     """Return which holes [s] are interpolated."""
     return steps <= bridge + REGULAR * FRAME
-
-
-def _node(what: str) -> str:
-    return "leader" if what == "drive" else "data"
 
 
 def _sorted(samples: pd.DataFrame, report: ReadReport) -> pd.DataFrame:
@@ -176,18 +178,18 @@ def _first_of_moments(
 
 
 def _usual_steps(
-    samples: pd.DataFrame, same: Mask, what: str, source: str, bridge: float
+    samples: pd.DataFrame, same: Mask, what: str, source: str, node: str
 ) -> tuple[Floats, Floats]:
     """Return the usual step of each row's record, and the longest that is no hole [s].
 
-    ``same``: whether the row before is of the same record; ``bridge``: infinite for fixed units.
+    ``same``: whether the row before is of the same record; ``node``: see :func:`continuous`.
     """
     steps = samples["time_s"].diff().where(same)
     step = float(steps.median())
     if not SHORTEST_STEP <= step < LONGEST_STEP:
         unit = "ms" if step < 1e3 * LONGEST_STEP else "us" if step < 1e6 * LONGEST_STEP else "ns"
         unit = "s" if step < SHORTEST_STEP else unit
-        fix = f"{_node(what)}.units.time={unit}" if bridge < np.inf else "convert it"
+        fix = f"{node}.units.time={unit}" if node else "convert it"
         span = "from {:.15g} to {:.15g}".format(*samples["time_s"].agg(["min", "max"]))
         raise DataError(
             f"{source}: samples of a {what} are {step:g} s apart; expected {SHORTEST_STEP:g} to "

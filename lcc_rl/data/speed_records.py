@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -95,7 +94,7 @@ def read_drives(
     records: dict[str, tuple[str, Tensor, Tensor | None]] = {}
     lines: list[str] = []
     for table in tables_of(files):
-        samples, report = _read(table, columns, plausible, units or {}, average_s, bridge)
+        samples, report = _read(table, columns, plausible, units or {}, average_s, bridge, "leader")
         loaded = dict(_records(samples, time_step))
         if twice := loaded.keys() & records.keys():
             raise DataError(f"{path}: drive {min(twice)!r} is in several files; expected one")
@@ -132,21 +131,21 @@ def _read(
     plausible: Plausible | None,
     units: Units,
     average_s: float = 0.0,
-    bridge: float = math.inf,
+    bridge: float = np.inf,
+    node: str = "",
 ) -> tuple[pd.DataFrame, list[str]]:
     """Return recording, episode and motion of the plausible samples of a file, and the report.
 
-    Without a finite ``bridge``, the record is not divided, and names of columns are fixed.
+    ``node``: section of the settings of columns and units; empty if they are fixed.
     """
-    divide = math.isfinite(bridge)
-    option = "leader.columns" if divide else ""
+    option = f"{node}.columns" if node else ""
     samples, report = _samples(table, columns, units, option), ReadReport([str(table.path)])
     place = partial(places, files=report.files, columns=table.names)
-    samples = continuous(samples, "drive", place, report, bridge)
-    declared = units_of(DRIVE_FIELDS, DRIVE_COLUMNS, units) if divide else {}
+    samples = continuous(samples, "drive", place, report, node, bridge)
+    declared = units_of(DRIVE_FIELDS, DRIVE_COLUMNS, units) if node else {}
     if average_s:
         samples = _averaged(samples, average_s, str(table.path))
-    remedy = ", smooth it (leader.average_s=0.5)" if divide and not average_s else ""
+    remedy = ", smooth it (leader.average_s=0.5)" if node and not average_s else ""
     rows, lines = (plausible or Plausible()).select(
         samples, str(table.path), place, "leader.plausible", remedy, declared
     )

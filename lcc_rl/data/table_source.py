@@ -216,7 +216,7 @@ def to_trajectories(
     """
     rows["recording"] = pd.Categorical(rows["recording"])
     rows["episode"] = rows.groupby(["recording", "vehicle"], observed=True).ngroup()
-    rows = continuous(rows, "vehicle", place, report, bridge)
+    rows = continuous(rows, "vehicle", place, report, "data", bridge)
     if "leader" in rows:
         _bridge_dropouts(rows, bridge, report)
     _check_way(rows, place, report)

@@ -37,7 +37,7 @@ from lcc_rl.io.files import read_parquet
 from lcc_rl.results.bootstrap import Estimate, share_saved
 from lcc_rl.results.measures import between, signed
 from lcc_rl.results.motion import most_varied
-from lcc_rl.results.names import ON_FRONT, RULE, in_words, several
+from lcc_rl.results.names import ON_FRONT, RULE, in_words, several, size_of
 from lcc_rl.results.render import column_cells
 from lcc_rl.results.report import AGAINST, ALL, COUNTS, Report
 from lcc_rl.results.runs import CONFIG, read_settings
@@ -185,9 +185,8 @@ def overview(episodes: pd.DataFrame, steps: pd.DataFrame, strategy: str, report:
         right.annotate(f"{value} {unit}", (1.0, place), xycoords=transform, **look)
     low, high = right.get_xlim()
     right.set_xlim(low, high + 0.3 * (high - low))
-    sizes = (episodes[name].nunique() for name in ("profile_id", "driver_id"))
     right.set(xlabel=f"{what} saved\nagainst {in_words(against)} [%]")
-    size = " × ".join(map(several, sizes, ("window", "driver")))
+    size = size_of(episodes["profile_id"].nunique(), episodes["driver_id"].nunique(), "")
     right.set_title(LINES.format(size), pad=16)
     return figure
 

@@ -200,7 +200,9 @@ def _surveyed(
 
 def _chosen(runs: Runs, names: Sequence[str] | None, columns: Sequence[str]) -> Runs:
     """Return the settings that become columns, also those that became others, as typed."""
-    runs = {path: x | {**choices_of(path.parent), **x} for path, x in runs.items()}
+    wanted, differ = {*(names or ALWAYS)}, names is None and len(runs) > 1
+    if differ or any(not wanted <= x.keys() for x in runs.values()):
+        runs = {path: x | {**choices_of(path.parent), **x} for path, x in runs.items()}
     every = dict.fromkeys(key for settings in runs.values() for key in settings)
     for name in names or ():
         if not any(fnmatchcase(key, name) for key in every):

@@ -112,6 +112,6 @@ def several(count: int, what: str) -> str:
     return f"{count} {what}{'s' * (count != 1)}"
 
 
-def counted_windows(windows: int, which: str = "") -> str:
-    """Return a count of windows in words; ``which``: a prefix such as ``"held-out "``."""
-    return several(windows, f"{which}window")
+def size_of(windows: int, drivers: int, which: str = "held-out ") -> str:
+    """Return the numbers of windows and drivers in words; ``which``: kind of the windows."""
+    return f"{several(windows, f'{which}window')} × {several(drivers, 'driver')}"

@@ -22,7 +22,7 @@ from lcc_rl.results.measures import (
     REACH,
     between,
 )
-from lcc_rl.results.names import HUMAN, NETWORK, RULE_ROWS, counted_windows, in_words, several
+from lcc_rl.results.names import HUMAN, NETWORK, RULE_ROWS, in_words, several
 from lcc_rl.results.windows import savings
 
 ONE = " ‡"  # marks a training of one seed beside several
@@ -152,13 +152,6 @@ def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
     ]
 
 
-def sample_of(rows: pd.DataFrame, drivers: pd.DataFrame | None = None) -> str:
-    """Return the numbers of windows and drivers of rows, for a title."""
-    windows, people = rows["profile_id"].nunique(), (rows if drivers is None else drivers)
-    size = several(people["driver_id"].nunique(), "driver")
-    return f"{counted_windows(windows, 'held-out ')} × {size}"
-
-
 def few_windows(windows: int, seconds: float | None = None) -> str:
     """Return a warning on few windows; empty for enough or long ones.
 
@@ -168,7 +161,7 @@ def few_windows(windows: int, seconds: float | None = None) -> str:
     """
     if windows >= FEW_WINDOWS or windows * (seconds or 0.0) >= SHORT:
         return ""
-    count = counted_windows(windows) + (f" of {seconds:g} s" if seconds else "")
+    count = several(windows, "window") + (f" of {seconds:g} s" if seconds else "")
     return f"{count} are too few for conclusions: these numbers only show that everything runs"
 
 
@@ -195,7 +188,7 @@ def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> 
             sentences.append(_sentence(windows, rows, name, other))
         elif of_few:
             both = (f"{rows[x][PATH_PER_KM]:,.1f} kJ ({in_words(x)})" for x in (name, other))
-            few = f"{counted_windows(count)} are too few for a conclusion."
+            few = f"{several(count, 'window')} are too few for a conclusion."
             sentences.append(f"Per vehicle and km: {', '.join(both)}; {few}")
     least = min(rows, key=lambda name: rows[name][PATH_PER_KM])
     # It may be the user's rule.

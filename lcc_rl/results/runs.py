@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import logging
+import platform
 import re
+import shlex
+import subprocess
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +22,15 @@ from lcc_rl.errors import LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.results.trust import own_modules, trusted
-from lcc_rl.runs.origin import ORIGIN, origin
 from lcc_rl.runs.states import CONFIG, no_run
+from lcc_rl.version import __version__
 
 log = logging.getLogger("lcc_rl")
 
 POLICY = "policy.pt"
 EPISODES = "episodes.parquet"  # last file of a run, which shows that it is finished
-STEPS = "steps.parquet"
+STEPS, RECORD = "steps.parquet", "training.parquet"
+ORIGIN = "origin.txt"  # where a run comes from
 PARTS, FINAL = ".parts", "evaluation"  # parts' settings and last part of a job of lcc-rl run
 SECTION = re.compile(r"^(?=[a-z])", re.MULTILINE)  # before the name of a section of settings
 # Results and states of stopped runs, which commands with other settings must not replace.
@@ -37,6 +43,35 @@ def save_config(cfg: BaseConfig, folder: Path) -> None:
         temporary.write_text(as_text(cfg), encoding="utf-8")
     with atomic_path(folder / ORIGIN) as temporary:
         temporary.write_text(origin(), encoding="utf-8")
+
+
+def origin() -> str:
+    """Return the lines of ``origin.txt``: command, versions, folder and its commit, if it has one.
+
+    It is no part of a run's identity; the settings and the hashes of its files are in config.yaml.
+    """
+    program = [Path(sys.argv[0]).name, *sys.argv[1:]]
+    versions = f"lcc_rl {__version__}, torch {version('torch')}, Python {platform.python_version()}"
+    return "\n".join([shlex.join(program), versions, f"{Path.cwd()}{_commit()}", ""])
+
+
+def _commit() -> str:
+    """Return the commit of the working directory, and how many of its files differ from it."""
+    commit, changed = _git("rev-parse", "HEAD"), _git("status", "--porcelain")
+    if not commit:
+        return ""
+    count = len((changed or "").splitlines())
+    return f", commit {commit.strip()}, {f'{count} files changed' if count else 'unchanged'}"
+
+
+def _git(*words: str) -> str:
+    # A monitor of file systems is a program that the repository names.
+    command = ["git", "-c", "core.fsmonitor=false", *words]
+    try:
+        found = subprocess.run(command, capture_output=True, text=True, timeout=5.0, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return found.stdout if found.returncode == 0 else ""
 
 
 def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:

@@ -16,7 +16,7 @@ from lcc_rl.energy import AVERAGED, BURNT, SECOND
 from lcc_rl.io.files import Rows, read_parquet
 from lcc_rl.results.bootstrap import NOTHING, Estimate, equal_seeds, estimate, saving, share_saved
 from lcc_rl.results.measures import DAMPING, DISTANCE, MEASURES, SHARE, WAYS, aggregates
-from lcc_rl.results.names import in_words
+from lcc_rl.results.names import in_words, size_of
 from lcc_rl.results.runs import EPISODES
 
 WINDOWS, DRIVERS = "windows.parquet", "drivers.parquet"
@@ -155,6 +155,11 @@ class Means:
     windows: pd.DataFrame
     drivers: pd.DataFrame
     per: str = "episode"
+
+    @property
+    def size(self) -> str:
+        """Numbers of windows and drivers, in words."""
+        return size_of(self.windows["profile_id"].nunique(), self.drivers["driver_id"].nunique())
 
     @classmethod
     def of(cls, rows: pd.DataFrame) -> Self:

@@ -70,14 +70,16 @@ def unfinished(root: Path) -> dict[str, str]:
     Cells of a plan without a folder are ``waiting``.
     """
     found = {run.name: str(run) for run in survey(root) if run.state != "finished"}
-    sweeps: dict[Path, list[dict[str, str]]] = {root: []}
+    sweeps: dict[Path, list[Path]] = {root: []}
     for run in (run for run in run_folders(root) if run != root):
-        sweeps.setdefault(run.parent, []).append(choices_of(run))
+        sweeps.setdefault(run.parent, []).append(run)
     for sweep, runs in sweeps.items():
         latest = read_plan(sweep)
-        for plan in (latest, *latest.earlier):
-            begun = {tuple(map(choices.get, plan.varied)) for choices in runs}
-            for cell in islice(product(*plan.values), MOST_RUNS) if plan.values else ():
+        plans = [plan for plan in (latest, *latest.earlier) if plan.values]
+        typed = [choices_of(run) for run in runs] if plans else []
+        for plan in plans:
+            begun = {tuple(map(choices.get, plan.varied)) for choices in typed}
+            for cell in islice(product(*plan.values), MOST_RUNS):
                 if cell not in begun:
                     each = zip(plan.varied, cell, strict=False)
                     name = "+".join(f"{key}={value}" for key, value in each)

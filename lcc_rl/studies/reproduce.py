@@ -31,8 +31,7 @@ from lcc_rl.studies.alcc import results as alcc_results
 from lcc_rl.studies.alcc import study as alcc
 from lcc_rl.studies.hcfs import results as hcfs_results
 from lcc_rl.studies.hcfs import study as hcfs
-from lcc_rl.studies.results import RESULTS_PAGE, StudyResults
-from lcc_rl.studies.study import Study
+from lcc_rl.studies.study import RESULTS_PAGE, Study, StudyResults
 
 log = logging.getLogger("lcc_rl")
 

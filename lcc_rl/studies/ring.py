@@ -18,7 +18,7 @@ from lcc_rl.io.files import read_parquet
 from lcc_rl.results.measures import signed
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import CONFIG, EPISODES, STEPS, read_settings
-from lcc_rl.studies.results import StudyResults
+from lcc_rl.studies.study import StudyResults
 
 RING_EVALUATION = "evaluation"
 RIVALS = ("follower_stopper", "pi_saturation")

@@ -30,7 +30,7 @@ from lcc_rl.results.report import Report, windows_for
 from lcc_rl.results.runs import CONFIG, EPISODES, read_settings
 from lcc_rl.results.windows import DRIVE, savings
 from lcc_rl.studies.alcc.study import DRIVERS_FILE
-from lcc_rl.studies.results import StudyResults
+from lcc_rl.studies.study import StudyResults
 
 ROAD_SHARES = ("5", "10", "20")  # shares of automated cars [%]
 # Strings with desired speeds below those of the leaders would fall behind.

@@ -7,12 +7,14 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 from commands import DATA, NO_AGENT, QUICK, TINY, content, jobs_in_threads, run_command
-from helpers import slow_but
+from helpers import check_refused, slow_but
 
+from benchmarks import command as benchmarks
 from lcc_rl.runs.states import claim, inspect_run
 
 RULE = ("variant=idm", *NO_AGENT)
@@ -20,7 +22,7 @@ COMMANDS = {
     "train": (*RULE, "seed=1"),
     "evaluate": (*RULE, "evaluation.seed=1"),
     "calibrate": (*DATA, QUICK),
-    "pipeline": ("variants=[alcc]", *TINY),
+    "run": ("variants=[alcc]", *TINY),
 }
 LISTS = ("seed=range(1000000)", "data.seed=range(1000000000)")
 
@@ -65,10 +67,10 @@ NAMED = (
 )
 
 
-def refused(words: list[str], cwd: Path, module: str = "lcc_rl.cli.console") -> str:
+def refused(words: Sequence[str], cwd: Path) -> str:
     """Return the one line of a command that ends with exit code 2 and leaves all as it was."""
     before = sorted(cwd.rglob("*")), content(cwd)
-    done = run_command(module, *words, cwd=cwd)
+    done = run_command(*words, cwd=cwd)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1, done.stderr
     assert done.stderr.startswith("lcc_rl: error: ")
@@ -84,7 +86,7 @@ def test_bad_input_is_one_line_and_exit_code_2_and_leaves_nothing(tmp_path) -> N
 
 def test_a_job_that_fails_once_its_data_are_read_is_recorded(tmp_path) -> None:
     words = (*NO_AGENT, "data.recordings=1", "hydra.run.dir=job")
-    done = run_command("lcc_rl.cli.pipeline", *words, cwd=tmp_path)
+    done = run_command("run", *words, cwd=tmp_path)
     assert done.stderr.count("\n") == 1
     assert "split.by=vehicle" in inspect_run(tmp_path / "job").error
 
@@ -97,18 +99,18 @@ def test_nothing_that_is_there_is_written_over(run, tmp_path) -> None:
 
 
 def test_so_do_the_benchmarks(run, tmp_path, monkeypatch) -> None:
-    for typed, said in (
+    cases = (
         ("env --out run/episodes.parquet", "exists already"),
         ("env --threads 100000", "--threads: must be less"),
         ("reed", "Did you mean 'read'"),
-    ):
-        monkeypatch.setattr("sys.argv", ["tool", *typed.split()])
-        assert said in refused(typed.split(), tmp_path, "benchmarks.command")
+    )
+    monkeypatch.chdir(tmp_path)
+    check_refused(lambda typed: benchmarks.main(typed.split()), cases)
 
 
 def test_flags_may_stand_anywhere(tmp_path) -> None:
     words = ("seed=7", "--cfg", "job", "variant=IDM")
-    done = run_command("lcc_rl.cli.train", *words, cwd=tmp_path, check=True)
+    done = run_command("train", *words, cwd=tmp_path, check=True)
     assert "seed: 7" in done.stdout
     assert "variant: idm" in done.stdout
 
@@ -118,14 +120,12 @@ def test_flags_may_stand_anywhere(tmp_path) -> None:
 
 def test_a_run_is_not_written_over_finished_or_stopped(run, tmp_path) -> None:
     for entry, words in COMMANDS.items():
-        said = refused([*words, "hydra.run.dir=run"], tmp_path, f"lcc_rl.cli.{entry}")
+        said = refused([entry, *words, "hydra.run.dir=run"], tmp_path)
         assert "already holds episodes.parquet of other settings" in said, entry
     held = run / "episodes.parquet"
     for kept in ("checkpoint.pt", "command.txt"):  # of a training and of a pipeline
         held = held.rename(run / kept)
-        said = refused(
-            [*RULE, "evaluation.seed=3", "hydra.run.dir=run"], tmp_path, "lcc_rl.cli.evaluate"
-        )
+        said = refused(["evaluate", *RULE, "evaluation.seed=3", "hydra.run.dir=run"], tmp_path)
         assert f"already holds {kept} of other settings" in said
 
 
@@ -138,7 +138,7 @@ def test_nor_is_a_folder_of_something_else(tmp_path) -> None:
 def test_a_sweep_does_not_write_over_a_run_of_other_settings(run, tmp_path) -> None:
     before = content(run)
     words = ("-m", *COMMANDS["train"], "hydra.sweep.dir=.", "hydra.sweep.subdir=run")
-    done = run_command("lcc_rl.cli.train", *words, cwd=tmp_path)
+    done = run_command("train", *words, cwd=tmp_path)
     assert done.returncode == 2
     after = content(run)
     assert all(before[name] == after[name] for name in ("episodes.parquet", "config.yaml"))
@@ -146,16 +146,16 @@ def test_a_sweep_does_not_write_over_a_run_of_other_settings(run, tmp_path) -> N
 
 def test_the_same_command_gives_the_same_rows_again(run, tmp_path) -> None:
     before = (run / "episodes.parquet").read_bytes()
-    run_command("lcc_rl.cli.train", *RULE, "hydra.run.dir=run", cwd=tmp_path, check=True)
+    run_command("train", *RULE, "hydra.run.dir=run", cwd=tmp_path, check=True)
     assert (run / "episodes.parquet").read_bytes() == before
     assert inspect_run(run).state == "finished"
 
 
 def test_a_refused_command_leaves_a_run_as_it_was(run, tmp_path) -> None:
     for words in (["resume=run", "seed=3"], ["hydra.run.dir=run", *RULE, "evaluation.drivers=0"]):
-        refused(words, tmp_path, "lcc_rl.cli.train")
+        refused(["train", *words], tmp_path)
     (run / "episodes.parquet").unlink()
-    refused(["resume=run", "seed=3"], tmp_path, "lcc_rl.cli.train")
+    refused(["train", "resume=run", "seed=3"], tmp_path)
     assert inspect_run(run).state == "stopped"
 
 
@@ -163,7 +163,7 @@ def test_a_run_whose_settings_were_changed_is_not_resumed(run, tmp_path) -> None
     path = run / "config.yaml"
     path.write_text(path.read_text().replace("seed: 0", "seed: 1", 1))
     before = content(run)
-    done = run_command("lcc_rl.cli.train", "resume=run", cwd=tmp_path)
+    done = run_command("train", "resume=run", cwd=tmp_path)
     assert done.returncode == 2
     assert "episodes.parquet belongs to another configuration" in done.stderr
     assert content(run) == before
@@ -181,7 +181,7 @@ def test_the_second_process_in_a_folder_touches_nothing(tmp_path, monkeypatch) -
     target = f"hydra.run.dir={tmp_path / 'run'}"
     with claim(tmp_path / "run"):
         for entry, words in COMMANDS.items():
-            said = refused([*words, target], tmp_path, f"lcc_rl.cli.{entry}")
+            said = refused([entry, *words, target], tmp_path)
             assert said.endswith("run: another process is working on this run\n"), entry
 
 

@@ -97,7 +97,7 @@ def test_a_stored_configuration_writes_nowhere_but_into_its_folder(run, tmp_path
     assert "data.keep=" in caplog.text
     assert "names a path to write to and is left out" in caplog.text
     change(run, {"logger": None})
-    run_command("lcc_rl.cli.train", f"resume={run}", cwd=tmp_path, check=True)
+    run_command("train", f"resume={run}", cwd=tmp_path, check=True)
     assert list(tmp_path.iterdir()) == [run]
 
 

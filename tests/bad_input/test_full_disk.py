@@ -24,8 +24,7 @@ from lcc_rl.figures.page import Page
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
 from lcc_rl.io.tensors import read_torch, write_torch
-from lcc_rl.results.runs import save_config
-from lcc_rl.runs.origin import ORIGIN
+from lcc_rl.results.runs import ORIGIN, save_config
 from lcc_rl.runs.states import inspect_run
 
 

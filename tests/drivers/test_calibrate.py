@@ -95,7 +95,7 @@ def test_bad_input_ends_in_an_error_that_names_it(cfg, tmp_path):
 @pytest.fixture
 def command(source):
     """Function that runs the command in the folder of the episode file."""
-    return partial(run_command, "lcc_rl.cli.calibrate", cwd=source)
+    return partial(run_command, "calibrate", cwd=source)
 
 
 @pytest.mark.usefixtures("blank_figures")

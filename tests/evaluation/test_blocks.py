@@ -128,7 +128,7 @@ def test_an_interrupted_command_names_the_one_that_goes_on(tmp_path, monkeypatch
     with monkeypatch.context() as patched:
         stop_after(patched, 2)
         patched.syspath_prepend(tmp_path)
-        done = run_command("lcc_rl.cli.evaluate", *words, cwd=tmp_path)
+        done = run_command("evaluate", *words, cwd=tmp_path)
     assert done.returncode == 130
     assert re.search(
         r"stopped; resume with: lcc-rl evaluate resume=\S*run trust=\[mine\]$", done.stderr.strip()
@@ -174,7 +174,7 @@ def test_figures_that_were_cut_short_are_drawn_by_the_same_command(tmp_path, mon
 def test_shards_are_one_table_and_a_missing_one_is_said(whole, tmp_path, caplog) -> None:
     words = [*WORDS, BLOCK, *NO_AGENT, "sweep=parts"]
     words += ["evaluation.shards=4", "evaluation.shard=range(4)"]
-    run_command("lcc_rl.cli.evaluate", "-m", *words, cwd=tmp_path, check=True)
+    run_command("evaluate", "-m", *words, cwd=tmp_path, check=True)
     root, order = tmp_path / "outputs/evaluate/parts", ["profile_id", "driver_id", "strategy"]
     rows, own = results.load(root, strict=True), read_parquet(whole / "episodes.parquet")
     kinds = own.dtypes.to_dict()  # text is categorical in a table of many runs
@@ -191,7 +191,7 @@ def test_shards_are_one_table_and_a_missing_one_is_said(whole, tmp_path, caplog)
     with pytest.raises(ResultsError, match=r"not finished: evaluation\.shard=2"):
         results.load(root, strict=True)
     # The same command plays what is missing and nothing else.
-    run_command("lcc_rl.cli.evaluate", "-m", *words, cwd=tmp_path, check=True)
+    run_command("evaluate", "-m", *words, cwd=tmp_path, check=True)
     again = {path: path.stat().st_mtime_ns for path in root.glob("*/episodes.parquet")}
     assert {path for path in again if again[path] == written.get(path)} == set(written) - {gone}
     assert len(results.load(root, strict=True)) == len(own)

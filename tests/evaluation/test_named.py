@@ -143,7 +143,7 @@ scenario: {{controllers: {{automated: {node}}}}}
         (tmp_path / "conf" / group / f"own_{group}.yaml").write_text(text)
     words = ["--config-dir", "conf", *SMALL, "hydra.run.dir=run"]
     for typed in ("compare=[own_controller,own_variant]", "variant=own_variant"):
-        run_command("lcc_rl.cli.evaluate", *words, typed, cwd=tmp_path, check=True)
+        run_command("evaluate", *words, typed, cwd=tmp_path, check=True)
         found = read_parquet(tmp_path / "run" / "episodes.parquet")
         assert "own_variant" in set(found["strategy"])
         (tmp_path / "run" / "episodes.parquet").unlink()
@@ -185,7 +185,7 @@ def test_a_file_that_the_package_hides_is_refused(tmp_path) -> None:
     path.parent.mkdir(parents=True)
     path.write_text(f"_target_: {PATH}\n")
     words = ["--config-dir", str(tmp_path / "mine"), "experiment=smoke", "compare=[acc]"]
-    done = run_command("lcc_rl.cli.evaluate", *words, cwd=tmp_path)
+    done = run_command("evaluate", *words, cwd=tmp_path)
     assert done.returncode == 2
     assert f"{path}: the package has a file of this name" in done.stderr
 
@@ -242,7 +242,7 @@ def test_a_controller_that_does_not_fit_is_named_and_leaves_no_folder(tmp_path) 
     out = {"overrides": SMALL, "folder": tmp_path / "a"}
     check_refused(lambda who: lcc_rl.compare([who], **out), cases)
     typed = [*SMALL, f"compare=[{__name__}.Wide]", "hydra.run.dir=b"]
-    assert run_command("lcc_rl.cli.evaluate", *typed, cwd=tmp_path).returncode == 2
+    assert run_command("evaluate", *typed, cwd=tmp_path).returncode == 2
     assert not list(tmp_path.iterdir())
 
 

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from helpers import t
 
 from lcc_rl.functional.driver_models import simulate_follower
 from lcc_rl.functional.gipps import GippsConstants
@@ -14,10 +15,6 @@ from lcc_rl.functional.ovm import (
 )
 
 EACH = pytest.mark.parametrize("model", list(LAWS))
-
-
-def t(*values: float) -> torch.Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def test_optimal_velocity_by_hand() -> None:

@@ -1,15 +1,12 @@
 """The Intelligent Driver Model: formula, equilibrium and behaviour."""
 
 import torch
+from helpers import t
 
 from lcc_rl.functional.driver_models import simulate_follower
 from lcc_rl.functional.idm import IDMConstants
 
 KNOWN = IDMConstants(acceleration=1.0, deceleration=1.5, min_gap=2.0)
-
-
-def t(*values: float) -> torch.Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def test_formula_a3() -> None:

@@ -1,14 +1,11 @@
 """Equations against values worked out by hand."""
 
 import torch
+from helpers import t
 
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.power import motor_power
 from lcc_rl.functional.safety import time_gap, time_to_collision
-
-
-def t(*values: float) -> torch.Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def test_advance_speed_stops_at_zero() -> None:

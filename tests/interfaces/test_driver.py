@@ -163,8 +163,8 @@ STEADY = {
 @pytest.mark.parametrize("name", [POLICY, "idm_acc_filtered", "pretrained/alcc_limits"])
 def test_faults_and_other_targets(name, subtests) -> None:
     """The command during a fault and after it, from step 10 on, against that without a fault."""
-    calm = Driver(name, 0.1)
-    usual = [calm.step(STEADY) for _ in range(30)]
+    driver, anew = (Driver(name, 0.1) for _ in range(2))
+    usual = [driver.step(STEADY) for _ in range(30)]
     zeros, lost = dict.fromkeys(STEADY, 0.0), {"self.gap": 0.0, "ahead.speed": 0.0}
     cases = [
         ("a sample of zeros", zeros, 1, usual[0]),
@@ -178,7 +178,8 @@ def test_faults_and_other_targets(name, subtests) -> None:
     ]
     for what, fault, count, expected in cases:
         with subtests.test(what):
-            driver = Driver(name, 0.1)
+            driver.reset()
+            anew.reset()
             steps = [STEADY | fault if 10 <= k < 10 + count else STEADY for k in range(30)]
             found = np.array([driver.step(x) for x in steps])
             during, after = found[10 : 10 + count], found[10 + count + 1 :]
@@ -186,8 +187,7 @@ def test_faults_and_other_targets(name, subtests) -> None:
             if expected is not None:
                 assert during[-1] == pytest.approx(expected, abs=1e-4)
             else:  # as a car that begins then
-                anew = Driver(name, 0.1).step(STEADY | fault)
-                np.testing.assert_allclose(during, anew, atol=0.05)
+                np.testing.assert_allclose(during, anew.step(STEADY | fault), atol=0.05)
 
 
 def test_a_driver_keeps_the_margin_of_its_filter_behind_a_car_at_standstill() -> None:
@@ -222,7 +222,11 @@ def test_without_a_vehicle_behind() -> None:
     without = {name: x for name, x in here.items() if not name.startswith("behind")}
     like_own = without | {"behind.speed": here["self.speed"], "behind.gap": here["self.gap"]}
     names = [here | {"behind.present": [1, 0, 0, 1]}, without, like_own, here]
-    some, none, assumed, every = (Driver(POLICY, 0.1).step(given) for given in names)
+    driver, found = Driver(POLICY, 0.1), []
+    for given in names:
+        driver.reset()
+        found.append(driver.step(given))
+    some, none, assumed, every = found
     np.testing.assert_array_equal(none, assumed)
     np.testing.assert_array_equal(some, np.where([True, False, False, True], every, none))
     assert (none != every).all()
@@ -333,9 +337,11 @@ def test_no_driver_takes_a_measurement_that_is_no_number() -> None:
     with pytest.raises(Diverged, match=r"alcc: self\.gap is inf in row 1 of the cars"):
         driver.step({**given, "self.gap": np.array([12.0, np.inf])})
     for name in (POLICY, "idm_acc_filtered", "pretrained/i80-follow"):
-        for k, entry in enumerate(Driver(name, 0.1).names):
+        driver = Driver(name, 0.1)
+        for k, entry in enumerate(driver.names):
             bad = (np.nan, np.inf, -np.inf)[k % 3]
-            found = Driver(name, 0.1).step({**given, entry: np.array([12.0, bad])})
+            driver.reset()
+            found = driver.step({**given, entry: np.array([12.0, bad])})
             rear = entry.startswith("behind.")
             assert found[1] == pytest.approx(found[0] if rear else -3.0), (name, entry)
             assert found[0] > -3.0

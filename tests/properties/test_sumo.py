@@ -153,7 +153,7 @@ def test_drivers_of_an_fcd_output_are_calibrated_to_their_constants(tmp_path) ->
     known = [f"calibration.constants.{x}" for x in ("acceleration=1.2", "deceleration=1.6")]
     named = [f"data.columns.{column}" for column in columns]
     settings = ["data=table", f"data.path={output}", *named, *known, f"hydra.run.dir={tmp_path}/c"]
-    run_command("lcc_rl.cli.calibrate", *settings, cwd=tmp_path, check=True)
+    run_command("calibrate", *settings, cwd=tmp_path, check=True)
     for row in pd.read_parquet(tmp_path / "c" / "drivers.parquet").itertuples():
         gap, top = DRIVERS[int(row.follower_id)]
         assert (row.time_gap_s, row.desired_speed_mps) == pytest.approx((gap, top), abs=0.02)

@@ -128,7 +128,7 @@ def test_actions_of_shipped_policies(name: str) -> None:
 
 def test_table_of_the_main_job(tmp_path: Path) -> None:
     """README's table, by the command: energies within 0.2 %, where no bit is promised."""
-    run_command("lcc_rl.cli.pipeline", cwd=tmp_path, check=True)
+    run_command("run", cwd=tmp_path, check=True)
     (rows,) = tmp_path.rglob("evaluation/episodes.parquet")
     table = summary(windows_for(pd.read_parquet(rows))).set_index("strategy")
     found = table["path_energy_kj_per_km"].to_dict()

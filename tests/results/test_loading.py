@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
@@ -15,12 +16,12 @@ import yaml
 from helpers import check_refused
 
 from lcc_rl import results
-from lcc_rl.cli.status import main as status
 from lcc_rl.commands import animate
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.runs import differences
 from lcc_rl.results.sweeps import load_sweep
+from lcc_rl.runs.overview import main as status
 
 TABLE = "episodes.parquet"
 
@@ -128,6 +129,8 @@ def test_an_unknown_setting_is_refused_with_the_nearest(tmp_path) -> None:
     hydra.mkdir()
     (hydra / "overrides.yaml").write_text("- ++reward.without=safety\n- ++seed=9")
     frame = results.load(tmp_path, settings=["seed", "reward.*"])  # stored and only typed ones
+    with patch("lcc_rl.results.loading.choices_of", lambda _: pytest.fail("not needed")):
+        assert list(results.load(tmp_path, settings=["seed"])["seed"]) == list(frame["seed"])
     found = frame.groupby(["reward.without", "seed"], observed=True).size()
     assert found.to_dict() == {("safety", 0): 6}
     with pytest.raises(ConfigError, match=r"'agent.gama'.*Did you mean 'agent.gamma'"):

@@ -15,7 +15,6 @@ from study_frames import episodes
 
 from lcc_rl import results
 from lcc_rl.cli import table
-from lcc_rl.cli.status import main as status
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.figures.evaluation import measures_of
@@ -25,6 +24,7 @@ from lcc_rl.results import names
 from lcc_rl.results.report import report, windows_for
 from lcc_rl.results.runs import EPISODES, save_config
 from lcc_rl.results.sweeps import labels, load_sweep, without_effect
+from lcc_rl.runs.overview import main as status
 from lcc_rl.runs.plans import PLAN, SweepPlan, read_plan, unfinished
 
 WEIGHT = "reward.terms.efficiency.weight"

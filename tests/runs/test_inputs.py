@@ -143,13 +143,13 @@ def test_a_changed_file_is_said_on_resume_and_seen_by_a_sweep(place, entry, anew
     words = [*NO_AGENT, "variant=idm", "drivers=calibrated", "drivers.path=d.parquet"]
     words += ["evaluation.drivers=2"] + ["evaluation.baselines=[]"] * (entry == "evaluate")
     seed = "evaluation.seed=0" if entry == "evaluate" else "seed=0"
-    sweep = (f"lcc_rl.cli.{entry}", "-m", *words, seed, "sweep=s")
+    sweep = (entry, "-m", *words, seed, "sweep=s")
     run_command(*sweep, cwd=place, check=True)
     (settings,) = (place / "outputs" / entry / "s").glob("*/config.yaml")
     run, first = settings.parent, made_by(settings.parent / "episodes.parquet")
     assert "finished before" in run_command(*sweep, cwd=place, check=True).stdout
     drivers(place, 1.1)
-    done = run_command(f"lcc_rl.cli.{entry}", f"resume='{run}'", cwd=place)
+    done = run_command(entry, f"resume='{run}'", cwd=place)
     assert done.returncode == 2
     assert "d.parquet (drivers) has changed since the run began" in done.stderr
     done = run_command(*sweep, cwd=place)
@@ -178,7 +178,7 @@ def test_a_file_of_config_dir_is_an_input(place) -> None:
             f"hydra.run.dir=run{accel}",
             *NO_AGENT,
         )
-        command = ("lcc_rl.cli.evaluate", "variant=idm", *words, "--config-dir", "own")
+        command = ("evaluate", "variant=idm", *words, "--config-dir", "own")
         run_command(*command, cwd=place, check=True)
         kept.append(made_by(place / f"run{accel}" / "episodes.parquet"))
     assert kept[0] != kept[1]

@@ -152,9 +152,9 @@ def whole(tmp_path_factory) -> Path:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [*SENT, signal.SIGKILL])
 def test_a_training_that_is_ended_resumes_to_the_same_rows(whole, tmp_path, kind) -> None:
-    with start("lcc_rl.cli.train", *TINY, *LONGER, "hydra.run.dir=run", cwd=tmp_path) as child:
+    with start("train", *TINY, *LONGER, "hydra.run.dir=run", cwd=tmp_path) as child:
         wait_for(tmp_path / "run" / "checkpoint.pt", child)
-        second = run_command("lcc_rl.cli.train", "resume=run", cwd=tmp_path)
+        second = run_command("train", "resume=run", cwd=tmp_path)
         assert child.poll() is None
         child.send_signal(kind)
         _, errors = child.communicate(timeout=60)
@@ -164,7 +164,7 @@ def test_a_training_that_is_ended_resumes_to_the_same_rows(whole, tmp_path, kind
     assert "Traceback" not in errors
     assert ("resume=" in errors) == (kind != signal.SIGKILL)
     assert not (tmp_path / "run" / "episodes.parquet").exists()
-    run_command("lcc_rl.cli.train", "resume=run", cwd=tmp_path, check=True)
+    run_command("train", "resume=run", cwd=tmp_path, check=True)
     assert_same_tables(whole, tmp_path / "run")
 
 
@@ -172,7 +172,7 @@ def test_a_training_that_is_ended_resumes_to_the_same_rows(whole, tmp_path, kind
 @pytest.mark.parametrize("send", [os.kill, os.killpg])
 def test_an_interrupted_pipeline_starts_no_further_training(tmp_path, monkeypatch, send) -> None:
     words = [*TINY, QUICK, "training.episodes=400", "variants=[alcc,reference]", "jobs=1"]
-    with start("lcc_rl.cli.pipeline", *words, "hydra.run.dir=job", cwd=tmp_path) as process:
+    with start("run", *words, "hydra.run.dir=job", cwd=tmp_path) as process:
         wait_for(tmp_path / "job/alcc/checkpoint.pt", process)
         send(process.pid, signal.SIGINT)  # a terminal sends it to every process of the job
         _, errors = process.communicate(timeout=60)
@@ -181,7 +181,7 @@ def test_an_interrupted_pipeline_starts_no_further_training(tmp_path, monkeypatc
     assert not (tmp_path / "job/alcc/episodes.parquet").exists()
     assert not (tmp_path / "job/reference").exists()
     jobs_in_threads(monkeypatch)
-    run_command("lcc_rl.cli.pipeline", "resume=job", cwd=tmp_path, check=True)
+    run_command("run", "resume=job", cwd=tmp_path, check=True)
     for name in ("alcc", "reference"):
         assert len(read_parquet(tmp_path / "job" / name / "training.parquet")) == 50
         assert f"train {name}: iteration 50/50" in (tmp_path / f"job/{name}/train.log").read_text()

@@ -15,7 +15,7 @@ from helpers import check_refused
 from lcc_rl.commands import repeat, training
 from lcc_rl.errors import LccError
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.runs.origin import ORIGIN, origin
+from lcc_rl.results.runs import ORIGIN, origin
 from lcc_rl.version import __version__
 
 
@@ -59,7 +59,7 @@ def test_settings_alone_are_a_run_to_begin(trained, tmp_path) -> None:
 
 JOB = (*TINY, QUICK, "variants=[alcc]", "jobs=1", "evaluation.baselines=[human]")
 COMMANDS = {"train": (*NO_AGENT, "variant=idm"), "evaluate": (*NO_AGENT, "variant=idm")}
-SLOW = pytest.param("pipeline", JOB, marks=pytest.mark.slow)
+SLOW = pytest.param("run", JOB, marks=pytest.mark.slow)
 
 
 @pytest.mark.usefixtures("blank_figures")
@@ -67,7 +67,7 @@ SLOW = pytest.param("pipeline", JOB, marks=pytest.mark.slow)
 def test_every_command_is_repeated(command, words, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     here = f"hydra.run.dir={tmp_path / 'run'}"
-    run_command(f"lcc_rl.cli.{command}", *words, here, cwd=tmp_path, check=True)
+    run_command(command, *words, here, cwd=tmp_path, check=True)
     assert repeat.main([str(tmp_path / "run")]) == 0
     assert "outputs/repeat/run: all rows are equal" in capsys.readouterr().out
 

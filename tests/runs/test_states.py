@@ -12,10 +12,9 @@ import pytest
 from commands import run_command
 from rich.console import Console
 
-from lcc_rl.cli.status import main
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
 from lcc_rl.results.runs import load_config
-from lcc_rl.runs.overview import states_table
+from lcc_rl.runs.overview import main, states_table
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import (
     Busy,
@@ -30,7 +29,7 @@ from lcc_rl.runs.states import (
 
 
 def status(folder: Path) -> list[str]:
-    done = run_command("lcc_rl.cli.status", str(folder), cwd=folder, check=True)
+    done = run_command("status", str(folder), cwd=folder, check=True)
     return done.stdout.splitlines()
 
 
@@ -145,7 +144,7 @@ def test_a_folder_that_is_no_run_is_refused_with_the_runs_and_tables_in_it(tmp_p
 
 def test_nothing_to_see(tmp_path) -> None:
     assert status(tmp_path)[-1].endswith("0 runs: none")
-    done = run_command("lcc_rl.cli.status", "", cwd=tmp_path)
+    done = run_command("status", "", cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "the name of the folder is empty" in done.stderr
 

@@ -33,7 +33,7 @@ INTERRUPTED = ("agents.loop.ProgressReporter.update", "commands.training.build_a
 
 def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path) -> None:
     words = (*SWEEP, f"{GAP}=1.2,-1")
-    first = run_command("lcc_rl.cli.train", *words, cwd=tmp_path)
+    first = run_command("train", *words, cwd=tmp_path)
     assert first.returncode == 2, first.stderr
     assert "1 of 2 runs failed" in first.stderr
     assert "Traceback" not in first.stderr
@@ -48,14 +48,14 @@ def test_a_sweep_with_failures_finishes_the_rest_and_skips_it_next_time(tmp_path
     written = table.stat().st_mtime_ns
     (folder / ".sweep.json.1.tmp").write_text("{")
     # The order of the settings does not change a folder's name.
-    second = run_command("lcc_rl.cli.train", "-m", *reversed(words[1:]), cwd=tmp_path)
+    second = run_command("train", "-m", *reversed(words[1:]), cwd=tmp_path)
     assert "finished before" in second.stdout
     assert second.returncode == 2
     assert table.stat().st_mtime_ns == written
     assert not list(folder.glob(".*.tmp"))
     table.unlink()
     with claim(table.parent):  # another process works on it
-        third = run_command("lcc_rl.cli.train", *words, cwd=tmp_path)
+        third = run_command("train", *words, cwd=tmp_path)
     assert "another process" in third.stdout
     assert not table.exists()
 
@@ -72,7 +72,7 @@ def test_a_sweep_that_is_interrupted_names_the_way_to_resume(tmp_path, monkeypat
 
     monkeypatch.setattr(f"lcc_rl.{where}", interrupted)
     words = ("-m", *TINY, "variant=alcc", "seed=0,1", "sweep=mine")
-    done = run_command("lcc_rl.cli.train", *words, cwd=tmp_path)
+    done = run_command("train", *words, cwd=tmp_path)
     line = "lcc_rl: stopped; the same command resumes it in outputs/train/mine\n"
     assert (done.returncode, done.stderr) == (130, line)
     assert not list(tmp_path.rglob("error.txt"))
@@ -83,7 +83,7 @@ def test_a_sweep_is_read_as_one_table(tmp_path, capsys) -> None:
     inputs._last.clear()  # what other sweeps of this process have read
     one = [*TINY, "variant=alcc", "training.episodes=16", "evaluation.baselines=[human]"]
     words = [*one, "seed=0,1", "reward.terms.safety.weight=0,2", "sweep=mine"]
-    done = run_command("lcc_rl.cli.train", "-m", *words, cwd=tmp_path, check=True)
+    done = run_command("train", "-m", *words, cwd=tmp_path, check=True)
     assert done.stdout.count(inputs.SHARED) == 3  # by all runs but the first
     assert "side by side: lcc-rl table outputs/train/mine --figure" in done.stdout
     folder = tmp_path / "outputs" / "train" / "mine"
@@ -102,7 +102,7 @@ def test_a_sweep_is_read_as_one_table(tmp_path, capsys) -> None:
     }
     assert (tmp_path / "sweep.pdf").stat().st_size > 5000
     alone = [*NO_AGENT, "variant=alcc", "evaluation.baselines=[human]", f"compare=[{folder}]"]
-    told = run_command("lcc_rl.cli.evaluate", *alone, cwd=tmp_path, check=True)
+    told = run_command("evaluate", *alone, cwd=tmp_path, check=True)
     assert all(told.stdout.count(f"{name}: the policy of") == 2 for name in names)
 
 
@@ -172,12 +172,12 @@ def test_a_run_of_a_sweep_is_refused_what_has_no_effect(tmp_path) -> None:
         "evaluation.seed=0",
         "sweep=s",
     )
-    done = run_command("lcc_rl.cli.evaluate", *words, cwd=tmp_path)
+    done = run_command("evaluate", *words, cwd=tmp_path)
     assert "+filter=cbf has no effect: nothing drives behind the filter (acc)" in done.stdout
 
 
 def test_a_sweep_of_nothing_is_one_line(tmp_path) -> None:
-    done = run_command("lcc_rl.cli.train", *SWEEP, "seed=range(0)", cwd=tmp_path)
+    done = run_command("train", *SWEEP, "seed=range(0)", cwd=tmp_path)
     assert done.returncode == 2
     assert "nothing was swept" in done.stderr
 
@@ -185,7 +185,7 @@ def test_a_sweep_of_nothing_is_one_line(tmp_path) -> None:
 def on_terminal(cwd: Path, *words: str) -> str:
     """Do a sweep on a terminal and return what that showed."""
     ours, its = pty.openpty()
-    typed = [sys.executable, "-m", "lcc_rl.cli.train", *words]
+    typed = [sys.executable, "-m", "lcc_rl", "train", *words]
     env = {**os.environ, "TERM": "xterm", "COLUMNS": "150", "LINES": "40"}
     child = subprocess.Popen(typed, cwd=cwd, stdin=its, stdout=its, stderr=its, env=env)
     os.close(its)
@@ -218,7 +218,7 @@ def test_launchers_give_the_rows_of_the_serial_one(tmp_path, launcher) -> None:
     words = ["-m", "experiment=smoke", *AGENT, "training.episodes=24", "variant=alcc,reference"]
     for name in ("basic", f"lcc_{launcher}"):
         where = [f"hydra/launcher={name}", f"hydra.sweep.dir={tmp_path / name}"]
-        subprocess.run([sys.executable, "-m", "lcc_rl.cli.train", *words, *where], check=True)
+        subprocess.run([sys.executable, "-m", "lcc_rl", "train", *words, *where], check=True)
     for table in ("training", "episodes", "steps"):
         both = (results.load(tmp_path / name, table) for name in ("basic", f"lcc_{launcher}"))
         pd.testing.assert_frame_equal(*both, check_exact=True)

@@ -29,10 +29,10 @@ ARROW = "pyarrow, to pandas"
 STARTS = {
     "import torchrl": ("-c", "import torchrl.envs, torchrl.collectors, torchrl.objectives"),
     "evaluate smoke": (
-        *("-m", "lcc_rl.cli.evaluate", "experiment=smoke", "policy=pretrained"),
+        *("-m", "lcc_rl", "evaluate", "experiment=smoke", "policy=pretrained"),
         "hydra.run.dir=evaluate",
     ),
-    "train smoke": ("-m", "lcc_rl.cli.train", "experiment=smoke", "hydra.run.dir=train"),
+    "train smoke": ("-m", "lcc_rl", "train", "experiment=smoke", "hydra.run.dir=train"),
 }
 
 

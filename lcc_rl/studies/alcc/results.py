@@ -15,13 +15,12 @@ from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.names import in_words
-from lcc_rl.results.remarks import sample_of
 from lcc_rl.results.runs import EPISODES, STEPS
 from lcc_rl.results.windows import LEADER_COLUMNS, WINDOWS, Means
 from lcc_rl.studies.alcc import figures, paper_tables, tables
 from lcc_rl.studies.alcc.paper_tables import PAIR
 from lcc_rl.studies.alcc.study import ABLATIONS, DRIVERS_FILE, EVALUATION_FOLDER
-from lcc_rl.studies.results import StudyResults
+from lcc_rl.studies.study import StudyResults
 
 ALCC_TITLE = "Adaptive Leading Cruise Control: the study"
 CURVES = "training.parquet"  # learning curves of the main trainings, if their folders are missing
@@ -78,7 +77,7 @@ def narrow(shown: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
 
 def add_main(found: StudyResults, means: Means) -> None:
     """Add the tables and figures of the main evaluation."""
-    windows, size = means.windows, sample_of(means.windows, means.drivers)
+    windows, size = means.windows, means.size
     found.table("headline", f"Savings of the total energy, {size}", tables.headline_rows(windows))
     found.table("energies", f"Energy per episode, {size}", tables.energies(windows))
     if set(LEADER_COLUMNS) <= set(windows):
@@ -103,7 +102,7 @@ def add_main(found: StudyResults, means: Means) -> None:
 
 
 def _awareness(study: StudyResults, means: Means) -> None:
-    caption = f"Table IV and this study, {sample_of(means.windows, means.drivers)}"
+    caption = f"Table IV and this study, {means.size}"
     study.table("table_iv", caption, paper_tables.table_iv(means.drivers))
     study.table("holistic", "Saving per driver", paper_tables.holistic(means))
     caption = "Path energy of both vehicles and its saving, by driver behind (Fig. 10)"

@@ -16,7 +16,7 @@ from lcc_rl.results.runs import EPISODES, STEPS
 from lcc_rl.studies.hcfs import tables
 from lcc_rl.studies.hcfs.study import TRAINING
 from lcc_rl.studies.hcfs.tables import LEARNED
-from lcc_rl.studies.results import StudyResults
+from lcc_rl.studies.study import StudyResults
 
 LENGTHS = "lengths.parquet"  # rows of windows of studies with several lengths of training
 SOURCES_FILE = "sources.parquet"  # rows of windows of other sources of leaders
