@@ -52,6 +52,8 @@ WRONG = {
     f"~{AUTO}": "names only human",
     # ranges
     "scenario.time_step=nan": "scenario.time_step must be .*finite",
+    "scenario.time_step=1": "scenario.time_step must be .* 0.5",
+    "agent.actor_lr=1e6": "agent.actor_lr must be less than or equal to 1",
     f"scenario.horizon={HUGE}": "scenario.horizon must be less than",
     f"seed={10**19}": "seed must be a number of 63 bits",
     "agent.batch_size=50000": "buffer_size",
