@@ -23,7 +23,7 @@ from lcc_rl.agents.gradient import GradientLoop
 from lcc_rl.agents.objective import Aiming, Objective
 from lcc_rl.agents.rules import make_policy
 from lcc_rl.errors import require
-from lcc_rl.settings import Count, NonNegative, Positive, Share
+from lcc_rl.settings import Count, LearningRate, NonNegative, Positive, Share
 
 
 class Analytic(Aiming):
@@ -41,7 +41,7 @@ class Analytic(Aiming):
     activation: Activation = "relu"  # between the layers of networks
     # As limits, but behind each record of leaders by itself, each with a price of its own.
     limits_each: dict[str, Share | None] = field(default_factory=dict)
-    learning_rate: Fraction = 3e-3  # of the policy at the start
+    learning_rate: LearningRate = 3e-3  # of the policy at the start
     final_lr_fraction: Fraction = 0.05  # of it that is left at the end
     schedule: Schedule = "cosine"  # how the learning rate falls
     # Gradients longer than this are shortened to it; through 300 steps of traffic they can become
@@ -51,7 +51,7 @@ class Analytic(Aiming):
     # Learn a value and add it at the end of every segment; without it the segment is all that
     # counts, and should be the whole episode.
     bootstrap: bool = True
-    value_lr: Fraction = 1e-3  # learning rate of the value network
+    value_lr: LearningRate = 1e-3  # learning rate of the value network
     td_lambda: Annotated[float, Field(ge=0.0, le=1.0)] = 0.95  # weight of longer returns, per step
     # Steps between two states at which the value is learned: a tenth of a second apart they tell
     # hardly more than one of them. 1 takes all.

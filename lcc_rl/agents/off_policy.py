@@ -24,7 +24,7 @@ from lcc_rl.agents.replay import ReplayLoop
 from lcc_rl.agents.sampling import Sampling
 from lcc_rl.agents.vectors import as_vector, take_step, vector_adam, views
 from lcc_rl.errors import ConfigError
-from lcc_rl.settings import Count, NonNegative, Positive, Settings, Share, Whole
+from lcc_rl.settings import Count, LearningRate, NonNegative, Positive, Settings, Share, Whole
 
 
 class Exploration(Settings):
@@ -58,8 +58,8 @@ class OffPolicy(Sampling):
 
     gamma: Share = 0.9  # discount
     hidden: Sequence[Count] = (200, 100, 50)  # layers of policy and Q networks
-    actor_lr: Fraction = 1e-3  # learning rate of the policy
-    critic_lr: Fraction = 1e-3  # learning rate of the Q networks
+    actor_lr: LearningRate = 1e-3  # learning rate of the policy
+    critic_lr: LearningRate = 1e-3  # learning rate of the Q networks
     batch_size: Count = 1024  # transitions per update
     buffer_size: Count = 20_000  # transitions that the replay buffer holds
     tau: Fraction = 0.005  # share of a step of the targets; not given in the paper

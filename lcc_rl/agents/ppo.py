@@ -19,7 +19,7 @@ from lcc_rl.agents.collecting import CollectingLoop, of_decisions, transitions
 from lcc_rl.agents.sac import SampledAction, tanh_gaussian
 from lcc_rl.agents.sampling import Sampling
 from lcc_rl.pieces.base import REWARD
-from lcc_rl.settings import Count, NonNegative, Positive, Share
+from lcc_rl.settings import Count, LearningRate, NonNegative, Positive, Share
 
 LOG_PROB = "action_log_prob"  # the key in TorchRL's loss
 
@@ -58,7 +58,7 @@ class PPO(Sampling):
     gamma: Share = 0.99  # discount
     td_lambda: Annotated[float, Field(ge=0.0, le=1.0)] = 0.95  # weight of longer returns, per step
     hidden: Sequence[Count] = (64, 64)  # layers of policy and value
-    learning_rate: Fraction = 1e-3  # of both networks at the start
+    learning_rate: LearningRate = 1e-3  # of both networks at the start
     final_lr_fraction: Fraction = 0.1  # final learning rate as a fraction of the initial one
     schedule: Schedule = "cosine"  # shape of the learning rates
     clip: Fraction = 0.2  # ratios of probabilities are clipped to 1 ± clip

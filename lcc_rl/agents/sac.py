@@ -15,12 +15,12 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss
 
 from lcc_rl.agents.actor import ONE, action_noise, seeded_mlp
-from lcc_rl.agents.agent import Fraction, Scene
+from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.fused import ActorCritic, Network
 from lcc_rl.agents.off_policy import Exploration, OffPolicy
 from lcc_rl.functional.random import stream_id
 from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP
-from lcc_rl.settings import Number, Positive
+from lcc_rl.settings import LearningRate, Number, Positive
 
 
 class Head(nn.Module):
@@ -101,7 +101,7 @@ class SAC(OffPolicy):
         default_factory=lambda: Exploration(initial=1.0, final=1.0, decay_share=1.0)
     )
     alpha_init: Positive = 0.1  # temperature at the start
-    alpha_lr: Fraction = 1e-3  # learning rate of the temperature
+    alpha_lr: LearningRate = 1e-3  # learning rate of the temperature
     target_entropy: Number | None = None  # target of the entropy; None: −1 per action
 
     critics = 2

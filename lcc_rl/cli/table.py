@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 return
             report = together(run.reports(options.against))
         if options.all:
-            table = chosen(worded(report.table), names)
+            table = chosen(report.table, names)
         else:
             note = report.note
             table = chosen(report.short, names) if csv else for_print(report, names)

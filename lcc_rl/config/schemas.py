@@ -36,7 +36,7 @@ from lcc_rl.settings import (
 
 log = logging.getLogger("lcc_rl")
 
-TimeStep = Annotated[float, Field(ge=0.001, le=10.0)]
+TimeStep = Annotated[float, Field(ge=0.001, le=0.5)]  # behind US06 the tuned IDM collides at 1 s
 Device = Annotated[str, Field(pattern=r"^(cpu|cuda)(:\d+)?$")]
 # Each variant has a folder in the job's folder.
 Variants = Annotated[list[Annotated[str, Field(pattern=r"^\w[\w.-]*$")]], Field(min_length=1)]

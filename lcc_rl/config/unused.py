@@ -83,6 +83,10 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
     if AUTOMATED not in cfg.scenario.vehicles.names:
         for name in ("max_braking", "max_acceleration"):
             yield f"scenario.{name}", "no vehicle of the string is automated"
+    actuators = cfg.scenario.actuators.get(AUTOMATED)
+    braking = None if actuators is None else actuators.settings.get("braking")
+    if braking is not None and braking < cfg.scenario.max_braking:
+        yield "scenario.max_braking", f"scenario.actuators.automated.braking={braking:g} is less"
     for name, node in cfg.scenario.fleet.items():
         roles = node.settings.get("roles") if node is not None else None  # none of another class
         if roles and not {*roles} & {*cfg.scenario.vehicles.names}:

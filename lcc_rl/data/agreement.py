@@ -339,6 +339,7 @@ def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Unit
     behind = (gap / speed)[speed > 1.0].median()
     slope, late = clear["slope"].median(), clear["late"].median()
     fitted = f"slope of gaps over speeds {slope:.2f}, lag {late:.1f} s of {len(clear):,} pair(s)"
+    fitted += " between gap and relative_speed, own speed's clock not checked" * (OF_LOGS in units)
     few = f"slope and lag unknown for {pairs - len(clear):,}"
     phrases = [fitted] * (len(clear) > 0) + [few] * (len(clear) < pairs)
     line = (

@@ -54,7 +54,8 @@ LONG, SHORT_STRING = 2_000, 40
 BLOCK = 2**20  # numbers of each entry that are measured at a time
 LEADER: Key = ("leader", "speed")
 SCENE = {f"scenario.{name}" for name in ("string", "time_step", "horizon")}
-OF_ARGUMENTS = SCENE | {"leader", "data", "split", "compare", "policy", "seed", "evaluation"}
+OF_FILES = {"leader", "data"}
+OF_ARGUMENTS = SCENE | {"split", "compare", "policy", "seed", "evaluation", "reward"}
 # Nothing reads the reward; this term fits any scenario.
 UNREAD = RewardConfig(terms={"collision": Node.of({TARGET: path_of(CollisionPenalty)}, "reward")})
 MOTION = {
@@ -128,10 +129,9 @@ def simulate(
     """
     table = isinstance(drivers, (str, PathLike))
     chosen = {"drivers.path"} if table else {"drivers"} if drivers is not None else set()
-    unused = "has no effect in simulate: see the arguments"
-    files = f"{unused}; files have time_s [s], speed_mps [m/s]"
-    check_overrides(overrides, {"leader", "data"}, files)
-    check_overrides(overrides, OF_ARGUMENTS | {"reward"} | chosen, unused)
+    reason = "has no effect in simulate: see the arguments"
+    check_overrides(overrides, OF_ARGUMENTS | chosen, reason)
+    check_overrides(overrides, OF_FILES, f"{reason}; files have time_s [s], speed_mps [m/s]")
     profiles = _profiles(leader, time_step, seconds)
     name, spec = ("", None) if controller is None else one_of(controller)
     reads = () if spec is None or is_policy(spec) else controller_of(spec).kind.reads

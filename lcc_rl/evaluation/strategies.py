@@ -192,8 +192,13 @@ def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
     """Return the scenario under study with the agent of ``own``, and its filter if it has none."""
     changes: dict[str, Any] = {"agent": own.agent}
     piece = own.observation.made(Piece)
-    if isinstance(piece, Observation) and piece.shows_presence(own.scenario.vehicles):
-        changes["observation"] = cfg.observation.changed(presence=True)
+    if isinstance(piece, Observation):
+        if piece.shows_presence(own.scenario.vehicles):
+            changes["observation"] = cfg.observation.changed(presence=True)
+        elif piece.shows_presence(cfg.scenario.vehicles):
+            text = "was trained with a vehicle behind each automated one"
+            hint = "scenario.string needs one, too, as in 'automated human'"
+            raise ConfigError(f"policy={cfg.policy} {text}: {hint}")
     given, trained = (one.scenario.filters.get(AUTOMATED) for one in (cfg, own))
     if given is None and trained is not None:
         log.info("the policy of variant %s keeps the filter of its training", own.variant)

@@ -38,7 +38,7 @@ _RATE = (0.001, 20.0)  # plausible [1/s]
 # The parameters of all models; your own model adds its own in ``own``.
 PARAMETERS: dict[str, Parameter] = {
     "desired_speed": Parameter(
-        "desired_speed_mps", "desired speed $v_0$ [m/s]", (5.0, 40.0), (1.0, 100.0)
+        "desired_speed_mps", "desired speed $v_0$ [m/s]", (5.0, 40.0), (1.0, 70.0)
     ),
     "time_gap": Parameter("time_gap_s", "time gap $T$ [s]", (0.3, 4.0), (0.05, 20.0)),
     "acceleration": Parameter(

@@ -68,7 +68,8 @@ class CarLimits(Settings):
 
     def of(self, world: World) -> World:
         """Return a world with these limits of automated vehicles."""
-        return replace(world, **{name: x for name, x in values(self).items() if x is not None})
+        given = {name: x for name, x in values(self).items() if x is not None}
+        return replace(world, limited_by="limits", **given)
 
 
 class Input(NamedTuple):

@@ -42,6 +42,7 @@ class World:
         max_acceleration: largest acceleration of automated vehicles [m/s²].
         replaced: whether the leader is replaced during episodes.
         slope: the grade of the road, :class:`lcc_rl.pieces.Slope`; None: a level road.
+        limited_by: section of the limits, for messages.
     """
 
     string: VehicleString = field(default_factory=VehicleString)
@@ -58,6 +59,7 @@ class World:
     max_acceleration: float = MAX_ACCELERATION
     replaced: bool = False
     slope: Any = None
+    limited_by: str = "scenario"
 
     def given(self, what: str, where: str) -> Any:
         """Return profiles, population or energy.
@@ -120,8 +122,8 @@ class World:
                 value <= (vehicle if backward else max(most)),
                 f"{name if backward else 'max_acceleration'}={value:g} exceeds the limits of "
                 f"automated vehicles, which brake by at most {most[0]:g} m/s² "
-                f"(scenario.max_braking) and accelerate by at most {most[1]:g} m/s² "
-                "(scenario.max_acceleration)",
+                f"({self.limited_by}.max_braking) and accelerate by at most {most[1]:g} m/s² "
+                f"({self.limited_by}.max_acceleration)",
             )
             ends.append(min(value, vehicle))
         return -ends[0], ends[1]

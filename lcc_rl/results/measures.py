@@ -23,7 +23,7 @@ PATH = "total_path_energy_kj"
 PATH_PER_KM = "path_energy_kj_per_km"  # per vehicle and km; falling behind does not lower it
 FASTER, BROKEN = "share_leader_faster", "share_promise_broken"
 REACH = ("cav_share_infeasible", "hdv_share_infeasible")
-FLOW = "flow_vph"
+FLOW, GAP = "flow_vph", "mean_gap_m"
 TTC, LONG_GAPS = "share_ttc_unsafe", "share_time_gap_long_moving"
 BARE, TURNED = "share_ttc_unpromised", "share_turned_unsafe"
 FILTER_ACTS = "share_filter_acts"  # NaN without a safety filter
@@ -210,7 +210,7 @@ MEASURES = [
     Measure("string_ratio", "string ratio", score="string_ratio"),
     Measure("damped", "episodes that end calm", form="{:.0%}"),
     Measure(DAMPING, "  from when on, mean", unit="s", form=COUNT, of="damped_s", per="damped"),
-    Measure("mean_gap_m", "mean gap", unit="m", form="{:.1f}"),
+    Measure(GAP, "mean gap", unit="m", form="{:.1f}"),
     Measure("gap_opened_m", "  opened during the counted time", unit="m", form="{:+.1f}"),
     _least("min_gap_m", "smallest gap", unit="m", limit="gap"),
     _largest("max_gap_m", "largest gap", unit="m", limit="gap"),

@@ -107,6 +107,13 @@ def worded(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(**{name: [in_words(str(x)) for x in table[name]] for name in names})
 
 
+def named(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table with the strategies in words, ``driver``, beside their names."""
+    table = table.copy()
+    table.insert(1, "driver", [in_words(str(name)) for name in table["strategy"]])
+    return table
+
+
 def several(count: int, what: str) -> str:
     """Return a count in words."""
     return f"{count} {what}{'s' * (count != 1)}"

@@ -175,12 +175,16 @@ def saved_text(share: float, low: float, high: float) -> str:
 
 
 def full_rows(report: Report) -> Iterator[tuple[str, list[str]]]:
-    """Yield label and cells of every measure with a value."""
+    """Yield label and cells of every measure with a value, and of the bounds of its interval."""
     for measure in report.rows:
-        values = report.table[measure.key].astype(float)
-        if values.notna().any():
-            cells = zip(report.table[measure.key], np.isfinite(values), strict=True)
-            yield measure.title, [signed(x, measure.number) if k else DASH for x, k in cells]
+        pad = " " * (2 + len(measure.label) - len(measure.label.lstrip()))
+        ends = {"": measure.title, "_low": f"{pad}95 % interval, low", "_high": f"{pad}  high"}
+        for end, title in ends.items():
+            values = report.table.get(f"{measure.key}{end}", pd.Series(dtype=float))
+            known = values.notna() & (values.astype(float).abs() < np.inf)
+            if known.any():
+                cells = zip(values, known, strict=True)
+                yield title, [signed(x, measure.number) if k else DASH for x, k in cells]
 
 
 def _side_by_side(report: Report, title: str) -> Group:

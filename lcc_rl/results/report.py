@@ -20,6 +20,7 @@ from lcc_rl.results.measures import (
     DISTANCE,
     FILTER_ACTS,
     FLOW,
+    GAP,
     MEASURES,
     PATH,
     PATH_PER_KM,
@@ -28,7 +29,15 @@ from lcc_rl.results.measures import (
     Measure,
     Shown,
 )
-from lcc_rl.results.names import HUMAN, ON_FRONT, RULE, RULE_ROWS, in_words, strategy_named
+from lcc_rl.results.names import (
+    HUMAN,
+    ON_FRONT,
+    RULE,
+    RULE_ROWS,
+    in_words,
+    named,
+    strategy_named,
+)
 from lcc_rl.results.remarks import (
     FEW_DRIVES,
     FLOW_LOST,
@@ -76,6 +85,8 @@ SAVINGS = {  # columns of short tables by estimate
     ),
 }
 WAY, FLOW_SHARE = Shown("distance_pct", "dis-\ntance\n[%]"), Shown("flow_pct", "flow\n[%]")
+# Tables show what is more than the baseline's, in per cent.
+LOST = {"distance_lost": (WAY.key, DISTANCE), FLOW_LOST: (FLOW_SHARE.key, FLOW)}
 COLLISIONS, KEEPS = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
 COUNTS = {"windows": "windows", "drives": "drives", "drivers": "drivers", "seeds": "training seeds"}
 ALL = "all measures: table=all or --all."
@@ -173,9 +184,9 @@ def summary(
         the score saved ``against`` the baseline, ``second_saving``, that of the second energy
         model, ``flow_saving`` and ``second_flow_saving``, those against the recorded drivers at
         their flow, ``rule_saving``, that against the rule at this flow, and ``drawn_saving``, that
-        of the energy drawn in an episode, with their intervals;
-        ``end_saving``, the difference of the drawn and the first saving; the shares of distance
-        and flow lost; numbers of windows, drives, drivers behind each window and training seeds;
+        of the energy drawn in an episode, and the share of the flow lost, with their intervals;
+        ``end_saving``, the difference of the drawn and the first saving; the share of the distance
+        lost; numbers of windows, drives, drivers behind each window and training seeds;
         ``left_out``, the seeds that the first saving leaves out, and ``single``, whether it has
         one training beside others of several; and for a task score, limits and whether they are
         kept without a collision. Missing values are NaN, as are savings and
@@ -205,15 +216,16 @@ def summary(
         hit = bool(frame.get("collisions", pd.Series(dtype=float)).sum())
         row |= _savings(windows, name, (column, per), None if hit else against)
         row |= ratio(windows, "all_path_energy_kj", name, [DISTANCE]).columns(PATH_PER_KM, 1e3)
+        row |= ratio(windows, GAP, name, []).columns(GAP)
         row |= {measure.key: measure.value(frame) for measure in MEASURES}
         rows.append(row)
     table = pd.DataFrame(rows)
     table = table.astype({"collisions": int, "episodes": int})
     table["single"] &= table["seeds"].max() > 1
     base = table[table["strategy"] == against]
-    for key, lost in {"distance_lost": DISTANCE, FLOW_LOST: FLOW}.items():
+    for key, (_, lost) in LOST.items():
         table[key] = 1.0 - table[lost] / (base[lost].iloc[0] if len(base) else np.nan)
-    table.loc[crashed(table), ["distance_lost", FLOW_LOST, FLOW]] = np.nan
+    table.loc[crashed(table), [*LOST, FLOW]] = np.nan
     if task:
         table["kept"] = table["collisions"] == 0
         for limit, bound in task.bounds.items():
@@ -232,6 +244,7 @@ def _savings(
         ("saving", *of),
         ("second_saving", second, [DISTANCE]),
         ("drawn_saving", "total_energy_kj", []),
+        (FLOW_LOST, FLOW, []),
     ):
         comparable = against not in (None, name) and energy in windows
         share = savings(windows, energy, name, str(against), per) if comparable else NOTHING
@@ -299,27 +312,30 @@ def report(
         for key, shown in SAVINGS.items()
         for end in ("", "_low", "_high")
     }
-    percent["distance_pct"] = -100.0 * table["distance_lost"]
-    every = pd.concat([table, pd.DataFrame(percent)], axis=1)  # in few blocks, for more columns
+    percent |= {shown: -100.0 * table[lost] for lost, (shown, _) in LOST.items()}
+    every = named(pd.concat([table, pd.DataFrame(percent)], axis=1))  # in few blocks, for more
     fields = _of_task(every, task) if task else _of_energy(every, energy, second, unit)
     short, shown = fields.pop("short")
-    rows = _rows(task, table["against"].iloc[0])
+    rows = _rows(task, table["against"].iloc[0], shown[1] if task or unit else None)
     text = "" if task else verdict(windows, table, few)
     text = "\n".join(filter(None, [text, few_drives(table)]))
     notes += [*crashes(table), *filter(None, [flow_note(table), by_ends(table), seeds_note(table)])]
     fields |= {"full_caption": FULL, "verdict": text, "remarks": notes}
-    return Report(of, table, short, shown, rows, **fields)
+    ends = {"_low": "_high", "_high": "_low"}
+    bounds = {f"{FLOW_SHARE.key}{x}": -100.0 * table[f"{FLOW_LOST}{y}"] for x, y in ends.items()}
+    every = every.drop(columns=[x for x in every if x.startswith((*LOST,))]).assign(**bounds)
+    further = short[["strategy", *short.columns.difference(every.columns, sort=False)]]
+    every = every.merge(further, how="left", on="strategy")
+    return Report(of, every, short, shown, rows, **fields)
 
 
-def _rows(task: Task | None, against: str | None) -> list[Measure]:
-    """Return the rows of the full table."""
+def _rows(task: Task | None, against: str | None, score: Shown | None) -> list[Measure]:
+    """Return the rows of the full table; ``score``: the first number of the short one, if any."""
     bounds = task.bounds if task else {}
     kept = [Measure("kept", "keeps the limits (1: yes)", form="{:d}")] if task else []
     return [
-        *([Measure(SCORE, task.label)] if task else ()),
+        *([Measure(score.key, score.words)] if score else ()),
         Measure("saving", f"saved against {in_words(str(against))}", form="{:+.2%}"),
-        Measure("saving_low", "  95 % interval, low", form="{:+.2%}"),
-        Measure("saving_high", "    high", form="{:+.2%}"),
         Measure(FEW_DRIVES[0], "  over its few drives (t), low", form="{:+.2%}"),
         Measure(FEW_DRIVES[1], "    high", form="{:+.2%}"),
         Measure("second_saving", "  second energy model", form="{:+.2%}"),
@@ -327,8 +343,8 @@ def _rows(task: Task | None, against: str | None) -> list[Measure]:
         Measure("rule_saving", "    against the rule", form="{:+.2%}"),
         Measure("drawn_saving", "  as drawn, per episode", form="{:+.1%}"),
         Measure("end_saving", "    of it by start and end of episodes", form="{:+.1%}"),
-        Measure("distance_lost", "distance lost", form="{:+.2%}"),
-        Measure(FLOW_LOST, "flow lost", form="{:+.2%}"),
+        Measure(WAY.key, "distance against the baseline", form="{:+.2f}%"),
+        Measure(FLOW_SHARE.key, "flow against the baseline", form="{:+.2f}%"),
         *(measure for measure in MEASURES if measure.label),
         *(
             replace(
@@ -356,13 +372,13 @@ def _of_energy(
     cars = cars.sort_values(PATH_PER_KM, ascending=False, kind="stable").reset_index(drop=True)
     against = (cars["against"].iloc[0] or None) if len(cars) > 1 else None
     ends = ("", "_low", "_high") if against is None and len(cars) > 1 else ("",)
-    source, flow = flow_against(cars)
-    loss, basis = (WAY, "distance against theirs") if flow.isna().all() else (FLOW_SHARE, source)
+    without = cars[FLOW_SHARE.key].isna().all()
+    loss, theirs = (WAY, "distance") if without else (FLOW_SHARE, "flow")
+    basis = f"{theirs} against {'theirs' if without else in_words(str(against))}"
     note = "" if against is None else f"{saved_against(cars, against)}; {basis}; "
     note += f"{with_interval(cars, 'energy')}; " * (len(ends) > 1)
     short = [one for one in MEASURES if one.short]
     columns = {f"energy_kj_per_km{end}": cars.get(f"{PATH_PER_KM}{end}") for end in ends}
-    columns[FLOW_SHARE.key] = flow
     columns |= {one.shown.key: one.scale * cars[one.key] for one in short}
     shown = [Shown("energy_kj_per_km", "energy\n[kJ/km]")] * (unit is None)
     if energy is not None and (unit or burns_one_fuel(energy)):
@@ -401,7 +417,7 @@ def behind_filter(found: pd.DataFrame) -> str:
 def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
     """Return the parts of a report that are specific to a task: score and limits."""
     distance = Shown(FLOW, "flow\n[1/h]") if table[FLOW].notna().any() else WAY
-    limits = [Shown(limit.key, limit.bounded(bound)) for limit, bound in task.bounds.items()]
+    limits = [Shown(limit.shown.key, limit.bounded(bound)) for limit, bound in task.bounds.items()]
     shown = [
         Shown(SCORE, task.label.replace(" ", "\n")),
         SAVED,
@@ -410,7 +426,7 @@ def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
         COLLISIONS,
         KEEPS,
     ]
-    columns = {limit.key: limit.scale * table[limit.key] for limit in task.bounds}
+    columns = {limit.shown.key: limit.scale * table[limit.key] for limit in task.bounds}
     note, least = saved_against(table, task.against, always=True), task.measure.least
     if (table.loc[table["strategy"] == task.against, SCORE] < least).any():
         note = f"no saving: the baseline, {in_words(task.against)}, is below {least:g} "
@@ -431,7 +447,7 @@ def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
 def shortened(
     table: pd.DataFrame, shown: Sequence[Shown]
 ) -> tuple[pd.DataFrame, tuple[Shown, ...]]:
-    """Return columns of a table with intervals and strategies in words, and the columns.
+    """Return columns of a :func:`named` table with intervals, and the columns.
 
     Strategies that lose more than 2 % of the flow, and single trainings beside several, are marked.
     With several seeds, collisions are means of a training.
@@ -443,9 +459,8 @@ def shortened(
     counts = [key for key in ("windows", "drivers") if key in table and table[key].nunique() > 1]
     shown = [*shown, *(Shown(key, key) for key in counts)]
     lost = table.get(FLOW_LOST, pd.Series(np.nan, table.index)) > FLOW_NAMED
-    labels = [in_words(str(name)) for name in table["strategy"]]
     single = table.get("single", lost & False)
-    rows = zip(labels, lost, single, strict=True)
+    rows = zip(table["driver"], lost, single, strict=True)
     table = table.assign(driver=[x + MARK * y + ONE * z for x, y, z in rows])
     shown = (Shown("driver", "driven by"), *shown)
     names = [f"{one.key}{end}" for one in shown for end in ("", "_low", "_high")]
@@ -479,15 +494,3 @@ def with_interval(found: pd.DataFrame, words: str) -> str:
         of = "one drive" if drives == 1 else f"only {drives} drives"
         over += f" (too narrow: all windows are of {of})"
     return f"{words}, with the 95 % interval over {over}"
-
-
-def flow_against(table: pd.DataFrame) -> tuple[str, pd.Series]:
-    """Return the caption of the flow's baseline, and the differences to it [%].
-
-    The baseline is the recorded drivers, else that of the savings.
-    """
-    names = set(table["strategy"])
-    name = RECORDED if RECORDED in names else table["against"].iloc[0]
-    base = table.loc[table["strategy"] == name, FLOW]
-    share = table[FLOW] / (base.iloc[0] if len(base) else np.nan) - 1.0
-    return f"flow against {in_words(str(name))}", 100.0 * share

@@ -52,6 +52,8 @@ WRONG = {
     f"~{AUTO}": "names only human",
     # ranges
     "scenario.time_step=nan": "scenario.time_step must be .*finite",
+    "scenario.time_step=1": "scenario.time_step must be .* 0.5",
+    "agent.actor_lr=1e6": "agent.actor_lr must be less than or equal to 1",
     f"scenario.horizon={HUGE}": "scenario.horizon must be less than",
     f"seed={10**19}": "seed must be a number of 63 bits",
     "agent.batch_size=50000": "buffer_size",
@@ -74,7 +76,6 @@ WRONG = {
     "scenario.string='automated human*100000000'": "10000 vehicles",
     "+faults=sensors scenario.sensors.automated.delay=1e9": "sensors.automated.delay must be at mo",
     "+faults=sensors scenario.sensors.automated.longest_dropout=200": "dropout must be at most 100",
-    "agent.actor_lr=1e6": "agent.actor_lr must be less than or equal to 1",
     "drivers.reaction_delay=0.25 drivers=i80_energy": "delay of drivers must be a multiple",
     f"data.platoons={HUGE}": "data.platoons must be less than or equal to 10000",
 }

@@ -528,7 +528,9 @@ def test_a_log_with_one_speed_in_another_unit_is_refused(tmp_path) -> None:
     def read(**units: str):
         return EpisodesSource(path=str(tmp_path / "log.csv"), columns=LOG, units=units)
 
-    assert "slope of gaps over speeds 0.96" in read().load().report[-1]
+    report = read().load().report[-1]
+    assert "slope of gaps over speeds 0.96" in report
+    assert report.endswith("between gap and relative_speed, own speed's clock not checked")
     words = r"where the follower's speed changes by 1 m/s, relative_speed changes by -3\.\d\d m/s; "
     words += r"is the follower's speed in m/s \(data\.units\.follower_speed=m/s\)\?.*max_mismatch"
     other = r"is the relative speed in m/s \(data\.units\.relative_speed=m/s\)\?"

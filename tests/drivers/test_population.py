@@ -123,6 +123,7 @@ def test_no_driver_is_like_that() -> None:
         [
             (lambda: bootstrap(least_speed=1e6), "desired_speed"),
             (lambda: fixed(desired_speed=-1.0), "desired_speed"),
+            (lambda: fixed(desired_speed=90.0), "'desired_speed' must be 1 to 70, got 90"),
             (lambda: fixed(time_gap=np.inf), "time_gap"),
             (lambda: fixed(min_gap=0.0), "min_gap"),
             (lambda: replace(fixed(), ids=()), "no drivers"),

@@ -112,6 +112,14 @@ def test_limits_without_effect_are_refused() -> None:
             lambda: lcc_rl.compare("acc", overrides=[f"+{AUTO}.max_acceleration=6"]),
             "has no effect: every controller is named",
         ),
+        (
+            lambda: load("train", ["+faults=actuation", "scenario.max_braking=6"]),
+            r"max_braking=6 has no effect: scenario.actuators.automated.braking=2\.8 is less",
+        ),
+        (
+            lambda: lcc_rl.export(FollowerStopper(max_deceleration=6.0), "x.c"),
+            r"brake by at most 3 m/s² \(limits\.max_braking\)",
+        ),
         (lambda: load("train", ["scenario.max_braking=-1"]), "max_braking must be greater than 0"),
     ]
     check_refused(lambda call: call(), cases, ConfigError)

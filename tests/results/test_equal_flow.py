@@ -101,7 +101,7 @@ def test_a_strategy_that_collides_has_no_saving_and_no_flow() -> None:
     one = report(windows_for(rows(collided={"alcc": True})))
     row = one.table.set_index("strategy").loc["alcc"]
     names = ["saving", "second_saving", "flow_saving", "rule_saving", "drawn_saving"]
-    names += ["flow_lost", "flow_vph"]
+    names += ["flow_pct", "flow_vph"]
     assert row[names].isna().all()
     assert one.short.set_index("strategy").loc["alcc", ["saved_pct", "flow_pct"]].isna().all()
     sentence = (

@@ -140,8 +140,13 @@ def test_energies_come_in_the_unit_asked_for(tmp_path, capsys) -> None:
         ("episodes", "energy_kj_per_km", "energy_kwh_per_100km"),
         ("task", "score", "score"),
     ):
-        asked = shown(name, "--unit", "kWh/100km")
-        np.testing.assert_allclose(asked[after], shown(name)[before] / 36.0)
+        asked, short = shown(name, "--unit", "kWh/100km"), shown(name)
+        np.testing.assert_allclose(asked[after], short[before] / 36.0)
+        every = shown(name, "--all", "--unit", "kWh/100km").set_index("strategy")
+        every = every.loc[asked["strategy"], [*asked][1:]]  # all that the short table has
+        pd.testing.assert_frame_equal(every, asked.set_index("strategy"), check_dtype=False)
+        table.main([str(tmp_path / name), "--all", "--unit", "kWh/100km"])
+        assert "[kWh/100km]" in capsys.readouterr().out
     cases = [
         (
             "episodes",

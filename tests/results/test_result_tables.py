@@ -213,7 +213,7 @@ def test_a_table_marks_strategies_that_lose_more_than_2_percent_of_the_flow() ->
     rows = pd.concat(driven(name, 1.0, flow_vph=flow) for name, flow in flows.items())
     one = report(windows_for(rows), TASK, MOTOR)
     found = one.table
-    assert found["flow_lost"].tolist() == pytest.approx([0.0, 0.04, 0.2])
+    assert found["flow_pct"].tolist() == pytest.approx([0.0, -4.0, -20.0])
     lost = "†: flow lost against simulated drivers: tuned IDM 4 %; PI with saturation 20 %."
     assert lost in one.remarks
     marked = ["simulated drivers", "tuned IDM †", "PI with saturation †"]
