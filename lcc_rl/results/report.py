@@ -323,7 +323,7 @@ def report(
     fields |= {"full_caption": FULL, "verdict": text, "remarks": notes}
     ends = {"_low": "_high", "_high": "_low"}
     bounds = {f"{FLOW_SHARE.key}{x}": -100.0 * table[f"{FLOW_LOST}{y}"] for x, y in ends.items()}
-    every = every.drop(columns=[x for x in every if x.startswith((*LOST,))]).assign(**bounds)
+    every = every.drop(columns=[x for x in every if str(x).startswith((*LOST,))]).assign(**bounds)
     further = short[["strategy", *short.columns.difference(every.columns, sort=False)]]
     every = every.merge(further, how="left", on="strategy")
     return Report(of, every, short, shown, rows, **fields)
