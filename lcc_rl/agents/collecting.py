@@ -35,6 +35,7 @@ LEARNED_FROM = {
 }
 
 BEGINS = "begins"  # whether a transition begins with a decision, if actions are held
+LIMITED: Key = ("next", "limited")  # terms with limits at price 1, if they are stored
 
 # Steps of a training from which compiling the environment, 5 to 10 s, pays off.
 COMPILED_TRAINING_STEPS = 40_000
@@ -165,10 +166,11 @@ def decisions(batch: TensorDictBase, every: int) -> TensorDictBase:
     begun, reached = parts[:, :, 0], parts[:, :, -1].get("next").clone()
     ended = parts.get(("next", "done")).cumsum(2) > 0
     before = torch.cat([torch.zeros_like(ended[:, :, :1]), ended[:, :, :-1]], 2)  # by step
-    reward = parts.get(("next", *REWARD))
-    reached.set(REWARD, (reward * ~before.unsqueeze(-1)).sum(2))
-    for key in ("done", "terminated"):
-        reached.set(key, (parts.get(("next", key)) & ~before).any(2))
+    for key in (REWARD, LIMITED[1:]):
+        if (value := parts.get(("next", *key), None)) is not None:
+            reached.set(key, (value * ~before.unsqueeze(-1)).sum(2))
+    for flag in ("done", "terminated"):
+        reached.set(flag, (parts.get(("next", flag)) & ~before).any(2))
     # After a collision decisions no longer begin with the parts.
     begun.set(BEGINS, begun.get(STEP) % every == 0)
     return begun.set("next", reached)
@@ -188,7 +190,7 @@ def transitions(batch: TensorDictBase) -> TensorDictBase:
     """
     shape = batch.get(("next", *REWARD)).shape[:-1]
     rows = TensorDict(batch_size=[shape.numel()], device=batch.device)
-    for source, target in {**LEARNED_FROM, (BEGINS,): (BEGINS,)}.items():
+    for source, target in {**LEARNED_FROM, LIMITED: LIMITED, (BEGINS,): (BEGINS,)}.items():
         entry = batch.get(source, None)
         if entry is None:
             continue

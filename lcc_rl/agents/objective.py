@@ -67,6 +67,7 @@ class Objective:
             getattr(settings, "limits_each", {}), settings.limit_rate, self.surrogates
         )
         self.terms: list[tuple[RewardTerm, float]] = []
+        self.priced = self.terms  # those with a limit of all episodes
 
     @property
     def differs(self) -> bool:
@@ -85,6 +86,7 @@ class Objective:
             if term.weight
         ]
         self.terms = chosen + [(term, 1.0) for term in self.regularizers.values()]
+        self.priced = [(term, x) for term, x in self.terms if term.name in self.limits.largest]
 
     def wanted(self, env: EnvBase) -> list[Key]:
         """Return the entries of the next state that the terms read.
@@ -122,6 +124,14 @@ class Objective:
                     kind = type(term).__name__
                     raise Diverged(f"the objective's term {term.name} ({kind}) is nan")
         return torch.stack(parts).sum(0)
+
+    def at_price_one(self, data: TensorDictBase) -> Tensor:
+        """Return the terms with limits at price 1, ``[batch, steps, A, terms]``; see `score`."""
+        return torch.cat([x * term.computed(_entries(term, data)) for term, x in self.priced], -1)
+
+    def prices(self, like: Tensor) -> Tensor:
+        """Return the present price of each term with a limit, ``[terms]``."""
+        return like.new_tensor([self.limits.price(term.name) for term, _ in self.priced])
 
     def _price(self, name: str, like: Tensor) -> Tensor | float:
         """Return the price of a term: that of all episodes, plus that behind its record."""

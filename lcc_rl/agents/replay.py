@@ -10,15 +10,16 @@ from torch import Tensor
 from torchrl.collectors import BaseCollector
 
 from lcc_rl.agents.agent import derived_seed
-from lcc_rl.agents.collecting import CollectingLoop, of_decisions, transitions
+from lcc_rl.agents.collecting import LIMITED, CollectingLoop, of_decisions, transitions
 from lcc_rl.io.tensors import check_like
 from lcc_rl.pieces.base import Key, as_key
 
+REWARDED: Key = ("next", "reward")
 KNOWN: Key = ("known",)  # value of the next state, and the number of moves of the target networks
 
 
 class ReplayLoop(CollectingLoop[Any]):
-    """Trains an off-policy agent.
+    """Trains an off-policy agent; the prices of limits are those of the draw, not of the storing.
 
     Arguments as for :class:`lcc_rl.agents.loop.TrainingLoop`.
     """
@@ -60,6 +61,7 @@ class ReplayLoop(CollectingLoop[Any]):
         kept = of_decisions(new)
         if settings.lasting:
             kept.set(KNOWN, torch.full((len(kept), 2), -1.0, device=kept.device))
+        kept.set(REWARDED, kept.get(REWARDED) - self._limited(kept))
         self.buffer.extend(kept)
         ratio = settings.updates_per_transition
         ready = len(self.buffer) >= max(settings.batch_size, settings.learning_starts)
@@ -67,13 +69,25 @@ class ReplayLoop(CollectingLoop[Any]):
         sums = {"loss_actor": torch.zeros(()), "loss_value": torch.zeros(())}
         for _ in range(count):
             drawn = self.buffer.draw()
-            if settings.scale_rewards:
-                drawn.set_(("next", "reward"), settings.scaled(drawn.get(("next", "reward"))))
+            drawn.set_(REWARDED, settings.scaled(drawn.get(REWARDED) + self._limited(drawn)))
             losses = settings.update(drawn)
             self.buffer.note()
             sums = {name: total + losses[name] for name, total in sums.items()}
         self.updates += count
         return {name: float(total) / max(count, 1) for name, total in sums.items()}
+
+    def _scored(self, batch: TensorDictBase) -> dict[str, float]:
+        shares = super()._scored(batch)
+        if shares:
+            batch.set(LIMITED, self.agent.objective.at_price_one(batch))
+        return shares
+
+    def _limited(self, rows: TensorDictBase) -> Tensor | float:
+        """Return the part of the rewards with limits at present prices, ``[rows, 1]``."""
+        limited = rows.get(LIMITED, None)
+        if limited is None:
+            return 0.0
+        return (limited * self.agent.objective.prices(limited)).sum(-1, keepdim=True)
 
     def _memory(self) -> dict[str, Any]:
         return {"buffer": self.buffer.state_dict(), "best": self.best}

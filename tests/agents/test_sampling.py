@@ -17,7 +17,7 @@ from helpers import (
 )
 from tensordict import TensorDict
 
-from lcc_rl.agents.collecting import decisions, of_decisions, transitions
+from lcc_rl.agents.collecting import LIMITED, decisions, of_decisions, transitions
 from lcc_rl.agents.factory import check_lengths, make_trainer, training_env
 from lcc_rl.agents.sampling import Returns
 from lcc_rl.envs import make_env
@@ -35,6 +35,7 @@ def test_a_decision_sums_the_rewards_up_to_a_collision() -> None:
     for key, value in {OBSERVATION: number, ACTION: number, STEP: step}.items():
         batch.set(key, value)
     after = {OBSERVATION: number + 1.0, REWARD: number + 1.0, ("done",): hit, ("terminated",): hit}
+    after[LIMITED[1:]] = torch.cat([number, number + 1.0], -1)
     for key, value in after.items():
         batch.set(("next", *key), value)
     assert decisions(batch, 1) is batch
@@ -45,6 +46,7 @@ def test_a_decision_sums_the_rewards_up_to_a_collision() -> None:
     rows = of_decisions(transitions(decisions(batch, 2)))
     assert rows["action"].flatten().tolist() == [0.0, 2.0, 4.0]
     assert rows["next", "reward"].flatten().tolist() == [3.0, 7.0, 11.0]
+    assert rows[LIMITED].tolist() == [[1.0, 3.0], [5.0, 7.0], [9.0, 11.0]]
     assert rows["next", "observation"].flatten().tolist() == [2.0, 4.0, 6.0]
 
 
@@ -104,6 +106,31 @@ def test_prices_of_limits_are_recorded_and_resume(tmp_path, agent: str, terms: s
     record = small_loop(tmp_path, *words, *sizes).run()
     assert {"limit_efficiency", "share_efficiency", "reward_cav_energy"} <= {*record.columns}
     assert record["price_efficiency"].nunique() > 1
+
+
+def test_drawn_rewards_have_the_present_prices_of_limits(tmp_path, monkeypatch) -> None:
+    words = ("agent=td3", "surrogates@agent=limits", "scenario.horizon=20", "agent.hold=0.5")
+    words += ("training.segment=20", "training.environments=4", "agent.batch_size=8")
+
+    def drawn(*overrides: str, stored_at: float = 1.0) -> torch.Tensor:
+        loop = small_loop(tmp_path, *words, *overrides)
+        prices, rewards = loop.agent.objective.limits.logarithms, []
+
+        def update(batch: TensorDict) -> dict[str, torch.Tensor]:
+            rewards.append(batch["next", "reward"].clone())
+            return dict.fromkeys(("loss_actor", "loss_value"), torch.zeros(()))
+
+        monkeypatch.setattr(loop.agent, "update", update)
+        source, now = loop._source(), {"safety": math.log(3.0), "efficiency": math.log(2.0)}
+        for given in (dict.fromkeys(now, math.log(stored_at)), now):
+            prices.update({name: given[name] for name in prices})
+            loop._iterate(source)
+        return rewards[-1]
+
+    fixed = ("agent.limits={safety:null,efficiency:null}", "agent.surrogates.safety.weight=1.5")
+    expected = drawn(*fixed, "agent.surrogates.efficiency.weight=16")
+    for price in (1e-6, 1.0, 50.0):
+        torch.testing.assert_close(drawn(stored_at=price), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_the_scale_of_rewards_is_that_of_discounted_sums() -> None:
