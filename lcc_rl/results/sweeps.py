@@ -34,7 +34,7 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
 
     Strategies are named by the settings in which the runs differ (:func:`labels`); the seeds of a
     training share a name. A strategy that no run trained, with the same rows in all of them, occurs
-    once. Settings that change the baseline name a ``source`` (:func:`sources`).
+    once. Settings that change the baseline name a ``source`` (:func:`conditions`).
     ``attrs["remarks"]`` has sentences on missing runs and settings without effect,
     ``attrs["first"]`` the folder of the first run.
 
@@ -46,9 +46,9 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
     loaded = load(root, settings=())
     rows = loaded.assign(run=loaded["run"].astype(str), strategy=loaded["strategy"].astype(str))
     runs = {name: _own(_settings(root / name)) for name in rows["run"].unique()}
-    if of := sources(rows, runs, root):
-        named = rows["run"].map(of)
-        rows[SOURCE] = rows[SOURCE].astype(str) + ", " + named if SOURCE in rows else named
+    if of := conditions(rows, runs, root):
+        words = rows["run"].map(of)
+        rows[SOURCE] = rows[SOURCE].astype(str) + ", " + words if SOURCE in rows else words
     for (strategy, *_), group in rows.groupby(["strategy", *[SOURCE] * bool(of)]):
         first, *rest = (one.drop(columns="run") for _, one in group.groupby("run"))
         equal = (first.reset_index(drop=True).equals(x.reset_index(drop=True)) for x in rest)
@@ -74,23 +74,18 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
     return table
 
 
-def sources(rows: pd.DataFrame, runs: Mapping[str, Choices], root: Path) -> dict[str, str]:
-    """Return for each run the words of what changes the baseline, ``event=cut_in``; else nothing.
-
-    Runs of an event, or of other drivers, are compared with the baseline of the same.
-    """
-    own = rows["strategy"] == baseline_of(rows["strategy"])
-    alike = defaultdict(list)
-    for name, part in rows[own].groupby("run"):
-        alike[pd.util.hash_pandas_object(part.drop(columns="run"), False).sum()].append(name)
+def conditions(rows: pd.DataFrame, runs: Mapping[str, Choices], root: Path) -> dict[str, str]:
+    """Return for each run the words of what changes the baseline, ``event=cut_in``; else nothing."""
+    own, alike = rows["strategy"] == baseline_of(rows["strategy"]), defaultdict(list)
+    for name, part in rows[own].astype({"run": str}).groupby("run"):
+        alike[pd.util.hash_pandas_object(part.drop(columns="run"), False).sum()].append(str(name))
     compared = {*rows.loc[own, "run"]} & {*rows.loc[~own, "run"]}
     if rows.loc[own, "training_seed"].notna().any() or compared != {*runs}:
         return {}
     firsts = [names[0] for names in alike.values()]
     found = labels([runs[name] for name in firsts], [root / name for name in firsts])
-    words = (", ".join(word.values()) for word in found)
-    named = zip(words, alike.values(), strict=True)
-    return {name: text for text, names in named if text for name in names}
+    named = zip(found, alike.values(), strict=True)
+    return {name: ", ".join(word.values()) for word, names in named if word for name in names}
 
 
 def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str, str]]:
