@@ -48,7 +48,7 @@ class Sensors(RoleTransform):
     delay: NonNegative = 0.0  # age of an arriving measurement, multiple of a step [s]
     dropouts: Share = 0.0  # probability that a measurement is missing; the last one is kept
     longest_dropout: NonNegative = 0.0  # longest drop-out, multiple of a step [s]
-    # Time from which the target is lost for longest_dropout; None: it is not [s].
+    # Time of the last measurement before longest_dropout without a target; None: there is one [s].
     lost_from: NonNegative | None = None
 
     LATER = ("scale_error", "lost_from")

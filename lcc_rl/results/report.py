@@ -287,7 +287,7 @@ def report(
         few: whether the verdict mentions too few windows.
         against: the baseline; by default that of the task, or the first of :data:`AGAINST`.
         second: the second energy model, if any, for a heading.
-        unit: energy per distance in short tables, see :func:`lcc_rl.results.units.in_unit`; None:
+        unit: energy per distance in tables, see :func:`lcc_rl.results.units.in_unit`; None:
             that of the task, or kJ/km, and g/km for one fuel.
 
     Raises:

@@ -75,7 +75,7 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
 
 
 def conditions(rows: pd.DataFrame, runs: Mapping[str, Choices], root: Path) -> dict[str, str]:
-    """Return for each run the words of what changes the baseline, ``event=cut_in``; else nothing."""
+    """Return the words of each run on what changes the baseline, ``event=cut_in``; else nothing."""
     own, alike = rows["strategy"] == baseline_of(rows["strategy"]), defaultdict(list)
     for name, part in rows[own].astype({"run": str}).groupby("run"):
         alike[pd.util.hash_pandas_object(part.drop(columns="run"), False).sum()].append(str(name))
