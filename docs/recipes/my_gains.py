@@ -7,16 +7,16 @@ from my_car import Follow
 import lcc_rl
 from lcc_rl.results.bootstrap import saving
 
-CAR = "energy._target_=my_car.MyCar"
+CAR = ["energy._target_=my_car.MyCar"]  # of all runs; harder brakes: "scenario.max_braking=6"
 # Windows of the training recordings; the evaluation's are set aside.
-TRAINING = [CAR, "split.tuning=true", "evaluation.drivers=24", "evaluation.baselines=[]"]
+TRAINING = [*CAR, "split.tuning=true", "evaluation.drivers=24", "evaluation.baselines=[]"]
 TRIALS = 40
 
 
 def growth(gains):
     """Growth of the speed's deviation along eight cars, in the worst of three waves."""
     waves = [15.0 + 3.0 * np.sin(np.arange(3000) / x) for x in (32, 64, 128)]  # 20, 40, 80 s
-    steps = lcc_rl.simulate(waves, "automated*8", Follow(**gains)).steps
+    steps = lcc_rl.simulate(waves, "automated*8", Follow(**gains), overrides=CAR).steps
     steps = steps[steps["time_s"] > 100.0]  # once the cars have settled
     deviation = steps.groupby(["episode", "vehicle"])["speed_mps"].std().unstack()
     return (deviation[8] / deviation[0]).max()
@@ -39,7 +39,7 @@ def cost(trial):
 def held_out(gains):
     """Print the flow in held-out windows, relative to that of the tuned IDM."""
     rivals = {"start": Follow(), "tuned": Follow(**gains), "known": "idm_acc"}
-    rows = lcc_rl.compare(rivals, overrides=[CAR, "evaluation.baselines=[]"]).rows
+    rows = lcc_rl.compare(rivals, overrides=[*CAR, "evaluation.baselines=[]"]).rows
     flow = rows.groupby(["profile", "strategy"])["flow_vph"].mean().unstack()
     for name in ("start", "tuned"):
         less = saving(flow[[name]], flow[["known"]])

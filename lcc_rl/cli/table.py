@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--all", action="store_true", help="all measures, as table=all")
     parser.add_argument("--columns", help="names of columns of --format csv, separated by commas")
     parser.add_argument("--against", help="baseline of savings, a name of the table")
-    unit = "energy per distance, such as kWh/100km, in short tables"
+    unit = "energy per distance, such as kWh/100km"
     parser.add_argument("--unit", choices=ENERGY_UNITS, help=unit)
     new = "another name of a row, in all formats; may be repeated"
     parser.add_argument("--rename", nargs=2, action="append", metavar=("ROW", "NAME"), help=new)

@@ -84,8 +84,8 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
         for name in ("max_braking", "max_acceleration"):
             yield f"scenario.{name}", "no vehicle of the string is automated"
     actuators = cfg.scenario.actuators.get(AUTOMATED)
-    braking = None if actuators is None else actuators.settings.get("braking")
-    if braking is not None and braking < cfg.scenario.max_braking:
+    braking = actuators.settings.get("braking") if actuators is not None else None
+    if braking and braking < cfg.scenario.max_braking:
         yield "scenario.max_braking", f"scenario.actuators.automated.braking={braking:g} is less"
     for name, node in cfg.scenario.fleet.items():
         roles = node.settings.get("roles") if node is not None else None  # none of another class

@@ -196,9 +196,8 @@ def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
         if piece.shows_presence(own.scenario.vehicles):
             changes["observation"] = cfg.observation.changed(presence=True)
         elif piece.shows_presence(cfg.scenario.vehicles):
-            text = "was trained with a vehicle behind each automated one"
-            hint = "scenario.string needs one, too, as in 'automated human'"
-            raise ConfigError(f"policy={cfg.policy} {text}: {hint}")
+            hint = "a vehicle behind each automated one: scenario.string needs one, too, as in"
+            raise ConfigError(f"policy={cfg.policy} was trained with {hint} 'automated human'")
     given, trained = (one.scenario.filters.get(AUTOMATED) for one in (cfg, own))
     if given is None and trained is not None:
         log.info("the policy of variant %s keeps the filter of its training", own.variant)

@@ -68,8 +68,8 @@ class CarLimits(Settings):
 
     def of(self, world: World) -> World:
         """Return a world with these limits of automated vehicles."""
-        given = {name: x for name, x in values(self).items() if x is not None}
-        return replace(world, limited_by="limits", **given)
+        given = values(self).items()
+        return replace(world, limited_by="limits", **{key: x for key, x in given if x is not None})
 
 
 class Input(NamedTuple):

@@ -109,9 +109,8 @@ def worded(table: pd.DataFrame) -> pd.DataFrame:
 
 def named(table: pd.DataFrame) -> pd.DataFrame:
     """Return a table with the strategies in words, ``driver``, beside their names."""
-    table = table.copy()
-    table.insert(1, "driver", [in_words(str(name)) for name in table["strategy"]])
-    return table
+    words = [in_words(str(name)) for name in table["strategy"]]
+    return table.assign(driver=words)[[table.columns[0], "driver", *table.columns[1:]]]
 
 
 def several(count: int, what: str) -> str:

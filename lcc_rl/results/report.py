@@ -12,6 +12,7 @@ import pandas as pd
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.energy import SECOND, Fleet
 from lcc_rl.errors import require, require_known
+from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import Rows
 from lcc_rl.results import measures
 from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING
@@ -29,15 +30,7 @@ from lcc_rl.results.measures import (
     Measure,
     Shown,
 )
-from lcc_rl.results.names import (
-    HUMAN,
-    ON_FRONT,
-    RULE,
-    RULE_ROWS,
-    in_words,
-    named,
-    strategy_named,
-)
+from lcc_rl.results.names import ON_FRONT, RULE, RULE_ROWS, in_words, named, strategy_named
 from lcc_rl.results.remarks import (
     FEW_DRIVES,
     FLOW_LOST,
@@ -294,7 +287,7 @@ def report(
         few: whether the verdict mentions too few windows.
         against: the baseline; by default that of the task, or the first of :data:`AGAINST`.
         second: the second energy model, if any, for a heading.
-        unit: energy per distance in short tables, see :func:`lcc_rl.results.units.in_unit`; None:
+        unit: energy per distance in tables, see :func:`lcc_rl.results.units.in_unit`; None:
             that of the task, or kJ/km, and g/km for one fuel.
 
     Raises:
@@ -323,9 +316,9 @@ def report(
     fields |= {"full_caption": FULL, "verdict": text, "remarks": notes}
     ends = {"_low": "_high", "_high": "_low"}
     bounds = {f"{FLOW_SHARE.key}{x}": -100.0 * table[f"{FLOW_LOST}{y}"] for x, y in ends.items()}
-    every = every.drop(columns=[x for x in every if str(x).startswith((*LOST,))]).assign(**bounds)
-    further = short[["strategy", *short.columns.difference(every.columns, sort=False)]]
-    every = every.merge(further, how="left", on="strategy")
+    every = every.filter(regex=f"^(?!{'|'.join(LOST)})").assign(**bounds)
+    further = ["strategy", *short.columns.difference(every.columns, sort=False)]
+    every = every.merge(short[further], how="left", on="strategy")
     return Report(of, every, short, shown, rows, **fields)
 
 
@@ -372,9 +365,9 @@ def _of_energy(
     cars = cars.sort_values(PATH_PER_KM, ascending=False, kind="stable").reset_index(drop=True)
     against = (cars["against"].iloc[0] or None) if len(cars) > 1 else None
     ends = ("", "_low", "_high") if against is None and len(cars) > 1 else ("",)
-    without = cars[FLOW_SHARE.key].isna().all()
-    loss, theirs = (WAY, "distance") if without else (FLOW_SHARE, "flow")
-    basis = f"{theirs} against {'theirs' if without else in_words(str(against))}"
+    loss, basis = FLOW_SHARE, f"flow against {in_words(str(against))}"
+    if cars[FLOW_SHARE.key].isna().all():
+        loss, basis = WAY, "distance against theirs"
     note = "" if against is None else f"{saved_against(cars, against)}; {basis}; "
     note += f"{with_interval(cars, 'energy')}; " * (len(ends) > 1)
     short = [one for one in MEASURES if one.short]

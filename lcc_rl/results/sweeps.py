@@ -9,21 +9,25 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from lcc_rl.arrays import Floats
 from lcc_rl.config import NOT_IDENTITY
 from lcc_rl.errors import ResultsError, require
 from lcc_rl.io.tensors import checksums
 from lcc_rl.results.loading import SHARD, listed, load
 from lcc_rl.results.names import ON_FRONT
+from lcc_rl.results.report import baseline_of
 from lcc_rl.results.runs import CONFIG, POLICY, differences, flat_settings
+from lcc_rl.results.windows import SOURCE
 from lcc_rl.runs.plans import choices_of
 from lcc_rl.runs.states import run_folders
 
 # Settings in which the parts and the seeds of one study differ.
 SHARED = tuple(f"{key}." for key in (*NOT_IDENTITY, "seed", SHARD))
 TRAINING = ["strategy", "training_seed"]
-EPISODE = [*TRAINING, "profile_id", "driver_id", "repeat", "case", "run_id", "follower"]
+EPISODE = [*TRAINING, SOURCE, "profile_id", "driver_id", "repeat", "case", "run_id", "follower"]
 Choices = Mapping[str, Any]  # of a run, by dotted key
 
 
@@ -32,7 +36,8 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
 
     Strategies are named by the settings in which the runs differ (:func:`labels`); the seeds of a
     training share a name. A strategy that no run trained, with the same rows in all of them, occurs
-    once. ``attrs["remarks"]`` has sentences on missing runs and settings without effect,
+    once. Settings that change the baseline name a ``source`` (:func:`conditions`).
+    ``attrs["remarks"]`` has sentences on missing runs and settings without effect,
     ``attrs["first"]`` the folder of the first run.
 
     Raises:
@@ -43,7 +48,10 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
     loaded = load(root, settings=())
     rows = loaded.assign(run=loaded["run"].astype(str), strategy=loaded["strategy"].astype(str))
     runs = {name: _own(_settings(root / name)) for name in rows["run"].unique()}
-    for strategy, group in rows.groupby("strategy"):
+    if of := conditions(rows, runs, root):
+        words = rows["run"].map(of)
+        rows[SOURCE] = rows[SOURCE].astype(str) + ", " + words if SOURCE in rows else words
+    for (strategy, *_), group in rows.groupby(["strategy", *[SOURCE] * bool(of)]):
         first, *rest = (one.drop(columns="run") for _, one in group.groupby("run"))
         equal = (first.reset_index(drop=True).equals(x.reset_index(drop=True)) for x in rest)
         if group["training_seed"].isna().any() and all(equal):
@@ -66,6 +74,30 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
     remarks = [f"Without rows: {listed(missing)}."] * bool(missing) + without_effect(root)
     table.attrs |= {"remarks": remarks, "first": str(root / next(iter(runs)))}
     return table
+
+
+def conditions(rows: pd.DataFrame, runs: Mapping[str, Choices], root: Path) -> dict[str, str]:
+    """Return the words of each run on what changes the baseline, ``event=cut_in``; else nothing.
+
+    Baselines of several machines differ by rounding and count as one.
+    """
+    own = rows["strategy"] == baseline_of(rows["strategy"])
+    alike: list[tuple[Floats, list[str]]] = []
+    for name, part in rows[own].astype({"run": str}).groupby("run"):
+        numbers = part.select_dtypes("number").to_numpy(np.float64)
+        for kept, names in alike:
+            if kept.shape == numbers.shape and np.allclose(kept, numbers, 1e-3, 1e-3, True):
+                names.append(str(name))
+                break
+        else:
+            alike.append((numbers, [str(name)]))
+    compared = {*rows.loc[own, "run"]} & {*rows.loc[~own, "run"]}
+    if rows.loc[own, "training_seed"].notna().any() or compared != {*runs}:
+        return {}
+    firsts = [names[0] for _, names in alike]
+    found = labels([runs[name] for name in firsts], [root / name for name in firsts])
+    named = zip(found, alike, strict=True)
+    return {name: ", ".join(word.values()) for word, (_, names) in named if word for name in names}
 
 
 def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str, str]]:

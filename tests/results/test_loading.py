@@ -100,7 +100,8 @@ def sweep_of(root: Path, *runs: dict[str, object], **columns: object) -> pd.Data
         folder = made(root / str(place), **settings)
         seed, weight = settings["seed"], settings.get("w", float("table" in settings))
         rows = pd.DataFrame({"strategy": ["idm", "alcc"], "training_seed": [None, seed]})
-        rows = rows.assign(profile_id=0, leader_speed_mps=9.0, energy_kj=[5.0, weight], **columns)
+        rows = rows.assign(profile_id=0, leader_speed_mps=9.0, **columns)
+        rows["energy_kj"] = [settings.get("base", 5.0), weight]
         rows = rows.astype({"training_seed": "Int64"})
         if "leader" in settings:
             rows["leader_speed_mps"] = settings["leader"]
@@ -115,6 +116,12 @@ def test_the_runs_of_a_sweep_are_read_as_one_evaluation(tmp_path) -> None:
     assert rows["strategy"].tolist() == names
     assert rows["training_seed"].tolist() == [pd.NA, 0, 1, 0, 1]
     assert sweep_of(tmp_path / "seeds", *grid[:2])["strategy"].tolist() == ["idm", "alcc", "alcc"]
+    runs = [{"seed": seed, "base": base} for base in (5.0, 6.0) for seed in (0, 1)]
+    rows = sweep_of(tmp_path / "events", *runs)  # each beside its own baseline
+    found = rows.groupby("source", sort=False)["strategy"].unique().map(list).to_dict()
+    assert found == {f"base={x}": ["idm", "alcc"] for x in (5.0, 6.0)}
+    rounded = [{"seed": seed, "base": 5.0 + 1e-6 * seed} for seed in (0, 1)]
+    assert "source" not in sweep_of(tmp_path / "machines", *rounded)
     refusals = [
         ([{"seed": 0}, {"seed": 0, "table": "all"}], "a training twice: alcc, seed 0"),
         ([{"seed": 0}, {"seed": 1, "leader": 8.0}], r"have different leaders .*results\.load"),
