@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.runs import differing, flatten
 from lcc_rl.results.task import Task
 from lcc_rl.results.units import OF_FUEL, burns_one_fuel, check_unit
-from lcc_rl.settings import parse
+from lcc_rl.settings import TARGET, parse
 
 MESSAGES = "communication"  # name of the piece with messages between connected vehicles
 FIRST_LAYER = "module.0.0.weight"  # first layer of a policy's network
@@ -86,7 +86,7 @@ def check_policy(cfg: StudyConfig, own: StudyConfig) -> None:
     if own.variant != cfg.variant and not hybrid:
         raise ConfigError(f"{path} was trained as variant {own.variant}, not {cfg.variant}")
     _check_entries(path, own, cfg)
-    _check_same(path, _observed(own), _observed(cfg))
+    _check_same(path, *(_observed(x, of_observation(own)) for x in (own, cfg)))
     check_action(path, own, cfg)
 
 
@@ -103,13 +103,19 @@ def _check_entries(path: str, own: StudyConfig, cfg: StudyConfig) -> None:
     )
 
 
-def _observed(cfg: StudyConfig) -> dict[str, Any]:
-    """Return the settings of an observation, the order of its entries and the memory."""
+def of_observation(cfg: StudyConfig) -> set[str]:
+    """Return the pieces that belong to an observation: named as an entry, or a user's own."""
+    scales = cfg.observation.settings.get("scales", {})
+    kinds = {x: node.settings[TARGET] for x, node in cfg.scenario.pieces.items() if node}
+    return {x for x, kind in kinds.items() if x in scales or not kind.startswith("lcc_rl.")}
+
+
+def _observed(cfg: StudyConfig, names: Iterable[str]) -> dict[str, Any]:
+    """Return the settings of an observation, the order of its entries and the named pieces."""
     node = as_plain(cfg.observation)
     order = [key for key, _ in flatten(node) if key.startswith("scales.")]
-    pieces = {name: cfg.scenario.pieces.get(name) for name in ("memory", "spread")}
-    memory = {f"scenario.pieces.{name}": as_plain(x) for name, x in pieces.items() if x is not None}
-    return {"observation": {**node, "order of scales": order}, **memory}
+    pieces = {f"scenario.pieces.{name}": as_plain(cfg.scenario.pieces.get(name)) for name in names}
+    return {"observation": {**node, "order of scales": order}, **pieces}
 
 
 def check_scenario(path: str, own: StudyConfig, cfg: StudyConfig) -> None:

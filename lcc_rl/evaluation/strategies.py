@@ -16,7 +16,7 @@ from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.errors import ConfigError, ResultsError, raised_as, require
-from lcc_rl.evaluation.fit import check_action, check_scenario, check_width
+from lcc_rl.evaluation.fit import check_action, check_scenario, check_width, of_observation
 from lcc_rl.evaluation.named import DIRECT, PEOPLE, controller_of, label_of
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
@@ -27,7 +27,6 @@ from lcc_rl.settings import TARGET, path_of
 
 log = logging.getLogger("lcc_rl")
 
-KNOWLEDGE = ("memory", "spread", "preview")  # pieces that belong to a policy's observation
 TrainedPolicy = tuple[dict[str, Any], StudyConfig]  # weights and configuration
 
 
@@ -235,11 +234,8 @@ def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Popu
     weights, training = policy
     check_scenario(path, training, cfg)
     other = _of_training(cfg.with_(observation=training.observation), training)
-    pieces = {
-        name: node
-        for name, node in training.scenario.pieces.items()
-        if name in KNOWLEDGE or name not in other.scenario.pieces
-    }
+    own, kept = training.scenario.pieces, of_observation(training)
+    pieces = {x: own[x] for x in own if x in kept or x not in other.scenario.pieces}
     driver = {AUTOMATED: training.scenario.controllers[AUTOMATED]}
     other = other.with_(
         variant=training.variant,

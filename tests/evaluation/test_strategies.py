@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,11 +13,13 @@ from tensordict.nn import TensorDictModule
 
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation import strategies
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.named import TUNED
 from lcc_rl.evaluation.naming import check_distinct, named_apart
 from lcc_rl.evaluation.strategies import Strategy, baseline, trained
 from lcc_rl.functional.pattern import AUTOMATED
+from lcc_rl.pieces.base import Piece
 from lcc_rl.results.policies import load_policy
 
 
@@ -96,10 +99,33 @@ def test_a_policy_of_other_settings_is_refused() -> None:
         ("alcc", "observation.scales.self.gap=0.2", "scales.self.gap=0.2, got 0.1"),
         ("alcc", "+knowledge=memory", r"with memory\.entries in its .* 'compare=\[p\.pt\]'"),
         ("alcc", "~observation.scales.ahead", r"trained without ahead\.speed in its"),
-        ("alcc", "+knowledge=memory", "~observation.scales.memory", "scenario.pieces.memory"),
+        ("alcc", "+knowledge=memory", "~observation.scales.memory", "widths.memory=4, got None"),
         ("alcc", "scenario.time_step=0.2", "scenario.time_step=0.2, got 0.1"),
     ]
     check_refused(lambda *words: check_policy(cfg, compose(*words)), cases, ConfigError)
+
+
+class Trend(Piece):
+    """A piece of a user."""
+
+    seconds: float = 2.0
+
+
+def test_a_policy_keeps_the_pieces_that_it_observes(monkeypatch) -> None:
+    monkeypatch.setattr(strategies, "with_weights", lambda cfg, *_: Strategy("alcc", cfg))
+    terrain = ["+slope=hills", "+knowledge=terrain", "scenario.pieces.terrain.distances=[9.0,99.0]"]
+    own = f"+scenario.pieces.trend={{_target_: {__name__}.Trend}}"
+    cases = {"terrain.distances=[9.0,98.0]": terrain, "trend.seconds=9.0": [own]}
+    for change, words in cases.items():
+        policy, cfg = (
+            compose("alcc", *words, *x).with_(policy="p.pt")
+            for x in ([], [f"scenario.pieces.{change}"])
+        )
+        check_policy(policy, policy)
+        with pytest.raises(ConfigError, match=re.escape(change.split("=")[0])):
+            check_policy(cfg, policy)
+        kept = trained(cfg, "p.pt", ({}, policy), POPULATION).cfg.scenario.pieces
+        assert kept == policy.scenario.pieces
 
 
 def test_a_policy_of_a_task_is_refused_without_a_task_and_in_another_scenario() -> None:
