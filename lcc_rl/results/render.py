@@ -77,13 +77,22 @@ def as_csv(frame: pd.DataFrame, decimal: str = "point") -> str:
     return frame.to_csv(index=False, sep=sep, decimal=mark).rstrip()
 
 
+LATEX = {
+    **{sign: f"${sign}$" for sign in "<>"},
+    **{"−": "$-$", " … ": " to ", DASH: "--", "²": "$^2$", "³": "$^3$", "Σ": r"$\Sigma$"},
+    **{"≤": r"$\leq$", "≥": r"$\geq$", "±": r"$\pm$", "×": r"$\times$"},
+}
+
+
 def as_latex(frame: pd.DataFrame) -> str:
     """Return a table for LaTeX (package booktabs) with headings and cells of :func:`columns`."""
     shown = columns(frame)
     cells = pd.DataFrame({column.heading: column.cells for column in shown})
     places = "".join("r" if column.number else "l" for column in shown)
     text = cells.to_latex(index=False, escape=True, column_format=places).rstrip()
-    return text.replace("−", "$-$").replace(" … ", " to ").replace(DASH, "--")
+    for sign, word in LATEX.items():
+        text = text.replace(sign, word)
+    return text
 
 
 def column_cells(frame: pd.DataFrame, name: str) -> list[str]:

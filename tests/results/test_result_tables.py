@@ -288,6 +288,9 @@ def test_signs_of_a_name_stay_in_its_cell() -> None:
     assert [len(re.split(r"(?<!\\)\|", line)) for line in (head, rule, row)] == [4, 4, 4]
     assert r"a\|b_c & 5 % #" in row
     assert r"a|b\_c \& 5 \%" in as_latex(table)
+    printed = as_latex(pd.DataFrame({"TTC < 4 s, Σ m²/s³": ["≤ −1 ± 2"]}))
+    assert "TTC $<$ 4 s" in printed  # a bare one is another sign in the default encoding
+    assert printed.isascii()
 
 
 def test_no_table_has_a_negative_zero_or_thousandths_of_a_per_cent() -> None:
