@@ -111,6 +111,7 @@ def test_prices_of_limits_are_recorded_and_resume(tmp_path, agent: str, terms: s
 def test_drawn_rewards_have_the_present_prices_of_limits(tmp_path, monkeypatch) -> None:
     words = ("agent=td3", "surrogates@agent=limits", "scenario.horizon=20", "agent.hold=0.5")
     words += ("training.segment=20", "training.environments=4", "agent.batch_size=8")
+    words += ("training.gap_range=[0.05,3.0]", "agent.updates_per_transition=1")
 
     def drawn(*overrides: str, stored_at: float = 1.0) -> torch.Tensor:
         loop = small_loop(tmp_path, *words, *overrides)
@@ -125,11 +126,13 @@ def test_drawn_rewards_have_the_present_prices_of_limits(tmp_path, monkeypatch) 
         for given in (dict.fromkeys(now, math.log(stored_at)), now):
             prices.update({name: given[name] for name in prices})
             loop._iterate(source)
-        return rewards[-1]
+        kept = loop.buffer.columns.get(LIMITED)
+        assert kept is None or kept[0].any(0).all()  # both limits are missed
+        return torch.cat(rewards[-16:])
 
     fixed = ("agent.limits={safety:null,efficiency:null}", "agent.surrogates.safety.weight=1.5")
     expected = drawn(*fixed, "agent.surrogates.efficiency.weight=16")
-    for price in (1e-6, 1.0, 50.0):
+    for price in (1e-6, 1.0, 9.0):
         torch.testing.assert_close(drawn(stored_at=price), expected, rtol=1e-4, atol=1e-5)
 
 
