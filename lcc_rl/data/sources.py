@@ -172,10 +172,15 @@ class EpisodesSource(Source):
         source += read_as(PAIR_FIELDS, named, self.units)
         units = units_of(PAIR_FIELDS, {**EPISODE_NAMES, **self.columns}, self.units)
         place = partial(places, files=files, columns=self.columns)
-        first = episodes.drop_duplicates("leader_id")
-        cars = dict(zip(first["leader_id"], first["label"].astype(str), strict=True))
-        loaded = self.select(episodes, source, lines, place=place, units=units)
-        return replace(loaded, vehicles=cars if self.columns.get("target") else {})
+        # A target names the leader of its episode, another text the car that is driven.
+        key = "leader_id" if self.columns.get("target") else "follower_id"
+        pairs = episodes.drop_duplicates([key, "label"])
+        cars, labels = pairs[key], pairs["label"].astype(str)
+        named = key == "leader_id" or not (labels == "").any() | labels.str.isnumeric().all()
+        vehicles = dict(zip(cars, labels, strict=True)) if named and cars.is_unique else {}
+        return replace(
+            self.select(episodes, source, lines, place=place, units=units), vehicles=vehicles
+        )
 
 
 def read_as(columns: Iterable[Column], names: Names, units: Units) -> str:

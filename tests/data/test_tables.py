@@ -538,6 +538,17 @@ def test_a_log_with_one_speed_in_another_unit_is_refused(tmp_path) -> None:
     check_refused(lambda key: read(**{key: "km/h"}).load(), cases, DataError)
 
 
+def test_episodes_named_by_texts_name_their_drivers(tmp_path) -> None:
+    pair = {"time_s": 0.1 * np.arange(300), "gap_m": 20.0}
+    pair |= {"leader_speed_mps": 10.0, "follower_speed_mps": 10.0}
+    for names, expected in (("ab", ["a", "b"]), ("01", [])):
+        pairs = pd.concat([pd.DataFrame(pair).assign(episode=name) for name in names])
+        pairs.to_csv(tmp_path / "pairs.csv", index=False)
+        loaded = EpisodesSource(path=str(tmp_path / "pairs.csv")).load()
+        found = map(loaded.vehicles.get, loaded.episodes["follower_id"].unique())
+        assert [name for name in found if name] == expected
+
+
 def test_noisy_speeds_of_a_fast_raster_are_smoothed_by_the_option_of_the_message(tmp_path) -> None:
     log = car_log()
     noise = 0.2 * np.random.default_rng(0).normal(size=len(log))
