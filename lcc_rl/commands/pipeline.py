@@ -29,7 +29,7 @@ from lcc_rl.config.schemas import (
     PipelineConfig,
     TrainConfig,
 )
-from lcc_rl.config.unused import BASELINES
+from lcc_rl.config.unused import OF_COMPARISONS
 from lcc_rl.data.episodes import SCHEMA
 from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.drivers.calibrator import count_records
@@ -122,7 +122,7 @@ def composed_part(
                 f"{override} has no effect on lcc-rl run, which trains several: use variants=[…]"
             )
     shared = [override for override in overrides if top_key(override) not in JOB_OPTIONS]
-    learned = [override for override in shared if key_of(override) != BASELINES]
+    learned = [override for override in shared if key_of(override) not in OF_COMPARISONS]
     names = cfg.variants or NETWORKS
     trainings = {name: load("train", [*learned, f"variant={name}"]) for name in names}
     if cfg.variants is None and trainings[names[-1]].agent.kind is Analytic:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -36,12 +37,14 @@ from lcc_rl.config.nodes import (
     with_defaults,
     without_defaults,
 )
-from lcc_rl.config.schemas import AUTO, KINDS, SECTIONS, parse_config
-from lcc_rl.config.unused import check_used
+from lcc_rl.config.schemas import AUTO, KINDS, SECTIONS, TrainingConfig, parse_config
+from lcc_rl.config.unused import check_used, refuse
 from lcc_rl.config.words import key_of, typed_keys
 from lcc_rl.errors import ConfigError, how_to_install, require, require_known, unknown_name
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, parse_string
 from lcc_rl.settings import TARGET, find_target
+
+log = logging.getLogger("lcc_rl")
 
 CONF = "lcc_rl.conf"
 # Settings that change no row of a result.
@@ -245,6 +248,8 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     except ConfigError as error:  # another choice of the group may have the setting
         if (found := OF_NODE.match(str(error))) and (hint := _file_of(*found.groups())):
             raise ConfigError(f"{error}; {hint}") from None
+        if re.match("deployed: expected a node .*{", str(error)):
+            refuse(overrides, {"deployed.": "it belongs to variant=hcfs"})
         match = re.match(r"unknown setting of (\w+) \(", str(error))
         group = match.group(1) if match else ""
         if not group or not choices(group):
@@ -254,7 +259,16 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         if getattr(tree, name, TARGET) is None:
             raise ConfigError(f"{name}: expected a node with {TARGET}, got None")
     check_used(tree, overrides, sweep, written)
+    if entry == "train" and tree.learns:
+        _report_rounded(content["training"]["episodes"], tree.training)
     return with_inputs(tree)
+
+
+def _report_rounded(asked: Any, training: TrainingConfig) -> None:
+    """Warn if a training has more episodes than asked for."""
+    if training.episodes != float(asked):
+        text = "training.episodes=%s is rounded up to %d, whole batches of %d environments"
+        log.warning(text, asked, training.episodes, training.environments)
 
 
 def with_inputs(cfg: Any) -> Any:

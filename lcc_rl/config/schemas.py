@@ -7,7 +7,7 @@ Values are in conf/. Objects with a ``_target_`` (pieces, agents, data …) are 
 from __future__ import annotations
 
 import dataclasses
-import logging
+from collections import Counter
 from collections.abc import Mapping
 from functools import partial
 from types import MappingProxyType
@@ -17,7 +17,7 @@ import yaml
 from pydantic import AfterValidator, Field
 
 from lcc_rl.config.nodes import Node, as_nodes, as_plain, check_nodes, check_numbers
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION, VehicleString, parse_string
 from lcc_rl.settings import (
     TARGET,
@@ -33,8 +33,6 @@ from lcc_rl.settings import (
     parse,
     values,
 )
-
-log = logging.getLogger("lcc_rl")
 
 TimeStep = Annotated[float, Field(ge=0.001, le=0.5)]  # behind US06 the tuned IDM collides at 1 s
 Device = Annotated[str, Field(pattern=r"^(cpu|cuda)(:\d+)?$")]
@@ -178,11 +176,8 @@ class TrainingConfig(Section):
     gap_range: list[float]
 
     def validate(self) -> None:
-        size, episodes = self.environments, self.episodes
-        vars(self).update(episodes=-(-episodes // size) * size)
-        if self.episodes > episodes:
-            text = "training.episodes=%d is rounded up to %d, whole batches of %d environments"
-            log.warning(text, episodes, self.episodes, size)
+        size = self.environments
+        vars(self).update(episodes=-(-self.episodes // size) * size)
 
 
 class EvaluationConfig(Section):
@@ -210,6 +205,9 @@ class EvaluationConfig(Section):
     terms: bool = False  # means of the reward's terms, of networks
 
     def validate(self) -> None:
+        for name in ("baselines", "behind_filter", "front"):
+            for item, count in Counter(getattr(self, name)).items():
+                require(count == 1, f"evaluation.{name} names {item} {count} times")
         if self.shard >= self.shards:
             raise ConfigError(
                 f"evaluation.shard must lie from 0 to {self.shards - 1}, got {self.shard}"

@@ -15,6 +15,12 @@ from lcc_rl.settings import TARGET
 
 NO_AGENT = ("agent=none", "agent=null")
 BASELINES = "evaluation.baselines"
+OF_COMPARISONS = (BASELINES, "evaluation.behind_filter", "evaluation.front")
+# Settings of evaluation.rows=episodes; the first three are refused in sweeps, too.
+OF_EPISODES = (
+    "repeats shards shard drivers batch_size sample_episodes compiled humans_first".split()
+)
+OF_EPISODES += ["second_energy", "terms"]
 OBSERVATION = "lcc_rl.pieces.Observation"
 
 
@@ -34,16 +40,18 @@ def check_used(
     """
     if not isinstance(cfg, StudyConfig):
         return
-    reasons = dict(_of_road(cfg))
+    reasons = dict(_of_road(cfg)) | dict(_of_rows(cfg, sweep))
     if not sweep:
         reasons |= dict(_of_roles(cfg)) | dict(_of_agent(cfg))
         observation = cfg.observation.settings
         if observation[TARGET] == OBSERVATION and "behind" not in (observation.get("scales") or ()):
             for key in ("visible", "presence"):
                 reasons[f"observation.{key}"] = "observation.scales names no vehicle behind"
-        plain = type(cfg) is TrainConfig and BASELINES in map(key_of, overrides)
-        if plain and RECORDED not in cfg.evaluation.baselines:
-            reasons[BASELINES] = "a training evaluates its own policy; lcc-rl evaluate compares"
+        named = {*OF_COMPARISONS} & {*map(key_of, overrides)} if type(cfg) is TrainConfig else set()
+        if RECORDED in cfg.evaluation.baselines:
+            named -= {BASELINES}
+        reason = "a training evaluates its own policy; lcc-rl evaluate compares"
+        reasons |= dict.fromkeys(named, reason)
         reasons["sweep"] = "it names the folder of a sweep, -m"
     if written is not None and cfg.agent is not None and "surrogates" in cfg.agent.settings:
         typed = set().union(*map(typed_keys, overrides))
@@ -52,8 +60,12 @@ def check_used(
 
 
 def refuse(overrides: Iterable[str], reasons: Mapping[str, str]) -> None:
-    """Refuse overrides of keys that have a reason, or of keys below them; ``key.``: below only."""
-    for option in overrides:
+    """Refuse overrides of keys that have a reason, or of keys below them; ``key.``: below only.
+
+    An override that another refers to has an effect: ``policy=<sweep>/seed${seed}``.
+    """
+    typed = list(overrides)
+    for option in (x for x in typed if not any(f"${{{key_of(x)}}}" in word for word in typed)):
         for unused, reason in reasons.items():
             for key in typed_keys(option):
                 if key == unused or key.startswith(f"{unused.removesuffix('.')}."):
@@ -72,6 +84,17 @@ def _of_road(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
         # A pipeline calibrates drivers on the data.
         for key in ("split",) if hasattr(cfg, "calibration") else ("data", "split"):
             yield key, "the leader drives the records of leader=…; use leader=trajectories"
+
+
+def _of_rows(cfg: StudyConfig, sweep: bool) -> Iterator[tuple[str, str]]:
+    """Yield settings of evaluations with other rows, and why they have no effect."""
+    if cfg.evaluation.rows == "episodes":
+        if not sweep:
+            yield "evaluation.full_length", "whole records belong to evaluation.rows=vehicles"
+        return
+    for name in OF_EPISODES[: 3 if sweep else None]:
+        reason = "it belongs to evaluation.rows=episodes; a platoon drives every record once"
+        yield f"evaluation.{name}", reason
 
 
 def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:

@@ -29,12 +29,19 @@ from lcc_rl.evaluation.strategies import (
     studied,
     trained,
 )
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
 from lcc_rl.results.runs import POLICY
 from lcc_rl.runs.states import CONFIG, run_folders
+from lcc_rl.settings import TARGET
 
 log = logging.getLogger("lcc_rl")
+
+OF_TRAINING = dict.fromkeys(("agent.", "training."), "a policy has the settings of its training")
+# Pieces that draw nothing in an evaluation and read no drivers.
+FIXED = {"HCFS", "CACC", "DeadBeat", "HeadwayStart", "NGSIMLeader", "Communication", "Action"}
+FIXED |= {"TimeToCollision", "TimeGap", "MotorPower"}
 
 
 class Entrants:
@@ -70,6 +77,9 @@ class Entrants:
         self.rivals, self.paths = self._compared()
         self._check_used(typed)
         self.policy, self.policies = self._read_policies()
+        learned = self.policy and self.policy[1].agent.name
+        if learned and learned != cfg.agent.name:
+            refuse(typed, {"agent": f"the policy has the agent of its training, {learned}"})
         check_installed(cfg, list(self.rivals.values()))
         recorded = RECORDED in {*self.rivals, *cfg.evaluation.baselines}
         for asked in [] if recorded else self._limits_of_record():
@@ -106,17 +116,35 @@ class Entrants:
         return rivals, policies
 
     def _check_used(self, typed: Sequence[str]) -> None:
-        rows = [*self.rivals, *self.cfg.evaluation.baselines]
-        if not any("${seed}" in word for word in typed):  # as in policy=<sweep>/seed${seed}
-            refuse(typed, {"seed": "it is that of trainings; evaluation.seed draws other noise"})
+        cfg, rows = self.cfg, [*self.rivals, *self.cfg.evaluation.baselines]
+        unused = {"seed": "it is that of trainings; evaluation.seed draws other noise"}
+        if self._is_fixed():
+            reason = "no vehicle of this platoon depends on drivers or noise"
+            unused |= dict.fromkeys(("seed", "evaluation.seed", "drivers"), reason)
+        if self.own and cfg.learns and cfg.policy is not None:
+            unused |= OF_TRAINING
+        refuse(typed, unused)
+        learned = self.paths or self.further or cfg.policy is not None
+        if cfg.evaluation.rows == "episodes" and not (cfg.evaluation.terms and learned):
+            changed = [word for word in typed if not word.startswith("~")]
+            reason = "only rows of policies have a reward, with evaluation.terms=true"
+            refuse(changed, {"reward.terms.": reason})
         if self.own or self.further or self.cfg.variant in rows or not self.cfg.automated:
             return
-        if not self.paths and self.cfg.evaluation.rows == "episodes":
-            changed = [word for word in typed if not word.startswith("~")]
-            refuse(changed, {"reward.terms.": "rows of policies have a reward, no others"})
         check_effective(
             typed, self.rivals or rows, [*rows, *self.rivals.values()], bool(self.paths)
         )
+
+    def _is_fixed(self) -> bool:
+        """Return whether the rows are of a platoon without humans, chance or unknown pieces."""
+        cfg, scenario = self.cfg, self.cfg.scenario
+        specs = [*cfg.evaluation.baselines, *self.rivals.values()]
+        platoon = cfg.evaluation.rows == "vehicles" and {*scenario.vehicles.names} == {AUTOMATED}
+        if not platoon or self.paths or self.further or DIRECT in specs:
+            return False
+        scenario = scenario.with_(controllers={HUMAN: None}, start={HUMAN: None})
+        nodes = nodes_in([scenario, cfg.deployed, *map(controller_of, specs)])
+        return all(node.settings[TARGET].removeprefix("lcc_rl.pieces.") in FIXED for node in nodes)
 
     def _of_task(self, path: str) -> str:
         return of_task(path, None if self.task is None else self.task.name)
@@ -201,7 +229,7 @@ def check_effective(
         learned: whether a row is a policy.
     """
     unused = {AUTO: "every controller is named and has its own settings"}
-    unused |= dict.fromkeys(("agent.", "training."), "a policy has the settings of its training")
+    unused |= OF_TRAINING
     if not learned and not any(str(x).endswith(FILTERED) for x in specs):
         reason = f"nothing drives behind the filter ({', '.join(rows)}); "
         reason += f"it needs a name that ends in {FILTERED}"
