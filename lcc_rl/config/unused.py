@@ -18,9 +18,9 @@ BASELINES = "evaluation.baselines"
 OF_COMPARISONS = (BASELINES, "evaluation.behind_filter", "evaluation.front")
 # Settings of evaluation.rows=episodes; the first three are refused in sweeps, too.
 OF_EPISODES = (
-    "repeats shards shard drivers batch_size sample_episodes compiled humans_first".split()
+    *("repeats", "shards", "shard", "drivers", "batch_size", "sample_episodes", "compiled"),
+    *("humans_first", "second_energy", "terms"),
 )
-OF_EPISODES += ["second_energy", "terms"]
 OBSERVATION = "lcc_rl.pieces.Observation"
 
 

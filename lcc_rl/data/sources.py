@@ -176,8 +176,8 @@ class EpisodesSource(Source):
         key = "leader_id" if self.columns.get("target") else "follower_id"
         pairs = episodes.drop_duplicates([key, "label"])
         cars, labels = pairs[key], pairs["label"].astype(str)
-        named = key == "leader_id" or not (labels == "").any() | labels.str.isnumeric().all()
-        vehicles = dict(zip(cars, labels, strict=True)) if named and cars.is_unique else {}
+        told = key == "leader_id" or not (labels == "").any() | labels.str.isnumeric().all()
+        vehicles = dict(zip(cars, labels, strict=True)) if told and cars.is_unique else {}
         return replace(
             self.select(episodes, source, lines, place=place, units=units), vehicles=vehicles
         )

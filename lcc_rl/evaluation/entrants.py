@@ -38,7 +38,7 @@ from lcc_rl.settings import TARGET
 
 log = logging.getLogger("lcc_rl")
 
-OF_TRAINING = dict.fromkeys(("agent.", "training."), "a policy has the settings of its training")
+OF_LEARNING = dict.fromkeys(("agent.", "training."), "a policy has the settings of its training")
 # Pieces that draw nothing in an evaluation and read no drivers.
 FIXED = {"HCFS", "CACC", "DeadBeat", "HeadwayStart", "NGSIMLeader", "Communication", "Action"}
 FIXED |= {"TimeToCollision", "TimeGap", "MotorPower"}
@@ -122,7 +122,7 @@ class Entrants:
             reason = "no vehicle of this platoon depends on drivers or noise"
             unused |= dict.fromkeys(("seed", "evaluation.seed", "drivers"), reason)
         if self.own and cfg.learns and cfg.policy is not None:
-            unused |= OF_TRAINING
+            unused |= OF_LEARNING
         refuse(typed, unused)
         learned = self.paths or self.further or cfg.policy is not None
         if cfg.evaluation.rows == "episodes" and not (cfg.evaluation.terms and learned):
@@ -229,7 +229,7 @@ def check_effective(
         learned: whether a row is a policy.
     """
     unused = {AUTO: "every controller is named and has its own settings"}
-    unused |= OF_TRAINING
+    unused |= OF_LEARNING
     if not learned and not any(str(x).endswith(FILTERED) for x in specs):
         reason = f"nothing drives behind the filter ({', '.join(rows)}); "
         reason += f"it needs a name that ends in {FILTERED}"

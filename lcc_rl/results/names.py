@@ -107,7 +107,7 @@ def worded(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(**{name: [in_words(str(x)) for x in table[name]] for name in names})
 
 
-def named(table: pd.DataFrame) -> pd.DataFrame:
+def with_drivers(table: pd.DataFrame) -> pd.DataFrame:
     """Return a table with the strategies in words, ``driver``, beside their names."""
     words = [in_words(str(name)) for name in table["strategy"]]
     return table.assign(driver=words)[[table.columns[0], "driver", *table.columns[1:]]]

@@ -8,7 +8,7 @@ import pandas as pd
 from lcc_rl.errors import require_known
 from lcc_rl.results import bootstrap
 from lcc_rl.results.measures import COUNT, Measure, Shown
-from lcc_rl.results.names import named
+from lcc_rl.results.names import with_drivers
 from lcc_rl.results.report import ALL, Report, shortened
 
 PER_RUN = ("switches", "clamps", "cap_interventions")
@@ -93,7 +93,7 @@ BELOW = "sums over followers and frames, means over runs"
 
 def case_report(rows: pd.DataFrame, case: str, of: str = "") -> Report:
     """Return the report of a case of a platoon, from rows of episodes.parquet."""
-    table = named(case_table(rows, case))
+    table = with_drivers(case_table(rows, case))
     shown = [Shown(one.key, one.short) for one in PLATOON if one.short]
     short = shortened(table.drop(columns=["reward_low", "reward_high"]), shown)
     caption = f"{BELOW}; {ALL}"

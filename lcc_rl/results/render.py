@@ -79,8 +79,16 @@ def as_csv(frame: pd.DataFrame, decimal: str = "point") -> str:
 
 LATEX = {
     **{sign: f"${sign}$" for sign in "<>"},
-    **{"−": "$-$", " … ": " to ", DASH: "--", "²": "$^2$", "³": "$^3$", "Σ": r"$\Sigma$"},
-    **{"≤": r"$\leq$", "≥": r"$\geq$", "±": r"$\pm$", "×": r"$\times$"},
+    "−": "$-$",
+    " … ": " to ",
+    DASH: "--",
+    "²": "$^2$",
+    "³": "$^3$",
+    "Σ": r"$\Sigma$",
+    "≤": r"$\leq$",
+    "≥": r"$\geq$",
+    "±": r"$\pm$",
+    "×": r"$\times$",
 }
 
 

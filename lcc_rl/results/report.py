@@ -30,7 +30,7 @@ from lcc_rl.results.measures import (
     Measure,
     Shown,
 )
-from lcc_rl.results.names import ON_FRONT, RULE, RULE_ROWS, in_words, named, strategy_named
+from lcc_rl.results.names import ON_FRONT, RULE, RULE_ROWS, in_words, strategy_named, with_drivers
 from lcc_rl.results.remarks import (
     FEW_DRIVES,
     FLOW_LOST,
@@ -306,7 +306,9 @@ def report(
         for end in ("", "_low", "_high")
     }
     percent |= {shown: -100.0 * table[lost] for lost, (shown, _) in LOST.items()}
-    every = named(pd.concat([table, pd.DataFrame(percent)], axis=1))  # in few blocks, for more
+    every = with_drivers(
+        pd.concat([table, pd.DataFrame(percent)], axis=1)
+    )  # in few blocks, for more
     fields = _of_task(every, task) if task else _of_energy(every, energy, second, unit)
     short, shown = fields.pop("short")
     rows = _rows(task, table["against"].iloc[0], shown[1] if task or unit else None)
@@ -440,7 +442,7 @@ def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
 def shortened(
     table: pd.DataFrame, shown: Sequence[Shown]
 ) -> tuple[pd.DataFrame, tuple[Shown, ...]]:
-    """Return columns of a :func:`named` table with intervals, and the columns.
+    """Return columns of a :func:`with_drivers` table with intervals, and the columns.
 
     Strategies that lose more than 2 % of the flow, and single trainings beside several, are marked.
     With several seeds, collisions are means of a training.

@@ -24,7 +24,7 @@ from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import parquet_metadata, read_parquet, write_parquet
 from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING, Estimate
 from lcc_rl.results.measures import MEASURES, Shown
-from lcc_rl.results.names import named, several
+from lcc_rl.results.names import several, with_drivers
 from lcc_rl.results.remarks import crashes
 from lcc_rl.results.report import Report, windows_for
 from lcc_rl.results.runs import CONFIG, EPISODES, read_settings
@@ -172,7 +172,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
         study.blocks += [f"{share:g} % automated: {remark}" for remark in crashes(rows)]
     shown = [Shown(x.shown.key, fill(x.title, 18)) for x in MEASURES if x.key in DRAWN]
     of = [f"{x:g} %" for x in table["automated_pct"]]
-    report = Report("", table, named(table.assign(of=of)), tuple(shown), (), "", "")
+    report = Report("", table, with_drivers(table.assign(of=of)), tuple(shown), (), "", "")
     study.figure("road", "The same values and intervals; shares of time in %", measures_of(report))
     for name, file in (("Data", folder / TRAJECTORIES), ("Drivers", folder / DRIVERS_FILE)):
         if file.is_file():
