@@ -306,9 +306,7 @@ def report(
         for end in ("", "_low", "_high")
     }
     percent |= {shown: -100.0 * table[lost] for lost, (shown, _) in LOST.items()}
-    every = with_drivers(
-        pd.concat([table, pd.DataFrame(percent)], axis=1)
-    )  # in few blocks, for more
+    every = with_drivers(pd.concat([table, pd.DataFrame(percent)], axis=1))
     fields = _of_task(every, task) if task else _of_energy(every, energy, second, unit)
     short, shown = fields.pop("short")
     rows = _rows(task, table["against"].iloc[0], shown[1] if task or unit else None)
