@@ -52,9 +52,8 @@ class Limits:
     ) -> None:
         given = {name: share for name, share in largest.items() if share is not None}
         for name in given:
-            remedy = "surrogates@agent=limits or another file of surrogates adds terms"
-            message = f"{where}.{name}: there is no agent.surrogates.{name}; {remedy}"
-            require(name in known, message)
+            lacking = f"there is no agent.surrogates.{name}; surrogates@agent=limits adds terms"
+            require(name in known, f"{where}.{name}: {lacking}")
             if not hasattr(known[name], "missed"):
                 kind = type(known[name]).__name__
                 raise ConfigError(f"{where}.{name}: {kind} has no limit to keep")

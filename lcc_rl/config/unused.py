@@ -17,10 +17,8 @@ NO_AGENT = ("agent=none", "agent=null")
 BASELINES = "evaluation.baselines"
 OF_COMPARISONS = (BASELINES, "evaluation.behind_filter", "evaluation.front")
 # Settings of evaluation.rows=episodes; the first three are refused in sweeps, too.
-OF_EPISODES = (
-    *("repeats", "shards", "shard", "drivers", "batch_size", "sample_episodes", "compiled"),
-    *("humans_first", "second_energy", "terms"),
-)
+OF_EPISODES = ["repeats", "shards", "shard", "drivers", "batch_size", "sample_episodes", "compiled"]
+OF_EPISODES += ["humans_first", "second_energy", "terms"]
 OBSERVATION = "lcc_rl.pieces.Observation"
 
 
@@ -47,11 +45,9 @@ def check_used(
         if observation[TARGET] == OBSERVATION and "behind" not in (observation.get("scales") or ()):
             for key in ("visible", "presence"):
                 reasons[f"observation.{key}"] = "observation.scales names no vehicle behind"
-        named = {*OF_COMPARISONS} & {*map(key_of, overrides)} if type(cfg) is TrainConfig else set()
-        if RECORDED in cfg.evaluation.baselines:
-            named -= {BASELINES}
-        reason = "a training evaluates its own policy; lcc-rl evaluate compares"
-        reasons |= dict.fromkeys(named, reason)
+        keys = {*OF_COMPARISONS[RECORDED in cfg.evaluation.baselines :]}
+        for key in keys & {*map(key_of, overrides)} if type(cfg) is TrainConfig else ():
+            reasons[key] = "a training evaluates its own policy; lcc-rl evaluate compares"
         reasons["sweep"] = "it names the folder of a sweep, -m"
     if written is not None and cfg.agent is not None and "surrogates" in cfg.agent.settings:
         typed = set().union(*map(typed_keys, overrides))
@@ -60,12 +56,11 @@ def check_used(
 
 
 def refuse(overrides: Iterable[str], reasons: Mapping[str, str]) -> None:
-    """Refuse overrides of keys that have a reason, or of keys below them; ``key.``: below only.
-
-    An override that another refers to has an effect: ``policy=<sweep>/seed${seed}``.
-    """
+    """Refuse overrides of keys that have a reason, or of keys below them; ``key.``: below only."""
     typed = list(overrides)
-    for option in (x for x in typed if not any(f"${{{key_of(x)}}}" in word for word in typed)):
+    for option in typed:
+        if any(f"${{{key_of(option)}}}" in word for word in typed):  # policy=<sweep>/seed${seed}
+            continue
         for unused, reason in reasons.items():
             for key in typed_keys(option):
                 if key == unused or key.startswith(f"{unused.removesuffix('.')}."):
@@ -88,13 +83,11 @@ def _of_road(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
 
 def _of_rows(cfg: StudyConfig, sweep: bool) -> Iterator[tuple[str, str]]:
     """Yield settings of evaluations with other rows, and why they have no effect."""
-    if cfg.evaluation.rows == "episodes":
-        if not sweep:
-            yield "evaluation.full_length", "whole records belong to evaluation.rows=vehicles"
-        return
-    for name in OF_EPISODES[: 3 if sweep else None]:
-        reason = "it belongs to evaluation.rows=episodes; a platoon drives every record once"
-        yield f"evaluation.{name}", reason
+    if cfg.evaluation.rows == "vehicles":
+        for name in OF_EPISODES[: 3 if sweep else None]:
+            yield f"evaluation.{name}", "evaluation.rows=vehicles drives behind every record once"
+    elif not sweep:
+        yield "evaluation.full_length", "whole records belong to evaluation.rows=vehicles"
 
 
 def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
@@ -107,8 +100,8 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
         for name in ("max_braking", "max_acceleration"):
             yield f"scenario.{name}", "no vehicle of the string is automated"
     actuators = cfg.scenario.actuators.get(AUTOMATED)
-    braking = actuators.settings.get("braking") if actuators is not None else None
-    if braking and braking < cfg.scenario.max_braking:
+    braking = None if actuators is None else actuators.settings.get("braking")
+    if braking is not None and braking < cfg.scenario.max_braking:
         yield "scenario.max_braking", f"scenario.actuators.automated.braking={braking:g} is less"
     for name, node in cfg.scenario.fleet.items():
         roles = node.settings.get("roles") if node is not None else None  # none of another class

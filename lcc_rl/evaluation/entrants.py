@@ -38,7 +38,7 @@ from lcc_rl.settings import TARGET
 
 log = logging.getLogger("lcc_rl")
 
-OF_LEARNING = dict.fromkeys(("agent.", "training."), "a policy has the settings of its training")
+FROM_TRAINING = dict.fromkeys(("agent.", "training."), "a policy has the settings of its training")
 # Pieces that draw nothing in an evaluation and read no drivers.
 FIXED = {"HCFS", "CACC", "DeadBeat", "HeadwayStart", "NGSIMLeader", "Communication", "Action"}
 FIXED |= {"TimeToCollision", "TimeGap", "MotorPower"}
@@ -116,34 +116,33 @@ class Entrants:
         return rivals, policies
 
     def _check_used(self, typed: Sequence[str]) -> None:
-        cfg, rows = self.cfg, [*self.rivals, *self.cfg.evaluation.baselines]
+        cfg, rivals = self.cfg, list(self.rivals.values())
+        rows, specs = (
+            [*self.rivals, *cfg.evaluation.baselines],
+            [*rivals, *cfg.evaluation.baselines],
+        )
         unused = {"seed": "it is that of trainings; evaluation.seed draws other noise"}
-        if self._is_fixed():
+        if self._is_fixed(specs):
             reason = "no vehicle of this platoon depends on drivers or noise"
             unused |= dict.fromkeys(("seed", "evaluation.seed", "drivers"), reason)
         if self.own and cfg.learns and cfg.policy is not None:
-            unused |= OF_LEARNING
-        refuse(typed, unused)
+            unused |= FROM_TRAINING
         learned = self.paths or self.further or cfg.policy is not None
         if cfg.evaluation.rows == "episodes" and not (cfg.evaluation.terms and learned):
-            changed = [word for word in typed if not word.startswith("~")]
-            reason = "only rows of policies have a reward, with evaluation.terms=true"
-            refuse(changed, {"reward.terms.": reason})
-        if self.own or self.further or self.cfg.variant in rows or not self.cfg.automated:
+            unused["reward.terms."] = "only rows of policies have it, with evaluation.terms=true"
+        refuse((word for word in typed if not word.startswith("~")), unused)
+        if self.own or self.further or cfg.variant in rows or not cfg.automated:
             return
-        check_effective(
-            typed, self.rivals or rows, [*rows, *self.rivals.values()], bool(self.paths)
-        )
+        check_effective(typed, self.rivals or rows, [*rows, *rivals], bool(self.paths))
 
-    def _is_fixed(self) -> bool:
-        """Return whether the rows are of a platoon without humans, chance or unknown pieces."""
-        cfg, scenario = self.cfg, self.cfg.scenario
-        specs = [*cfg.evaluation.baselines, *self.rivals.values()]
-        platoon = cfg.evaluation.rows == "vehicles" and {*scenario.vehicles.names} == {AUTOMATED}
-        if not platoon or self.paths or self.further or DIRECT in specs:
+    def _is_fixed(self, specs: Sequence[Any]) -> bool:
+        """Return whether all rows are of a platoon in which no piece reads drivers or noise."""
+        scenario, others = self.cfg.scenario, self.paths or self.further or DIRECT in specs
+        platoon = self.cfg.evaluation.rows == "vehicles"
+        if others or not platoon or {*scenario.vehicles.names} != {AUTOMATED}:
             return False
-        scenario = scenario.with_(controllers={HUMAN: None}, start={HUMAN: None})
-        nodes = nodes_in([scenario, cfg.deployed, *map(controller_of, specs)])
+        own = scenario.with_(controllers={HUMAN: None}, start={HUMAN: None})
+        nodes = nodes_in([own, self.cfg.deployed, *map(controller_of, specs)])
         return all(node.settings[TARGET].removeprefix("lcc_rl.pieces.") in FIXED for node in nodes)
 
     def _of_task(self, path: str) -> str:
@@ -229,7 +228,7 @@ def check_effective(
         learned: whether a row is a policy.
     """
     unused = {AUTO: "every controller is named and has its own settings"}
-    unused |= OF_LEARNING
+    unused |= FROM_TRAINING
     if not learned and not any(str(x).endswith(FILTERED) for x in specs):
         reason = f"nothing drives behind the filter ({', '.join(rows)}); "
         reason += f"it needs a name that ends in {FILTERED}"
