@@ -149,11 +149,7 @@ def rule(cfg: StudyConfig) -> Strategy:
 
 
 def name_of(cfg: StudyConfig) -> str:
-    """Return the name of what drives after training: the variant, or its class if it is another.
-
-    Raises:
-        ConfigError: if a controller that is deployed with a policy is no hybrid strategy.
-    """
+    """Return the name of what drives after training: the variant, or its class if it is another."""
     if cfg.deployed is not None:
         cfg.deployed.made(Hybrid)
     elif cfg.learns:
@@ -178,7 +174,7 @@ def _baseline_controllers(cfg: StudyConfig) -> list[Any]:
 def studied(
     cfg: StudyConfig, policy: TrainedPolicy | None, population: Population
 ) -> list[Strategy]:
-    """Build the strategy under study; for a hybrid, its parents and the oracle of HCFS, too.
+    """Build the strategy under study; for a hybrid, its parents and oracle, too.
 
     Args:
         cfg: configuration of the entry point ``evaluate``.

@@ -40,7 +40,8 @@ WINNER = ("hybrid", "winner")
 COUNTERS = SWITCHES, CLAMPS, CAPS = tuple(
     ("hybrid", name) for name in ("switches", "clamps", "cap_interventions")
 )
-HYBRID_READS = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
+MOTION = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
+HYBRID_READS = (".".join(WINNER), *(f"self.{name}" for name in MOTION))
 SPARE = 2.0  # headway beyond the gap that the cap needs, for deviations [m]
 
 
@@ -61,33 +62,30 @@ class Hybrid(Controller):
         Entry(CAPS, "–", "steps in which the safe cap cut a candidate", whole=True),
     )
     # Maps both commands [m/s²] and the entries of ``reads``, each [*batch, n, 1], to true where the
-    # policy drives.
-    choose: ClassVar[Callable[..., Tensor]]
+    # policy drives, or to a Decision.
+    choose: ClassVar[Callable[..., Tensor | Decision]]
 
     def declare(self, world: World, reads: Any = None, *others: Any, **named: Any) -> None:
         """Read the action, the entries of the choice and those of the rule."""
         self.rule = self.rule.bind(world, self.name)
         own = self.reads if reads is None else reads
         self.weighed = len(own)
-        entries = [f"{self.name}.action", *own, *self.rule.names]
-        super().declare(world, entries, *others, **named)
+        super().declare(world, [f"{self.name}.action", *own, *self.rule.names], *others, **named)
 
     def command(self, action: Tensor, *entries: Tensor) -> tuple[Tensor, ...]:
         """Return the commands, the winners and the counters."""
-        read, (winner, *counts) = entries[: -len(self.remembers)], entries[-len(self.remembers) :]
+        read, (before, *counts) = entries[: -len(self.remembers)], entries[-len(self.remembers) :]
         rule = self.rule.command(*read[self.weighed :])
         learned = action * self.max_acceleration
-        decision = self.decide(rule, learned, winner, *read[: self.weighed])
-        flags = (decision.switched, decision.clamped, decision.capped)
-        counted = [count + flag for count, flag in zip(counts, flags, strict=True)]
-        return (decision.acceleration, decision.winner, *counted)
-
-    def decide(self, rule: Tensor, learned: Tensor, before: Tensor, *entries: Tensor) -> Decision:
-        """Return the decision between both commands after the winner ``before``."""
-        chosen = self.choose(rule, learned, *entries)
-        winner, no = chosen.to(before.dtype), torch.zeros_like(before, dtype=torch.bool)
-        switched = (before >= 0) & (winner != before)
-        return Decision(torch.where(winner > 0, learned, rule), winner, switched, no, no)
+        chosen: Any = self.choose(rule, learned, *read[: self.weighed])
+        if isinstance(chosen, Tensor) and chosen.dtype == torch.bool:
+            winner, no = chosen.to(before.dtype), torch.zeros_like(chosen)
+            switched = (before >= 0) & (winner != before)
+            chosen = Decision(torch.where(chosen, learned, rule), winner, switched, no, no)
+        if not isinstance(chosen, Decision):
+            raise ConfigError(f"{self.title}.choose must return a tensor of bool, got {chosen!r}")
+        counted = [count + flag for count, flag in zip(counts, chosen[2:], strict=True)]
+        return (chosen.acceleration, chosen.winner, *counted)
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         super().begin(given, start)
@@ -124,7 +122,7 @@ class HCFS(Hybrid):
     gap_scale: Positive = PlatoonReward.gap_scale  # [m]
     spacing_time: NonNegative = PlatoonReward.spacing_time  # time until e_x counts [s]
 
-    reads = (*(f"self.{name}" for name in HYBRID_READS), *leader_names("causal"))
+    reads = (*HYBRID_READS, *leader_names("causal"))
 
     def validate(self) -> None:
         if self.braking > self.max_acceleration:  # harder braking than possible is not safe
@@ -135,8 +133,7 @@ class HCFS(Hybrid):
 
     def setup(self, world: World) -> None:
         """Read the entries of both candidates and of the decision."""
-        motion = self.reads[: len(HYBRID_READS)]
-        self.declare(world, [*motion, *leader_names(self.lookahead)])
+        self.declare(world, [*HYBRID_READS, *leader_names(self.lookahead)])
         check_leader(self.lookahead, self)
         if self.choice == "first":
             check_platoon(self, "choice=first", "needs a string that is one platoon", "between")
@@ -144,8 +141,8 @@ class HCFS(Hybrid):
         self.reward = PlatoonReward(**settings)
         self.both_brake = Braking(self.braking, self.braking, time_to_collision=0.0)
 
-    def decide(self, rule: Tensor, learned: Tensor, before: Tensor, *entries: Tensor) -> Decision:
-        speed, last, gap, speed_error, leader_gap, *leader = entries
+    def choose(self, rule: Tensor, learned: Tensor, *entries: Tensor) -> Decision:
+        before, speed, last, gap, speed_error, leader_gap, *leader = entries
         interval = jerk_interval(last, self.jerk_bound, self.time_step, self.max_acceleration)
         ahead, time_step = speed + speed_error, self.time_step
         cap = safe_acceleration(speed, gap - self.margin, ahead, self.both_brake, time_step)
