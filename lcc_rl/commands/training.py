@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from lcc_rl.errors import ConfigError, Interrupted, ResultsError
 from lcc_rl.evaluation.cases import WINDOW_CASES
 from lcc_rl.evaluation.comparison import Comparison
 from lcc_rl.evaluation.fit import check_policy
-from lcc_rl.evaluation.strategies import Strategy, rule, with_weights
+from lcc_rl.evaluation.strategies import Strategy, name_of, rule, with_weights
 from lcc_rl.io.files import Rows, as_rows
 from lcc_rl.results.platoons import case_table
 from lcc_rl.results.policies import load_policy, save_policy
@@ -106,7 +107,7 @@ def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
     else:
         agent = build_agent(cfg, inputs.population, cfg.device)
         strategy = Strategy(
-            cfg.variant, cfg.after_training(), shared_policy(agent.policy), cfg.seed
+            name_of(cfg), cfg.after_training(), shared_policy(agent.policy), cfg.seed
         )
     comparison = Comparison(cfg, inputs, [strategy])  # before a training, which takes long
     if agent is not None:
@@ -132,7 +133,7 @@ def _given(cfg: TrainConfig, inputs: Inputs) -> tuple[TrainConfig, dict[str, Any
     check_policy(cfg, own)
     cfg = cfg.with_(agent=own.agent)
     strategy = with_weights(cfg, weights, own.seed, str(cfg.policy), inputs.population)
-    return cfg, weights, Strategy(cfg.variant, cfg.after_training(), strategy.policy, own.seed)
+    return cfg, weights, replace(strategy, cfg=cfg.after_training())
 
 
 def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume: bool) -> None:

@@ -279,8 +279,10 @@ def _completed(settings: dict[str, Any], where: str) -> dict[str, Any]:
 
 def takes_action(node: Node) -> bool:
     """Whether a controller, or one inside it, executes the action of a policy."""
-    reads = (getattr(inner.kind, "reads", ()) for inner in nodes_in(node))
-    return any(name.endswith(".action") for names in reads for name in names)
+    kinds = [inner.kind for inner in nodes_in(node)]
+    reads = (name for kind in kinds for name in getattr(kind, "reads", ()))
+    hybrid = any(getattr(kind, "takes_action", False) for kind in kinds)
+    return hybrid or any(name.endswith(".action") for name in reads)
 
 
 def check_numbers(value: Any, where: str) -> None:

@@ -132,9 +132,8 @@ def measured_series(series: CaseSeries, time_step: float = 0.1) -> pd.DataFrame:
 
     Speed errors are e_v(i,0), as in the paper's tables. ``energy_ratio`` is Σ e_v(i,i−1)² divided
     by that of the vehicle ahead (string stability: at most 1); it is missing for the first vehicle
-    and without motion. ``energy_kj_per_km`` is the energy of the scenario's power divided by the
-    distance, missing at standstill. ``max_gap_error_m`` is the largest |e_x(i,i−1)| of an automated
-    vehicle.
+    and without motion. ``drawn_energy_kj_per_km`` is the scenario's power over the distance,
+    missing at standstill. ``max_gap_error_m`` is the largest |e_x(i,i−1)| of an automated vehicle.
     """
     error, jerk = series["leader_speed_error"].abs(), series["jerk"].abs()
     energy = series["speed_error"].square().sum(0)
@@ -154,7 +153,9 @@ def measured_series(series: CaseSeries, time_step: float = 0.1) -> pd.DataFrame:
         "max_gap_error_m": torch.where(keeps, gap_error, torch.nan),
         "peak_jerk_mps3": jerk.amax(0),
         "energy_ratio": ratio,
-        "energy_kj_per_km": torch.where(driven > 0.0, series["power"].sum(0) / driven, torch.nan),
+        "drawn_energy_kj_per_km": torch.where(
+            driven > 0.0, series["power"].sum(0) / driven, torch.nan
+        ),
     }
     if "winner" in series:
         columns["learned_share"] = series["winner"].double().mean(0)

@@ -20,7 +20,7 @@ from lcc_rl.evaluation.fit import check_action, check_scenario, check_width, of_
 from lcc_rl.evaluation.named import DIRECT, PEOPLE, controller_of, label_of
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
-from lcc_rl.pieces import Observation, Piece, TimeGapStart
+from lcc_rl.pieces import CACC, HCFS, Hybrid, Observation, Piece, TimeGapStart
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.results.names import ON_FRONT, RULE_ROWS
 from lcc_rl.settings import TARGET, path_of
@@ -141,18 +141,24 @@ def front_of(strategies: Sequence[Strategy], time_gaps: Sequence[float]) -> list
 
 
 def rule(cfg: StudyConfig) -> Strategy:
-    """Return the strategy of a configuration without an agent.
-
-    Its name is that of the variant, or of the controller's class if it is not the variant's.
-    """
+    """Return the strategy of a configuration without an agent."""
     if not cfg.automated:
         return Strategy(DIRECT, cfg)
+    return Strategy(name_of(cfg), cfg.after_training())
+
+
+def name_of(cfg: StudyConfig) -> str:
+    """Return the name of what drives after training: the variant, or its class if it is another."""
+    if cfg.deployed is not None:
+        cfg.deployed.made(Hybrid)
+    elif cfg.learns:
+        return cfg.variant
+    cfg = cfg.after_training()
     try:
-        kind = _kind(load("evaluate", [f"variant={cfg.variant}"]))
+        kind = _kind(load("evaluate", [f"variant={cfg.variant}"]).after_training())
     except ConfigError:  # a user's variant that only this command line defines
         kind = _kind(cfg)
-    name = cfg.variant if _kind(cfg) is kind else label_of(cfg.scenario.controllers[AUTOMATED])
-    return Strategy(name, cfg.after_training())
+    return cfg.variant if _kind(cfg) is kind else label_of(cfg.scenario.controllers[AUTOMATED])
 
 
 def _kind(cfg: StudyConfig) -> Any:
@@ -167,7 +173,7 @@ def _baseline_controllers(cfg: StudyConfig) -> list[Any]:
 def studied(
     cfg: StudyConfig, policy: TrainedPolicy | None, population: Population
 ) -> list[Strategy]:
-    """Build the strategy under study; for a hybrid, its parents and its oracle, too.
+    """Build the strategy under study; for a hybrid, its parents and oracle, too.
 
     Args:
         cfg: configuration of the entry point ``evaluate``.
@@ -211,15 +217,16 @@ def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
 
 
 def hybrids(strategy: Strategy) -> list[Strategy]:
-    """Build a hybrid strategy, its parents and its oracle."""
+    """Build a hybrid strategy and its parents; for HCFS, its oracle, too."""
     cfg = strategy.cfg
     parent = cfg.driven_by(cfg.scenario.controllers[AUTOMATED])
     strategies = [replace(strategy, name=cfg.agent.name, cfg=parent)]
     parent_rule = cfg.deployed.settings.get("rule")
     if parent_rule is not None and parent_rule not in _baseline_controllers(cfg):
-        strategies.insert(0, Strategy("cacc", cfg.driven_by(parent_rule)))
+        name = "cacc" if parent_rule.kind is CACC else label_of(parent_rule)
+        strategies.insert(0, Strategy(name, cfg.driven_by(parent_rule)))
     strategies.append(replace(strategy, cfg=cfg.after_training()))
-    if set(cfg.scenario.vehicles.names) == {AUTOMATED}:
+    if issubclass(cfg.deployed.kind, HCFS) and set(cfg.scenario.vehicles.names) == {AUTOMATED}:
         knowing = cfg.driven_by(cfg.deployed.changed(lookahead="oracle"))
         strategies.append(replace(strategy, name=f"{strategy.name} oracle", cfg=knowing))
     return strategies
@@ -265,4 +272,4 @@ def with_weights(
     message = f"{path}: the weights do not fit the policy network"
     with raised_as(ResultsError, message, RuntimeError):
         agent.policy.load_state_dict(dict(weights))
-    return Strategy(cfg.variant, cfg, shared_policy(agent.policy), seed, path)
+    return Strategy(name_of(cfg), cfg, shared_policy(agent.policy), seed, path)

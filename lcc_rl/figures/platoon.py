@@ -15,9 +15,8 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.figures.drawing import INK, PAGE_WIDTH, footnote, legend_above, new_figure, paper
 from lcc_rl.results.names import in_words
 
-# Strategies with a panel.
+# Strategies with a panel, beside those of the user.
 PANEL_STRATEGIES = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")
-PANEL_HYBRIDS = ("hcfs", "hcfs oracle")
 NEAR_COLOUR, FAR_COLOUR = np.array([0.0, 0.45, 0.70]), np.array([0.90, 0.62, 0.0])
 BOUND = "#b00020"
 PAPER_SPEEDS = {"case 1": (0.37, 10.76)}  # first and last speed in the paper [m/s]
@@ -35,9 +34,9 @@ def platoon_figures(steps: pd.DataFrame, bound: float) -> Iterator[tuple[str, Fi
     for case in dict.fromkeys(steps["case"]) if len(steps) else ():
         yield f"{case} velocities", velocities(steps, case)
         yield f"{case} jerk", jerks(steps, case, bound)
-        for strategy in PANEL_HYBRIDS:
-            if (steps["strategy"] == strategy).any():
-                yield f"{case} switching {strategy}", switching(steps, case, strategy)
+        driven = steps.dropna(subset=["winner"]) if "winner" in steps else steps[:0]
+        for strategy in dict.fromkeys(driven["strategy"]):
+            yield f"{case} switching {strategy}", switching(steps, case, strategy)
 
 
 @paper
@@ -122,9 +121,10 @@ def jerks(steps: pd.DataFrame, case: str, bound: float) -> Figure:
 
 
 def shown(steps: pd.DataFrame) -> list[str]:
-    """Return the strategies of :data:`PANEL_STRATEGIES` in a table; all if there is none."""
+    """Return the user's strategies in a table and those of :data:`PANEL_STRATEGIES`, or all."""
     names = list(dict.fromkeys(steps["strategy"]))
-    return [name for name in PANEL_STRATEGIES if name in names] or names
+    own = [name for name in names if in_words(name) == name]
+    return [name for name in (*PANEL_STRATEGIES, *own) if name in names] or names
 
 
 def _panels(

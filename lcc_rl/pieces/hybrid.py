@@ -1,11 +1,11 @@
-"""The hybrid car-following strategy: a rule or the action of a policy, step by step (HCFS)."""
+"""Hybrid strategies, such as HCFS: a rule or the action of a policy, step by step."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from pydantic import InstanceOf
@@ -17,12 +17,13 @@ from lcc_rl.functional.braking import Braking, safe_acceleration
 from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.hcfs import (
     Choice,
+    Decision,
     PlatoonPlace,
     PlatoonReward,
     hybrid_decision,
     jerk_interval,
 )
-from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION
+from lcc_rl.functional.pattern import MAX_ACCELERATION
 from lcc_rl.pieces.base import Entry, Piece
 from lcc_rl.pieces.connected import (
     Communication,
@@ -39,19 +40,65 @@ WINNER = ("hybrid", "winner")
 COUNTERS = SWITCHES, CLAMPS, CAPS = tuple(
     ("hybrid", name) for name in ("switches", "clamps", "cap_interventions")
 )
-HYBRID_READS = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
+MOTION = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
+HYBRID_READS = (".".join(WINNER), *(f"self.{name}" for name in MOTION))
 SPARE = 2.0  # headway beyond the gap that the cap needs, for deviations [m]
 
 
-class HCFS(Controller):
+class Hybrid(Controller):
+    """Base of hybrid strategies: in each step the command of a rule or the action of a policy.
+
+    A subclass names entries in ``reads`` and defines :meth:`choose`.
+    """
+
+    rule: InstanceOf[Controller]  # its command is one candidate
+    max_acceleration: Positive = MAX_ACCELERATION  # acceleration of action 1 [m/s²]
+
+    takes_action = True
+    remembers = (
+        Entry(WINNER, "–", "candidate chosen: 0 rule, 1 policy, −1 at reset", whole=True),
+        Entry(SWITCHES, "–", "changes of the winner since the start", whole=True),
+        Entry(CLAMPS, "–", "steps in which the jerk bound cut a candidate", whole=True),
+        Entry(CAPS, "–", "steps in which the safe cap cut a candidate", whole=True),
+    )
+    # Maps both commands [m/s²] and the entries of ``reads``, each [*batch, n, 1], to true where the
+    # policy drives, or to a Decision.
+    choose: ClassVar[Callable[..., Tensor | Decision]]
+
+    def declare(self, world: World, reads: Any = None, *others: Any, **named: Any) -> None:
+        """Read the action, the entries of the choice and those of the rule."""
+        self.rule = self.rule.bind(world, self.name)
+        own = self.reads if reads is None else reads
+        self.weighed = len(own)
+        super().declare(world, [f"{self.name}.action", *own, *self.rule.names], *others, **named)
+
+    def command(self, action: Tensor, *entries: Tensor) -> tuple[Tensor, ...]:
+        """Return the commands, the winners and the counters."""
+        read, (before, *counts) = entries[: -len(self.remembers)], entries[-len(self.remembers) :]
+        rule = self.rule.command(*read[self.weighed :])
+        learned = action * self.max_acceleration
+        chosen: Any = self.choose(rule, learned, *read[: self.weighed])
+        if isinstance(chosen, Tensor) and chosen.dtype == torch.bool:
+            winner, no = chosen.to(before.dtype), torch.zeros_like(chosen)
+            switched = (before >= 0) & (winner != before)
+            chosen = Decision(torch.where(chosen, learned, rule), winner, switched, no, no)
+        if not isinstance(chosen, Decision):
+            raise ConfigError(f"{self.title}.choose must return a tensor of bool, got {chosen!r}")
+        counted = [count + flag for count, flag in zip(counts, chosen[2:], strict=True)]
+        return (chosen.acceleration, chosen.winner, *counted)
+
+    def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
+        super().begin(given, start)
+        start.set(WINNER, torch.full_like(start.get(WINNER), -1))
+
+
+class HCFS(Hybrid):
     """The hybrid car-following strategy: the better of a rule and an action in each step.
 
     The two candidates are the command of a rule and the action of a policy (H12–H14), see
     :func:`lcc_rl.functional.hcfs.hybrid_decision`.
     """
 
-    rule: InstanceOf[Controller]  # its command is one candidate
-    max_acceleration: Positive = MAX_ACCELERATION  # acceleration of action 1 [m/s²]
     jerk_bound: Positive = 30.0  # J; the paper's 2 a_max/T = 30 never binds [m/s³]
     lookahead: Lookahead = "causal"
     clamp: bool = True  # hold the candidates within the jerk bound; false: the literal rule
@@ -75,13 +122,7 @@ class HCFS(Controller):
     gap_scale: Positive = PlatoonReward.gap_scale  # [m]
     spacing_time: NonNegative = PlatoonReward.spacing_time  # time until e_x counts [s]
 
-    reads = (f"{AUTOMATED}.action",)
-    remembers = (
-        Entry(WINNER, "–", "candidate chosen: 0 rule, 1 policy, −1 at reset", whole=True),
-        Entry(SWITCHES, "–", "changes of the winner since the start", whole=True),
-        Entry(CLAMPS, "–", "steps in which the jerk bound cut a candidate", whole=True),
-        Entry(CAPS, "–", "steps in which the safe cap cut a candidate", whole=True),
-    )
+    reads = (*HYBRID_READS, *leader_names("causal"))
 
     def validate(self) -> None:
         if self.braking > self.max_acceleration:  # harder braking than possible is not safe
@@ -92,9 +133,7 @@ class HCFS(Controller):
 
     def setup(self, world: World) -> None:
         """Read the entries of both candidates and of the decision."""
-        self.rule = rule = self.rule.bind(world, self.name)
-        reads = [f"{self.name}.action", *(f"self.{name}" for name in HYBRID_READS)]
-        self.declare(world, [*reads, *leader_names(self.lookahead), *rule.names])
+        self.declare(world, [*HYBRID_READS, *leader_names(self.lookahead)])
         check_leader(self.lookahead, self)
         if self.choice == "first":
             check_platoon(self, "choice=first", "needs a string that is one platoon", "between")
@@ -102,20 +141,17 @@ class HCFS(Controller):
         self.reward = PlatoonReward(**settings)
         self.both_brake = Braking(self.braking, self.braking, time_to_collision=0.0)
 
-    def command(self, action: Tensor, *entries: Tensor) -> tuple[Tensor, ...]:
-        """Return the commands, the winners and the counters."""
-        motion, leader, rule = entries[:5], entries[5:8], entries[8:-4]
-        winner, *counts = entries[-4:]
-        speed, last, gap, speed_error, leader_gap = motion
+    def choose(self, rule: Tensor, learned: Tensor, *entries: Tensor) -> Decision:
+        before, speed, last, gap, speed_error, leader_gap, *leader = entries
         interval = jerk_interval(last, self.jerk_bound, self.time_step, self.max_acceleration)
         ahead, time_step = speed + speed_error, self.time_step
         cap = safe_acceleration(speed, gap - self.margin, ahead, self.both_brake, time_step)
-        decision = hybrid_decision(
-            self.rule.command(*rule),
-            action * self.max_acceleration,
+        return hybrid_decision(
+            rule,
+            learned,
             speed,
             last,
-            winner,
+            before,
             next_leader_speed(leader, self.lookahead, self.time_step),
             interval if self.clamp else None,
             cap if self.safe_cap else None,
@@ -125,13 +161,6 @@ class HCFS(Controller):
             PlatoonPlace(leader_gap, leader[0]),
             self.choice,
         )
-        flags = (decision.switched, decision.clamped, decision.capped)
-        counted = [count + flag for count, flag in zip(counts, flags, strict=True)]
-        return (decision.acceleration, decision.winner, *counted)
-
-    def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
-        super().begin(given, start)
-        start.set(WINNER, torch.full_like(start.get(WINNER), -1))
 
 
 def check_spacing(pieces: Sequence[Piece], profiles: Any) -> None:

@@ -51,6 +51,7 @@ LABELS = SEVERAL | {
     "hcfs oracle": "HCFS, oracle",
     "hcfs untuned": "HCFS of the fitted CACC",
     "deadbeat": "dead-beat, nothing learned",
+    "deadbeat oracle": "dead-beat, oracle",
 }
 FORMER: dict[str, str] = {}  # renamed strategies by their words before
 

@@ -36,7 +36,7 @@ SUMS += ["collided", *PER_RUN]
 LARGEST_COLUMNS = ["max_gap_error_m", "peak_jerk_mps3", "energy_ratio"]
 # Stored columns and strategies of runs behind other sources of leaders.
 COMPARED_BY = ["reward", "jerk_sum", "min_gap_m", "max_gap_error_m", "energy_ratio"]
-COMPARED_BY += ["energy_kj_per_km"]
+COMPARED_BY += ["drawn_energy_kj_per_km"]
 STABLE = ("cacc tuned", "deadbeat", LEARNED, "hcfs", "hcfs between", "hcfs first")
 LEADERS = {  # names of sources of leaders in tables
     "traffic": "I-80",
@@ -52,7 +52,7 @@ LEADERS = {  # names of sources of leaders in tables
 def per_run(episodes: pd.DataFrame) -> pd.DataFrame:
     """Sum the rows of each run's vehicles; :func:`case_table` also accepts the result."""
     kinds = {**dict.fromkeys(SUMS, "sum"), **dict.fromkeys(LARGEST_COLUMNS, "max")}
-    kinds |= {"min_gap_m": "min", "learned_share": "mean", "energy_kj_per_km": "mean"}
+    kinds |= {"min_gap_m": "min", "learned_share": "mean", "drawn_energy_kj_per_km": "mean"}
     kinds |= {DRIVE: "first"} if DRIVE in episodes else {}
     return episodes.groupby(RUN, sort=False, dropna=False, as_index=False).agg(kinds)
 
@@ -229,7 +229,7 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
     named = runs["source"].map(LEADERS).fillna(runs["source"])
     for source, group in runs.groupby(named, sort=False):
         spent = {
-            name: reward_per_seed(group, name, WINDOW_CASES, "energy_kj_per_km")
+            name: reward_per_seed(group, name, WINDOW_CASES, "drawn_energy_kj_per_km")
             for name in strategies
             if name in set(group["strategy"])
         }
@@ -241,7 +241,7 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
             row |= crossed_rewards(reward_per_seed(group, name, WINDOW_CASES)).columns("Σ reward")
             row |= {"gap error_m": driven["max_gap_error_m"].max()}
             row |= {"string ratio, above 1": f"{driven['energy_ratio'].max():.2f}, {above}"}
-            rows.append(row | saved.columns("energy saved_pct", 100.0))
+            rows.append(row | saved.columns("drawn energy saved_pct", 100.0))
     return pd.DataFrame(rows)
 
 
