@@ -292,7 +292,7 @@ def test_the_pages_stay_short() -> None:
         for number, line in enumerate(text, 1):
             free = number in inside or line.startswith(("|", "!["))
             assert free or len(line) <= 100, f"{page.name}:{number}"
-    assert sum(lines.values()) <= 4390
+    assert sum(lines.values()) <= 4_400
     assert lines["README.md"] <= 90
 
 

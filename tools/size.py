@@ -27,8 +27,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 44_250, "code": 29_300},
-    "tests": {"lines": 26_350},
+    "lcc_rl + tools": {"lines": 44_350, "code": 29_430},
+    "tests": {"lines": 26_480},
     "conf": {"yaml": 165},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py
@@ -36,7 +36,7 @@ STRUCTURE = {
     "names in several modules": 60,
     "floors": 10,
     "circles": 0,
-    "functions with a configuration": 127,
+    "functions with a configuration": 128,
 }
 
 
