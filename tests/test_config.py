@@ -90,6 +90,9 @@ def test_a_training_has_whole_batches(caplog) -> None:
     cfg = load("train", ["training.environments=128", "training.episodes=4000"])
     assert cfg.training.episodes == 4096
     assert "training.episodes=4000 is rounded up to 4096, whole batches of 128" in caplog.text
+    caplog.clear()
+    load("evaluate", ["training.environments=128", "training.episodes=4000"])
+    assert not caplog.text
 
 
 def test_a_sweep_can_leave_out_a_term() -> None:

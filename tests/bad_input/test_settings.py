@@ -57,6 +57,8 @@ WRONG = {
     f"scenario.horizon={HUGE}": "scenario.horizon must be less than",
     f"seed={10**19}": "seed must be a number of 63 bits",
     "agent.batch_size=50000": "buffer_size",
+    "evaluation.baselines=[human,human]": "baselines names human 2 times",
+    "agent.limits.efficiency=0.2": "no agent.surrogates.efficiency; surrogates@agent=limits adds",
     "reward.without=[safety,jerk]": "term of the reward in reward.without 'jerk'; valid",
     "+logger={_target_: lcc_rl.runs.loggers.RowLogger, kind: paper}": "kind must be",
     # objects of another kind
@@ -89,8 +91,24 @@ IGNORED = {
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",
     "evaluation.baselines=[human]": "a training evaluates its own policy",
     "variant=alcc agent=ppo agent.gamma=0.9": "agent.horizon=30 sets it",
+    "evaluation.behind_filter=[]": "a training evaluates its own policy",
+    "evaluation.front=[1.2]": "a training evaluates its own policy",
+    "evaluation.full_length=true": "belong to evaluation.rows=vehicles",
+    "variant=hcfs evaluation.repeats=5": "drives behind every record once",
+    "variant=alcc deployed.choice=first": "belongs to variant=hcfs",
     "sweep=mine": "names the folder of a sweep, -m",
     "variant=own_energy observation.visible=2": "scales names no vehicle behind",
+}
+# Settings of an evaluation of a policy without effect, by variant, and why.
+OF_TRAINING = "has the (settings|agent) of its training"
+EVALUATED = {
+    "alcc training.gap_range=[0.2,0.3]": OF_TRAINING,
+    "alcc agent.hold=5": OF_TRAINING,
+    "alcc agent=ppo": f"{OF_TRAINING}, analytic",
+    "alcc reward.terms.safety.weight=5": "only rows of policies have it, with evaluation.terms",
+    "hcfs evaluation.sample_episodes=0": "drives behind every record once",
+    "hcfs evaluation.seed=99": "no vehicle of this platoon depends on drivers or noise",
+    "hcfs drivers=highway": "no vehicle of this platoon depends on drivers or noise",
 }
 # Settings of terms and surrogates that a training by the gradient ignores, and why.
 GRADIENT = {
@@ -121,6 +139,11 @@ def train_without_data(words: list[str], folder: Path) -> None:
     training.run(cfg, folder, quiet=True)
 
 
+def evaluated(variant: str, *words: str) -> None:
+    typed = [f"variant={variant}", "policy=pretrained", "experiment=smoke", *words]
+    Entrants(load("evaluate", typed), typed=typed)
+
+
 def test_a_bad_setting_is_one_line_before_the_data_are_read(tmp_path) -> None:
     begun = perf_counter()
     check_refused(
@@ -139,6 +162,11 @@ def test_options_without_effect_are_refused() -> None:
     ignored = {f"variant=alcc agent=analytic {typed}": why for typed, why in GRADIENT.items()}
     cases += [(typed, rf"has no effect: .*({why})") for typed, why in ignored.items()]
     check_refused(lambda typed: load("train", typed.split()), cases, ConfigError)
+    cases = [(typed, rf"has no effect: .*({why})") for typed, why in EVALUATED.items()]
+    check_refused(lambda typed: evaluated(*typed.split()), cases, ConfigError)
+    evaluated("alcc", "agent=analytic", "seed=7", "evaluation.seed=${seed}")  # have an effect
+    evaluated("alcc", "evaluation.terms=true", "reward.terms.safety.weight=5")
+    evaluated("hcfs", "compare=[idm]", "drivers=highway", "evaluation.seed=99")
     stronger = f"+{AUTO}.max_acceleration=6"
     words = [stronger, "compare=[idm_acc]"]
     named = "has no effect: every controller is named"

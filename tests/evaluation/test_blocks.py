@@ -119,11 +119,9 @@ def test_resuming_equals_never_having_stopped(whole, tmp_path, monkeypatch, coun
 
 
 def test_an_interrupted_command_names_the_one_that_goes_on(tmp_path, monkeypatch) -> None:
-    (tmp_path / "mine.py").write_text(
-        "from lcc_rl.pieces import RewardTerm\n\n\nclass Nothing(RewardTerm):\n"
-        "    reads = ('self.speed',)\n\n    def reward(self, speed):\n        return 0.0 * speed\n"
-    )
-    own = "+reward.terms.nothing={_target_: mine.Nothing, weight: 1.0}"
+    text = "from lcc_rl.pieces import IDM\n\n\nclass Mine(IDM):\n    pass\n"
+    (tmp_path / "mine.py").write_text(text)
+    own = "scenario.controllers.automated._target_=mine.Mine"
     words = (*NO_AGENT, "variant=idm", own, "evaluation.drivers=2", "hydra.run.dir=run")  # a block
     with monkeypatch.context() as patched:
         stop_after(patched, 2)
