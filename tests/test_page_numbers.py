@@ -10,6 +10,8 @@ import pandas as pd
 import pytest
 from page_blocks import ROOT
 
+from lcc_rl.functional.power import POWER_COEFFICIENTS
+
 REFERENCE = ROOT / "outputs" / "reference"
 PATH, FLOW, FUEL = "total_path_energy_kj", "flow_vph", 42.4  # kJ per g of petrol
 PETROL, VARIANTS = "total_second_path_energy_kj", ("alcc", "own_energy")
@@ -108,6 +110,8 @@ def bounds() -> list[str]:
 
 def alcc() -> list[str]:
     drawn = means("alcc/evaluation/windows", "total_energy_kj")["total_energy_kj"]
+    of_page = (ROOT / "docs" / "alcc.md").read_text(encoding="utf-8").replace("\n", " ")
+    assert f"({POWER_COEFFICIENTS[0][2]:.0f} + {POWER_COEFFICIENTS[1][2]} v) a²" in of_page
     return [f"| this study | 8 | {100.0 * (1.0 - drawn['alcc'] / drawn['reference']):.2f} ("]
 
 

@@ -13,8 +13,11 @@ from helpers import check_refused, slow_but
 from lcc_rl.api import Run
 from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
+from lcc_rl.config.nodes import Node
 from lcc_rl.io.files import read_parquet
+from lcc_rl.pieces import Action, Hybrid
 from lcc_rl.results.policies import load_policy
+from lcc_rl.settings import TARGET, path_of
 
 TINY = ("experiment=smoke", HORIZON, "evaluation.profiles=3")
 RULES = {"cacc path", "cacc paper_like", "cacc tuned", "deadbeat", "deadbeat oracle"}
@@ -69,7 +72,7 @@ def test_the_gradient_through_the_simulator_trains_platoons_too(tmp_path) -> Non
 @pytest.mark.slow
 def test_with_a_spacing_term_a_platoon_keeps_its_gaps(tmp_path) -> None:
     # A quarter of the recipe's length; 600 s behind a leader never trained on.
-    short = ("training.episodes=7680", "evaluation.profiles=1", "evaluation.baselines=[]")
+    short = ("training.episodes=7680", "evaluation.profiles=1")
     words = ["variant=ddpg", "agent=analytic", "experiment=hcfs_spacing", "leader.cases={}", *short]
     rows = training.run(load("train", words), tmp_path, quiet=True)
     whole = rows[rows["case"] == "full length us06"]
@@ -95,6 +98,38 @@ def test_rows_do_not_depend_on_what_else_is_evaluated(trained, tmp_path) -> None
     pd.testing.assert_frame_equal(one[one.columns.intersection(two.columns)], two[one.columns])
     reward = rows[1].groupby("strategy")["reward"].sum()
     assert reward.idxmax() == "deadbeat oracle"  # it bounds the rest
+
+
+class Gentler(Hybrid):
+    reads = ("self.gap",)
+
+    def choose(self, rule, learned, gap):
+        return (learned.abs() < rule.abs()) & (gap > 3.0)
+
+
+class Number(Gentler):
+    def choose(self, rule, learned, gap):
+        return 1.0
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_an_own_choice_is_named_and_has_no_oracle(tmp_path) -> None:
+    cfg = load("evaluate", [*TINY, "variant=hcfs", "policy=pretrained", "evaluation.baselines=[]"])
+
+    def evaluated(kind: type, **settings: object) -> pd.DataFrame:
+        node = Node.of({TARGET: path_of(kind), **settings}, "deployed")
+        return evaluation.run(cfg.with_(deployed=node), tmp_path)
+
+    cacc = cfg.deployed.settings["rule"]
+    refused = [(Action, {}, "deployed: expected a subclass of .*Hybrid, got .*Action")]
+    refused += [(Number, {"rule": cacc}, "Number.choose must return a tensor of bool, got 1.0")]
+    check_refused(lambda kind, settings: evaluated(kind, **settings), refused)
+    rows = evaluated(Gentler, rule=cacc).set_index("strategy")
+    assert [*rows.index.unique()] == ["cacc", "ddpg", "Gentler"]
+    driven = rows.loc["Gentler", ["learned_share", "switches", "drawn_energy_kj_per_km"]].mean()
+    assert driven.min() > 0.0
+    assert driven["learned_share"] < 1.0
+    assert (tmp_path / "figures" / "case_1_switching_Gentler.png").exists()
 
 
 @pytest.mark.parametrize("variant", slow_but(["hcfs"], ["cacc", "ddpg", "hcfs"]))

@@ -28,7 +28,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
     "lcc_rl + tools": {"lines": 44_350, "code": 29_430},
-    "tests": {"lines": 26_480},
+    "tests": {"lines": 26_550},
     "conf": {"yaml": 165},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py

@@ -70,6 +70,7 @@ from lcc_rl.pieces import (
     Gipps,
     Handover,
     HeadwayStart,
+    Hybrid,
     JerkReward,
     Law,
     LeaderPreview,
@@ -150,7 +151,7 @@ SCALES = {
 }
 DRIVEN = ("human", "handover", "late", "optimal", "difference", "gipps", "calibrated")
 ACTIONS = {ACTION: (2, 1), ("plain", "action"): (1, 1), ("hybrid", "action"): (2, 1)}
-BASES = (Piece, Feature, StepTransform, RewardPiece, RewardTerm, Controller, DriverModel)
+BASES = (Piece, Feature, StepTransform, RewardPiece, RewardTerm, Controller, DriverModel, Hybrid)
 STARTS = (HeadwayStart, TimeGapStart, EquilibriumStart)
 
 
