@@ -69,7 +69,7 @@ def test_the_gradient_through_the_simulator_trains_platoons_too(tmp_path) -> Non
 @pytest.mark.slow
 def test_with_a_spacing_term_a_platoon_keeps_its_gaps(tmp_path) -> None:
     # A quarter of the recipe's length; 600 s behind a leader never trained on.
-    short = ("training.episodes=7680", "evaluation.profiles=1", "evaluation.baselines=[]")
+    short = ("training.episodes=7680", "evaluation.profiles=1")
     words = ["variant=ddpg", "agent=analytic", "experiment=hcfs_spacing", "leader.cases={}", *short]
     rows = training.run(load("train", words), tmp_path, quiet=True)
     whole = rows[rows["case"] == "full length us06"]
