@@ -40,8 +40,8 @@ WINNER = ("hybrid", "winner")
 COUNTERS = SWITCHES, CLAMPS, CAPS = tuple(
     ("hybrid", name) for name in ("switches", "clamps", "cap_interventions")
 )
-MOTION = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
-HYBRID_READS = (".".join(WINNER), *(f"self.{name}" for name in MOTION))
+STATE = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
+HYBRID_READS = (".".join(WINNER), *(f"self.{name}" for name in STATE))
 SPARE = 2.0  # headway beyond the gap that the cap needs, for deviations [m]
 
 
