@@ -120,8 +120,8 @@ def test_measures_of_a_platoon_by_hand() -> None:
     assert pd.isna(first["energy_ratio"])
     assert second["energy_ratio"] == pytest.approx(4.0 / 2.0)
     # J and m of a step's length: 600 / (11 + 11 + 10), 30 / (8 + 7.5 + 7).
-    assert first["energy_kj_per_km"] == pytest.approx(600 / 32)
-    assert second["energy_kj_per_km"] == pytest.approx(30 / 22.5)
+    assert first["drawn_energy_kj_per_km"] == pytest.approx(600 / 32)
+    assert second["drawn_energy_kj_per_km"] == pytest.approx(30 / 22.5)
     assert first["learned_share"] == pytest.approx(2 / 3)
     assert (first["switches"], second["switches"], first["frames"]) == (1, 0, 3)
 
