@@ -326,27 +326,28 @@ def interpolated(samples: pd.DataFrame, step: float, skipped: bool = False) -> l
     steps -= usual
     odd = int((np.abs(steps, out=steps) > UNEVEN * usual).sum())
     irregular = f", {odd:,} of them irregular," * bool(odd)
-    how = "averaged over" if usual < (1 - UNEVEN) * step else "interpolated to"
+    how = "averaged over" if usual < (1 - UNEVEN) * min(step, FRAME) else "interpolated to"
     line = f"samples {usual:g} s apart{irregular} were {how} {step:g} s"
     return [line] * bool(skipped or odd or abs(usual - step) > UNEVEN * step)
 
 
-def steps_at(at: Floats, step: float, time: Floats, values: Floats) -> Floats:
+def steps_at(at: Floats, step: float, time: Floats, values: Floats, frame: float = FRAME) -> Floats:
     """Return values at the times ``at``, ``step`` apart: of a monotone interpolant (PCHIP).
 
-    It does not overshoot the samples. Where samples are closer than a step, the values are means
-    over a step, at the ends of the record over the shorter part with the same centre.
+    It does not overshoot the samples. Where samples are closer than a step and 0.1 s, the values
+    are means over a step, at the ends of the record over the shorter part with the same centre.
 
     Args:
         at, step: new times and their distance, in the unit of ``time``.
         time: increasing times of the samples.
         values: samples, ``[samples, …]``.
+        frame: 0.1 s in the unit of ``time``.
     """
     from scipy.interpolate import PchipInterpolator  # here: it loads for a second
 
     curve, at = PchipInterpolator(time, values), at.clip(time[0], time[-1])
     found = curve(at)
-    if np.median(np.diff(time)) >= (1 - UNEVEN) * step:
+    if np.median(np.diff(time)) >= (1 - UNEVEN) * min(step, frame):
         return found
     half = np.minimum(step / 2, np.minimum(at - time[0], time[-1] - at))
     inner = half > UNEVEN * step
@@ -373,7 +374,7 @@ def _interpolated(
         if len(grid) < 2:
             report.drop("stretch without two samples on the time grid", int(length))
             continue
-        values.append(steps_at(grid, 1.0, sampled, table[start : start + length]))
+        values.append(steps_at(grid, 1.0, sampled, table[start : start + length], 1.0))
         before.append(start + np.searchsorted(sampled, grid + 1e-6, side="right") - 1)
         frames.append(grid.astype(np.int32))
     if not frames:

@@ -426,7 +426,7 @@ def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
         note += task.measure.unit
     saved = f"{note}; " * (len(table) > 1)
     caption = f"{saved}kept: all limits, without a collision; {ALL}"
-    short, headed = shortened(table.assign(**columns), shown)
+    short, headed = shortened(table.copy().assign(**columns), shown)  # a copy has few blocks
     unit = task.unit if task.measure.per else task.measure.unit
     short = short.assign(unit=unit)  # in CSV, where the score has no heading
     return {

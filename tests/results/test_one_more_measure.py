@@ -83,7 +83,7 @@ def test_it_stands_in_every_table(words, mine, tmp_path, capsys) -> None:
         found[form] = capsys.readouterr().out
     assert "hardest jerk [m/s³]" in found["text"]
     assert "peak jerk [m/s³]" in found["markdown"]
-    assert "peak jerk [m/s³]" in found["latex"]
+    assert "peak jerk [m/s$^3$]" in found["latex"]
     cells = list(csv.DictReader(found["csv"].splitlines()))
     for row in cells:  # of all its episodes
         own = rows.loc[rows["strategy"] == row["strategy"], MINE.key].max()
