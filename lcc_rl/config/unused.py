@@ -17,8 +17,10 @@ NO_AGENT = ("agent=none", "agent=null")
 BASELINES = "evaluation.baselines"
 OF_COMPARISONS = (BASELINES, "evaluation.behind_filter", "evaluation.front")
 # Settings of evaluation.rows=episodes; the first three are refused in sweeps, too.
-OF_EPISODES = ["repeats", "shards", "shard", "drivers", "batch_size", "sample_episodes", "compiled"]
-OF_EPISODES += ["humans_first", "second_energy", "terms"]
+OF_EPISODES = (
+    *("repeats", "shards", "shard", "drivers", "batch_size", "sample_episodes", "compiled"),
+    *("humans_first", "second_energy", "terms"),
+)
 OBSERVATION = "lcc_rl.pieces.Observation"
 
 

@@ -40,8 +40,10 @@ log = logging.getLogger("lcc_rl")
 
 FROM_TRAINING = dict.fromkeys(("agent.", "training."), "a policy has the settings of its training")
 # Pieces that draw nothing in an evaluation and read no drivers.
-FIXED = {"HCFS", "CACC", "DeadBeat", "HeadwayStart", "NGSIMLeader", "Communication", "Action"}
-FIXED |= {"TimeToCollision", "TimeGap", "MotorPower"}
+FIXED = {
+    *("HCFS", "CACC", "DeadBeat", "HeadwayStart", "NGSIMLeader", "Communication", "Action"),
+    *("TimeToCollision", "TimeGap", "MotorPower"),
+}
 
 
 class Entrants:
@@ -116,11 +118,8 @@ class Entrants:
         return rivals, policies
 
     def _check_used(self, typed: Sequence[str]) -> None:
-        cfg, rivals = self.cfg, list(self.rivals.values())
-        rows, specs = (
-            [*self.rivals, *cfg.evaluation.baselines],
-            [*rivals, *cfg.evaluation.baselines],
-        )
+        cfg, rivals, named = self.cfg, [*self.rivals.values()], self.cfg.evaluation.baselines
+        rows, specs = [*self.rivals, *named], [*rivals, *named]
         unused = {"seed": "it is that of trainings; evaluation.seed draws other noise"}
         if self._is_fixed(specs):
             reason = "no vehicle of this platoon depends on drivers or noise"

@@ -82,6 +82,9 @@ def conditions(rows: pd.DataFrame, runs: Mapping[str, Choices], root: Path) -> d
     Baselines of several machines differ by rounding and count as one.
     """
     own = rows["strategy"] == baseline_of(rows["strategy"])
+    compared = {*rows.loc[own, "run"]} & {*rows.loc[~own, "run"]}
+    if rows.loc[own, "training_seed"].notna().any() or compared != {*runs}:
+        return {}
     alike: list[tuple[Floats, list[str]]] = []
     for name, part in rows[own].astype({"run": str}).groupby("run"):
         numbers = part.select_dtypes("number").to_numpy(np.float64)
@@ -91,9 +94,6 @@ def conditions(rows: pd.DataFrame, runs: Mapping[str, Choices], root: Path) -> d
                 break
         else:
             alike.append((numbers, [str(name)]))
-    compared = {*rows.loc[own, "run"]} & {*rows.loc[~own, "run"]}
-    if rows.loc[own, "training_seed"].notna().any() or compared != {*runs}:
-        return {}
     firsts = [names[0] for _, names in alike]
     found = labels([runs[name] for name in firsts], [root / name for name in firsts])
     named = zip(found, alike, strict=True)
