@@ -20,7 +20,7 @@ PANEL_STRATEGIES = ("cacc paper_like", "cacc tuned", "cacc", "ddpg", "hcfs")
 NEAR_COLOUR, FAR_COLOUR = np.array([0.0, 0.45, 0.70]), np.array([0.90, 0.62, 0.0])
 BOUND = "#b00020"
 PAPER_SPEEDS = {"case 1": (0.37, 10.76)}  # first and last speed in the paper [m/s]
-WINNER_COLOURS = {"CACC": "#e8e8e8", "DDPG": "#0072b2"}  # by the value of the column "winner"
+WINNER_COLOURS = {"rule": "#e8e8e8", "policy": "#0072b2"}  # by the value of the column "winner"
 WHO_DRIVES = ListedColormap(list(WINNER_COLOURS.values()))
 
 
@@ -52,7 +52,7 @@ def record_figure(record: Profiles, from_s: float, cases: Sequence[Case]) -> Fig
     grid = figure.subplot_mosaic([["record"] * len(cases), [case.name for case in cases]])
     axis, windows = grid.pop("record"), list(grid.values())
     seconds = _speeds(axis, record)
-    axis.axvspan(from_s, seconds[-1], color=WINNER_COLOURS["DDPG"], alpha=0.15, lw=0)
+    axis.axvspan(from_s, seconds[-1], color=WINNER_COLOURS["policy"], alpha=0.15, lw=0)
     axis.set_title(f"{_in_record(record)}; blue: training")
     for window, case in zip(windows, cases, strict=True):
         ends = _speeds(window, case.profile)[[0, -1]]
@@ -155,10 +155,10 @@ def _lines(axis: Axes, rows: pd.DataFrame, column: str) -> None:
 
 @paper
 def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
-    """Controller in use for each follower over time, CACC or DDPG (Figs. 6, 9, 12).
+    """Candidate in use for each follower over time, rule or policy (Figs. 6, 9, 12).
 
     Args:
-        steps: rows of steps.parquet; ``winner`` is 0 for CACC and 1 for DDPG.
+        steps: rows of steps.parquet; ``winner`` is 0 for the rule and 1 for the policy.
         case: name of the case.
         strategy: name of a hybrid strategy.
     """
@@ -177,7 +177,7 @@ def switching(steps: pd.DataFrame, case: str, strategy: str = "hcfs") -> Figure:
     axis.set(xlabel="time [s]", ylabel="follower")
     axis.grid(visible=False)
     share = float(np.nanmean(raster.to_numpy()))
-    title = f"{case}: controller in use, {in_words(strategy)} (DDPG {100 * share:.0f} %)"
+    title = f"{case}: {in_words(strategy)} (policy {100 * share:.0f} %)"
     axis.set_title(title, loc="right")
     legend_above(axis)
     return figure
