@@ -23,16 +23,16 @@ from omegaconf import DictConfig
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.cli.help import FULL_HELP, HELP
 from lcc_rl.cli.help import text as help_text
-from lcc_rl.config import (
+from lcc_rl.config.compose import (
     HYDRA_ERRORS,
     as_meant,
     check_own_files,
     explained,
     is_sweep,
     parsed,
-    top_key,
 )
 from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config.words import top_key
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, input_error
 from lcc_rl.runs.interrupts import ending_quietly, was_interrupted
 from lcc_rl.runs.states import CONFIG, Busy, forget, record, withdraw

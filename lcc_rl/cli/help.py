@@ -13,8 +13,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from lcc_rl.cli.console import HYDRA_COMMANDS
-from lcc_rl.config import as_meant, choices
-from lcc_rl.config.compose import CONF
+from lcc_rl.config.compose import CONF, as_meant, choices
 
 HELP, FULL_HELP = {"-h", "--help"}, "--help-all"
 ENTRY_COMMANDS = {"pipeline": "run"}  # commands with another name than their configuration

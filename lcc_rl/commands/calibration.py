@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from lcc_rl.config import config_hash
+from lcc_rl.config.compose import config_hash
 from lcc_rl.config.nodes import CALLED, as_plain
 from lcc_rl.config.schemas import CalibrateConfig
 from lcc_rl.drivers.calibrator import (

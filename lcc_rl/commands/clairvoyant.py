@@ -26,8 +26,9 @@ import pandas as pd
 from rich.console import Console
 
 from lcc_rl.commands.evaluation import show_tables
-from lcc_rl.config import check_overrides, load
+from lcc_rl.config import load
 from lcc_rl.config.schemas import EvaluateConfig
+from lcc_rl.config.words import check_overrides
 from lcc_rl.envs import load_inputs
 from lcc_rl.envs.inputs import Inputs
 from lcc_rl.errors import ConfigError, require

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from lcc_rl.config import identity
+from lcc_rl.config.compose import identity
 from lcc_rl.errors import ResultsError
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import parquet_metadata, read_parquet, write_parquet

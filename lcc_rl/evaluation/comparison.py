@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from lcc_rl.config import identity
+from lcc_rl.config.compose import identity
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.envs.inputs import Inputs
 from lcc_rl.evaluation.blocks import Store

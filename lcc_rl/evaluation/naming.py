@@ -9,7 +9,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lcc_rl.config import NOT_IDENTITY
+from lcc_rl.config.compose import NOT_IDENTITY
 from lcc_rl.config.nodes import as_plain
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import Strategy

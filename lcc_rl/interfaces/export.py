@@ -18,7 +18,8 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 
-from lcc_rl.config import key_of, load, with_variant
+from lcc_rl.config import load
+from lcc_rl.config.words import key_of, with_variant
 from lcc_rl.errors import needing, require, require_known
 from lcc_rl.evaluation.foreign import network_of
 from lcc_rl.evaluation.named import is_policy, one_of

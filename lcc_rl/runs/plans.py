@@ -7,7 +7,7 @@ from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
-from lcc_rl.config import key_of
+from lcc_rl.config.words import key_of
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.settings import parse_yaml, read_json, read_text
 from lcc_rl.runs.states import HYDRA_FOLDER, run_folders, survey

@@ -14,7 +14,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from lcc_rl.config import is_sweep
+from lcc_rl.config.compose import is_sweep
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.runs.output import show_headline
 from lcc_rl.runs.states import PROGRESS, check_present, read_progress

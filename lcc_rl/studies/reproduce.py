@@ -21,8 +21,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lcc_rl.config import check_overrides
 from lcc_rl.config.schemas import FORMATS
+from lcc_rl.config.words import check_overrides
 from lcc_rl.io.atomic import own_folder
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.states import claim

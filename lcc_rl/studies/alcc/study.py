@@ -15,8 +15,9 @@ from lcc_rl.commands.pipeline import (
     read_once,
     train_all,
 )
-from lcc_rl.config import key_of, load, quoted, top_key, with_inputs
+from lcc_rl.config.compose import load, with_inputs
 from lcc_rl.config.schemas import EvaluateConfig, PipelineConfig, TrainConfig
+from lcc_rl.config.words import key_of, quoted, top_key
 from lcc_rl.errors import require_known
 from lcc_rl.studies.study import Study
 

@@ -12,8 +12,9 @@ import pandas as pd
 
 from lcc_rl.commands.evaluation import evaluate_and_write, made_by
 from lcc_rl.commands.pipeline import known_settings, train_all
-from lcc_rl.config import identity, load, quoted, top_key, with_inputs
+from lcc_rl.config.compose import identity, load, with_inputs
 from lcc_rl.config.schemas import StudyConfig, TrainConfig
+from lcc_rl.config.words import quoted, top_key
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.evaluation.comparison import Comparison
 from lcc_rl.evaluation.fit import check_policy
