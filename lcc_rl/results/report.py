@@ -69,13 +69,9 @@ AT_FLOW = (
 SAVINGS = {  # columns of short tables by estimate
     "saving": SAVED.key,
     "second_saving": SECOND_SAVED.key,
-    **dict(
-        zip(
-            ("flow_saving", "second_flow_saving", "rule_saving"),
-            (x.key for x in AT_FLOW),
-            strict=True,
-        )
-    ),
+    "flow_saving": AT_FLOW[0].key,
+    "second_flow_saving": AT_FLOW[1].key,
+    "rule_saving": AT_FLOW[2].key,
 }
 WAY, FLOW_SHARE = Shown("distance_pct", "dis-\ntance\n[%]"), Shown("flow_pct", "flow\n[%]")
 # Tables show what is more than the baseline's, in per cent.

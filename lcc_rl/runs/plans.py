@@ -69,9 +69,10 @@ def unfinished(root: Path) -> dict[str, str]:
 
     Cells of a plan without a folder are ``waiting``.
     """
-    found = {run.name: str(run) for run in survey(root) if run.state != "finished"}
+    folders = run_folders(root)
+    found = {run.name: str(run) for run in survey(root, folders) if run.state != "finished"}
     sweeps: dict[Path, list[Path]] = {root: []}
-    for run in (run for run in run_folders(root) if run != root):
+    for run in (run for run in folders if run != root):
         sweeps.setdefault(run.parent, []).append(run)
     for sweep, runs in sweeps.items():
         latest = read_plan(sweep)
