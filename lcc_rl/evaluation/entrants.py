@@ -34,16 +34,10 @@ from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
 from lcc_rl.results.runs import POLICY
 from lcc_rl.runs.states import CONFIG, run_folders
-from lcc_rl.settings import TARGET
 
 log = logging.getLogger("lcc_rl")
 
 FROM_TRAINING = dict.fromkeys(("agent.", "training."), "a policy has the settings of its training")
-# Pieces that draw nothing in an evaluation and read no drivers.
-FIXED = {
-    *("HCFS", "CACC", "DeadBeat", "HeadwayStart", "NGSIMLeader", "Communication", "Action"),
-    *("TimeToCollision", "TimeGap", "MotorPower"),
-}
 
 
 class Entrants:
@@ -142,7 +136,7 @@ class Entrants:
             return False
         own = scenario.with_(controllers={HUMAN: None}, start={HUMAN: None})
         nodes = nodes_in([own, self.cfg.deployed, *map(controller_of, specs)])
-        return all(node.settings[TARGET].removeprefix("lcc_rl.pieces.") in FIXED for node in nodes)
+        return all(vars(node.kind).get("steady", False) for node in nodes)
 
     def _of_task(self, path: str) -> str:
         return of_task(path, None if self.task is None else self.task.name)
