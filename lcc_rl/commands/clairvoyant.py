@@ -33,9 +33,9 @@ from lcc_rl.envs import load_inputs
 from lcc_rl.envs.inputs import Inputs
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.clairvoyant import BOUND_BOTH, BOUND_OWN, clairvoyant
+from lcc_rl.evaluation.entrants import check_distinct
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.fit import task_of
-from lcc_rl.evaluation.naming import check_distinct
 from lcc_rl.evaluation.strategies import Strategy, baseline, trained
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.atomic import own_folder

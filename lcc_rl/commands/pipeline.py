@@ -39,7 +39,7 @@ from lcc_rl.envs.inputs import LOADS, build_energy, load_inputs, second_energy
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
-from lcc_rl.figures.main_page import held_to, write_page
+from lcc_rl.figures.page import held_to, write_page
 from lcc_rl.figures.training import training_figure
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows, parquet_metadata, write_parquet
