@@ -43,7 +43,7 @@ from lcc_rl.results.names import NETWORK, ON_FRONT, in_words, worded
 from lcc_rl.results.render import as_markdown, markdown_table, saved_text
 from lcc_rl.results.runs import naming_run
 from lcc_rl.results.task import Task
-from lcc_rl.studies.alcc.results import narrow
+from lcc_rl.studies.alcc.study import narrow
 from lcc_rl.studies.reproduce import STUDY_RESULTS
 
 REFERENCE, DOCS = Path("outputs/reference"), Path("docs")

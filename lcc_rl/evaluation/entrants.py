@@ -139,7 +139,7 @@ class Entrants:
             return False
         own = scenario.with_(controllers={HUMAN: None}, start={HUMAN: None})
         nodes = nodes_in([own, self.cfg.deployed, *map(controller_of, specs)])
-        return all(vars(node.kind).get("steady", False) for node in nodes)
+        return all(getattr(node.kind, "__dict__", {}).get("steady") for node in nodes)
 
     def _of_task(self, path: str) -> str:
         return of_task(path, None if self.task is None else self.task.name)
