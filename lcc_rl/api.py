@@ -10,7 +10,8 @@ from typing import Any
 
 from lcc_rl.commands import evaluation, training
 from lcc_rl.commands.evaluation import Run
-from lcc_rl.config import load, with_variant
+from lcc_rl.config import load
+from lcc_rl.config.words import with_variant
 from lcc_rl.errors import require
 from lcc_rl.evaluation.foreign import as_given
 from lcc_rl.evaluation.named import setting_of

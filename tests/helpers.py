@@ -18,7 +18,7 @@ from torchrl.envs import TransformedEnv
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent
 from lcc_rl.agents.loop import TrainingLoop
-from lcc_rl.config import identity, load
+from lcc_rl.config.compose import identity, load
 from lcc_rl.config.schemas import EvaluateConfig, TrainConfig
 from lcc_rl.data.episodes import SCHEMA
 from lcc_rl.data.profiles import Profiles, from_records

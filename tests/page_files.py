@@ -15,7 +15,7 @@ from table_text import long_table, openacc_text
 
 from benchmarks.read import write_ngsim
 from lcc_rl.data.sources import NgsimSource
-from lcc_rl.drivers.tables import load_drivers
+from lcc_rl.drivers.population import load_drivers
 from lcc_rl.io.files import write_parquet
 from lcc_rl.synthetic.stream import StreamSource
 

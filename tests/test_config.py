@@ -13,9 +13,8 @@ from hydra import compose, initialize_config_module
 import lcc_rl.conf
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent
-from lcc_rl.config import identity, load
 from lcc_rl.config.compose import CONF as MODULE
-from lcc_rl.config.compose import as_meant, composed
+from lcc_rl.config.compose import as_meant, composed, identity, load
 from lcc_rl.config.nodes import as_plain, settings_at, with_defaults, without_defaults
 from lcc_rl.config.schemas import TrainConfig, as_text, parse_config
 from lcc_rl.envs import build_env

@@ -15,7 +15,7 @@ from commands import DATA
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent, check_lengths, make_trainer, training_env
-from lcc_rl.config import NOT_IDENTITY, load
+from lcc_rl.config.compose import NOT_IDENTITY, load
 from lcc_rl.config.nodes import as_plain
 from lcc_rl.envs import load_inputs
 from lcc_rl.errors import LccError

@@ -27,7 +27,7 @@ from lcc_rl.energy.fuel import coefficients
 from lcc_rl.errors import DataError, require
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.bootstrap import Estimate, saving
-from lcc_rl.results.render import saved_text
+from lcc_rl.results.render import markdown_table, saved_text
 from lcc_rl.runs.arguments import Arguments
 
 Speeds = NDArray[np.float64]  # [rows, time] [m/s]
@@ -184,14 +184,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("folder", type=Path, help="folder of an evaluation with steps.parquet")
     parser.add_argument("baseline", nargs="?", default="human", help="strategy to compare with")
     table = savings(**vars(parser.parse_args(arguments)))
-    names = list(next(iter(table.values())))
-    print("| | " + " | ".join(names) + " |\n|---|" + "---|" * len(names))
-    for model, found in table.items():
-        cells = (
-            saved_text(100.0 * x.value, 100.0 * x.low, 100.0 * x.high)
-            for x in map(found.__getitem__, names)
-        )
-        print(f"| {model} | " + " | ".join(cells) + " |")
+    lines = [
+        [model, *(saved_text(100.0 * x.value, 100.0 * x.low, 100.0 * x.high) for x in row.values())]
+        for model, row in table.items()
+    ]
+    print(markdown_table(["", *next(iter(table.values()))], lines))
     print(*disagreements(table), sep="\n")
 
 

@@ -40,10 +40,10 @@ from lcc_rl.results import board
 from lcc_rl.results.fronts import ENERGY, FRONT_KINDS, LONG_SHARE, at_equal_flow, points
 from lcc_rl.results.measures import FLOW, SIGNS, Measure, signed
 from lcc_rl.results.names import NETWORK, ON_FRONT, in_words, worded
-from lcc_rl.results.render import as_markdown, markdown_row, markdown_table, saved_text
+from lcc_rl.results.render import as_markdown, markdown_table, saved_text
 from lcc_rl.results.runs import naming_run
 from lcc_rl.results.task import Task
-from lcc_rl.studies.alcc.results import narrow
+from lcc_rl.studies.alcc.study import narrow
 from lcc_rl.studies.reproduce import STUDY_RESULTS
 
 REFERENCE, DOCS = Path("outputs/reference"), Path("docs")
@@ -172,8 +172,8 @@ def task_table(name: str, table: pd.DataFrame) -> str:
     kept = {x.removeprefix(LIMIT): float(first[x]) for x in first if x.startswith(LIMIT)}
     given = {"score": first["score_name"], "unit": first["unit"], "against": first["against"]}
     task = Task(name=name, limits=kept, **given)
-    names = ["driven by", task.label, "saved [%]", "distance [%]", "flow [1/h] (%)", "limits"]
-    lines = [[*names, "decision [ms]"]]
+    head = ["driven by", task.label, "saved [%]", "distance [%]", "flow [1/h] (%)", "limits"]
+    lines = []
     whole = table.set_index("strategy").loc[task.against, FLOW]
     for row in table.to_dict("records"):
         share = (100.0 * row[f"saving{end}"] for end in ("", "_low", "_high"))
@@ -187,11 +187,10 @@ def task_table(name: str, table: pd.DataFrame) -> str:
             f"{row['decision_ms']:.2f}" if np.isfinite(row["decision_ms"]) else "",
         ]
         lines.append(cells)
-    head, *others = map(markdown_row, lines)
     bounds = ", ".join(bounded(one, bound) for one, bound in task.bounds.items())
     words = f"Saved against {in_words(task.against)}. Limits: {bounds or 'no collision'}."
-    title = f"### {name}\n\n{first['windows']} windows. {words}"
-    return "\n".join([title, "", head, "|" + "---|" * len(lines[0]), *others])
+    shown = markdown_table([*head, "decision [ms]"], lines)
+    return f"### {name}\n\n{first['windows']} windows. {words}\n\n{shown}"
 
 
 def bounded(measure: Measure, bound: float) -> str:

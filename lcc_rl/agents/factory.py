@@ -13,7 +13,7 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.agent import Agent, Scene
 from lcc_rl.agents.loop import TrainingLoop
-from lcc_rl.config import identity
+from lcc_rl.config.compose import identity
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env

@@ -10,10 +10,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 import pandas as pd
 import torch
+from pydantic import AfterValidator
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
@@ -22,21 +23,48 @@ from lcc_rl.agents.agent import Agent
 from lcc_rl.agents.checks import check_learner, check_restored, check_state
 from lcc_rl.agents.vectors import denormals_flushed
 from lcc_rl.config.schemas import TrainingConfig
-from lcc_rl.errors import Diverged, Interrupted, ResultsError, require
+from lcc_rl.errors import ConfigError, Diverged, Interrupted, ResultsError, require
 from lcc_rl.io.files import write_parquet
 from lcc_rl.io.tensors import check_like, write_torch
 from lcc_rl.pieces.base import REWARD
 from lcc_rl.pieces.rewards import TERMS
 from lcc_rl.results.policies import read_checked
-from lcc_rl.runs.checkpoints import Checkpoint
 from lcc_rl.runs.interrupts import stop_signal
 from lcc_rl.runs.progress import ProgressReporter
+from lcc_rl.settings import Settings, Whole
 
 # Entries from which the record of an iteration is computed.
 REPORTED = tuple(("next", *key) for key in (REWARD, TERMS, ("done",), ("terminated",)))
 
-
 AgentT = TypeVar("AgentT", bound=Agent)
+
+
+def check_columns(columns: dict[str, Any]) -> dict[str, Any]:
+    """Check that the columns of a record are numbers in double precision."""
+    for name, value in columns.items():
+        if not isinstance(value, Tensor) or value.dtype != torch.float64 or value.ndim != 1:
+            raise ValueError(f"column {name!r} is no list of numbers in double precision")
+    return columns
+
+
+RecordColumns = Annotated[dict[str, Any], AfterValidator(check_columns)]
+
+
+class Checkpoint(Settings):
+    """Contents of a checkpoint."""
+
+    identity: str
+    iteration: Whole
+    updates: Whole
+    agent: dict[str, Any]
+    rows: RecordColumns  # the record, an entry per iteration
+    times: RecordColumns
+    memory: dict[str, Any]
+
+    def validate(self) -> None:
+        lengths = {len(column) for column in (*self.rows.values(), *self.times.values())}
+        if not {*lengths, *([] if self.rows else [0])} <= {self.iteration}:
+            raise ConfigError(f"iteration {self.iteration}, but rows of {sorted(lengths)}")
 
 
 class TrainingLoop(ABC, Generic[AgentT]):

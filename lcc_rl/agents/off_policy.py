@@ -220,22 +220,8 @@ class OffPolicy(Sampling):
             target, vector = self.targets[name]
             target.lerp_(vector, self.tau)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything that :meth:`load_state_dict` needs to resume bit for bit."""
-        return {
-            "count": self.count,
-            "loss": dict(self.loss.state_dict()),
-            **{name: part.state_dict() for name, part in self._more().items()},
-            "optimizers": {name: part.state_dict() for name, part in self.optimizers.items()},
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.count = state["count"]
-        self.loss.load_state_dict(state["loss"])
-        for name, part in self.optimizers.items():
-            part.load_state_dict(state["optimizers"][name])
-        for name, part in self._more().items():
-            part.load_state_dict(state[name])
+    def _parts(self) -> dict[str, Any]:
+        return {"loss": self.loss, **self._more(), **self.optimizers}
 
 
 def leaves(parameters: TensorDictBase) -> list[Tensor]:

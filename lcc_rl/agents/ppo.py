@@ -131,10 +131,3 @@ class PPO(Sampling):
 
     def _parts(self) -> dict[str, Any]:
         return {**super()._parts(), **self._more()}
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"count": self.count, **super().state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.count = state["count"]
-        super().load_state_dict(state)

@@ -66,6 +66,13 @@ class Sampling(Aiming):
         *("surrogates", "regularizers", "limits", "limit_rate"),
     )
 
+    def state_dict(self) -> dict[str, Any]:
+        return {"count": self.count, **super().state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.count = state["count"]
+        super().load_state_dict(state)
+
     def _more(self) -> dict[str, Any]:
         """Return further parts of the state, if there are: rule, prices of limits and scale."""
         limits = self.objective.limits if self.objective.limits.largest else None

@@ -7,8 +7,9 @@ import logging
 from hydra.core.hydra_config import HydraConfig
 
 from lcc_rl.cli.entry import entry_point, resumed_folder, run_folder
-from lcc_rl.config import is_sweep, top_key
+from lcc_rl.config.compose import is_sweep
 from lcc_rl.config.schemas import CalibrateConfig, EvaluateConfig, PipelineConfig, TrainConfig
+from lcc_rl.config.words import top_key
 from lcc_rl.runs.output import headlines
 
 log = logging.getLogger("lcc_rl")

@@ -30,7 +30,7 @@ from lcc_rl.results.render import as_csv, as_latex, as_markdown, chosen, for_pri
 from lcc_rl.results.report import together
 from lcc_rl.results.runs import EPISODES, FINAL, PARTS, load_config, naming_run
 from lcc_rl.results.sweeps import load_sweep
-from lcc_rl.results.units import ENERGY_UNITS
+from lcc_rl.results.task import ENERGY_UNITS
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.states import CONFIG, run_folders
 

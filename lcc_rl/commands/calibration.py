@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from lcc_rl.config import config_hash
+from lcc_rl.config.compose import config_hash
 from lcc_rl.config.nodes import CALLED, as_plain
 from lcc_rl.config.schemas import CalibrateConfig
 from lcc_rl.drivers.calibrator import (
@@ -37,7 +37,7 @@ from lcc_rl.results.render import DASH
 from lcc_rl.results.runs import check_folder, save_config
 from lcc_rl.runs.output import PLAIN
 from lcc_rl.runs.precision import prepare_torch
-from lcc_rl.runs.progress import Phases
+from lcc_rl.runs.progress import phases
 from lcc_rl.runs.states import claim
 
 ERROR_HEADINGS = (
@@ -82,7 +82,7 @@ def run(
         dataset = load_episodes(cfg.data)
         emit(dataset.report)
         start = perf_counter()
-        with Phases("calibration", console, emit) as progress:
+        with phases("calibration", console, emit) as progress:
             result = calibrator(dataset.episodes, seed=cfg.seed, device=device, progress=progress)
         for role in ("follower", "leader"):
             names = result.drivers[f"{role}_id"].map(dataset.vehicles)

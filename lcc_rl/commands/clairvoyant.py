@@ -26,15 +26,16 @@ import pandas as pd
 from rich.console import Console
 
 from lcc_rl.commands.evaluation import show_tables
-from lcc_rl.config import check_overrides, load
+from lcc_rl.config import load
 from lcc_rl.config.schemas import EvaluateConfig
+from lcc_rl.config.words import check_overrides
 from lcc_rl.envs import load_inputs
 from lcc_rl.envs.inputs import Inputs
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.clairvoyant import BOUND_BOTH, BOUND_OWN, clairvoyant
+from lcc_rl.evaluation.entrants import check_distinct
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.fit import task_of
-from lcc_rl.evaluation.naming import check_distinct
 from lcc_rl.evaluation.strategies import Strategy, baseline, trained
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.atomic import own_folder

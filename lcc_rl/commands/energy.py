@@ -19,7 +19,8 @@ import pandas as pd
 import torch
 
 from lcc_rl.arrays import times
-from lcc_rl.config import load, quoted, top_key
+from lcc_rl.config import load
+from lcc_rl.config.words import quoted, top_key
 from lcc_rl.data.leaders import DriveLeaders
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.inputs import build_energy

@@ -13,7 +13,7 @@ import pandas as pd
 from rich.console import Console
 
 from lcc_rl.commands.checks import check_measured
-from lcc_rl.config import identity, with_inputs
+from lcc_rl.config.compose import identity, with_inputs
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.envs.inputs import build_energy, second_energy

@@ -20,7 +20,7 @@ from lcc_rl import results
 from lcc_rl.agents import Analytic
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.checks import check_measured, check_settings
-from lcc_rl.config import NOT_IDENTITY, config_hash, key_of, load, top_key, with_inputs
+from lcc_rl.config.compose import NOT_IDENTITY, config_hash, load, with_inputs
 from lcc_rl.config.nodes import Node, as_plain
 from lcc_rl.config.schemas import (
     KINDS,
@@ -30,6 +30,7 @@ from lcc_rl.config.schemas import (
     TrainConfig,
 )
 from lcc_rl.config.unused import OF_COMPARISONS
+from lcc_rl.config.words import key_of, top_key
 from lcc_rl.data.episodes import SCHEMA
 from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.drivers.calibrator import count_records
@@ -38,7 +39,7 @@ from lcc_rl.envs.inputs import LOADS, build_energy, load_inputs, second_energy
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
-from lcc_rl.figures.main_page import held_to, write_page
+from lcc_rl.figures.page import held_to, write_page
 from lcc_rl.figures.training import training_figure
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import Rows, parquet_metadata, write_parquet

@@ -29,10 +29,10 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from lcc_rl.commands.evaluation import evaluate_and_write
-from lcc_rl.config import check_overrides, choices, identity, load, top_key
+from lcc_rl.config.compose import choices, identity, load
 from lcc_rl.config.inputs import compared_files
 from lcc_rl.config.schemas import EvaluateConfig
-from lcc_rl.config.words import FILTERED, RECORDED
+from lcc_rl.config.words import FILTERED, RECORDED, check_overrides, top_key
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.drivers.population import fixed
 from lcc_rl.envs import build_env, load_inputs

@@ -15,7 +15,7 @@ from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import Agent, build_agent, make_trainer, training_env
 from lcc_rl.commands.checks import build_logger, check_settings
 from lcc_rl.commands.evaluation import evaluate_and_write, made_by
-from lcc_rl.config import NOT_IDENTITY, identity, with_inputs
+from lcc_rl.config.compose import NOT_IDENTITY, identity, with_inputs
 from lcc_rl.config.schemas import TrainConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError

@@ -248,7 +248,7 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     except ConfigError as error:  # another choice of the group may have the setting
         if (found := OF_NODE.match(str(error))) and (hint := _file_of(*found.groups())):
             raise ConfigError(f"{error}; {hint}") from None
-        if re.match("deployed: expected a node .*{", str(error)):
+        if TARGET not in (content.get("deployed") or (TARGET,)):
             refuse(overrides, {"deployed.": "it belongs to variant=hcfs"})
         match = re.match(r"unknown setting of (\w+) \(", str(error))
         group = match.group(1) if match else ""

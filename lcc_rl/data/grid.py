@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -89,7 +89,7 @@ def continuous(
     place: Places,
     report: ReadReport,
     node: str,
-    bridge: float = np.inf,
+    bridge: float,
 ) -> pd.DataFrame:
     """Sort records by time, keep the first row of each time, and divide records at holes.
 
@@ -326,15 +326,20 @@ def interpolated(samples: pd.DataFrame, step: float, skipped: bool = False) -> l
     steps -= usual
     odd = int((np.abs(steps, out=steps) > UNEVEN * usual).sum())
     irregular = f", {odd:,} of them irregular," * bool(odd)
-    how = "averaged over" if usual < (1 - UNEVEN) * min(step, FRAME) else "interpolated to"
+    how = "averaged over" if is_dense(usual, step, FRAME) else "interpolated to"
     line = f"samples {usual:g} s apart{irregular} were {how} {step:g} s"
     return [line] * bool(skipped or odd or abs(usual - step) > UNEVEN * step)
+
+
+def is_dense(usual: Any, step: float, frame: float) -> Any:
+    """Whether samples are closer than a step and 0.1 s (``frame``), so that they are averaged."""
+    return usual < (1 - UNEVEN) * min(step, frame)
 
 
 def steps_at(at: Floats, step: float, time: Floats, values: Floats, frame: float = FRAME) -> Floats:
     """Return values at the times ``at``, ``step`` apart: of a monotone interpolant (PCHIP).
 
-    It does not overshoot the samples. Where samples are closer than a step and 0.1 s, the values
+    It does not overshoot the samples. Where samples are dense (:func:`is_dense`), the values
     are means over a step, at the ends of the record over the shorter part with the same centre.
 
     Args:
@@ -347,7 +352,7 @@ def steps_at(at: Floats, step: float, time: Floats, values: Floats, frame: float
 
     curve, at = PchipInterpolator(time, values), at.clip(time[0], time[-1])
     found = curve(at)
-    if np.median(np.diff(time)) >= (1 - UNEVEN) * min(step, frame):
+    if not is_dense(np.median(np.diff(time)), step, frame):
         return found
     half = np.minimum(step / 2, np.minimum(at - time[0], time[-1] - at))
     inner = half > UNEVEN * step

@@ -13,9 +13,15 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from lcc_rl.drivers.fit_error import GAP_NRMSE, GAP_RMSE, SPEED_RMSPE, FitError, FitMeasure
+from lcc_rl.drivers.fit_error import (
+    GAP_NRMSE,
+    GAP_RMSE,
+    SPEED_RMSPE,
+    FitError,
+    FitMeasure,
+    intervals,
+)
 from lcc_rl.drivers.genetic import Evolution, Fitness, GeneticSettings, Progress, minimise
-from lcc_rl.drivers.intervals import intervals
 from lcc_rl.drivers.observed import Observed, Selection, observe
 from lcc_rl.drivers.parameters import (
     DEFAULT_BOUNDS,

@@ -11,9 +11,10 @@ import torch
 from tensordict.utils import NestedKey
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.config import load, with_variant
+from lcc_rl.config import load
 from lcc_rl.config.nodes import CALLED, Node
 from lcc_rl.config.schemas import AUTO, ScenarioConfig, StudyConfig
+from lcc_rl.config.words import with_variant
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
 from lcc_rl.envs.clock import Clock, Traffic, batch_shape

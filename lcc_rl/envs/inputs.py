@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import torch
 
-from lcc_rl.config import is_sweep
+from lcc_rl.config.compose import is_sweep
 from lcc_rl.config.inputs import inputs_of
 from lcc_rl.config.nodes import CALLED, Node, as_plain, nodes_in
 from lcc_rl.config.schemas import StudyConfig

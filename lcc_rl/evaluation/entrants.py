@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lcc_rl.config.nodes import Node, nodes_in
+from lcc_rl.config.compose import NOT_IDENTITY
+from lcc_rl.config.nodes import Node, as_plain, nodes_in
 from lcc_rl.config.schemas import AUTO, EvaluateConfig, StudyConfig
 from lcc_rl.config.unused import refuse
 from lcc_rl.config.words import FILTERED, RECORDED
@@ -18,7 +21,6 @@ from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.fit import check_policy, check_variant, other_traffic, task_of
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import DIRECT, PEOPLE, controller_of, is_policy, label_of
-from lcc_rl.evaluation.naming import check_distinct, named_apart
 from lcc_rl.evaluation.strategies import (
     Strategy,
     TrainedPolicy,
@@ -32,18 +34,13 @@ from lcc_rl.evaluation.strategies import (
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
-from lcc_rl.results.runs import POLICY
+from lcc_rl.results.runs import POLICY, flatten
+from lcc_rl.results.sweeps import labels
 from lcc_rl.runs.states import CONFIG, run_folders
-from lcc_rl.settings import TARGET
 
 log = logging.getLogger("lcc_rl")
 
 FROM_TRAINING = dict.fromkeys(("agent.", "training."), "a policy has the settings of its training")
-# Pieces that draw nothing in an evaluation and read no drivers.
-FIXED = {
-    *("HCFS", "CACC", "DeadBeat", "HeadwayStart", "NGSIMLeader", "Communication", "Action"),
-    *("TimeToCollision", "TimeGap", "MotorPower"),
-}
 
 
 class Entrants:
@@ -142,7 +139,7 @@ class Entrants:
             return False
         own = scenario.with_(controllers={HUMAN: None}, start={HUMAN: None})
         nodes = nodes_in([own, self.cfg.deployed, *map(controller_of, specs)])
-        return all(node.settings[TARGET].removeprefix("lcc_rl.pieces.") in FIXED for node in nodes)
+        return all(getattr(node.kind, "__dict__", {}).get("steady") for node in nodes)
 
     def _of_task(self, path: str) -> str:
         return of_task(path, None if self.task is None else self.task.name)
@@ -280,3 +277,101 @@ def check_installed(cfg: StudyConfig, compared: Sequence[Any] = ()) -> None:
     further = [controller_of(spec) for spec in (*names, *compared) if spec not in (DIRECT, PEOPLE)]
     for node in nodes_in([cfg.scenario.controllers, *further]):
         getattr(node.kind, "check_installed", lambda: None)()
+
+
+# -- names in tables that tell policies of different trainings apart -------------------------------
+
+# Settings that do not distinguish trainings: those of other commands, and those of the seed.
+OF_NO_TRAINING = tuple(
+    f"{key}." for key in (*NOT_IDENTITY, "seed", "evaluation", "policy", "inputs.policy")
+)
+DATED = re.compile(r"^\d{4}-\d\d-\d\d_(\d\d-\d\d-\d\d)-\d{6}_.*")
+
+
+def named_apart(strategies: Sequence[Strategy]) -> list[Strategy]:
+    """Return strategies with names that differ if their trainings differ by more than the seed.
+
+    If a variant was learned by several kinds of agents, the agent is added to the name. If settings
+    differ otherwise, or a seed occurs twice, the file or folder of the policy is added. Several
+    seeds of one training share a name, that of their folder. If one folder holds several trainings,
+    the settings that differ are added.
+    """
+    kinds = [s.cfg.agent.name if s.policy else "" for s in strategies]
+    by_agent = _where_several(strategies, kinds, kinds)
+    marks = _trainings(by_agent)
+    return _where_several(by_agent, marks, _labels(by_agent, marks))
+
+
+def _where_several(
+    strategies: Sequence[Strategy], marks: Sequence[Hashable], labels: Sequence[str]
+) -> list[Strategy]:
+    different = Counter(
+        name for name, _ in {(s.name, m) for s, m in zip(strategies, marks, strict=True)}
+    )
+    return [
+        replace(one, name=f"{one.name} {label}") if different[one.name] > 1 else one
+        for one, label in zip(strategies, labels, strict=True)
+    ]
+
+
+def _trainings(strategies: Sequence[Strategy]) -> list[tuple[str, int]]:
+    """Return settings, and number among equal seeds, by which policies of a name differ."""
+    marks: list[tuple[str, int]] = []
+    of_seed: Counter[Hashable] = Counter()
+    for s in strategies:
+        settings = dict(flatten(as_plain(s.own or s.cfg))) if s.policy else {}
+        kept = {key: x for key, x in settings.items() if not f"{key}.".startswith(OF_NO_TRAINING)}
+        text = json.dumps(kept, sort_keys=True, default=str)
+        of_seed[s.name, text, s.seed] += 1
+        marks.append((text, of_seed[s.name, text, s.seed] if s.policy else 0))
+    return marks
+
+
+def _labels(strategies: Sequence[Strategy], marks: Sequence[tuple[str, int]]) -> list[str]:
+    """Return the addition to the name of each policy, the same for the seeds of a training."""
+    groups = [(s.name, mark) for s, mark in zip(strategies, marks, strict=True)]
+    titles: dict[tuple[str, tuple[str, int]], str] = {}
+    for s, group in zip(strategies, groups, strict=True):
+        titles.setdefault(group, _place(s, groups.count(group) > 1))
+    apart = Counter((name, title) for (name, _), title in titles.items())
+    differences: dict[tuple[str, str], str] = {}
+    for name in {name for name, _ in groups}:
+        texts = {
+            text: Path(s.source)
+            for s, (other, (text, _)) in zip(strategies, groups, strict=True)
+            if other == name
+        }
+        every = labels([json.loads(text) for text in texts], list(texts.values()))
+        for text, changes in zip(texts, every, strict=True):
+            differences[name, text] = ", ".join(changes.values())
+    additions = []
+    for s, (name, (text, which)) in zip(strategies, groups, strict=True):
+        title = titles[name, (text, which)]
+        if apart[name, title] > 1:  # one folder holds several trainings, or one twice
+            twice = (name, (text, 2)) in titles or not differences[name, text]
+            title = _place(s, False) if twice else differences[name, text]
+        additions.append(title)
+    return additions
+
+
+def _place(strategy: Strategy, of_sweep: bool) -> str:
+    """Return the name of a policy's file or run, or of the folder of its runs."""
+    path = Path(strategy.source).absolute()  # a relative path has a folder, too
+    path = path.parent if path.name == POLICY else path
+    name = path.parent.name if of_sweep else path.name.removesuffix(".pt")
+    return DATED.sub(r"\1", name)  # of a run's folder, the time of day
+
+
+def check_distinct(strategies: Sequence[Strategy]) -> None:
+    """Refuse two policies of one name and seed.
+
+    Raises:
+        ConfigError: naming the variant and the seed.
+    """
+    counts = Counter((strategy.name, strategy.seed) for strategy in strategies)
+    for name, seed in (key for key, count in counts.items() if count > 1):
+        which = name if seed is None else f"{name} with training seed {seed}"
+        raise ConfigError(
+            f"policy and compare name two policies called {which}: give them different "
+            "names, 'compare={first: …, second: …}'"
+        )

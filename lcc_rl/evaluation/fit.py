@@ -18,8 +18,7 @@ from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.runs import differing, flatten
-from lcc_rl.results.task import Task
-from lcc_rl.results.units import OF_FUEL, burns_one_fuel, check_unit
+from lcc_rl.results.task import OF_FUEL, Task, burns_one_fuel, check_unit
 from lcc_rl.settings import TARGET, parse
 
 MESSAGES = "communication"  # name of the piece with messages between connected vehicles

@@ -13,7 +13,7 @@ from typing import Any, TypeGuard
 from omegaconf import OmegaConf
 from torch import nn
 
-from lcc_rl.config import choices, composed, load, own_file
+from lcc_rl.config.compose import choices, composed, load, own_file
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.config.words import DOTTED, FILTERED, YAML

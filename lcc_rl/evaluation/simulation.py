@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from lcc_rl.arrays import times
-from lcc_rl.config import check_overrides, load
+from lcc_rl.config import load
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import RewardConfig, StudyConfig, TimeStep
-from lcc_rl.config.words import quoted
+from lcc_rl.config.words import check_overrides, quoted
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record

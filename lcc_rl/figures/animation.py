@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
+from base64 import b64encode
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from html import escape
 from importlib.resources import files
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +17,16 @@ import numpy as np
 from matplotlib.animation import FFMpegWriter
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from PIL import Image  # comes with matplotlib
+from PIL import (
+    Image,  # comes with matplotlib
+    ImageDraw,
+)
 
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.figures.drawing import INK, PAGE_WIDTH, legend_above, new_figure, paper
-from lcc_rl.figures.ring_picture import ring_picture
-from lcc_rl.figures.unrolled import unroll
+from lcc_rl.figures.space_time import SPEED_COLOURS, side_by_side
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.results.motion import MotionSeries, SampleMotion
@@ -224,3 +231,183 @@ def _write_mp4(motion: SampleMotion, title: str, path: Path) -> None:
             writer.setup(figure, str(path), dpi=DPI)
         writer.grab_frame()
     writer.finish()
+
+
+# -- rings side by side, as an SVG -----------------------------------------------------------------
+
+SPEED_UP, KEY_STEP = 20.0, 1.5  # factor of the speed; time between key frames [s]
+WIDE, HIGH = 330, 380  # size of a panel [px]
+RADIUS, ROAD, CAR_SIZE = 118, 24, 12  # radius of the ring, widths of road and cars [px]
+SVG_FRAME = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {high}" width="{wide}" \
+height="{high}" font-family="system-ui, 'Segoe UI', Roboto, sans-serif" text-anchor="middle">
+<title>{title}</title>
+<style>.card {{ fill: #fff; stroke: #dfe3e8 }} .road {{ stroke: #e4e7ec; fill: none }}
+.name {{ fill: #1b1f24; font-weight: 600 }} .soft {{ fill: #5a6370 }} .mark {{ stroke: #0b5fc0 }}
+.bar {{ fill: #0b5fc0 }}
+@media (prefers-color-scheme: dark) {{ .card {{ fill: #181c22; stroke: #2b323b }}
+.road {{ stroke: #2b323b }} .car {{ stroke: #ffffffa0; stroke-width: 1.2 }}
+.name {{ fill: #e8ecf1 }} .soft {{ fill: #9ba6b4 }}
+.mark {{ stroke: #6fb4ff }} .bar {{ fill: #6fb4ff }} }}</style>
+<rect class="card" x=".5" y=".5" width="{inner}" height="{below}" rx="12"/>
+{panels}
+<g font-size="12">{time}</g>
+</svg>
+"""
+
+
+def ring_picture(motions: Mapping[str, SampleMotion]) -> str:
+    """Return an SVG of rings side by side; cars move and change their colour.
+
+    Args:
+        motions: motions with equal times, by title.
+
+    Raises:
+        ConfigError: if a motion is not of a ring road.
+    """
+    if any(motion.circumference is None for motion in motions.values()):
+        raise ConfigError("an .svg shows rings or open roads, not both")
+    top = max(float(motion.speed.max()) for motion in motions.values())
+    panels = [_panel(*item, place, top) for place, item in enumerate(motions.items())]
+    wide = WIDE * len(motions)
+    size = {"wide": wide, "high": HIGH, "inner": wide - 1, "below": HIGH - 1}
+    bar = _bar(next(iter(motions.values())), wide)
+    title = escape("; ".join(motions))
+    return SVG_FRAME.format(**size, title=title, panels="\n".join(panels), time=bar)
+
+
+def _panel(name: str, motion: SampleMotion, place: int, top: float) -> str:
+    """Return one ring with its cars."""
+    step = float(motion.time[1] - motion.time[0])
+    shown = motion.at(slice(None, None, max(round(KEY_STEP / step), 1)))
+    turn = 360.0 / float(motion.circumference or 1.0)  # of a metre [degrees]
+    angles = -turn * (shown.position - 0.5 * motion.lengths[1:])
+    long = math.radians(turn) * RADIUS * motion.lengths[1:]
+    cars = [
+        _car(role != HUMAN, angles[:, car], shown.speed[:, car] / top, long[car], _time_of(motion))
+        for car, role in enumerate(motion.roles)
+    ]
+    last = motion.speed[motion.time > motion.time[-1] - 60.0]
+    return (
+        f'<g transform="translate({WIDE * (place + 0.5)} 192)">'
+        f'<text class="name" y="-156" font-size="16">{escape(name)}</text>'
+        f'<circle class="road" r="{RADIUS}" stroke-width="{ROAD}"/>\n'
+        + "\n".join(cars)
+        + f'<text class="name" y="4" font-size="26">{3.6 * last.mean():.1f} km/h</text>'
+        '<text class="soft" y="26" font-size="13">mean speed in the end</text></g>'
+    )
+
+
+def _car(marked: bool, angles: MotionSeries, shares: MotionSeries, long: float, time: str) -> str:
+    """Return a car with angles over time [degrees], coloured by shares of the top speed."""
+    hues = ";".join(to_hex(SPEED_COLOURS(share)) for share in shares)
+    mark = (
+        f'<circle class="mark" cx="{RADIUS}" r="{0.8 * long:.1f}" fill="none" stroke-width="2.5"/>'
+    )
+    return (
+        f'<g>{mark * marked}<rect class="car" x="{RADIUS - CAR_SIZE / 2}" y="{-long / 2:.1f}" '
+        f'width="{CAR_SIZE}" height="{long:.1f}" rx="3.5">'
+        f'<animate attributeName="fill" {time} values="{hues}"/></rect>'
+        f'<animateTransform attributeName="transform" type="rotate" {time} '
+        f'values="{";".join(f"{angle:.1f}" for angle in angles)}"/></g>'
+    )
+
+
+def _time_of(motion: SampleMotion) -> str:
+    duration = (motion.time[-1] - motion.time[0]) / SPEED_UP
+    return f'dur="{duration:.2f}s" repeatCount="indefinite"'
+
+
+def _bar(motion: SampleMotion, wide: int) -> str:
+    """Return a bar that grows with the time."""
+    first, last = float(motion.time[0]), float(motion.time[-1])
+    room, low = wide - 80, HIGH - 34
+    ticks = [
+        f'<text class="soft" x="{40 + room * (60.0 * minute - first) / (last - first):.0f}" '
+        f'y="{low + 20}">{minute} min</text>'
+        for minute in range(math.ceil(first / 60.0), math.floor(last / 60.0) + 1)
+    ]
+    return (
+        f'<path class="road" d="M40 {low + 2}h{room}" stroke-width="4"/>'
+        f'<rect class="bar" x="40" y="{low}" height="4" width="0" rx="2">'
+        f'<animate attributeName="width" {_time_of(motion)} values="0;{room}"/></rect>'
+        + "".join(ticks)
+    )
+
+
+# -- space-time diagrams that unroll with time, as an SVG or a GIF ---------------------------------
+
+FINE, TALL = 160, 3.4  # resolution [1/inch] and height [inches] of the picture
+POINTS = 400  # most points of a line
+SECONDS, HELD, FRAMES = 12.0, 3.0, 60  # time of unrolling, pause [s]; frames of a GIF
+PAPER, COLOURS = "#ffffff", 255
+
+Box = tuple[float, float, float, float]  # left, top, right, bottom [px]
+
+
+def unroll(motions: Mapping[str, SampleMotion], path: Path, ending: str) -> None:
+    """Write diagrams that appear from left to right.
+
+    Args:
+        motions: motions on an open road with equal times, by title.
+        path: the file.
+        ending: ``.svg`` or ``.gif``.
+
+    Raises:
+        ConfigError: if a motion is on a ring.
+    """
+    if any(motion.circumference is not None for motion in motions.values()):
+        raise ConfigError("a .gif shows one ring; an .svg shows several")
+    picture, boxes = _picture(motions)
+    if ending == ".svg":
+        path.write_text(_svg(picture, boxes, "; ".join(motions)), encoding="utf-8")
+        return
+    frames = [_covered(picture, boxes, share) for share in np.linspace(0.0, 1.0, FRAMES)]
+    duration = [round(1e3 * SECONDS / FRAMES)] * (FRAMES - 1) + [round(1e3 * HELD)]
+    frames[0].save(path, "GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0)
+
+
+def _picture(motions: Mapping[str, SampleMotion]) -> tuple[Image.Image, list[Box]]:
+    """Return the whole diagram and the boxes of its time axes."""
+    every = max(len(next(iter(motions.values())).time) // POINTS, 1)
+    short = {name: motion.at(slice(None, None, every)) for name, motion in motions.items()}
+    figure = side_by_side(short, TALL)
+    figure.set_dpi(FINE)
+    axes = figure.axes[: len(motions)]
+    for axis, motion in zip(axes, short.values(), strict=True):
+        axis.set_xlim(motion.time[0], motion.time[-1])
+    figure.canvas.draw()
+    pixels = np.asarray(figure.canvas.buffer_rgba())  # type: ignore[attr-defined]
+    extents, high = [axis.get_window_extent() for axis in axes], len(pixels)
+    boxes = [(box.x0 + 1.0, high - box.y1, box.x1 + 1.0, high - box.y0 - 1.0) for box in extents]
+    image = Image.fromarray(pixels).convert("RGB")
+    return image.quantize(COLOURS, Image.Quantize.MEDIANCUT), boxes
+
+
+def _covered(picture: Image.Image, boxes: list[Box], share: float) -> Image.Image:
+    """Return the picture up to a share of the time."""
+    image = picture.convert("RGB")
+    for left, top, right, bottom in boxes:
+        now = left + share * (right - left)
+        ImageDraw.Draw(image).rectangle((now, top, max(right, now), bottom), PAPER)
+    return image.quantize(palette=picture, dither=Image.Dither.NONE)
+
+
+def _svg(picture: Image.Image, boxes: list[Box], title: str) -> str:
+    """Return the picture under moving covers."""
+    data = BytesIO()
+    picture.save(data, "PNG", optimize=True)
+    (wide, high), whole = picture.size, SECONDS + HELD
+    times = f'keyTimes="0;{SECONDS / whole:g};1" dur="{whole:g}s" repeatCount="indefinite"'
+    covers = [
+        f'<rect y="{top:.1f}" height="{bottom - top:.1f}" fill="{PAPER}" x="{right:.1f}" width="0">'
+        f'<animate attributeName="x" values="{left:.1f};{right:.1f};{right:.1f}" {times}/>'
+        f'<animate attributeName="width" values="{right - left:.1f};0;0" {times}/></rect>'
+        for left, top, right, bottom in boxes
+    ]
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {high}" width="{wide}" '
+        f'height="{high}">\n<title>{escape(title)}</title>\n<image width="{wide}" height="{high}" '
+        f'href="data:image/png;base64,{b64encode(data.getvalue()).decode()}"/>\n'
+        + "\n".join(covers)
+        + "\n</svg>\n"
+    )

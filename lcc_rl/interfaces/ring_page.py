@@ -17,8 +17,9 @@ from typing import Any
 
 from torch import nn
 
-from lcc_rl.config import key_of, load, top_key
+from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config.words import key_of, top_key
 from lcc_rl.energy.fuel import STANDSTILL, STILL, CirclesFuel
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import build_energy, load_inputs

@@ -36,6 +36,7 @@ class Communication(Feature):
     headway: NonNegative = 5.0  # h, the gap to be kept [m]
     delay: NonNegative = 0.005  # of messages; it acts on the positions received [s]
 
+    steady = True
     role = VEHICLES
     writes = (
         Entry("vehicles.gap_error", "m", "e_x(i,i−1), positive where too far behind"),
@@ -118,6 +119,7 @@ class CACC(Controller):
     # close to its leader. Stability is not checked.
     literal: bool = False
 
+    steady = True
     reads = tuple(f"self.{name}" for name in PLATOON_ERRORS)
 
     def setup(self, world: World) -> None:
@@ -144,6 +146,7 @@ class DeadBeat(Controller):
     max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
     lookahead: Lookahead = "causal"
 
+    steady = True
     reads = ("self.speed", *leader_names("causal"))
 
     def setup(self, world: World) -> None:

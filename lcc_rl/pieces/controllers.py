@@ -132,6 +132,7 @@ class Action(Controller):
     hold: NonNegative = 0.0  # time for which an action is executed [s]; 0: one step
 
     LATER = ("hold",)
+    steady = True
     reads = (".".join(ACTION),)
     held = Entry("role.held", "–", "action of a policy that is executed since its last decision")
 

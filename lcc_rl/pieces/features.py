@@ -25,6 +25,7 @@ class TimeToCollision(Feature):
 
     floor: Positive = 0.01  # smallest value, also after a collision [s]
 
+    steady = True
     role = VEHICLES
     reads = ("vehicles.gap", "vehicles.relative_speed")
     writes = (Entry("vehicles.ttc", "s", "time-to-collision; 1000 where the gap does not close"),)
@@ -39,6 +40,7 @@ class TimeGap(Feature):
 
     speed_floor: NonNegative = 1.0  # speeds below this count as this; 0: the literal rule [m/s]
 
+    steady = True
     role = VEHICLES
     reads = ("vehicles.gap", "vehicles.speed")
     writes = (Entry("vehicles.time_gap", "s", "gap divided by speed"),)
@@ -128,6 +130,7 @@ class MotorPower(StepTransform):
     power: str = "power"  # their entry that is written
     recuperation: bool = True  # braking feeds the battery
 
+    steady = True
     kinds = (
         Entry("vehicles.power", "W", "power drawn during the last step"),
         Entry("role.predicted_power", "W", "motor power at the predicted acceleration"),

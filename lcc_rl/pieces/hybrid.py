@@ -122,6 +122,7 @@ class HCFS(Hybrid):
     gap_scale: Positive = PlatoonReward.gap_scale  # [m]
     spacing_time: NonNegative = PlatoonReward.spacing_time  # time until e_x counts [s]
 
+    steady = True
     reads = (*HYBRID_READS, *leader_names("causal"))
 
     def validate(self) -> None:

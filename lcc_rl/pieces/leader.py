@@ -37,6 +37,7 @@ class NGSIMLeader(StepTransform):
     perturbation: NonNegative = 0.0  # p; 0 in evaluation
     foresight: bool = False  # write the next speed, too
 
+    steady = True
     role = EPISODE
     keeps = (
         Entry(PROFILE, "–", "id of the speed record that the leader plays", option=True),

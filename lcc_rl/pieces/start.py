@@ -104,6 +104,8 @@ class HeadwayStart(Part):
     gap_spread: NonNegative = 2.0  # largest deviation of a gap; 0 in evaluation [m]
     speed_spread: NonNegative = 1.0  # largest deviation of a speed; 0 in evaluation [m/s]
 
+    steady = True
+
     def validate(self) -> None:
         if self.gap_spread >= self.headway:
             raise ValueError(f"gap_spread={self.gap_spread} must be below headway={self.headway}")

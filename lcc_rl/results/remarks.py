@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lcc_rl.config import choices
+from lcc_rl.config.compose import choices
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.results import measures
 from lcc_rl.results.measures import (

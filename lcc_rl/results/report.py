@@ -46,8 +46,7 @@ from lcc_rl.results.remarks import (
     seeds_note,
     verdict,
 )
-from lcc_rl.results.task import Task
-from lcc_rl.results.units import ELECTRIC, burns_one_fuel, check_unit, in_unit
+from lcc_rl.results.task import ELECTRIC, Task, burns_one_fuel, check_unit, in_unit
 from lcc_rl.results.windows import DRIVE, TRAINED, ratio, savings, seeds_left_out, windows_of
 
 # Baselines of tables and verdicts; the first one that was evaluated is used.
@@ -69,13 +68,9 @@ AT_FLOW = (
 SAVINGS = {  # columns of short tables by estimate
     "saving": SAVED.key,
     "second_saving": SECOND_SAVED.key,
-    **dict(
-        zip(
-            ("flow_saving", "second_flow_saving", "rule_saving"),
-            (x.key for x in AT_FLOW),
-            strict=True,
-        )
-    ),
+    "flow_saving": AT_FLOW[0].key,
+    "second_flow_saving": AT_FLOW[1].key,
+    "rule_saving": AT_FLOW[2].key,
 }
 WAY, FLOW_SHARE = Shown("distance_pct", "dis-\ntance\n[%]"), Shown("flow_pct", "flow\n[%]")
 # Tables show what is more than the baseline's, in per cent.
@@ -287,7 +282,7 @@ def report(
         few: whether the verdict mentions too few windows.
         against: the baseline; by default that of the task, or the first of :data:`AGAINST`.
         second: the second energy model, if any, for a heading.
-        unit: energy per distance in tables, see :func:`lcc_rl.results.units.in_unit`; None:
+        unit: energy per distance in tables, see :func:`lcc_rl.results.task.in_unit`; None:
             that of the task, or kJ/km, and g/km for one fuel.
 
     Raises:

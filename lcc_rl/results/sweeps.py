@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from lcc_rl.arrays import Floats
-from lcc_rl.config import NOT_IDENTITY
+from lcc_rl.config.compose import NOT_IDENTITY
 from lcc_rl.errors import ResultsError, require
 from lcc_rl.io.tensors import checksums
 from lcc_rl.results.loading import SHARD, listed, load

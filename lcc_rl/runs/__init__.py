@@ -1,1 +1,1 @@
-"""States of runs, sweeps, progress, checkpoints and loggers."""
+"""States of runs, sweeps, progress and loggers."""

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import yaml
 
-from lcc_rl.config import NOT_IDENTITY, config_hash
+from lcc_rl.config.compose import NOT_IDENTITY, config_hash
 from lcc_rl.errors import needing
 from lcc_rl.results.runs import CONFIG, flatten, read_settings
 from lcc_rl.settings import Settings

@@ -7,7 +7,7 @@ from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
-from lcc_rl.config import key_of
+from lcc_rl.config.words import key_of
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.settings import parse_yaml, read_json, read_text
 from lcc_rl.runs.states import HYDRA_FOLDER, run_folders, survey
@@ -69,9 +69,10 @@ def unfinished(root: Path) -> dict[str, str]:
 
     Cells of a plan without a folder are ``waiting``.
     """
-    found = {run.name: str(run) for run in survey(root) if run.state != "finished"}
+    folders = run_folders(root)
+    found = {run.name: str(run) for run in survey(root, folders) if run.state != "finished"}
     sweeps: dict[Path, list[Path]] = {root: []}
-    for run in (run for run in run_folders(root) if run != root):
+    for run in (run for run in folders if run != root):
         sweeps.setdefault(run.parent, []).append(run)
     for sweep, runs in sweeps.items():
         latest = read_plan(sweep)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
+from contextlib import contextmanager
 from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from lcc_rl.config import is_sweep
+from lcc_rl.config.compose import is_sweep
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.runs.output import show_headline
 from lcc_rl.runs.states import PROGRESS, check_present, read_progress
@@ -42,8 +43,14 @@ def bar(console: Console, shown: bool, transient: bool = False) -> Progress:
     )
 
 
-class Phases:
-    """Reports the progress of a job in phases with separate counts.
+@contextmanager
+def phases(
+    title: str,
+    console: Console,
+    emit: Callable[[Sequence[str]], None],
+    every: float = 10.0,
+) -> Iterator[Callable[[int, int, str], None]]:
+    """Report the progress of a job in phases with separate counts.
 
     A terminal shows a live bar, which disappears at the end; else a line is written at most every
     ``every`` seconds.
@@ -53,41 +60,28 @@ class Phases:
         console: console of the bar.
         emit: function that receives the lines.
         every: seconds between lines without a terminal.
+
+    Yields:
+        A function ``report(done, total, text)`` of the finished units of a phase.
     """
+    begun = last = last_line = time.monotonic()
+    before = 0
 
-    def __init__(
-        self,
-        title: str,
-        console: Console,
-        emit: Callable[[Sequence[str]], None],
-        every: float = 10.0,
-    ) -> None:
-        self.title, self.emit, self.every = title, emit, every
-        self.live = console.is_terminal
-        self.bar = bar(console, self.live, transient=True)
-        self.task = self.bar.add_task(title, total=None, note="")
-        self.begun = self.last = self.last_line = time.monotonic()
-        self.done = 0
-
-    def __enter__(self) -> Phases:
-        self.bar.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.bar.stop()
-
-    def __call__(self, done: int, total: int, text: str) -> None:
-        """Report that ``done`` of ``total`` units of a phase are finished."""
+    def report(done: int, total: int, text: str) -> None:
+        nonlocal before, begun, last, last_line
         now = time.monotonic()
-        if done <= self.done:
-            self.begun = self.last
-        self.done, self.last = done, now
-        eta = clock((now - self.begun) / max(done, 1) * (total - done))
+        begun = last if done <= before else begun
+        before, last = done, now
+        eta = clock((now - begun) / max(done, 1) * (total - done))
         note = f"{text}: {done}/{total}  ETA {eta}"
-        self.bar.update(self.task, completed=done, total=total, note=note)
-        if not self.live and now - self.last_line >= self.every:
-            self.last_line = now
-            self.emit([f"{self.title}: {note}"])
+        shown.update(task, completed=done, total=total, note=note)
+        if not console.is_terminal and now - last_line >= every:
+            last_line = now
+            emit([f"{title}: {note}"])
+
+    with bar(console, console.is_terminal, transient=True) as shown:
+        task = shown.add_task(title, total=None, note="")
+        yield report
 
 
 class ProgressReporter:

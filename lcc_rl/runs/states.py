@@ -262,9 +262,9 @@ def no_run(folder: Path) -> ConfigError:
     return ConfigError(text)
 
 
-def survey(root: Path) -> list[RunState]:
-    """Return the state of every run at or below a folder."""
+def survey(root: Path, folders: Sequence[Path] | None = None) -> list[RunState]:
+    """Return the state of every run at or below a folder; ``folders``: those of its runs."""
     return [
         inspect_run(folder, str(folder.relative_to(root)) if folder != root else root.name)
-        for folder in run_folders(root)
+        for folder in (run_folders(root) if folders is None else folders)
     ]

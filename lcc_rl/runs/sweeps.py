@@ -26,7 +26,8 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.live import Live
 
-from lcc_rl.config import NOT_IDENTITY, composed, identity, key_of, parsed
+from lcc_rl.config.compose import NOT_IDENTITY, composed, identity, parsed
+from lcc_rl.config.words import key_of
 from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.runs.interrupts import BAD_INPUT, was_interrupted

@@ -21,15 +21,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lcc_rl.config import check_overrides
 from lcc_rl.config.schemas import FORMATS
+from lcc_rl.config.words import check_overrides
 from lcc_rl.io.atomic import own_folder
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.states import claim
 from lcc_rl.studies import ring, road
-from lcc_rl.studies.alcc import results as alcc_results
 from lcc_rl.studies.alcc import study as alcc
-from lcc_rl.studies.hcfs import results as hcfs_results
 from lcc_rl.studies.hcfs import study as hcfs
 from lcc_rl.studies.study import RESULTS_PAGE, Study, StudyResults
 
@@ -53,8 +51,8 @@ OWN_FOLDER_WORDS = (
     "the variants"
 )
 STUDY_RESULTS: dict[str, Callable[..., StudyResults]] = {
-    "alcc": alcc_results.study_results,
-    "hcfs": hcfs_results.study_results,
+    "alcc": alcc.study_results,
+    "hcfs": hcfs.study_results,
     "ring": ring.study_results,
     "road": road.study_results,
 }

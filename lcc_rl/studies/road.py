@@ -17,7 +17,8 @@ import pandas as pd
 
 from lcc_rl.commands.evaluation import complete
 from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, read_once
-from lcc_rl.config import key_of, load, quoted, top_key, with_inputs
+from lcc_rl.config.compose import load, with_inputs
+from lcc_rl.config.words import key_of, quoted, top_key
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.figures.evaluation import measures_of
 from lcc_rl.functional.pattern import HUMAN

@@ -267,7 +267,7 @@ def cast(kind: torch.dtype) -> Callable[[dict], None]:
 
 def spoil_optimizer(state: dict) -> None:
     agent = state["agent"]
-    steps = agent.get("optimizer") or next(iter(agent["optimizers"].values()))
+    steps = agent.get("optimizer") or agent["all"]
     steps["state"][0]["exp_avg"].view(-1)[0] = torch.nan
 
 

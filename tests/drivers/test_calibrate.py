@@ -20,7 +20,7 @@ from lcc_rl.functional.laws import LAWS
 from lcc_rl.io.files import parquet_metadata
 from lcc_rl.pieces import CalibratedDrivers
 from lcc_rl.pieces.world import World
-from lcc_rl.runs.progress import Phases
+from lcc_rl.runs.progress import phases
 
 
 @pytest.fixture
@@ -153,12 +153,12 @@ def test_the_report_counts_records_and_drivers(cfg, source, tmp_path):
 
 def test_phases_report_lines_with_the_time_left_where_there_is_no_terminal():
     lines, quiet = [], Console(file=io.StringIO())
-    with Phases("calibration", quiet, lines.extend, every=0.0) as progress:
+    with phases("calibration", quiet, lines.extend, every=0.0) as progress:
         for phase in ("generations", "reactions tried"):
             for done in (1, 2):
                 progress(done, 2, phase)
     assert lines[-1] == "calibration: reactions tried: 2/2  ETA 0:00"
     assert len(lines) == 4
-    with Phases("calibration", quiet, lines.extend) as progress:
+    with phases("calibration", quiet, lines.extend) as progress:
         progress(1, 2, "generations")
     assert len(lines) == 4

@@ -99,7 +99,7 @@ def test_draws_in_groups_give_intervals_of_the_same_width(known, monkeypatch):
     records = noisy(*known, "acceleration")
     widths = []
     for samples in (2**23, 1):
-        monkeypatch.setattr("lcc_rl.drivers.intervals.SAMPLES_AT_ONCE", samples)
+        monkeypatch.setattr("lcc_rl.drivers.fit_error.SAMPLES_AT_ONCE", samples)
         found = Calibrator()(records).drivers
         widths.append(found["time_gap_s_high"] - found["time_gap_s_low"])
     assert 0.6 < (widths[1] / widths[0]).median() < 1.6

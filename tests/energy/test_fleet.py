@@ -6,7 +6,7 @@ from helpers import check_refused, compose, make_agent, slow_but, small_env, ste
 
 import lcc_rl
 from lcc_rl.agents.actor import shared_policy
-from lcc_rl.config import identity, load
+from lcc_rl.config.compose import identity, load
 from lcc_rl.config.nodes import as_plain
 from lcc_rl.energy import CirclesFuel, ElectricCar, EnergyModel, Fleet, PaperMotor, VehicleClass
 from lcc_rl.envs import DifferentiableRollout, StringCollector

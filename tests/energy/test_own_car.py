@@ -12,7 +12,7 @@ from page_blocks import ROOT, blocks
 from scipy.interpolate import RegularGridInterpolator
 
 from lcc_rl.pieces.base import Piece
-from lcc_rl.results.units import in_unit
+from lcc_rl.results.task import in_unit
 
 
 def test_the_car_of_the_page_draws_what_its_map_says(tmp_path) -> None:

@@ -18,7 +18,7 @@ from lcc_rl.config import load
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.envs import Inputs
 from lcc_rl.errors import ResultsError
-from lcc_rl.evaluation.blocks import BLOCKS, Store
+from lcc_rl.evaluation.comparison import BLOCKS, Store
 from lcc_rl.evaluation.episodes import Episodes, Plan, evaluate
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.figures import evaluation as figures

@@ -13,8 +13,7 @@ from lcc_rl.commands.simulate import main
 from lcc_rl.config import load
 from lcc_rl.data.profiles import from_records, no_profiles
 from lcc_rl.data.sources import ASSETS
-from lcc_rl.drivers.population import bootstrap
-from lcc_rl.drivers.tables import SHIPPED_DRIVERS
+from lcc_rl.drivers.population import SHIPPED_DRIVERS, bootstrap
 from lcc_rl.envs import Inputs
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.episodes import evaluate

@@ -14,9 +14,9 @@ from tensordict.nn import TensorDictModule
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation import strategies
+from lcc_rl.evaluation.entrants import check_distinct, named_apart
 from lcc_rl.evaluation.fit import check_policy
 from lcc_rl.evaluation.named import TUNED
-from lcc_rl.evaluation.naming import check_distinct, named_apart
 from lcc_rl.evaluation.strategies import Strategy, baseline, trained
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import Piece

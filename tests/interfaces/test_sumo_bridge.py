@@ -14,7 +14,7 @@ import torch
 from helpers import check_refused, play
 from torch import Tensor
 
-from benchmarks import sumo
+from benchmarks import string
 from lcc_rl.config import load
 from lcc_rl.config.nodes import Node
 from lcc_rl.data.profiles import from_records
@@ -70,7 +70,7 @@ def start(
     folder: Path, cars: dict[str, tuple[float, float]], step: float = STEP, of_type: str = ""
 ) -> None:
     """Start SUMO on a ring of 10 km with vehicles at given places and speeds."""
-    sumo.write_network(folder / "net.xml", 10_000.0)
+    string.write_network(folder / "net.xml", 10_000.0)
     rows = [
         f'<vehicle id="{car}" type="t" depart="0" departPos="{place}" departSpeed="{speed}">'
         '<route edges="east west"/></vehicle>'
@@ -216,7 +216,7 @@ def test_sumo_is_imported_without_its_line_about_pyarrow() -> None:
 @pytest.mark.parametrize("driver", [None, "pretrained/ring-22"])
 def test_a_policy_keeps_a_wave_from_growing(driver, tmp_path) -> None:
     cfg = load("evaluate", ["variant=alcc", "task=ring-22"])
-    sumo.start(cfg, tmp_path, cfg.scenario.circumference)
+    string.start(cfg, tmp_path, cfg.scenario.circumference)
     bridge = Bridge(driver, "car0") if driver else None
     noise = np.random.default_rng(0)
     deviation = cfg.scenario.controllers["human"].made().wiener * STEP**0.5

@@ -13,10 +13,10 @@ from commands import NO_AGENT, run_command
 from helpers import slow_but
 
 from lcc_rl.commands.evaluation import made_by
-from lcc_rl.config import identity, load
+from lcc_rl.config.compose import identity, load
 from lcc_rl.config.inputs import inputs_of
 from lcc_rl.config.nodes import as_plain
-from lcc_rl.drivers.tables import load_drivers
+from lcc_rl.drivers.population import load_drivers
 from lcc_rl.envs.inputs import shared_inputs
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import write_parquet

@@ -11,7 +11,7 @@ from commands import UNTRAINED, jobs_in_threads
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.studies import reproduce
-from lcc_rl.studies.alcc.results import ITSELF, study_results
+from lcc_rl.studies.alcc.study import ITSELF, study_results
 
 pytestmark = [pytest.mark.xdist_group("small_study"), pytest.mark.slow]
 

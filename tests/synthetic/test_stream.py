@@ -19,8 +19,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.functional.driver_models import simulate_follower
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.power import motor_power
-from lcc_rl.synthetic.lane import Stream, draw_drivers
-from lcc_rl.synthetic.stream import StreamSource, as_recorded
+from lcc_rl.synthetic.stream import Stream, StreamSource, as_recorded, draw_drivers
 
 SMALL: dict[str, Any] = {"recordings": 2, "platoons": 4, "vehicles": 3, "duration_s": (35.0, 50.0)}
 QUANTILES = [0.05, 0.25, 0.5, 0.75, 0.95]

@@ -19,15 +19,11 @@ import torch
 
 from benchmarks import harness
 from benchmarks.calibrate import calibrate
-from benchmarks.collect import collect
-from benchmarks.env import env
-from benchmarks.gym import gym
+from benchmarks.env import collect, env, gym
 from benchmarks.harness import EXTRA, Row, installed, page, table
-from benchmarks.jobs import analytic, evaluate, train
+from benchmarks.jobs import analytic, evaluate, train, update
 from benchmarks.read import loading, read, start
-from benchmarks.simulate import simulate
-from benchmarks.string import string
-from benchmarks.update import update
+from benchmarks.string import simulate, string
 from lcc_rl.data.tables import TableFile
 from lcc_rl.errors import how_to_install, require_known
 from lcc_rl.io.atomic import new_file
