@@ -210,7 +210,8 @@ def test_switching_has_the_colour_of_the_controller_that_drives() -> None:
         for t in range(4)
     ]
     figure = switching(pd.DataFrame(rows), "case 1")
-    assert "case 1: HCFS (policy 42 %)" in texts(figure) and "\nrule\n" in texts(figure)
+    assert "case 1: HCFS (policy 42 %)" in texts(figure)
+    assert "\nrule\n" in texts(figure)
     figure.canvas.draw()
     image = np.asarray(figure.canvas.buffer_rgba())[..., :3] / 255.0
     colours = np.array([to_rgb(hue) for hue in WINNER_COLOURS.values()])
