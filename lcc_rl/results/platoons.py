@@ -88,12 +88,12 @@ PLATOON = [
     Measure("clamps", "jerk clamps", form="{:.1f}"),
     Measure("cap_interventions", "safe-cap interventions", form="{:.1f}"),
 ]
-BELOW = "sums over followers and frames, means over runs"
+BELOW = "sums over followers and frames, means over runs; collisions: cars in all runs"
 
 
 def case_report(rows: pd.DataFrame, case: str, of: str = "") -> Report:
     """Return the report of a case of a platoon, from rows of episodes.parquet."""
-    table = with_drivers(case_table(rows, case))
+    table = with_drivers(case_table(rows, case)).astype({"collisions": int})
     shown = [Shown(one.key, one.short) for one in PLATOON if one.short]
     short = shortened(table.drop(columns=["reward_low", "reward_high"]), shown)
     caption = f"{BELOW}; {ALL}"
