@@ -66,6 +66,7 @@ def test_help_fits_80_columns(tmp_path, monkeypatch, subtests) -> None:
 QUICK_TO_START = [  # what is done, what is not loaded for it, and what is printed
     (["train", "--help-all"], HEAVY | TABLES, "calibration: both, energy, global, local"),
     (["train", "-h", "agent=td3"], HEAVY | TABLES, "td3             analytic, ddpg"),
+    (["simulate", "-h"], HEAVY, "--string"),
     (["status", "."], HEAVY | TABLES, "1 finished"),
     (["from lcc_rl import results; print(results.load('.')['seed'].tolist())"], HEAVY, "[3]"),
     (

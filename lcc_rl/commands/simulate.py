@@ -15,10 +15,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from lcc_rl.config.schemas import TimeStep
-from lcc_rl.evaluation.simulation import simulate
 from lcc_rl.io.atomic import new_file
 from lcc_rl.io.files import write_table
 from lcc_rl.runs.arguments import TABLE, Arguments, files_and_settings, typed
+from lcc_rl.runs.interrupts import ending_quietly
 from lcc_rl.settings import Count, Positive, Seed
 
 ARGUMENTS: dict[str, tuple[Callable[[str], Any], str]] = {
@@ -47,6 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     leaders, settings = files_and_settings(options.pop("words"))
     given = {name: value for name, value in options.items() if value is not None}
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    with ending_quietly():  # loads torch
+        from lcc_rl.evaluation.simulation import simulate
     found = simulate(leaders or None, overrides=settings, **given)
     shown = found.vehicles.loc[: MOST_ROWS - 1, :LAST_SHOWN]
     print(shown.to_string(index=False, float_format="{:,.4g}".format))

@@ -243,20 +243,21 @@ def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
         DataError: if the table has another time step, or no episode.
     """
     records, names, recordings, followers = [], [], [], []
-    for number, episode in episodes.groupby("episode", sort=True):
-        time = episode["time_s"].to_numpy()
+    columns = [episodes[name].to_numpy() for name in ("time_s", "recording", "leader_id")]
+    speeds = episodes["leader_speed_mps"].to_numpy(np.float32)
+    behind = episodes[["follower_speed_mps", "gap_m"]].to_numpy(np.float32)
+    for number, rows in episodes.groupby("episode", sort=True).indices.items():
+        time, recording, leader = (column[rows] for column in columns)
         if len(time) > 1 and not np.allclose(np.diff(time), time_step, atol=0.1 * time_step):
             raise DataError(
                 f"episode {number}: samples are {np.median(np.diff(time)):g} s apart (or not "
                 f"evenly spaced), but scenario.time_step={time_step:g}: leaders are played at the "
                 "rate at which they were recorded; remove the setting"
             )
-        recording, leader = str(episode["recording"].iloc[0]), int(episode["leader_id"].iloc[0])
-        records.append(torch.tensor(episode["leader_speed_mps"].to_numpy(np.float32)))
-        names.append(f"{recording}/{leader}@{time[0]:.1f}s")
-        recordings.append(recording)
-        behind = episode[["follower_speed_mps", "gap_m"]].to_numpy(np.float32)
-        followers.append(torch.from_numpy(behind))
+        records.append(torch.from_numpy(speeds[rows]))
+        names.append(f"{recording[0]}/{int(leader[0])}@{time[0]:.1f}s")
+        recordings.append(str(recording[0]))
+        followers.append(torch.from_numpy(behind[rows]))
     return from_records(records, names, recordings, time_step, followers)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -20,6 +20,9 @@ from lcc_rl.envs.single import VIEWS, MultiAgent, SingleAgent, group_key
 from lcc_rl.envs.step import DONE, Step, closure, entries_of, leaf_keys, pieces_of, read_before
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.pieces.base import NEXT, Key, State, as_key, root_key
+
+# Plain resets, 2 ms each, before they are compiled, which takes 3 to 7 s.
+PLAIN_RESETS = 2_000
 
 
 class StringCollector(BaseCollector):
@@ -92,6 +95,7 @@ class StringCollector(BaseCollector):
         self.renew = Compiled(self._renewed, "its resets", compiled, env.device)
         # Number of episodes of a compiled reset, about twice as many as end in a step.
         self.rows = min(episodes, max(32, episodes // 64)) if compiled else 0
+        self.resets = 0
 
     def _asked(self, keys: Sequence[NestedKey] | None, state: list[Key]) -> list[Key]:
         """Return the leaves of a batch; by default all entries before and after a step."""
@@ -136,7 +140,7 @@ class StringCollector(BaseCollector):
             self.state, entries, over = self.advance(self.state)
             record.append(entries)
             if over:
-                self.state = self._renew(self.state, self.renew, self.rows)
+                self.state = self._renew(self.state)
         self._frames += self.requested_frames_per_batch
         self._iter += 1
         batch = self.env.batch_size
@@ -172,14 +176,16 @@ class StringCollector(BaseCollector):
         inner = self._inner(key)
         return state[key] if inner == key else state[inner].squeeze(-2)
 
-    def _renew(self, state: State, renewed: Callable[..., State], size: int = 0) -> State:
-        """Begin new episodes where one is over, ``size`` at a time; 0: all at once."""
+    def _renew(self, state: State) -> State:
+        """Begin new episodes where one is over, ``rows`` at a time; 0: all at once."""
         rows = state[DONE].flatten().nonzero().flatten()
         seeds = self.env.base_env.draw_seeds().view(-1, 1)[rows]
-        for first in range(0, len(rows), size or len(rows)):
+        size = self.rows or len(rows)
+        for first in range(0, len(rows), size):
             # Missing episodes are filled by repeating the last one, which is written twice.
-            last = first + (size or len(rows))
-            places = torch.arange(first, last, device=rows.device).clamp(max=len(rows) - 1)
+            places = torch.arange(first, first + size, device=rows.device).clamp(max=len(rows) - 1)
+            self.resets += 1
+            renewed = self.renew if self.resets > PLAIN_RESETS else self._renewed
             state = renewed(state, rows[places], seeds[places])
         return state
 
@@ -189,7 +195,8 @@ class StringCollector(BaseCollector):
 
         def put(value: Tensor, new: Tensor) -> Tensor:
             flat = value.reshape(-1, *new.shape[1:])
-            return flat.index_put((rows,), new).view(value.shape)
+            renewed = flat.index_put((rows,), new).view(value.shape)
+            return torch.empty_like(value).copy_(renewed)  # other strides need another graph
 
         return {key: put(value, fresh[key]) for key, value in state.items()}
 
@@ -205,11 +212,12 @@ class StringCollector(BaseCollector):
     def state_dict(self) -> OrderedDict[str, Any]:
         """Return the state of the episodes and the number of frames played."""
         state = {".".join(key): value for key, value in self.state.items()}
-        return OrderedDict(frames=self._frames, iter=self._iter, state=state)
+        return OrderedDict(frames=self._frames, iter=self._iter, resets=self.resets, state=state)
 
     def load_state_dict(self, state_dict: OrderedDict[str, Any]) -> None:
         """Restore the result of :meth:`state_dict`."""
         self._frames, self._iter = state_dict["frames"], state_dict["iter"]
+        self.resets = state_dict["resets"]
         self.state = {tuple(key.split(".")): value for key, value in state_dict["state"].items()}
 
     def shutdown(

@@ -8,11 +8,13 @@ import pytest
 import torch
 from helpers import TERMS, check_refused, compose, make_agent, single_env, small_env, string
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch._dynamo.utils import counters
 from torchrl.collectors import BaseCollector, Collector
 
 from lcc_rl.agents.actor import GaussianExploration, shared_policy
 from lcc_rl.agents.collecting import LEARNED_FROM
 from lcc_rl.envs import StringCollector
+from lcc_rl.envs.collector import PLAIN_RESETS
 from lcc_rl.envs.step import Step, pieces_of
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces.base import SEED, as_key
@@ -112,19 +114,15 @@ def test_an_environment_may_be_made_by_a_function_and_its_state_restored() -> No
 
     one = StringCollector(lambda: small_env("alcc", 4), policy(), frames_per_batch=40)
     segments(one)
+    one.resets = PLAIN_RESETS + 1  # compiled from here on
     state = one.state_dict()
     expected = segments(one)
     two = StringCollector(lambda: small_env("alcc", 4), policy(), frames_per_batch=40)
     two.load_state_dict(state)
+    assert two.resets == PLAIN_RESETS + 1
     assert torch.equal(segments(two), expected)
 
 
-def first(env, **settings):
-    return next(iter(StringCollector(env, policy(), keys=KEYS, **settings)))
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of the compiler's own making
 def test_what_cannot_be_collected_is_refused() -> None:
     cases = [
         (small_env("alcc", 4, [string("human*3")]), 40, "no vehicle of the string is automated"),
@@ -137,15 +135,22 @@ def test_what_cannot_be_collected_is_refused() -> None:
     check_refused(collect, cases, ConfigError)
 
 
-def test_compiled_agrees_and_repeats_itself() -> None:
-    env = ["scenario.horizon=100"]
-    plain = first(small_env("alcc", 8, env), frames_per_batch=800)
-    one, two = (
-        first(small_env("alcc", 8, env), frames_per_batch=800, compiled=True) for _ in range(2)
-    )
-    for key in plain.keys(True, True):
-        torch.testing.assert_close(one[key], plain[key], rtol=1e-4, atol=1e-4)
-        assert torch.equal(one[key], two[key]), key
+def test_compiled_agrees_and_repeats_itself_past_an_end() -> None:
+    def collector(compiled: bool):
+        env = small_env("alcc", 1, ["scenario.horizon=80"])
+        return StringCollector(env, policy(), frames_per_batch=50, keys=KEYS, compiled=compiled)
+
+    collectors = [collector(compiled) for compiled in (False, True, True)]
+    begun = [source.collect() for source in collectors]
+    graphs = counters["stats"]["unique_graphs"]
+    assert graphs
+    ended = [source.collect() for source in collectors]
+    assert counters["stats"]["unique_graphs"] == graphs  # a reset needs no other graph
+    assert ended[0]["next", "done"].sum() == 1
+    for plain, one, two in (begun, ended):
+        for key in plain.keys(True, True):
+            torch.testing.assert_close(one[key], plain[key], rtol=1e-4, atol=1e-4)
+            assert torch.equal(one[key], two[key]), key
 
 
 def crashing(compiled: bool, batch: int = 40, seed: int = 0):
@@ -159,10 +164,12 @@ def crashing(compiled: bool, batch: int = 40, seed: int = 0):
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_compiled_replaces_the_episodes_that_end() -> None:
     ours = crashing(True)
+    ours.resets = PLAIN_RESETS - 50  # both kinds
     assert ours.rows < 40  # so that those that all reach the horizon are more than fit
     compiled, plain = ours.collect(), crashing(False).collect()
     assert isinstance(ours.renew.function, type(ours.advance.function))
     assert ours.renew.function is not ours.renew.plain
+    assert ours.resets > PLAIN_RESETS
     assert plain["next", "terminated"].any()
     assert (plain["next", "done"].sum(1) > 1).any()
     # A gap of nearly zero may end an episode a step earlier; from there on the seeds differ.

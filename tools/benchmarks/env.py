@@ -19,6 +19,7 @@ from lcc_rl.agents.agent import Scene
 from lcc_rl.agents.collecting import LEARNED_FROM
 from lcc_rl.agents.loop import REPORTED
 from lcc_rl.envs import StringCollector
+from lcc_rl.envs.collector import PLAIN_RESETS
 from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD
 
 
@@ -144,13 +145,15 @@ def in_training(options: Namespace, policy: Any, batch: int, steps: int, ending:
 
 def collector(env: TransformedEnv, policy: Any, steps: int, compiled: bool) -> Run:
     """Return the training's collection; one call collects so many steps of every environment."""
-    return StringCollector(
+    source = StringCollector(
         env,
         shared_policy(policy),
         frames_per_batch=env.batch_size.numel() * steps,
         keys=(*LEARNED_FROM, *REPORTED),
         compiled=compiled,
-    ).collect
+    )
+    source.resets = PLAIN_RESETS  # as late in a training
+    return source.collect
 
 
 def torchrl_collector(env: TransformedEnv, policy: Any, steps: int, compiled: bool) -> Run:
