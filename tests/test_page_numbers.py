@@ -100,6 +100,15 @@ def at_equal_flow() -> list[str]:
     return [f"network against tuned IDM | {equal_flow(rows, 'alcc', 'idm_acc_filtered'):.1%}"]
 
 
+def trainings() -> list[str]:
+    rows, rule = means("limits_trainings", PATH, "distance_m", FLOW), "idm_acc_filtered"
+    one, three = (
+        sorted(100.0 * equal_flow(rows, f"{limit}_{seed}", rule) for seed in range(3))
+        for limit in ("one", "three")
+    )
+    return [f"need {one[0]:.1f} to {one[2]:.1f}% less", f"below {three[0]:.1f} to {three[2]:.1f}%"]
+
+
 def bounds() -> list[str]:
     found = []
     for source in ("platoons", "stop_and_go"):
@@ -188,6 +197,7 @@ PAGES: dict[str, tuple[Callable[[], list[str]], str]] = {
     "limits, bounds": (bounds, ""),
     "limits": (limits, "| network, `pretrained/alcc_limits` | 528,"),
     "limits, equal flow": (at_equal_flow, "| OpenACC, test track and low speed"),
+    "limits, trainings": (trainings, ""),
     "alcc": (alcc, "| this study |"),
     "hcfs": (hcfs, "| I-80 | HCFS |"),
     "waves": (waves, "| 0.4 s, noise 0.4 m/s² |"),
