@@ -10,7 +10,7 @@ from lcc_rl.config.nodes import nodes_in, takes_action
 from lcc_rl.config.schemas import BaseConfig, StudyConfig, TrainConfig
 from lcc_rl.config.words import RECORDED, key_of, typed_keys
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.pattern import AUTOMATED, RING
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.settings import TARGET
 
 NO_AGENT = ("agent=none", "agent=null")
@@ -21,7 +21,10 @@ OF_EPISODES = (
     *("repeats", "shards", "shard", "drivers", "batch_size", "sample_episodes", "compiled"),
     *("humans_first", "second_energy", "terms"),
 )
+# Groups of files that equip roles, and what they set.
+CHOICES = {"filter": ("filters",), "faults": ("actuators", "sensors")}
 OBSERVATION = "lcc_rl.pieces.Observation"
+FIXED = "no vehicle of this platoon depends on drivers or noise"
 
 
 def check_used(
@@ -48,8 +51,11 @@ def check_used(
             for key in ("visible", "presence"):
                 reasons[f"observation.{key}"] = "observation.scales names no vehicle behind"
         keys = {*OF_COMPARISONS[RECORDED in cfg.evaluation.baselines :]}
-        for key in keys & {*map(key_of, overrides)} if type(cfg) is TrainConfig else ():
-            reasons[key] = "a training evaluates its own policy; lcc-rl evaluate compares"
+        if type(cfg) is TrainConfig:
+            for key in keys & {*map(key_of, overrides)}:
+                reasons[key] = "a training evaluates its own policy; lcc-rl evaluate compares"
+            if is_fixed(cfg) and of_package([cfg.observation, cfg.reward, cfg.agent]):
+                reasons |= dict.fromkeys(("drivers", "evaluation.seed"), FIXED)
         reasons["sweep"] = "it names the folder of a sweep, -m"
     if written is not None and cfg.agent is not None and "surrogates" in cfg.agent.settings:
         typed = set().union(*map(typed_keys, overrides))
@@ -68,6 +74,21 @@ def refuse(overrides: Iterable[str], reasons: Mapping[str, str]) -> None:
             for key in typed_keys(option):
                 if key == unused or key.startswith(f"{unused.removesuffix('.')}."):
                     raise ConfigError(f"{option.removeprefix('++')} has no effect: {reason}")
+
+
+def of_package(part: Any) -> bool:
+    """Return whether all nodes in a part of a configuration are of classes of the package."""
+    return all(str(node.settings[TARGET]).startswith("lcc_rl.") for node in nodes_in(part))
+
+
+def is_fixed(cfg: StudyConfig, further: Sequence[Any] = ()) -> bool:
+    """Return whether a platoon, with further controllers, depends on no drivers and no noise."""
+    scenario = cfg.scenario
+    if cfg.evaluation.rows != "vehicles" or {*scenario.vehicles.names} != {AUTOMATED}:
+        return False
+    own = scenario.with_(controllers={HUMAN: None}, start={HUMAN: None})
+    nodes = nodes_in([own, cfg.deployed, *further])
+    return all(getattr(node.kind, "__dict__", {}).get("steady") for node in nodes)
 
 
 def _of_road(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
@@ -95,6 +116,10 @@ def _of_rows(cfg: StudyConfig, sweep: bool) -> Iterator[tuple[str, str]]:
 
 def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
     """Yield settings of roles without vehicles, and why they have no effect."""
+    for choice, groups in CHOICES.items():
+        roles = {role for group in groups for role in getattr(cfg.scenario, group)}
+        if roles and not roles & {*cfg.scenario.vehicles.names}:
+            yield choice, f"no vehicle of the string is {' or '.join(sorted(roles))}"
     for group in ("controllers", "start", "filters", "actuators", "sensors"):
         for role in {*getattr(cfg.scenario, group)} & {*cfg.scenario.controllers}:
             if role not in cfg.scenario.vehicles.names:
@@ -124,7 +149,7 @@ def _of_agent(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
         reason = "no vehicle of the string is automated"
     elif driver is not None and not takes_action(driver):
         reason += f": {driver.name} drives the automated vehicles and uses no action of a policy"
-    for key in ("agent", "training"):
+    for key in ("agent", "training", *["policy"] * (cfg.policy is not None)):
         yield key, reason
 
 

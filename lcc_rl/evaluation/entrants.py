@@ -14,7 +14,7 @@ from typing import Any
 from lcc_rl.config.compose import NOT_IDENTITY
 from lcc_rl.config.nodes import Node, as_plain, nodes_in
 from lcc_rl.config.schemas import AUTO, EvaluateConfig, StudyConfig
-from lcc_rl.config.unused import refuse
+from lcc_rl.config.unused import FIXED, is_fixed, of_package, refuse
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError, require
@@ -31,7 +31,7 @@ from lcc_rl.evaluation.strategies import (
     studied,
     trained,
 )
-from lcc_rl.functional.pattern import AUTOMATED, HUMAN
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
 from lcc_rl.results.runs import POLICY, flatten
@@ -76,9 +76,12 @@ class Entrants:
         self.rivals, self.paths = self._compared()
         self._check_used(typed)
         self.policy, self.policies = self._read_policies()
-        learned = self.policy and self.policy[1].agent.name
-        if learned and learned != cfg.agent.name:
-            refuse(typed, {"agent": f"the policy has the agent of its training, {learned}"})
+        read = [self.policy] if self.policy else self.policies
+        agents = sorted({training.agent.name for _, training in read})
+        idle = self.policy or not (self.own or self.further)
+        if cfg.agent is not None and cfg.agent.name not in agents and idle:
+            reason = f"the policy has the agent of its training, {' or '.join(agents)}"
+            refuse(typed, {"agent": reason if agents else "no row is a policy"})
         check_installed(cfg, list(self.rivals.values()))
         recorded = RECORDED in {*self.rivals, *cfg.evaluation.baselines}
         for asked in [] if recorded else self._limits_of_record():
@@ -118,28 +121,27 @@ class Entrants:
         cfg, rivals, named = self.cfg, [*self.rivals.values()], self.cfg.evaluation.baselines
         rows, specs = [*self.rivals, *named], [*rivals, *named]
         unused = {"seed": "it is that of trainings; evaluation.seed draws other noise"}
-        if self._is_fixed(specs):
-            reason = "no vehicle of this platoon depends on drivers or noise"
-            unused |= dict.fromkeys(("seed", "evaluation.seed", "drivers"), reason)
+        if not (self.paths or self.further or DIRECT in specs):
+            if is_fixed(cfg, list(map(controller_of, specs))):
+                unused |= dict.fromkeys(("seed", "evaluation.seed", "drivers"), FIXED)
         if self.own and cfg.learns and cfg.policy is not None:
             unused |= FROM_TRAINING
-        learned = self.paths or self.further or cfg.policy is not None
+        # In a sweep, a rule may have the policy of the other runs.
+        observing = self.further or cfg.policy is not None or (self.own and cfg.learns)
+        learned = self.paths or observing
         if cfg.evaluation.rows == "episodes" and not (cfg.evaluation.terms and learned):
             unused["reward.terms."] = "only rows of policies have it, with evaluation.terms=true"
+            if cfg.evaluation.terms:
+                unused["evaluation.terms"] = "no row is a policy"
+        # A user's controller or piece may read what is observed.
+        drivers = [controller_of(spec) for spec in specs if spec not in (DIRECT, PEOPLE)]
+        laws = any("law" in node.settings for node in nodes_in(drivers))
+        if not observing and not laws and of_package([cfg.scenario, cfg.observation, *drivers]):
+            unused["observation"] = "no row observes; a policy observes as in its training"
         refuse((word for word in typed if not word.startswith("~")), unused)
         if self.own or self.further or cfg.variant in rows or not cfg.automated:
             return
         check_effective(typed, self.rivals or rows, [*rows, *rivals], bool(self.paths))
-
-    def _is_fixed(self, specs: Sequence[Any]) -> bool:
-        """Return whether all rows are of a platoon in which no piece reads drivers or noise."""
-        scenario, others = self.cfg.scenario, self.paths or self.further or DIRECT in specs
-        platoon = self.cfg.evaluation.rows == "vehicles"
-        if others or not platoon or {*scenario.vehicles.names} != {AUTOMATED}:
-            return False
-        own = scenario.with_(controllers={HUMAN: None}, start={HUMAN: None})
-        nodes = nodes_in([own, self.cfg.deployed, *map(controller_of, specs)])
-        return all(getattr(node.kind, "__dict__", {}).get("steady") for node in nodes)
 
     def _of_task(self, path: str) -> str:
         return of_task(path, None if self.task is None else self.task.name)

@@ -197,7 +197,15 @@ def _record(leader: Any, time_step: float) -> Tensor:
             raise ValueError(f"got an array of shape {list(speeds.shape)}")
         if (speeds > Plausible().max_speed).any():
             raise ValueError(f"got {speeds.max():g} m/s; is it in km/h?")
-        return torch.from_numpy(speeds.copy())
+        record = torch.from_numpy(speeds.copy())
+        rate, most = record.diff() / time_step, Plausible().max_acceleration
+        if (record >= 0.0).all() and (rate.abs() > most).any():
+            step = int(rate.abs().argmax())
+            raise ValueError(
+                f"it changes by {rate[step]:.3g} m/s² after {step * time_step:g} s, more than "
+                f"{most:g}; is the time between two speeds time_step={time_step:g}?"
+            )
+        return record
 
 
 def _simulated(strategy: Strategy, inputs: Inputs, repeats: int, seed: int) -> Simulation:

@@ -441,9 +441,9 @@ def shortened(
     With several seeds, collisions are means of a training.
     """
     if table.get("seeds", pd.Series([0])).max() > 1:
-        per = Shown(COLLISIONS.key, f"{COLLISIONS.heading}\n/ seed")
+        per = Shown(f"{COLLISIONS.key}_per_seed", f"{COLLISIONS.heading}\n/ seed")
         shown = [*(per if one == COLLISIONS else one for one in shown), Shown("seeds", "seeds")]
-        table = table.assign(collisions=table["collisions"] / table["seeds"].clip(lower=1))
+        table = table.assign(**{per.key: table["collisions"] / table["seeds"].clip(lower=1)})
     counts = [key for key in ("windows", "drivers") if key in table and table[key].nunique() > 1]
     shown = [*shown, *(Shown(key, key) for key in counts)]
     lost = table.get(FLOW_LOST, pd.Series(np.nan, table.index)) > FLOW_NAMED
