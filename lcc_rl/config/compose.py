@@ -69,7 +69,7 @@ NAMES_HINT = (
 )
 # Groups that no file of the package chooses.
 ADDED = ("event", "faults", "filter", "fleet", "knowledge", "slope")
-OF_NODE = re.compile(r"([\w.: ]+): expected a node with .*, got '(\w+)'$")
+OF_NODE = re.compile(r"([\w.: ]+): expected a node with .*, got (?:'(\w+)'|{.*)$")
 OWN_FILES = re.compile(r"path=(?!pkg://|structured://)")  # in Hydra's search path
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
@@ -352,7 +352,8 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         names = NAMES_HINT if key == "compare" and "{" in value else ""
         return ConfigError(
             f"{typed}: cannot be read as a setting. Brackets must be closed, and text "
-            f"with spaces, commas or signs needs quotes within quotes: \"{key}='…'\"{names}"
+            f"with spaces, commas or signs (= in braces) needs quotes within quotes: "
+            f"\"{key}='…'\"{names}"
         )
     match = re.search(
         r"Could not (override|append to config|delete from config)\S* '([^']+)'", str(error)
@@ -385,8 +386,10 @@ def _groups() -> set[str]:
     return {path.parts[len(folder.parts)] for path in folder.glob("*/**/*.yaml")}
 
 
-def _file_of(key: str, name: str) -> str:
+def _file_of(key: str, name: str | None) -> str:
     """Return how a file of a group is chosen for a node, if there is one of this name."""
+    if name is None:  # settings without a choice
+        return f"choose one, too: {key}={'|'.join(choices(key))}" if choices(key) else ""
     group = next((group for group in sorted(_groups()) if name in choices(group)), "")
     choice = f"{group}@{key.replace(': ', '.')}={name}"
     choice = f"+{group}={name}" if group in ADDED else f"{choice}, or +{choice}"

@@ -21,8 +21,6 @@ OF_EPISODES = (
     *("repeats", "shards", "shard", "drivers", "batch_size", "sample_episodes", "compiled"),
     *("humans_first", "second_energy", "terms"),
 )
-# Groups of files that equip roles, and what they set.
-CHOICES = {"filter": ("filters",), "faults": ("actuators", "sensors")}
 OBSERVATION = "lcc_rl.pieces.Observation"
 FIXED = "no vehicle of this platoon depends on drivers or noise"
 
@@ -77,8 +75,11 @@ def refuse(overrides: Iterable[str], reasons: Mapping[str, str]) -> None:
 
 
 def of_package(part: Any) -> bool:
-    """Return whether all nodes in a part of a configuration are of classes of the package."""
-    return all(str(node.settings[TARGET]).startswith("lcc_rl.") for node in nodes_in(part))
+    """Return whether all nodes in a part of a configuration are of the package's code."""
+    every = (
+        x for node in nodes_in(part) for x in (node.settings[TARGET], node.settings.get("law"))
+    )
+    return all(str(x).startswith("lcc_rl.") for x in every if x is not None)
 
 
 def is_fixed(cfg: StudyConfig, further: Sequence[Any] = ()) -> bool:
@@ -116,14 +117,13 @@ def _of_rows(cfg: StudyConfig, sweep: bool) -> Iterator[tuple[str, str]]:
 
 def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
     """Yield settings of roles without vehicles, and why they have no effect."""
-    for choice, groups in CHOICES.items():
-        roles = {role for group in groups for role in getattr(cfg.scenario, group)}
-        if roles and not roles & {*cfg.scenario.vehicles.names}:
-            yield choice, f"no vehicle of the string is {' or '.join(sorted(roles))}"
     for group in ("controllers", "start", "filters", "actuators", "sensors"):
         for role in {*getattr(cfg.scenario, group)} & {*cfg.scenario.controllers}:
             if role not in cfg.scenario.vehicles.names:
-                yield f"scenario.{group}.{role}", f"no vehicle of the string is {role}"
+                reason = f"no vehicle of the string is {role}"
+                yield f"scenario.{group}.{role}", reason
+                if {*getattr(cfg.scenario, group)} == {role} and group == "filters":
+                    yield "filter", reason
     if AUTOMATED not in cfg.scenario.vehicles.names:
         for name in ("max_braking", "max_acceleration"):
             yield f"scenario.{name}", "no vehicle of the string is automated"

@@ -35,8 +35,6 @@ def typed_keys(override: str) -> set[str]:
     Examples:
         >>> sorted(typed_keys("+a.b={c: 1, d: x}"))
         ['a.b', 'a.b.c', 'a.b.d']
-        >>> sorted(typed_keys("group@a.b=x"))
-        ['a.b', 'group']
     """
     key, _, value = override.lstrip("+~").partition("=")
     inside = re.findall(r"(\w+)\s*:", value) if value.startswith("{") else []

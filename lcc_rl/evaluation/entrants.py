@@ -31,7 +31,6 @@ from lcc_rl.evaluation.strategies import (
     studied,
     trained,
 )
-from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
 from lcc_rl.results.runs import POLICY, flatten
@@ -78,10 +77,10 @@ class Entrants:
         self.policy, self.policies = self._read_policies()
         read = [self.policy] if self.policy else self.policies
         agents = sorted({training.agent.name for _, training in read})
-        idle = self.policy or not (self.own or self.further)
-        if cfg.agent is not None and cfg.agent.name not in agents and idle:
-            reason = f"the policy has the agent of its training, {' or '.join(agents)}"
-            refuse(typed, {"agent": reason if agents else "no row is a policy"})
+        unread = self.policy or not (self.own or self.further)
+        if unread and cfg.learns and cfg.agent.name not in agents:
+            reason = f"a policy has the agent of its training, {' or '.join(agents) or 'if any'}"
+            refuse(typed, {"agent": reason})
         check_installed(cfg, list(self.rivals.values()))
         recorded = RECORDED in {*self.rivals, *cfg.evaluation.baselines}
         for asked in [] if recorded else self._limits_of_record():
@@ -121,9 +120,10 @@ class Entrants:
         cfg, rivals, named = self.cfg, [*self.rivals.values()], self.cfg.evaluation.baselines
         rows, specs = [*self.rivals, *named], [*rivals, *named]
         unused = {"seed": "it is that of trainings; evaluation.seed draws other noise"}
-        if not (self.paths or self.further or DIRECT in specs):
-            if is_fixed(cfg, list(map(controller_of, specs))):
-                unused |= dict.fromkeys(("seed", "evaluation.seed", "drivers"), FIXED)
+        nodes = [controller_of(spec) for spec in specs if spec not in (DIRECT, PEOPLE)]
+        others = self.paths or self.further or {DIRECT, PEOPLE} & {*map(str, specs)}
+        if not others and is_fixed(cfg, nodes):
+            unused |= dict.fromkeys(("seed", "evaluation.seed", "drivers"), FIXED)
         if self.own and cfg.learns and cfg.policy is not None:
             unused |= FROM_TRAINING
         # In a sweep, a rule may have the policy of the other runs.
@@ -134,9 +134,7 @@ class Entrants:
             if cfg.evaluation.terms:
                 unused["evaluation.terms"] = "no row is a policy"
         # A user's controller or piece may read what is observed.
-        drivers = [controller_of(spec) for spec in specs if spec not in (DIRECT, PEOPLE)]
-        laws = any("law" in node.settings for node in nodes_in(drivers))
-        if not observing and not laws and of_package([cfg.scenario, cfg.observation, *drivers]):
+        if not observing and of_package([cfg.scenario, cfg.observation, *nodes]):
             unused["observation"] = "no row observes; a policy observes as in its training"
         refuse((word for word in typed if not word.startswith("~")), unused)
         if self.own or self.further or cfg.variant in rows or not cfg.automated:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from os import PathLike, fspath
 from typing import Any
@@ -15,9 +17,9 @@ from torch import Tensor
 
 from lcc_rl.arrays import times
 from lcc_rl.config import load
-from lcc_rl.config.nodes import Node
+from lcc_rl.config.nodes import Node, as_plain
 from lcc_rl.config.schemas import RewardConfig, StudyConfig, TimeStep
-from lcc_rl.config.words import check_overrides, quoted
+from lcc_rl.config.words import FILTERED, check_overrides, key_of, quoted
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
@@ -44,6 +46,7 @@ from lcc_rl.pieces.connected import MESSAGES
 from lcc_rl.pieces.features import CLASS, GRADE
 from lcc_rl.pieces.rewards import CollisionPenalty
 from lcc_rl.pieces.slope import PLACE
+from lcc_rl.results.runs import flatten
 from lcc_rl.settings import TARGET, Count, Positive, Seed, checked, path_of
 
 log = logging.getLogger("lcc_rl")
@@ -57,7 +60,10 @@ SCENE = {f"scenario.{name}" for name in ("string", "time_step", "horizon")}
 OF_FILES = {"leader", "data"}
 OF_ARGUMENTS = SCENE | {"split", "compare", "policy", "seed", "evaluation", "reward"}
 # Nothing reads the reward; this term fits any scenario.
-UNREAD = RewardConfig(terms={"collision": Node.of({TARGET: path_of(CollisionPenalty)}, "reward")})
+PLACEHOLDER = RewardConfig(
+    terms={"collision": Node.of({TARGET: path_of(CollisionPenalty)}, "reward")}
+)
+UNREAD = "gap_range|^(agent|training|evaluation|reward|observation|data|split|inputs)[.]"
 MOTION = {
     "speed": "speed_mps",
     "gap": "gap_m",
@@ -143,18 +149,31 @@ def simulate(
         *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
     )
-    cfg = load("evaluate", settings).with_(compare={name: spec} if spec else [], reward=UNREAD)
+    cfg = load("evaluate", settings).with_(compare={name: spec} if spec else [], reward=PLACEHOLDER)
     require(
         (cfg.scenario.road == RING) == (leader is None),
         "simulate: a ring (scenario=ring in overrides) has leader=None, an open road has a leader",
     )
     require(cfg.automated or spec is None, "simulate: controller has no vehicle to drive in string")
+    named = any(str(x).endswith(FILTERED) for x in (name, spec)) or spec is None or is_policy(spec)
+    _check_recipe(settings, UNREAD if cfg.automated and named else rf"{UNREAD}|filters\.")
     people = build_drivers(cfg) if table or drivers is None else drivers
     fits = all(hasattr(people, name) for name in POPULATION)
     require(fits, f"drivers: not a population: {in_short(people)}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, spec is None, typed=overrides).strategies(inputs)[-1]
     return _simulated(strategy, inputs, repeats, seed)
+
+
+def _check_recipe(settings: Sequence[str], unread: str) -> None:
+    """Refuse a recipe that sets only what a simulation leaves ``unread``, a regular expression."""
+    for recipe in (word for word in settings if key_of(word) == "experiment"):
+        found = []
+        with suppress(ConfigError):  # other settings need the recipe
+            for words in (settings, [word for word in settings if word != recipe]):
+                every = flatten(as_plain(load("evaluate", words)))
+                found.append([x for x in every if not re.search(unread, x[0])])
+        require(found[0] != found[-1] or len(found) < 2, f"{recipe} has no effect in simulate")
 
 
 def _words(string: str | Mapping[str, Any]) -> str:
@@ -200,11 +219,8 @@ def _record(leader: Any, time_step: float) -> Tensor:
         record = torch.from_numpy(speeds.copy())
         rate, most = record.diff() / time_step, Plausible().max_acceleration
         if (record >= 0.0).all() and (rate.abs() > most).any():
-            step = int(rate.abs().argmax())
-            raise ValueError(
-                f"it changes by {rate[step]:.3g} m/s² after {step * time_step:g} s, more than "
-                f"{most:g}; is the time between two speeds time_step={time_step:g}?"
-            )
+            changes = f"changes by {rate.abs().max():.3g} m/s², max_acceleration={most:g}"
+            raise ValueError(f"{changes}; time_step={time_step:g} is the time between two speeds")
         return record
 
 

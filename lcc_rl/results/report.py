@@ -307,7 +307,8 @@ def report(
     rows = _rows(task, table["against"].iloc[0], shown[1] if task or unit else None)
     text = "" if task else verdict(windows, table, few)
     text = "\n".join(filter(None, [text, few_drives(table)]))
-    notes += [*crashes(table), *filter(None, [flow_note(table), by_ends(table), seeds_note(table)])]
+    seen = table[table["strategy"].isin(short["strategy"])]
+    notes += [*crashes(seen), *filter(None, [flow_note(seen), by_ends(seen), seeds_note(seen)])]
     fields |= {"full_caption": FULL, "verdict": text, "remarks": notes}
     ends = {"_low": "_high", "_high": "_low"}
     bounds = {f"{FLOW_SHARE.key}{x}": -100.0 * table[f"{FLOW_LOST}{y}"] for x, y in ends.items()}
