@@ -352,8 +352,7 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         names = NAMES_HINT if key == "compare" and "{" in value else ""
         return ConfigError(
             f"{typed}: cannot be read as a setting. Brackets must be closed, and text "
-            f"with spaces, commas or signs (= in braces) needs quotes within quotes: "
-            f"\"{key}='…'\"{names}"
+            f"with spaces, commas or signs needs quotes within quotes: \"{key}='…'\"{names}"
         )
     match = re.search(
         r"Could not (override|append to config|delete from config)\S* '([^']+)'", str(error)

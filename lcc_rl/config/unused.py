@@ -49,11 +49,11 @@ def check_used(
             for key in ("visible", "presence"):
                 reasons[f"observation.{key}"] = "observation.scales names no vehicle behind"
         keys = {*OF_COMPARISONS[RECORDED in cfg.evaluation.baselines :]}
-        if type(cfg) is TrainConfig:
-            for key in keys & {*map(key_of, overrides)}:
-                reasons[key] = "a training evaluates its own policy; lcc-rl evaluate compares"
-            if is_fixed(cfg) and of_package([cfg.observation, cfg.reward, cfg.agent]):
-                reasons |= dict.fromkeys(("drivers", "evaluation.seed"), FIXED)
+        training = type(cfg) is TrainConfig
+        for key in keys & {*map(key_of, overrides)} if training else ():
+            reasons[key] = "a training evaluates its own policy; lcc-rl evaluate compares"
+        if training and is_fixed(cfg) and of_package([cfg.observation, cfg.reward, cfg.agent]):
+            reasons |= dict.fromkeys(("drivers", "evaluation.seed"), FIXED)
         reasons["sweep"] = "it names the folder of a sweep, -m"
     if written is not None and cfg.agent is not None and "surrogates" in cfg.agent.settings:
         typed = set().union(*map(typed_keys, overrides))
@@ -76,10 +76,8 @@ def refuse(overrides: Iterable[str], reasons: Mapping[str, str]) -> None:
 
 def of_package(part: Any) -> bool:
     """Return whether all nodes in a part of a configuration are of the package's code."""
-    every = (
-        x for node in nodes_in(part) for x in (node.settings[TARGET], node.settings.get("law"))
-    )
-    return all(str(x).startswith("lcc_rl.") for x in every if x is not None)
+    settings = (node.settings for node in nodes_in(part))
+    return all(str(x.get("law") or x[TARGET]).startswith("lcc_rl.") for x in settings)
 
 
 def is_fixed(cfg: StudyConfig, further: Sequence[Any] = ()) -> bool:
@@ -120,10 +118,8 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
     for group in ("controllers", "start", "filters", "actuators", "sensors"):
         for role in {*getattr(cfg.scenario, group)} & {*cfg.scenario.controllers}:
             if role not in cfg.scenario.vehicles.names:
-                reason = f"no vehicle of the string is {role}"
-                yield f"scenario.{group}.{role}", reason
-                if {*getattr(cfg.scenario, group)} == {role} and group == "filters":
-                    yield "filter", reason
+                for key in (f"scenario.{group}.{role}", *["filter"] * (group == "filters")):
+                    yield key, f"no vehicle of the string is {role}"
     if AUTOMATED not in cfg.scenario.vehicles.names:
         for name in ("max_braking", "max_acceleration"):
             yield f"scenario.{name}", "no vehicle of the string is automated"

@@ -32,7 +32,7 @@ from lcc_rl.evaluation.strategies import (
     trained,
 )
 from lcc_rl.results.names import in_words
-from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
+from lcc_rl.results.policies import load_policy, of_task
 from lcc_rl.results.runs import POLICY, flatten
 from lcc_rl.results.sweeps import labels
 from lcc_rl.runs.states import CONFIG, run_folders
@@ -66,8 +66,6 @@ class Entrants:
         typed: Sequence[str] = (),
     ) -> None:
         self.cfg, self.further, self.task = cfg, further or {}, task_of(cfg)
-        if cfg.policy not in (None, PRETRAINED) and not cfg.learns and cfg.automated:
-            raise ConfigError(f"variant {cfg.variant} has no agent: remove policy={cfg.policy}")
         only_named = bool(cfg.compare) and cfg.policy is None and cfg.learns
         self.own = own and not only_named
         if self.own and cfg.automated:
@@ -79,8 +77,8 @@ class Entrants:
         agents = sorted({training.agent.name for _, training in read})
         unread = self.policy or not (self.own or self.further)
         if unread and cfg.learns and cfg.agent.name not in agents:
-            reason = f"a policy has the agent of its training, {' or '.join(agents) or 'if any'}"
-            refuse(typed, {"agent": reason})
+            reason = f"the policy has the agent of its training, {' or '.join(agents)}"
+            refuse(typed, {"agent": reason if agents else "no row is a policy"})
         check_installed(cfg, list(self.rivals.values()))
         recorded = RECORDED in {*self.rivals, *cfg.evaluation.baselines}
         for asked in [] if recorded else self._limits_of_record():
@@ -126,7 +124,7 @@ class Entrants:
             unused |= dict.fromkeys(("seed", "evaluation.seed", "drivers"), FIXED)
         if self.own and cfg.learns and cfg.policy is not None:
             unused |= FROM_TRAINING
-        # In a sweep, a rule may have the policy of the other runs.
+        # Also for a rule with the policy of a sweep's other runs.
         observing = self.further or cfg.policy is not None or (self.own and cfg.learns)
         learned = self.paths or observing
         if cfg.evaluation.rows == "episodes" and not (cfg.evaluation.terms and learned):
@@ -223,8 +221,7 @@ def check_effective(
         specs: names of all controllers.
         learned: whether a row is a policy.
     """
-    unused = {AUTO: "every controller is named and has its own settings"}
-    unused |= FROM_TRAINING
+    unused = FROM_TRAINING | {AUTO: "every controller is named and has its own settings"}
     if not learned and not any(str(x).endswith(FILTERED) for x in specs):
         reason = f"nothing drives behind the filter ({', '.join(rows)}); "
         reason += f"it needs a name that ends in {FILTERED}"

@@ -166,7 +166,7 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     """
     if cfg.task is not None or Path(path).parts[:1] == (PRETRAINED,):
         return ""
-    changed = [x for x in TRAFFIC_NODES if _contents(own, x).isdisjoint(_contents(cfg, x))]
+    changed = [x for x in TRAFFIC_NODES if _hashes(own, x, True).isdisjoint(_hashes(cfg, x))]
     if not changed:
         return ""
     nodes = {name: getattr(own, name) for name in changed}
@@ -179,13 +179,13 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     )
 
 
-def _contents(cfg: StudyConfig, name: str) -> set[str]:
-    """Return hashes of a node: as given, of its files' contents, and of what they are copies of."""
+def _hashes(cfg: StudyConfig, name: str, copies: bool = False) -> set[str]:
+    """Return hashes of a node, of its files' contents and, for ``copies``, of their originals."""
     node, files = as_plain(getattr(cfg, name)), cfg.inputs.get(name)
     hashes = {config_hash(node), config_hash([node, files])}
     if files:
         hashes.add(config_hash([{**node, "path": None}, sorted(files.values())]))
-    for file in (x for x in map(Path, files or ()) if x.suffix == ".parquet" and x.is_file()):
+    for file in (x for x in files or () if copies and x.endswith(".parquet") and Path(x).is_file()):
         hashes |= {x for key, x in parquet_metadata(file).items() if key == MADE}
     return hashes
 

@@ -60,10 +60,8 @@ SCENE = {f"scenario.{name}" for name in ("string", "time_step", "horizon")}
 OF_FILES = {"leader", "data"}
 OF_ARGUMENTS = SCENE | {"split", "compare", "policy", "seed", "evaluation", "reward"}
 # Nothing reads the reward; this term fits any scenario.
-PLACEHOLDER = RewardConfig(
-    terms={"collision": Node.of({TARGET: path_of(CollisionPenalty)}, "reward")}
-)
-UNREAD = "gap_range|^(agent|training|evaluation|reward|observation|data|split|inputs)[.]"
+UNREAD = RewardConfig(terms={"collision": Node.of({TARGET: path_of(CollisionPenalty)}, "reward")})
+IDLE = "gap_range|^(agent|training|evaluation|reward|observation|data|split|inputs)[.]"
 MOTION = {
     "speed": "speed_mps",
     "gap": "gap_m",
@@ -149,14 +147,14 @@ def simulate(
         *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
     )
-    cfg = load("evaluate", settings).with_(compare={name: spec} if spec else [], reward=PLACEHOLDER)
+    cfg = load("evaluate", settings).with_(compare={name: spec} if spec else [], reward=UNREAD)
     require(
         (cfg.scenario.road == RING) == (leader is None),
         "simulate: a ring (scenario=ring in overrides) has leader=None, an open road has a leader",
     )
     require(cfg.automated or spec is None, "simulate: controller has no vehicle to drive in string")
     named = any(str(x).endswith(FILTERED) for x in (name, spec)) or spec is None or is_policy(spec)
-    _check_recipe(settings, UNREAD if cfg.automated and named else rf"{UNREAD}|filters\.")
+    _check_recipe(settings, IDLE if cfg.automated and named else rf"{IDLE}|filters\.")
     people = build_drivers(cfg) if table or drivers is None else drivers
     fits = all(hasattr(people, name) for name in POPULATION)
     require(fits, f"drivers: not a population: {in_short(people)}")
@@ -165,14 +163,14 @@ def simulate(
     return _simulated(strategy, inputs, repeats, seed)
 
 
-def _check_recipe(settings: Sequence[str], unread: str) -> None:
-    """Refuse a recipe that sets only what a simulation leaves ``unread``, a regular expression."""
+def _check_recipe(settings: Sequence[str], idle: str) -> None:
+    """Refuse a recipe that sets only keys that are ``idle``, a regular expression."""
     for recipe in (word for word in settings if key_of(word) == "experiment"):
         found = []
         with suppress(ConfigError):  # other settings need the recipe
             for words in (settings, [word for word in settings if word != recipe]):
                 every = flatten(as_plain(load("evaluate", words)))
-                found.append([x for x in every if not re.search(unread, x[0])])
+                found.append([x for x in every if not re.search(idle, x[0])])
         require(found[0] != found[-1] or len(found) < 2, f"{recipe} has no effect in simulate")
 
 
@@ -216,11 +214,11 @@ def _record(leader: Any, time_step: float) -> Tensor:
             raise ValueError(f"got an array of shape {list(speeds.shape)}")
         if (speeds > Plausible().max_speed).any():
             raise ValueError(f"got {speeds.max():g} m/s; is it in km/h?")
-        record = torch.from_numpy(speeds.copy())
-        rate, most = record.diff() / time_step, Plausible().max_acceleration
-        if (record >= 0.0).all() and (rate.abs() > most).any():
-            changes = f"changes by {rate.abs().max():.3g} m/s², max_acceleration={most:g}"
-            raise ValueError(f"{changes}; time_step={time_step:g} is the time between two speeds")
+        record, most = torch.from_numpy(speeds.copy()), Plausible().max_acceleration
+        rate = record.diff().abs() / time_step
+        if (record >= 0.0).all() and (rate > most).any():
+            changes = f"changes by {rate.max():.3g} m/s², max_acceleration={most:g}"
+            raise ValueError(f"{changes}; give the time between two speeds, time_step=…")
         return record
 
 
