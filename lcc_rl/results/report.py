@@ -294,7 +294,7 @@ def report(
     if task:
         task = replace(task, against=against) if against else task.among(windows["strategy"])
         task = replace(task, unit=unit or task.unit).resolved(windows)
-    table, notes = summary(windows, task, energy, against), remarks(windows)
+    table = summary(windows, task, energy, against)
     percent = {
         f"{shown}{end}": 100.0 * table[f"{key}{end}"]
         for key, shown in SAVINGS.items()
@@ -307,8 +307,9 @@ def report(
     rows = _rows(task, table["against"].iloc[0], shown[1] if task or unit else None)
     text = "" if task else verdict(windows, table, few)
     text = "\n".join(filter(None, [text, few_drives(table)]))
-    seen = table[table["strategy"].isin(short["strategy"])]
-    notes += [*crashes(seen), *filter(None, [flow_note(seen), by_ends(seen), seeds_note(seen)])]
+    seen, shown_windows = (x[x["strategy"].isin(short["strategy"])] for x in (table, windows))
+    notes = [*remarks(shown_windows), *crashes(seen)]
+    notes += filter(None, [flow_note(seen), by_ends(seen), seeds_note(seen)])
     fields |= {"full_caption": FULL, "verdict": text, "remarks": notes}
     ends = {"_low": "_high", "_high": "_low"}
     bounds = {f"{FLOW_SHARE.key}{x}": -100.0 * table[f"{FLOW_LOST}{y}"] for x, y in ends.items()}

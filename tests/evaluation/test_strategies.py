@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from commands import tiny
 from helpers import ACTION, POPULATION, check_refused, compose, wavy_profiles
 from tensordict.nn import TensorDictModule
 
+from lcc_rl.commands.pipeline import _episodes, read_once
+from lcc_rl.config.compose import with_inputs
+from lcc_rl.data.sources import ASSETS
+from lcc_rl.drivers.population import SHIPPED_DRIVERS
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation import strategies
 from lcc_rl.evaluation.entrants import check_distinct, named_apart
-from lcc_rl.evaluation.fit import check_policy
+from lcc_rl.evaluation.fit import check_policy, other_traffic
 from lcc_rl.evaluation.named import TUNED
 from lcc_rl.evaluation.strategies import Strategy, baseline, trained
 from lcc_rl.functional.pattern import AUTOMATED
@@ -103,6 +109,23 @@ def test_a_policy_of_other_settings_is_refused() -> None:
         ("alcc", "scenario.time_step=0.2", "scenario.time_step=0.2, got 0.1"),
     ]
     check_refused(lambda *words: check_policy(cfg, compose(*words)), cases, ConfigError)
+
+
+def test_files_of_a_pipeline_are_those_that_it_was_given(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.parquet", "b.parquet"):
+        shutil.copy(ASSETS / SHIPPED_DRIVERS, name)
+    job, drivers = tiny("pipeline"), ("variant=alcc", "drivers=calibrated")
+    read_once(job, Path())
+    given = {"data": _episodes(job, Path())}
+    own = with_inputs(tiny("train", *drivers, "drivers.path=a.parquet").with_(**given))
+    for path in ("a.parquet", tmp_path / "b.parquet"):
+        words = (*drivers, f"drivers.path={path}")
+        assert not other_traffic("p.pt", own, tiny("evaluate", *words))
+        found = other_traffic(
+            "p.pt", own, tiny("evaluate", *words, "data.seed=3", "drivers.mode=global")
+        )
+        assert "other data (path=trajectories.parquet), drivers (path=a.parquet): use" in found
 
 
 class Trend(Piece):
