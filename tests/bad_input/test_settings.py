@@ -191,8 +191,8 @@ def test_options_without_effect_are_refused() -> None:
     }
     for typed, why in idle.items():
         cases += [(lambda x=typed: lcc_rl.compare("acc", overrides=[x]), f"{typed} has.*{why}")]
-    own = "agent=ppo has no effect: the policy has the agent of its training, analytic"
-    cases += [(lambda: lcc_rl.compare("pretrained/alcc", overrides=["agent=ppo"]), own)]
+    of_it = "agent=ppo has no effect: the policy has the agent of its training, analytic"
+    cases += [(lambda: lcc_rl.compare("pretrained/alcc", overrides=["agent=ppo"]), of_it)]
     check_refused(lambda call: call(), cases, ConfigError)
     words = ["evaluation.terms=true", "policy=pretrained", "observation.presence=true"]
     shared = load("evaluate", ["variant=idm", words[0]]).with_(policy="pretrained")
