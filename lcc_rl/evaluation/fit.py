@@ -184,7 +184,8 @@ def _hashes(cfg: StudyConfig, name: str, copies: bool = False) -> set[str]:
     node, files = as_plain(getattr(cfg, name)), cfg.inputs.get(name)
     hashes = {config_hash(node), config_hash([node, files])}
     if files:
-        hashes.add(config_hash([{**node, "path": None}, sorted(files.values())]))
+        rest = {key: x for key, x in node.items() if key != "path" and x is not None}
+        hashes.add(config_hash([rest, sorted(files.values())]))
     for file in (x for x in files or () if copies and x.endswith(".parquet") and Path(x).is_file()):
         hashes |= {x for key, x in parquet_metadata(file).items() if key == MADE}
     return hashes

@@ -194,10 +194,10 @@ def test_options_without_effect_are_refused() -> None:
     of_it = "agent=ppo has no effect: the policy has the agent of its training, analytic"
     cases += [(lambda: lcc_rl.compare("pretrained/alcc", overrides=["agent=ppo"]), of_it)]
     check_refused(lambda call: call(), cases, ConfigError)
-    words = ["evaluation.terms=true", "policy=pretrained", "observation.presence=true"]
-    shared = load("evaluate", ["variant=idm", words[0]]).with_(policy="pretrained")
-    check_used(shared, words[:2], sweep=True)  # of runs with and without an agent
-    Entrants(shared, typed=words)
+    both = ["evaluation.terms=true", "policy=pretrained", "observation.raw=true"]
+    shared = load("evaluate", ["variant=idm", both[0]]).with_(policy="pretrained")
+    check_used(shared, both, sweep=True)  # of runs with and without an agent
+    Entrants(shared, typed=both)
     assert load("evaluate", [f"{AUTO}.time_gap=1.5", words[1], "variant=idm"]).compare
     words = ["variants=[alcc]", "evaluation.baselines=[human]"]  # a job compares
     trainings, final = composed_part(load("pipeline", words), words)
