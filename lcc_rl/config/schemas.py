@@ -298,8 +298,6 @@ class StudyConfig(BaseConfig):
         return self.with_(scenario={"pieces": {"leader": leader.changed(profile=None)}})
 
     def validate(self) -> None:
-        missing = self.task is not None and "name" not in self.task
-        require(not missing, f"task={self.task}: choose a task, too: task=i80-follow")
         for module in self.measures:
             load_module(module, "measures")
 

@@ -169,8 +169,7 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     changed = [x for x in TRAFFIC_NODES if _hashes(own, x, True).isdisjoint(_hashes(cfg, x))]
     if not changed:
         return ""
-    nodes = {name: getattr(own, name) for name in changed}
-    paths = {name: node and node.settings.get("path") for name, node in nodes.items()}
+    paths = {x: (node := getattr(own, x)) and node.settings.get("path") for x in changed}
     sources = ", ".join(name + (f" (path={at})" if at else "") for name, at in paths.items())
     options = " ".join(f"{name}=…" for name in changed)
     return (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +14,6 @@ from tensordict.nn import TensorDictModule
 
 from lcc_rl.commands.pipeline import _episodes, read_once
 from lcc_rl.config.compose import with_inputs
-from lcc_rl.config.nodes import Node
-from lcc_rl.data.sources import ASSETS
-from lcc_rl.drivers.population import SHIPPED_DRIVERS, bootstrap
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation import strategies
@@ -28,7 +24,6 @@ from lcc_rl.evaluation.strategies import Strategy, baseline, trained
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import Piece
 from lcc_rl.results.policies import load_policy
-from lcc_rl.settings import TARGET, path_of
 
 
 @pytest.mark.parametrize("name", TUNED)
@@ -115,14 +110,14 @@ def test_a_policy_of_other_settings_is_refused() -> None:
 
 def test_files_of_a_pipeline_are_those_that_it_was_given(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    job, copy = tiny("pipeline"), shutil.copy(ASSETS / SHIPPED_DRIVERS, tmp_path / "a.parquet")
-    read_once(job, Path())
-    people = Node.of({TARGET: path_of(bootstrap), "path": "a.parquet"}, "drivers")
-    own = with_inputs(tiny("train").with_(data=_episodes(job, Path()), drivers=people))
-    words = ("drivers=calibrated", f"drivers.path={copy}")
+    Path("drivers").write_text("")
+    read_once(job := tiny("pipeline"), Path())
+    words = ("drivers=calibrated", "drivers.path=drivers", "~drivers.mode")
+    own = with_inputs(tiny("train", *words).with_(data=_episodes(job, Path())))
+    words = (words[0], f"drivers.path={tmp_path}/drivers")
     assert not other_traffic("p.pt", own, tiny("evaluate", *words))
     other = tiny("evaluate", *words, "data.seed=3", "drivers.mode=global")
-    named = "other data (path=trajectories.parquet), drivers (path=a.parquet): use"
+    named = "other data (path=trajectories.parquet), drivers (path=drivers): use"
     assert named in other_traffic("p.pt", own, other)
 
 
