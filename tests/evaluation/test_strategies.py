@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictModule
 
 from lcc_rl.commands.pipeline import _episodes, read_once
 from lcc_rl.config.compose import with_inputs
+from lcc_rl.config.nodes import Node
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation import strategies
@@ -112,9 +113,10 @@ def test_files_of_a_pipeline_are_those_that_it_was_given(tmp_path, monkeypatch) 
     monkeypatch.chdir(tmp_path)
     Path("drivers").write_text("")
     read_once(job := tiny("pipeline"), Path())
-    words = ("drivers=calibrated", "drivers.path=drivers", "~drivers.mode")
-    own = with_inputs(tiny("train", *words).with_(data=_episodes(job, Path())))
-    words = (words[0], f"drivers.path={tmp_path}/drivers")
+    people = {"_target_": "lcc_rl.drivers.population.bootstrap", "path": "drivers"}
+    made = {"data": _episodes(job, Path()), "drivers": Node.of(people, "drivers")}
+    own = with_inputs(tiny("train").with_(**made))
+    words = ("drivers=calibrated", f"drivers.path={tmp_path}/drivers")
     assert not other_traffic("p.pt", own, tiny("evaluate", *words))
     other = tiny("evaluate", *words, "data.seed=3", "drivers.mode=global")
     named = "other data (path=trajectories.parquet), drivers (path=drivers): use"
