@@ -35,7 +35,7 @@ from lcc_rl.data.episodes import SCHEMA
 from lcc_rl.data.sources import EpisodesSource
 from lcc_rl.drivers.calibrator import count_records
 from lcc_rl.drivers.population import bootstrap
-from lcc_rl.envs.inputs import LOADS, build_energy, load_inputs, second_energy
+from lcc_rl.envs.inputs import LOADS, MADE, build_energy, load_inputs, second_energy
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
@@ -63,7 +63,6 @@ log = logging.getLogger("lcc_rl")
 # passed to calibration and trainings.
 JOB_OPTIONS = ("calibration", "variants", "jobs", "variant", "resume", "hydra", "data")
 COMMAND_FILE, TRAJECTORIES = "command.txt", "trajectories.parquet"
-MADE = "lcc_rl.data"  # key of the data's hash in the metadata of trajectories
 NETWORKS = ("reference", "alcc")  # trained by default, besides the rule
 
 

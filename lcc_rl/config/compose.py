@@ -69,7 +69,7 @@ NAMES_HINT = (
 )
 # Groups that no file of the package chooses.
 ADDED = ("event", "faults", "filter", "fleet", "knowledge", "slope")
-OF_NODE = re.compile(r"([\w.: ]+): expected a node with .*, got '(\w+)'$")
+OF_NODE = re.compile(r"([\w.: ]+): expected a node with .*, got (?:'(\w+)'|{.*)$")
 OWN_FILES = re.compile(r"path=(?!pkg://|structured://)")  # in Hydra's search path
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
@@ -385,8 +385,10 @@ def _groups() -> set[str]:
     return {path.parts[len(folder.parts)] for path in folder.glob("*/**/*.yaml")}
 
 
-def _file_of(key: str, name: str) -> str:
+def _file_of(key: str, name: str | None) -> str:
     """Return how a file of a group is chosen for a node, if there is one of this name."""
+    if name is None:  # settings without a choice
+        return f"choose one, too: {key}={'|'.join(choices(key))}" if choices(key) else ""
     group = next((group for group in sorted(_groups()) if name in choices(group)), "")
     choice = f"{group}@{key.replace(': ', '.')}={name}"
     choice = f"+{group}={name}" if group in ADDED else f"{choice}, or +{choice}"

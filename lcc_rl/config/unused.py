@@ -10,7 +10,7 @@ from lcc_rl.config.nodes import nodes_in, takes_action
 from lcc_rl.config.schemas import BaseConfig, StudyConfig, TrainConfig
 from lcc_rl.config.words import RECORDED, key_of, typed_keys
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.pattern import AUTOMATED, RING
+from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.settings import TARGET
 
 NO_AGENT = ("agent=none", "agent=null")
@@ -22,6 +22,7 @@ OF_EPISODES = (
     *("humans_first", "second_energy", "terms"),
 )
 OBSERVATION = "lcc_rl.pieces.Observation"
+FIXED = "no vehicle of this platoon depends on drivers or noise"
 
 
 def check_used(
@@ -48,8 +49,11 @@ def check_used(
             for key in ("visible", "presence"):
                 reasons[f"observation.{key}"] = "observation.scales names no vehicle behind"
         keys = {*OF_COMPARISONS[RECORDED in cfg.evaluation.baselines :]}
-        for key in keys & {*map(key_of, overrides)} if type(cfg) is TrainConfig else ():
+        training = type(cfg) is TrainConfig
+        for key in keys & {*map(key_of, overrides)} if training else ():
             reasons[key] = "a training evaluates its own policy; lcc-rl evaluate compares"
+        if training and is_fixed(cfg) and of_package([cfg.observation, cfg.reward, cfg.agent]):
+            reasons |= dict.fromkeys(("drivers", "evaluation.seed"), FIXED)
         reasons["sweep"] = "it names the folder of a sweep, -m"
     if written is not None and cfg.agent is not None and "surrogates" in cfg.agent.settings:
         typed = set().union(*map(typed_keys, overrides))
@@ -68,6 +72,22 @@ def refuse(overrides: Iterable[str], reasons: Mapping[str, str]) -> None:
             for key in typed_keys(option):
                 if key == unused or key.startswith(f"{unused.removesuffix('.')}."):
                     raise ConfigError(f"{option.removeprefix('++')} has no effect: {reason}")
+
+
+def of_package(part: Any) -> bool:
+    """Return whether all nodes in a part of a configuration are of the package's code."""
+    settings = (node.settings for node in nodes_in(part))
+    return all(str(x.get("law") or x[TARGET]).startswith("lcc_rl.") for x in settings)
+
+
+def is_fixed(cfg: StudyConfig, further: Sequence[Any] = ()) -> bool:
+    """Return whether a platoon, with further controllers, depends on no drivers and no noise."""
+    scenario = cfg.scenario
+    if cfg.evaluation.rows != "vehicles" or {*scenario.vehicles.names} != {AUTOMATED}:
+        return False
+    own = scenario.with_(controllers={HUMAN: None}, start={HUMAN: None})
+    nodes = nodes_in([own, cfg.deployed, *further])
+    return all(getattr(node.kind, "__dict__", {}).get("steady") for node in nodes)
 
 
 def _of_road(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
@@ -98,7 +118,8 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
     for group in ("controllers", "start", "filters", "actuators", "sensors"):
         for role in {*getattr(cfg.scenario, group)} & {*cfg.scenario.controllers}:
             if role not in cfg.scenario.vehicles.names:
-                yield f"scenario.{group}.{role}", f"no vehicle of the string is {role}"
+                for key in (f"scenario.{group}.{role}", *["filter"] * (group == "filters")):
+                    yield key, f"no vehicle of the string is {role}"
     if AUTOMATED not in cfg.scenario.vehicles.names:
         for name in ("max_braking", "max_acceleration"):
             yield f"scenario.{name}", "no vehicle of the string is automated"
@@ -124,7 +145,7 @@ def _of_agent(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
         reason = "no vehicle of the string is automated"
     elif driver is not None and not takes_action(driver):
         reason += f": {driver.name} drives the automated vehicles and uses no action of a policy"
-    for key in ("agent", "training"):
+    for key in ("agent", "training", *["policy"] * (cfg.policy is not None)):
         yield key, reason
 
 

@@ -30,7 +30,7 @@ def key_of(override: str) -> str:
 
 
 def typed_keys(override: str) -> set[str]:
-    """Return the dotted keys that an override sets; those in braces, too.
+    """Return the dotted keys that an override sets; group and place of a choice, too.
 
     Examples:
         >>> sorted(typed_keys("+a.b={c: 1, d: x}"))
@@ -38,7 +38,8 @@ def typed_keys(override: str) -> set[str]:
     """
     key, _, value = override.lstrip("+~").partition("=")
     inside = re.findall(r"(\w+)\s*:", value) if value.startswith("{") else []
-    return {key.partition("@")[0], *(f"{key}.{name}" for name in inside)}
+    group, _, place = key.partition("@")
+    return {group, place or group, *(f"{key}.{name}" for name in inside)}
 
 
 def with_variant(variant: str, overrides: Any) -> list[Any]:

@@ -24,6 +24,7 @@ from lcc_rl.functional.pattern import RING
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.settings import TARGET
 
+MADE = "lcc_rl.data"  # key of the data's hash in the metadata of a pipeline's trajectories
 BOOTSTRAP = "lcc_rl.drivers.population.bootstrap"  # of a table, by default the shipped one
 POPULATION = ("desired_speed", "time_gap", "constants")  # attributes of human drivers
 LOADS = ("load",)  # method of sources of episodes and of leaders

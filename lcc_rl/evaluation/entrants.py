@@ -14,7 +14,7 @@ from typing import Any
 from lcc_rl.config.compose import NOT_IDENTITY
 from lcc_rl.config.nodes import Node, as_plain, nodes_in
 from lcc_rl.config.schemas import AUTO, EvaluateConfig, StudyConfig
-from lcc_rl.config.unused import refuse
+from lcc_rl.config.unused import FIXED, is_fixed, of_package, refuse
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError, require
@@ -31,9 +31,8 @@ from lcc_rl.evaluation.strategies import (
     studied,
     trained,
 )
-from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.results.names import in_words
-from lcc_rl.results.policies import PRETRAINED, load_policy, of_task
+from lcc_rl.results.policies import load_policy, of_task
 from lcc_rl.results.runs import POLICY, flatten
 from lcc_rl.results.sweeps import labels
 from lcc_rl.runs.states import CONFIG, run_folders
@@ -67,8 +66,6 @@ class Entrants:
         typed: Sequence[str] = (),
     ) -> None:
         self.cfg, self.further, self.task = cfg, further or {}, task_of(cfg)
-        if cfg.policy not in (None, PRETRAINED) and not cfg.learns and cfg.automated:
-            raise ConfigError(f"variant {cfg.variant} has no agent: remove policy={cfg.policy}")
         only_named = bool(cfg.compare) and cfg.policy is None and cfg.learns
         self.own = own and not only_named
         if self.own and cfg.automated:
@@ -76,9 +73,12 @@ class Entrants:
         self.rivals, self.paths = self._compared()
         self._check_used(typed)
         self.policy, self.policies = self._read_policies()
-        learned = self.policy and self.policy[1].agent.name
-        if learned and learned != cfg.agent.name:
-            refuse(typed, {"agent": f"the policy has the agent of its training, {learned}"})
+        read = [self.policy] if self.policy else self.policies
+        agents = sorted({training.agent.name for _, training in read})
+        unread = self.policy or not (self.own or self.further)
+        if unread and cfg.learns and cfg.agent.name not in agents:
+            reason = f"the policy has the agent of its training, {' or '.join(agents)}"
+            refuse(typed, {"agent": reason if agents else "no row is a policy"})
         check_installed(cfg, list(self.rivals.values()))
         recorded = RECORDED in {*self.rivals, *cfg.evaluation.baselines}
         for asked in [] if recorded else self._limits_of_record():
@@ -118,28 +118,26 @@ class Entrants:
         cfg, rivals, named = self.cfg, [*self.rivals.values()], self.cfg.evaluation.baselines
         rows, specs = [*self.rivals, *named], [*rivals, *named]
         unused = {"seed": "it is that of trainings; evaluation.seed draws other noise"}
-        if self._is_fixed(specs):
-            reason = "no vehicle of this platoon depends on drivers or noise"
-            unused |= dict.fromkeys(("seed", "evaluation.seed", "drivers"), reason)
+        nodes = [controller_of(spec) for spec in specs if spec not in (DIRECT, PEOPLE)]
+        others = self.paths or self.further or {DIRECT, PEOPLE} & {*map(str, specs)}
+        if not others and is_fixed(cfg, nodes):
+            unused |= dict.fromkeys(("seed", "evaluation.seed", "drivers"), FIXED)
         if self.own and cfg.learns and cfg.policy is not None:
             unused |= FROM_TRAINING
-        learned = self.paths or self.further or cfg.policy is not None
+        # Also for a rule with the policy of a sweep's other runs.
+        observing = self.further or cfg.policy is not None or (self.own and cfg.learns)
+        learned = self.paths or observing
         if cfg.evaluation.rows == "episodes" and not (cfg.evaluation.terms and learned):
             unused["reward.terms."] = "only rows of policies have it, with evaluation.terms=true"
+            if cfg.evaluation.terms:
+                unused["evaluation.terms"] = "no row is a policy"
+        # A user's controller or piece may read what is observed.
+        if not observing and of_package([cfg.scenario, cfg.observation, *nodes]):
+            unused["observation"] = "no row observes; a policy observes as in its training"
         refuse((word for word in typed if not word.startswith("~")), unused)
         if self.own or self.further or cfg.variant in rows or not cfg.automated:
             return
         check_effective(typed, self.rivals or rows, [*rows, *rivals], bool(self.paths))
-
-    def _is_fixed(self, specs: Sequence[Any]) -> bool:
-        """Return whether all rows are of a platoon in which no piece reads drivers or noise."""
-        scenario, others = self.cfg.scenario, self.paths or self.further or DIRECT in specs
-        platoon = self.cfg.evaluation.rows == "vehicles"
-        if others or not platoon or {*scenario.vehicles.names} != {AUTOMATED}:
-            return False
-        own = scenario.with_(controllers={HUMAN: None}, start={HUMAN: None})
-        nodes = nodes_in([own, self.cfg.deployed, *map(controller_of, specs)])
-        return all(getattr(node.kind, "__dict__", {}).get("steady") for node in nodes)
 
     def _of_task(self, path: str) -> str:
         return of_task(path, None if self.task is None else self.task.name)
@@ -223,8 +221,7 @@ def check_effective(
         specs: names of all controllers.
         learned: whether a row is a policy.
     """
-    unused = {AUTO: "every controller is named and has its own settings"}
-    unused |= FROM_TRAINING
+    unused = FROM_TRAINING | {AUTO: "every controller is named and has its own settings"}
     if not learned and not any(str(x).endswith(FILTERED) for x in specs):
         reason = f"nothing drives behind the filter ({', '.join(rows)}); "
         reason += f"it needs a name that ends in {FILTERED}"

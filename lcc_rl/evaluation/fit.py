@@ -10,12 +10,14 @@ from typing import Any
 from tensordict.nn import TensorDictModule
 
 from lcc_rl.config import load
+from lcc_rl.config.compose import config_hash
 from lcc_rl.config.nodes import as_plain
 from lcc_rl.config.schemas import AUTO, StudyConfig
 from lcc_rl.energy import VehicleClass
-from lcc_rl.envs.inputs import build_energy, origin_of
+from lcc_rl.envs.inputs import MADE, build_energy, origin_of
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
+from lcc_rl.io.files import parquet_metadata
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.runs import differing, flatten
 from lcc_rl.results.task import OF_FUEL, Task, burns_one_fuel, check_unit
@@ -164,17 +166,28 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     """
     if cfg.task is not None or Path(path).parts[:1] == (PRETRAINED,):
         return ""
-    changed = [name for name in TRAFFIC_NODES if getattr(own, name) != getattr(cfg, name)]
+    changed = [x for x in TRAFFIC_NODES if _hashes(own, x, True).isdisjoint(_hashes(cfg, x))]
     if not changed:
         return ""
-    nodes = {name: getattr(own, name) for name in changed}
-    paths = {name: node and node.settings.get("path") for name, node in nodes.items()}
+    paths = {x: (node := getattr(own, x)) and node.settings.get("path") for x in changed}
     sources = ", ".join(name + (f" (path={at})" if at else "") for name, at in paths.items())
     options = " ".join(f"{name}=…" for name in changed)
     return (
         f"{path} was trained with other {sources}: use {options} as in the config.yaml of its "
         "training to evaluate on the windows that were held out there"
     )
+
+
+def _hashes(cfg: StudyConfig, name: str, copies: bool = False) -> set[str]:
+    """Return hashes of a node, of its files' contents and, for ``copies``, of their originals."""
+    node, files = as_plain(getattr(cfg, name)), cfg.inputs.get(name)
+    hashes = {config_hash(node), config_hash([node, files])}
+    if files:
+        rest = {key: x for key, x in node.items() if key != "path" and x is not None}
+        hashes.add(config_hash([rest, sorted(files.values())]))
+    for file in (x for x in files or () if copies and x.endswith(".parquet") and Path(x).is_file()):
+        hashes |= {x for key, x in parquet_metadata(file).items() if key == MADE}
+    return hashes
 
 
 def other_drivers(cfg: StudyConfig) -> str:

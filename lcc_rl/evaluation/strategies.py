@@ -187,13 +187,13 @@ def studied(
         named = strategy.name in cfg.evaluation.baselines
         return [] if repeats or named else [strategy]
     weights, own_cfg = policy
-    cfg = _of_training(cfg, own_cfg)
+    cfg = _of_training(cfg, own_cfg, f"policy={cfg.policy}")
     strategy = with_weights(cfg, weights, own_cfg.seed, str(cfg.policy), population)
     strategy = replace(strategy, own=own_cfg)
     return [strategy] if cfg.deployed is None else hybrids(strategy)
 
 
-def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
+def _of_training(cfg: StudyConfig, own: StudyConfig, path: str) -> StudyConfig:
     """Return the scenario under study with the agent of ``own``, and its filter if it has none."""
     changes: dict[str, Any] = {"agent": own.agent}
     piece = own.observation.made(Piece)
@@ -202,7 +202,7 @@ def _of_training(cfg: StudyConfig, own: StudyConfig) -> StudyConfig:
             changes["observation"] = cfg.observation.changed(presence=True)
         elif piece.shows_presence(cfg.scenario.vehicles):
             hint = "a vehicle behind each automated one: scenario.string needs one, too, as in"
-            raise ConfigError(f"policy={cfg.policy} was trained with {hint} 'automated human'")
+            raise ConfigError(f"{path} was trained with {hint} 'automated human'")
     given, trained = (one.scenario.filters.get(AUTOMATED) for one in (cfg, own))
     if given is None and trained is not None:
         log.info("the policy of variant %s keeps the filter of its training", own.variant)
@@ -240,7 +240,7 @@ def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Popu
     """
     weights, training = policy
     check_scenario(path, training, cfg)
-    other = _of_training(cfg.with_(observation=training.observation), training)
+    other = _of_training(cfg.with_(observation=training.observation), training, path)
     own, kept = training.scenario.pieces, of_observation(training)
     pieces = {x: own[x] for x in own if x in kept or x not in other.scenario.pieces}
     driver = {AUTOMATED: training.scenario.controllers[AUTOMATED]}

@@ -294,7 +294,7 @@ def report(
     if task:
         task = replace(task, against=against) if against else task.among(windows["strategy"])
         task = replace(task, unit=unit or task.unit).resolved(windows)
-    table, notes = summary(windows, task, energy, against), remarks(windows)
+    table = summary(windows, task, energy, against)
     percent = {
         f"{shown}{end}": 100.0 * table[f"{key}{end}"]
         for key, shown in SAVINGS.items()
@@ -307,7 +307,9 @@ def report(
     rows = _rows(task, table["against"].iloc[0], shown[1] if task or unit else None)
     text = "" if task else verdict(windows, table, few)
     text = "\n".join(filter(None, [text, few_drives(table)]))
-    notes += [*crashes(table), *filter(None, [flow_note(table), by_ends(table), seeds_note(table)])]
+    seen, shown_windows = (x[x["strategy"].isin(short["strategy"])] for x in (table, windows))
+    notes = [*remarks(shown_windows), *crashes(seen)]
+    notes += filter(None, [flow_note(seen), by_ends(seen), seeds_note(seen)])
     fields |= {"full_caption": FULL, "verdict": text, "remarks": notes}
     ends = {"_low": "_high", "_high": "_low"}
     bounds = {f"{FLOW_SHARE.key}{x}": -100.0 * table[f"{FLOW_LOST}{y}"] for x, y in ends.items()}
@@ -441,9 +443,9 @@ def shortened(
     With several seeds, collisions are means of a training.
     """
     if table.get("seeds", pd.Series([0])).max() > 1:
-        per = Shown(COLLISIONS.key, f"{COLLISIONS.heading}\n/ seed")
+        per = Shown(f"{COLLISIONS.key}_per_seed", f"{COLLISIONS.heading}\n/ seed")
         shown = [*(per if one == COLLISIONS else one for one in shown), Shown("seeds", "seeds")]
-        table = table.assign(collisions=table["collisions"] / table["seeds"].clip(lower=1))
+        table = table.assign(**{per.key: table["collisions"] / table["seeds"].clip(lower=1)})
     counts = [key for key in ("windows", "drivers") if key in table and table[key].nunique() > 1]
     shown = [*shown, *(Shown(key, key) for key in counts)]
     lost = table.get(FLOW_LOST, pd.Series(np.nan, table.index)) > FLOW_NAMED

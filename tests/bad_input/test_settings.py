@@ -15,6 +15,7 @@ from lcc_rl.agents.controller import ControllerPolicy
 from lcc_rl.commands import calibration, evaluation, training
 from lcc_rl.commands.pipeline import composed_part
 from lcc_rl.config import load
+from lcc_rl.config.unused import check_used
 from lcc_rl.data.leaders import Mixture
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.entrants import Entrants
@@ -45,6 +46,7 @@ WRONG = {
     # types
     "seed=abc": "seed must be .* integer",
     "scenario.pieces.ttc=5": "ttc: expected a node",
+    "leader.path=a.csv": r"got \{'path': 'a.csv'\}; choose one, too: leader=drives\|",
     "data.path=a (copy).csv": r"data\.path=a \(copy\)\.csv.*quotes",
     "+scenario.controllers.human.time_gap=${scenario}": "parent node",
     "+scenario.controllers.human.time_gap=${reward.no}": "takes its value from 'reward.no'",
@@ -95,6 +97,8 @@ IGNORED = {
     "evaluation.front=[1.2]": "a training evaluates its own policy",
     "evaluation.full_length=true": "belong to evaluation.rows=vehicles",
     "variant=hcfs evaluation.repeats=5": "drives behind every record once",
+    "variant=hcfs drivers=highway": "no vehicle of this platoon depends on drivers",
+    "variant=direct +filter=cbf": "no vehicle of the string is automated",
     "variant=alcc deployed.choice=first": "belongs to variant=hcfs",
     "sweep=mine": "names the folder of a sweep, -m",
     "variant=own_energy observation.visible=2": "scales names no vehicle behind",
@@ -106,6 +110,8 @@ EVALUATED = {
     "alcc agent.hold=5": OF_TRAINING,
     "alcc agent=ppo": f"{OF_TRAINING}, analytic",
     "alcc reward.terms.safety.weight=5": "only rows of policies have it, with evaluation.terms",
+    "idm": "variant idm has no agent",
+    "hcfs +energy@evaluation.second_energy=compact": "drives behind every record once",
     "hcfs evaluation.sample_episodes=0": "drives behind every record once",
     "hcfs evaluation.seed=99": "no vehicle of this platoon depends on drivers or noise",
     "hcfs drivers=highway": "no vehicle of this platoon depends on drivers or noise",
@@ -177,9 +183,17 @@ def test_options_without_effect_are_refused() -> None:
     idle = r"\+filter=cbf has no effect: nothing drives behind the filter \(acc\)"
     cases += [(lambda: lcc_rl.compare("acc", overrides="+filter=cbf"), idle)]
     idle = {"agent.gamma=0.5": "of its training", "seed=3": "evaluation.seed"}
-    for typed, why in {**idle, "reward.terms.safety.weight=0": "of policies"}.items():
+    idle |= {"observation.visible=3": "no row observes", "agent=ppo": "no row is a policy"}
+    idle |= {"evaluation.terms=true": "no row", "reward.terms.safety.weight=0": "of policies"}
+    for typed, why in idle.items():
         cases += [(lambda x=typed: lcc_rl.compare("acc", overrides=[x]), f"{typed} has.*{why}")]
+    shipped = "pretrained/alcc"
+    cases += [(lambda: lcc_rl.compare(shipped, overrides=["agent=ppo"]), "training, analytic$")]
     check_refused(lambda call: call(), cases, ConfigError)
+    both = ["evaluation.terms=true", "policy=pretrained", "observation.raw=true"]
+    shared = load("evaluate", ["variant=idm", both[0]]).with_(policy="pretrained")
+    check_used(shared, both, sweep=True)  # of runs with and without an agent
+    Entrants(shared, typed=both)
     assert load("evaluate", [f"{AUTO}.time_gap=1.5", words[1], "variant=idm"]).compare
     words = ["variants=[alcc]", "evaluation.baselines=[human]"]  # a job compares
     trainings, final = composed_part(load("pipeline", words), words)

@@ -163,9 +163,13 @@ def test_wrong_arguments_are_named(tmp_path) -> None:
             for key in ("scenario.horizon", "scenario.string", "seed", "compare")
         ),
         ({"leader": WAVE, "overrides": ["leader.path=2"]}, "the arguments; files have time_s"),
+        ({"leader": [9.0, 9.0, 18.0]}, r"changes by 90 m/s², max_acceleration=10; .*time_step=…"),
+        ({"leader": WAVE, "overrides": ["experiment=limits"]}, "limits has no effect in simulate"),
+        ({**BEHIND, "controller": "acc", "overrides": ["experiment=limits"]}, "limits has no effe"),
+        ({**BEHIND, "overrides": ["observation.raw=true"]}, "raw=true has no effect: no row obs"),
         (
             {"leader": WAVE, "string": "automated", "controller": "pretrained/i80-follow"},
-            "a vehicle behind each automated one: scenario.string needs one, .*'automated human'",
+            "^pretrained/i80-follow was .* behind each automated one: .*string needs one, .*human",
         ),
         *(
             ({"leader": x}, rf"{x}: no such file, and none of .*\(hwfet, udds, us06, wltc_3b\)")

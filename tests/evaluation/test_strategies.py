@@ -8,14 +8,18 @@ from pathlib import Path
 
 import pytest
 import torch
+from commands import tiny
 from helpers import ACTION, POPULATION, check_refused, compose, wavy_profiles
 from tensordict.nn import TensorDictModule
 
+from lcc_rl.commands.pipeline import _episodes, read_once
+from lcc_rl.config.compose import with_inputs
+from lcc_rl.config.nodes import Node
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation import strategies
 from lcc_rl.evaluation.entrants import check_distinct, named_apart
-from lcc_rl.evaluation.fit import check_policy
+from lcc_rl.evaluation.fit import check_policy, other_traffic
 from lcc_rl.evaluation.named import TUNED
 from lcc_rl.evaluation.strategies import Strategy, baseline, trained
 from lcc_rl.functional.pattern import AUTOMATED
@@ -103,6 +107,20 @@ def test_a_policy_of_other_settings_is_refused() -> None:
         ("alcc", "scenario.time_step=0.2", "scenario.time_step=0.2, got 0.1"),
     ]
     check_refused(lambda *words: check_policy(cfg, compose(*words)), cases, ConfigError)
+
+
+def test_files_of_a_pipeline_are_those_that_it_was_given(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("drivers").write_text("")
+    read_once(job := tiny("pipeline"), Path())
+    people = {"_target_": "lcc_rl.drivers.population.bootstrap", "path": "drivers"}
+    made = {"data": _episodes(job, Path()), "drivers": Node.of(people, "drivers")}
+    own = with_inputs(tiny("train").with_(**made))
+    words = ("drivers=calibrated", f"drivers.path={tmp_path}/drivers")
+    assert not other_traffic("p.pt", own, tiny("evaluate", *words))
+    other = tiny("evaluate", *words, "data.seed=3", "drivers.mode=global")
+    named = "other data (path=trajectories.parquet), drivers (path=drivers): use"
+    assert named in other_traffic("p.pt", own, other)
 
 
 class Trend(Piece):

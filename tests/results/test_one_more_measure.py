@@ -108,7 +108,7 @@ def test_rows_of_platoons_have_it(mine, tmp_path, capsys) -> None:
 
 
 def test_vehicles_of_a_simulation_have_it(mine) -> None:
-    vehicles = lcc_rl.simulate([9.0, *[12.0] * 40], "human automated", overrides=[mine]).vehicles
+    vehicles = lcc_rl.simulate([9.0, *[9.9] * 40], "human automated", overrides=[mine]).vehicles
     np.testing.assert_allclose(vehicles[MINE.key][1:], vehicles["max_jerk_mps3"][1:])
     assert vehicles[MINE.key][1:].min() > 0.0
 

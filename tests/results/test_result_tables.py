@@ -216,6 +216,9 @@ def test_a_table_marks_strategies_that_lose_more_than_2_percent_of_the_flow() ->
     assert found["flow_pct"].tolist() == pytest.approx([0.0, -4.0, -20.0])
     lost = "†: flow lost against simulated drivers: tuned IDM 4 %; PI with saturation 20 %."
     assert lost in one.remarks
+    crowd = driven("direct", 1.0, flow_vph=1800.0)  # no path energy of automated cars: no row
+    rows = pd.concat([rows.assign(total_path_energy_kj=1.0), crowd])
+    assert [lost] == report(windows_for(rows), energy=MOTOR).remarks
     marked = ["simulated drivers", "tuned IDM †", "PI with saturation †"]
     assert one.short["driver"].tolist() == marked
     assert found["kept"].all()
