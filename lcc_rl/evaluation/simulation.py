@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from os import PathLike, fspath
 from typing import Any
@@ -17,9 +15,9 @@ from torch import Tensor
 
 from lcc_rl.arrays import times
 from lcc_rl.config import load
-from lcc_rl.config.nodes import Node, as_plain
+from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import RewardConfig, StudyConfig, TimeStep
-from lcc_rl.config.words import FILTERED, check_overrides, key_of, quoted
+from lcc_rl.config.words import check_overrides, quoted
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
@@ -46,7 +44,6 @@ from lcc_rl.pieces.connected import MESSAGES
 from lcc_rl.pieces.features import CLASS, GRADE
 from lcc_rl.pieces.rewards import CollisionPenalty
 from lcc_rl.pieces.slope import PLACE
-from lcc_rl.results.runs import flatten
 from lcc_rl.settings import TARGET, Count, Positive, Seed, checked, path_of
 
 log = logging.getLogger("lcc_rl")
@@ -61,7 +58,6 @@ OF_FILES = {"leader", "data"}
 OF_ARGUMENTS = SCENE | {"split", "compare", "policy", "seed", "evaluation", "reward"}
 # Nothing reads the reward; this term fits any scenario.
 UNREAD = RewardConfig(terms={"collision": Node.of({TARGET: path_of(CollisionPenalty)}, "reward")})
-IDLE = "gap_range|^(agent|training|evaluation|reward|observation|data|split|inputs)[.]"
 MOTION = {
     "speed": "speed_mps",
     "gap": "gap_m",
@@ -153,25 +149,12 @@ def simulate(
         "simulate: a ring (scenario=ring in overrides) has leader=None, an open road has a leader",
     )
     require(cfg.automated or spec is None, "simulate: controller has no vehicle to drive in string")
-    named = any(str(x).endswith(FILTERED) for x in (name, spec)) or spec is None or is_policy(spec)
-    _check_recipe(settings, IDLE if cfg.automated and named else rf"{IDLE}|filters\.")
     people = build_drivers(cfg) if table or drivers is None else drivers
     fits = all(hasattr(people, name) for name in POPULATION)
     require(fits, f"drivers: not a population: {in_short(people)}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, spec is None, typed=overrides).strategies(inputs)[-1]
     return _simulated(strategy, inputs, repeats, seed)
-
-
-def _check_recipe(settings: Sequence[str], idle: str) -> None:
-    """Refuse a recipe that sets only keys that are ``idle``, a regular expression."""
-    for recipe in (word for word in settings if key_of(word) == "experiment"):
-        found = []
-        with suppress(ConfigError):  # other settings need the recipe
-            for words in (settings, [word for word in settings if word != recipe]):
-                every = flatten(as_plain(load("evaluate", words)))
-                found.append([x for x in every if not re.search(idle, x[0])])
-        require(found[0] != found[-1] or len(found) < 2, f"{recipe} has no effect in simulate")
 
 
 def _words(string: str | Mapping[str, Any]) -> str:

@@ -164,8 +164,6 @@ def test_wrong_arguments_are_named(tmp_path) -> None:
         ),
         ({"leader": WAVE, "overrides": ["leader.path=2"]}, "the arguments; files have time_s"),
         ({"leader": [9.0, 9.0, 18.0]}, r"changes by 90 m/s², max_acceleration=10; .*time_step=…"),
-        ({"leader": WAVE, "overrides": ["experiment=limits"]}, "limits has no effect in simulate"),
-        ({**BEHIND, "controller": "acc", "overrides": ["experiment=limits"]}, "limits has no effe"),
         ({**BEHIND, "overrides": ["observation.raw=true"]}, "raw=true has no effect: no row obs"),
         (
             {"leader": WAVE, "string": "automated", "controller": "pretrained/i80-follow"},
