@@ -166,11 +166,8 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     """
     if cfg.task is not None or Path(path).parts[:1] == (PRETRAINED,):
         return ""
-    changed = []
-    for name in TRAFFIC_NODES:
-        mine, given = ((getattr(x, name), x.inputs.get(name)) for x in (own, cfg))
-        if _hashes(*mine, copies=True).isdisjoint(_hashes(*given)):
-            changed.append(name)
+    pairs = {x: [(getattr(y, x), y.inputs.get(x)) for y in (own, cfg)] for x in TRAFFIC_NODES}
+    changed = [x for x, (a, b) in pairs.items() if _hashes(*a, True).isdisjoint(_hashes(*b))]
     if not changed:
         return ""
     paths = {x: (node := getattr(own, x)) and node.settings.get("path") for x in changed}
