@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, Self
@@ -16,9 +16,15 @@ from typing import Annotated, Any, Literal, Self
 import yaml
 from pydantic import AfterValidator, Field
 
-from lcc_rl.config.nodes import Node, as_nodes, as_plain, check_nodes, check_numbers
+from lcc_rl.config.nodes import Node, as_nodes, as_plain, check_nodes, check_numbers, nodes_in
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION, VehicleString, parse_string
+from lcc_rl.functional.pattern import (
+    AUTOMATED,
+    HUMAN,
+    MAX_ACCELERATION,
+    VehicleString,
+    parse_string,
+)
 from lcc_rl.settings import (
     TARGET,
     Count,
@@ -289,6 +295,15 @@ class StudyConfig(BaseConfig):
         """Return the configuration without automated vehicles."""
         roles = [role for role in self.scenario.vehicles.roles if role != AUTOMATED]
         return self.with_(scenario={"string": " ".join(roles)})
+
+    def is_fixed(self, further: Sequence[Node] = ()) -> bool:
+        """Whether a platoon, with further controllers, depends on no drivers and no noise."""
+        scenario = self.scenario
+        if self.evaluation.rows != "vehicles" or {*scenario.vehicles.names} != {AUTOMATED}:
+            return False
+        own = scenario.with_(controllers={HUMAN: None}, start={HUMAN: None})
+        nodes = nodes_in([own, self.deployed, *further])
+        return all(getattr(node.kind, "__dict__", {}).get("steady") for node in nodes)
 
     def for_any_leader(self) -> Self:
         """Return the configuration with a leader that may play any record."""

@@ -10,7 +10,7 @@ from lcc_rl.config.nodes import nodes_in, takes_action
 from lcc_rl.config.schemas import BaseConfig, StudyConfig, TrainConfig
 from lcc_rl.config.words import RECORDED, key_of, typed_keys
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
+from lcc_rl.functional.pattern import AUTOMATED, RING
 from lcc_rl.settings import TARGET
 
 NO_AGENT = ("agent=none", "agent=null")
@@ -52,7 +52,7 @@ def check_used(
         training = type(cfg) is TrainConfig
         for key in keys & {*map(key_of, overrides)} if training else ():
             reasons[key] = "a training evaluates its own policy; lcc-rl evaluate compares"
-        if training and is_fixed(cfg) and of_package([cfg.observation, cfg.reward, cfg.agent]):
+        if training and cfg.is_fixed() and of_package([cfg.observation, cfg.reward, cfg.agent]):
             reasons |= dict.fromkeys(("drivers", "evaluation.seed"), FIXED)
         reasons["sweep"] = "it names the folder of a sweep, -m"
     if written is not None and cfg.agent is not None and "surrogates" in cfg.agent.settings:
@@ -78,16 +78,6 @@ def of_package(part: Any) -> bool:
     """Return whether all nodes in a part of a configuration are of the package's code."""
     settings = (node.settings for node in nodes_in(part))
     return all(str(x.get("law") or x[TARGET]).startswith("lcc_rl.") for x in settings)
-
-
-def is_fixed(cfg: StudyConfig, further: Sequence[Any] = ()) -> bool:
-    """Return whether a platoon, with further controllers, depends on no drivers and no noise."""
-    scenario = cfg.scenario
-    if cfg.evaluation.rows != "vehicles" or {*scenario.vehicles.names} != {AUTOMATED}:
-        return False
-    own = scenario.with_(controllers={HUMAN: None}, start={HUMAN: None})
-    nodes = nodes_in([own, cfg.deployed, *further])
-    return all(getattr(node.kind, "__dict__", {}).get("steady") for node in nodes)
 
 
 def _of_road(cfg: StudyConfig) -> Iterator[tuple[str, str]]:

@@ -14,7 +14,7 @@ from typing import Any
 from lcc_rl.config.compose import NOT_IDENTITY
 from lcc_rl.config.nodes import Node, as_plain, nodes_in
 from lcc_rl.config.schemas import AUTO, EvaluateConfig, StudyConfig
-from lcc_rl.config.unused import FIXED, is_fixed, of_package, refuse
+from lcc_rl.config.unused import FIXED, of_package, refuse
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError, require
@@ -120,7 +120,7 @@ class Entrants:
         unused = {"seed": "it is that of trainings; evaluation.seed draws other noise"}
         nodes = [controller_of(spec) for spec in specs if spec not in (DIRECT, PEOPLE)]
         others = self.paths or self.further or {DIRECT, PEOPLE} & {*map(str, specs)}
-        if not others and is_fixed(cfg, nodes):
+        if not others and cfg.is_fixed(nodes):
             unused |= dict.fromkeys(("seed", "evaluation.seed", "drivers"), FIXED)
         if self.own and cfg.learns and cfg.policy is not None:
             unused |= FROM_TRAINING

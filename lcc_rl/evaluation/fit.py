@@ -166,7 +166,8 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     """
     if cfg.task is not None or Path(path).parts[:1] == (PRETRAINED,):
         return ""
-    changed = [x for x in TRAFFIC_NODES if _hashes(own, x, True).isdisjoint(_hashes(cfg, x))]
+    pairs = {x: [(getattr(y, x), y.inputs.get(x)) for y in (own, cfg)] for x in TRAFFIC_NODES}
+    changed = [x for x, (a, b) in pairs.items() if _hashes(*a, True).isdisjoint(_hashes(*b))]
     if not changed:
         return ""
     paths = {x: (node := getattr(own, x)) and node.settings.get("path") for x in changed}
@@ -178,9 +179,9 @@ def other_traffic(path: str, own: StudyConfig, cfg: StudyConfig) -> str:
     )
 
 
-def _hashes(cfg: StudyConfig, name: str, copies: bool = False) -> set[str]:
+def _hashes(described: Any, files: Mapping[str, str] | None, copies: bool = False) -> set[str]:
     """Return hashes of a node, of its files' contents and, for ``copies``, of their originals."""
-    node, files = as_plain(getattr(cfg, name)), cfg.inputs.get(name)
+    node = as_plain(described)
     hashes = {config_hash(node), config_hash([node, files])}
     if files:
         rest = {key: x for key, x in node.items() if key != "path" and x is not None}
