@@ -9,8 +9,8 @@ set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv" &&
-    "$folder/venv/bin/python" -m pip install -qq rliable==1.2.0 arch==7.2.0 numpy==2.4.1 \
-        pandas==2.3.3 || exit 2
+    "$folder/venv/bin/python" -m pip install -qq \
+        rliable==1.2.0 arch==7.2.0 numpy==2.4.1 pandas==2.3.3 || exit 2
 cd "$folder"
 venv/bin/python -W ignore - <<'EOF'
 import sys

@@ -9,8 +9,8 @@ set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv" &&
-    "$folder/venv/bin/python" -m pip install -qq SALib==1.6.0 numpy==2.4.1 scipy==1.17.1 \
-        pandas==2.3.3 || exit 2
+    "$folder/venv/bin/python" -m pip install -qq \
+        SALib==1.6.0 numpy==2.4.1 scipy==1.17.1 pandas==2.3.3 || exit 2
 cd "$folder"
 venv/bin/python -W ignore - <<'EOF'
 import sys

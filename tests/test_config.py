@@ -65,7 +65,8 @@ def test_every_controller_drives(subtests) -> None:
         own = [x for x in options("controller") if SCENARIO_OF.get(x, "alcc") == variant]
         places = [f"+controller@scenario.controllers.the_{name}={name}" for name in own]
         words = [f"variant={variant}", "scenario.horizon=20"]
-        controllers = load("train", [*words, *places]).scenario.controllers
+        string = f"scenario.string='automated {' '.join(f'the_{name}' for name in own)}'"
+        controllers = load("train", [*words, string, *places]).scenario.controllers
         for name in own:
             with subtests.test(name=name):
                 cfg = load("train", words)
