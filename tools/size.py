@@ -28,7 +28,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
     "lcc_rl + tools": {"lines": 44_200, "code": 29_300},
-    "tests": {"lines": 26_590},
+    "tests": {"lines": 26_600},
     "conf": {"yaml": 165},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py

@@ -17,6 +17,9 @@ log = logging.getLogger("lcc_rl")
 # Attributes in which an object with a compiled method keeps the environment and its pieces.
 CONSTANT = ("self.env", "self.step", "self.first", "_modules['transforms']._modules[")
 LONGEST_VECTOR = 16  # numbers
+# Bits of a vector; torch's key of a compiled graph lacks them, so that a cache shared by processors
+# of two kinds gives kernels that leave out half of the entries.
+VECTORS = {"AVX512": 512, "AVX2": 256}
 CACHE_LOG = "torch._inductor.codecache"  # prints a traceback for a damaged file, and compiles anew
 
 
@@ -27,7 +30,10 @@ def options(device: torch.device | None) -> dict[str, Any]:
     quarters of the time. On a GPU that would need the headers of CUDA.
     """
     on_cpu = device is None or device.type == "cpu"
-    return {"cpp_wrapper": True, "size_asserts": False} if on_cpu else {}
+    if not on_cpu:
+        return {}
+    bits = VECTORS.get(torch.backends.cpu.get_cpu_capability())
+    return {"cpp_wrapper": True, "size_asserts": False, "cpp.simdlen": bits}
 
 
 def compiler_errors() -> tuple[type[Exception], ...]:

@@ -123,6 +123,19 @@ def test_gradients_are_finite_through_contact_and_standstill() -> None:
         assert all(torch.isfinite(weight.grad).all() for weight in network.parameters())
 
 
+@pytest.mark.skipif(torch.backends.cpu.get_cpu_capability() != "AVX512", reason="no such processor")
+def test_processors_that_share_a_cache(monkeypatch, tmp_path) -> None:
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    numbers = torch.arange(64.0)
+    for processor in ("AVX512", "AVX2"):
+        monkeypatch.setenv("ATEN_CPU_CAPABILITY", processor.lower())
+        monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: processor)  # noqa: B023
+        torch.compiler.reset()
+        half = Compiled(lambda numbers: numbers / 2 + 1, "a half", compiled=True)
+        assert (half(numbers) == numbers / 2 + 1).all()
+        assert half.function is not half.plain
+
+
 def test_a_damaged_file_of_torchs_cache_is_no_traceback(capfd) -> None:
     Compiled(abs, "a number", compiled=True)
     try:
