@@ -49,6 +49,11 @@ def readme() -> list[str]:
         kinds = ("e", "petrol")
         found += [f"| {equal_flow(rows, name, 'recorded', x):.1%} (" for x in kinds]
     found += [f"| {equal_flow(rows, name, 'rule'):.1%} (" for name in ("reference", "alcc")]
+    rows = means("main_electric", PETROL, "distance_m", FLOW)
+    rule, *networks = (
+        100.0 * equal_flow(rows, x, "recorded") for x in ("rule", "reference", "alcc")
+    )
+    found += [f"saves {rule:.1f}, {networks[0]:.1f} and {networks[1]:.1f}%"]
     i80 = means("averaged", PATH, "distance_m", FLOW, source="i80")
     return [
         *found,
