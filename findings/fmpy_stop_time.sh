@@ -48,7 +48,7 @@ for stop in (60.0, 120.0, 1200.0):
     rows = simulate_fmu("Cruise.fmu", stop_time=stop, input=leader, output=["gap"])
     step = rows["time"][1] - rows["time"][0]
     smallest = rows["gap"][rows["time"] < 60.05].min()
-    print(f"drive of {stop:.0f} s: called every {step:.1f} s, smallest gap before 60 s {smallest:.1f} m")
+    print(f"drive of {stop:.0f} s: called every {step:.1f} s, gap of {smallest:.1f} m before 60 s")
     found[stop] = (round(step, 3), smallest > 0.0)
 sys.exit(0 if found == {60.0: (0.1, True), 120.0: (0.2, False), 1200.0: (1.6, False)} else 1)
 EOF
