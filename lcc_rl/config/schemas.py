@@ -138,6 +138,15 @@ class ScenarioConfig(Section):
     fleet: Nodes = Field(default_factory=dict)  # further classes of vehicles
     pieces: Nodes
 
+    def validate(self) -> None:
+        for role in self.vehicles.names:
+            roles = ", ".join(name for name, node in self.controllers.items() if node)
+            message = (
+                f"scenario.string has the role {role!r}, but scenario.controllers names only "
+                f"{roles}; use +controller@scenario.controllers.{role}=… for another"
+            )
+            require(self.controllers.get(role) is not None, message)
+
     @property
     def vehicles(self) -> VehicleString:
         """The string of vehicles of ``string`` and ``road``.

@@ -239,13 +239,6 @@ def _leader(scenario: ScenarioConfig, node: Any, world: World) -> list[Piece]:
 
 def _drivers(scenario: ScenarioConfig, world: World) -> list[Any]:
     """Build the controllers of the roles in the string, and their safety filters."""
-    for role in world.string.names:
-        if scenario.controllers.get(role) is None:
-            roles = ", ".join(name for name, node in scenario.controllers.items() if node)
-            raise ConfigError(
-                f"scenario.string has the role {role!r}, but scenario.controllers names only "
-                f"{roles}; use +controller@scenario.controllers.{role}=… for another"
-            )
     nodes = [*_by_role(scenario, "controllers"), *_by_role(scenario, "filters")]
     return [node.made(Piece).bind(world, role) for role, node in nodes]
 
