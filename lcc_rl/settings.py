@@ -180,7 +180,9 @@ def _reason(error: Any, kind: Any, where: str) -> str:
     if first["type"] in ("unexpected_keyword_argument", "unexpected_positional_argument"):
         names = [field.name for field in dataclasses.fields(kind)]
         what = f"setting of {where} ({kind.__name__})" if where else "option"
-        return str(unknown_name(what, str(first["loc"][-1]), names))
+        name = str(first["loc"][-1])
+        plain = f" A setting has a type: {name}: float = …" if hasattr(kind, name) else ""
+        return f"{unknown_name(what, name, names)}{plain}"
     path = "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in first["loc"])
     key = (where + path).removeprefix(".")
     if first["type"] == "missing" and len(first["loc"]) == 1:

@@ -161,7 +161,8 @@ def _rows(
     read = file.read(PAIR_FIELDS, names, units, "data.columns", PAIR_MEASURED)
     read, cars = _targets(read, file)
     if not len(read["time"]):
-        raise DataError(f"{file.path}: has no episodes; expected at least one row")
+        message = f"{file.path}: has no episodes; expected at least one row"
+        raise DataError("; ".join([message, *file.notes]))
     row, turn = read.pop("row"), read.pop("turn", None)
     rows = len(row)
     labels = read.pop("episode", same_text("", rows))

@@ -181,7 +181,7 @@ def _samples(table: TableFile, columns: Names, units: Units, option: str) -> pd.
         raise DataError(f"{table.path}: holds 0 samples, at least 2 are needed")
     # A record may end before the table; in native files, blank cells divide it.
     if rows[-1] >= len(rows) and (single or not table.preamble):
-        raise table.fault(int(np.argmax(rows != np.arange(len(rows)))), "speed", "is blank")
+        raise table.fault(int(np.argmax(rows != np.arange(len(rows)))), "speed", "is blank or NaN")
     samples = pd.DataFrame({TIME_COLUMN: read["time"], SPEED_COLUMN: read["speed"]})
     if "grade" in read:
         slope = units.get("grade", "rad") in SLOPES

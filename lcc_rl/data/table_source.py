@@ -133,7 +133,7 @@ class TableSource(TrajectorySource):
             report.rows_read += table.count
             for key in (key for key in IDENTIFYING if key in block):
                 if (blank := block[key] == "").any():
-                    raise table.fault(int(block["row"][np.argmax(blank)]), key, "is blank")
+                    raise table.fault(int(block["row"][np.argmax(blank)]), key, "is blank or NaN")
             unsized = "gap" not in block and self.vehicle_length is None
             if unsized and (blank := ~(block["length"] > 0)).any():
                 remedy = "is blank or 0; data.vehicle_length sets such lengths [m]"
@@ -162,7 +162,7 @@ def _report_blank_gaps(table: TableFile, read: Mapping[str, Any]) -> None:
         return
     blank = np.isnan(read["gap"]) & ~read["leader"].isin(NO_LEADER)
     if blank.any():
-        first = table.fault(int(read["row"][np.argmax(blank)]), "gap", "is blank")
+        first = table.fault(int(read["row"][np.argmax(blank)]), "gap", "is blank or NaN")
         table.notes.append(
             f"{int(blank.sum()):,} samples have a leader but a blank gap, the first: {first}"
         )

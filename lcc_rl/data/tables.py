@@ -162,7 +162,7 @@ class TableFile:
         if not wrong.any():
             return read
         row = int(np.argmax(wrong))
-        first = self.fault(row, next(key for key in blank if blank[key][row]), "is blank")
+        first = self.fault(row, next(key for key in blank if blank[key][row]), "is blank or NaN")
         if wrong.all() and not any(column.all() for column in blank.values()):
             raise DataError(f"{first}; {APART.format(time=self.names.get('time'))}")
         if wrong.all():

@@ -56,7 +56,7 @@ def read_torch(path: str | Path) -> Any:
         raise ResultsError(f"{path}: cannot be read: {error.strerror}") from error
     except Exception as error:  # torch raises many kinds for damaged or malicious files
         raise ResultsError(
-            f"{path}: not a readable weights file: damaged or of another kind"
+            f"{path}: not a readable weights file (.pt): damaged or of another kind"
         ) from error
 
 
