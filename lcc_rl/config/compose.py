@@ -54,12 +54,6 @@ NOT_IDENTITY = (
 )
 # Extras that install launchers.
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
-# Settings of later versions, which older runs lack.
-LATER = (
-    *("evaluation.warm_up", "evaluation.front", "evaluation.second_energy"),
-    *("evaluation.terms", "scenario.fleet"),
-    "measures",
-)
 NEEDED = ("data", "split", "drivers", "observation", "calibration")  # required nodes of commands
 NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =
 # Hint on Hydra's keys, which have no quotes.
@@ -433,22 +427,20 @@ def config_hash(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def identity(cfg: Any, *unused: str, changed: bool = False) -> str:
+def identity(cfg: Any, *unused: str) -> str:
     """Return the hash of everything in a configuration that determines the results.
+
+    Defaults of classes do not count, so settings of later versions change no hash.
 
     Args:
         cfg: the configuration.
         *unused: keys of further settings that do not count.
-        changed: only settings that differ from the defaults of classes count.
     """
-    content = without_defaults(cfg) if changed else as_plain(cfg, places=False)
-    for key in (*NOT_IDENTITY, *unused, *LATER):
+    content = without_defaults(cfg)
+    for key in (*NOT_IDENTITY, *unused):
         *path, last = key.split(".")
         node = content
         for name in path:
             node = node.get(name) or {}
-        if key not in LATER or not node.get(last):
-            node.pop(last, None)
-    if not any((content.get("inputs") or {}).values()):
-        content.pop("inputs", None)
+        node.pop(last, None)
     return config_hash(content)

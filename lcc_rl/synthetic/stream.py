@@ -346,8 +346,6 @@ class StreamSource(Settings):
     The default size gives 270 pairs in three recordings; the I-80 data have 264 in three.
     """
 
-    WRITES = ("keep",)  # settings that name a path to write to
-
     # Recordings with independent leaders, drivers and vehicle ids.
     recordings: Annotated[int, Field(ge=1, le=1000)] = 3
     platoons: Annotated[int, Field(ge=1, le=10_000)] = 30  # successive platoons per recording
