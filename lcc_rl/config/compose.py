@@ -55,7 +55,8 @@ NOT_IDENTITY = (
 # Extras that install launchers.
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
 NEEDED = ("data", "split", "drivers", "observation", "calibration")  # required nodes of commands
-NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =
+# Text with =, alone, in a list or behind a name.
+NAMED = re.compile(r"(?:(?<=[\[,])|(?<=: )|^)((?:(?!: )[^\[\],{}])*=[^\[\],{}]*)")
 # Hint on Hydra's keys, which have no quotes.
 NAMES_HINT = (
     "; names before a colon consist of letters, digits, spaces and _-+./%*@?|, begin with a letter "
@@ -145,6 +146,8 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
         ['variant=alcc,hcfs', '++reward.terms.safety.margin=0', 'agent=td3']
         >>> as_meant(["compare=[idm,outputs/seed=0_1f]"])
         ['++compare=[idm,"outputs/seed=0_1f"]']
+        >>> as_meant(["compare={a: outputs/seed=0, b: idm}"])
+        ['++compare={a: "outputs/seed=0", b: idm}']
         >>> as_meant(["compare=['a=1,b=2_1f']"])
         ["++compare=['a=1,b=2_1f']"]
     """
@@ -163,7 +166,8 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
             converted.append(f"{key}{equals}{value.lower()}")
         elif key in ("compare", "policy", "resume"):  # folders of a sweep: seed=0_…
             quoted = "'" in value or '"' in value
-            converted.append(f"++{key}{equals}{value if quoted else NAMED.sub(QUOTED, value)}")
+            meant = value if quoted else NAMED.sub(r'"\1"', value)
+            converted.append(f"++{key}{equals}{meant}")
         else:
             setting = key.partition(".")[0] in _top_level() and not _is_choice(item)
             converted.append(f"++{item}" if equals and setting else item)
