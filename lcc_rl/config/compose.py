@@ -56,7 +56,7 @@ NOT_IDENTITY = (
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
 NEEDED = ("data", "split", "drivers", "observation", "calibration")  # required nodes of commands
 # Text with =, alone, in a list or behind a name.
-NAMED = re.compile(r"(?:(?<=[\[,])|(?<=: )|^)((?:(?!: )[^\[\],{}])*=[^\[\],{}]*)")
+NAMED = re.compile(r"(?:(?<=[\[,])|(?<=: )|^)( *)((?:(?!: )[^\[\],{}])*=[^\[\],{}]*)")
 # Hint on Hydra's keys, which have no quotes.
 NAMES_HINT = (
     "; names before a colon consist of letters, digits, spaces and _-+./%*@?|, begin with a letter "
@@ -166,7 +166,7 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
             converted.append(f"{key}{equals}{value.lower()}")
         elif key in ("compare", "policy", "resume"):  # folders of a sweep: seed=0_…
             quoted = "'" in value or '"' in value
-            meant = value if quoted else NAMED.sub(r'"\1"', value)
+            meant = value if quoted else NAMED.sub(r'\1"\2"', value)
             converted.append(f"++{key}{equals}{meant}")
         else:
             setting = key.partition(".")[0] in _top_level() and not _is_choice(item)
