@@ -28,8 +28,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 44_200, "code": 29_300},
-    "tests": {"lines": 26_590},
+    "lcc_rl + tools": {"lines": 44_030, "code": 29_185},
+    "tests": {"lines": 26_553},
     "conf": {"yaml": 165},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py
@@ -37,7 +37,7 @@ STRUCTURE = {
     "names in several modules": 57,
     "floors": 10,
     "circles": 0,
-    "functions with a configuration": 130,
+    "functions with a configuration": 128,
 }
 
 
