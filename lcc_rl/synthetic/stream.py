@@ -358,7 +358,7 @@ class StreamSource(Settings):
     drivers: InstanceOf[DriverPopulation] | None = None  # None: the shipped I-80 drivers
     # Criteria of car following; the default is that of real files.
     criteria: Criteria = field(default_factory=Criteria)
-    keep: None = None  # no file is written; the setting remains in the hashes of runs
+    keep: None = None  # no file is written; stored runs name the setting
 
     def generate(self) -> Stream:
         """Simulate all recordings."""
