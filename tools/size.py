@@ -29,7 +29,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
     "lcc_rl + tools": {"lines": 44_030, "code": 29_185},
-    "tests": {"lines": 26_553},
+    "tests": {"lines": 26_549},
     "conf": {"yaml": 165},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py
