@@ -232,20 +232,15 @@ def defaults(kind: type[Settings]) -> dict[str, Any]:
     return plain
 
 
-def as_plain(value: Any, places: bool = True) -> Any:
-    """Return settings as plain containers, as files store them.
-
-    Args:
-        value: a configuration, a part of one or a node.
-        places: include paths to write to; else they are null.
-    """
+def as_plain(value: Any) -> Any:
+    """Return a configuration, a part of one or a node as plain containers, as files store them."""
     if hasattr(value, "stored"):  # a node
-        value = value.stored(places)
+        value = value.stored()
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = values(value)
     if isinstance(value, Mapping):
-        return {key: as_plain(item, places) for key, item in value.items()}
-    return [as_plain(x, places) for x in value] if isinstance(value, (list, tuple)) else value
+        return {key: as_plain(item) for key, item in value.items()}
+    return [as_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def path_of(kind: Any) -> str:

@@ -82,7 +82,6 @@ class OffPolicy(Sampling):
     # less time. False, or networks without ReLU: differentiate the loss automatically.
     fused: bool = True
 
-    LATER = ("activation", "schedule", "clip_norm", *Sampling.LATER)
     loop = ReplayLoop
     critics: ClassVar[int] = 1
     joint: ClassVar[bool] = True  # whether one optimizer steps all networks at once

@@ -68,7 +68,6 @@ class PPO(Sampling):
     sigma: Positive = 0.5  # standard deviation before the tanh at the start
     clip_norm: Positive = 0.5  # largest norm of a gradient
 
-    LATER = ("activation", "schedule", *Sampling.LATER)
     loop = OnPolicyLoop
 
     def setup(self, scene: Scene) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -60,11 +60,6 @@ class Sampling(Aiming):
     humans_first: NonNegative = 0.0
     # Learn from rewards over the running standard deviation of their discounted sum.
     scale_rewards: bool = False
-
-    LATER: ClassVar[Sequence[str]] = (
-        *("policy", "constants", "bound", "hold", "horizon", "scale_rewards", "humans_first"),
-        *("surrogates", "regularizers", "limits", "limit_rate"),
-    )
 
     def state_dict(self) -> dict[str, Any]:
         return {"count": self.count, **super().state_dict()}

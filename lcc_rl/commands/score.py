@@ -172,7 +172,7 @@ def play_source(entrant: Scored, source: str, cfg: EvaluateConfig, folder: Path)
     rows = read_parquet(folder / EPISODES)
     # Further controllers and the size of files do not count; "data" is the hash of the leaders.
     unused = ("evaluation.behind_filter", "evaluation.sample_mb", "inputs.data", "inputs.leader")
-    settings = identity(cfg, *unused, changed=True)
+    settings = identity(cfg, *unused)
     hashes = {"data": hash_of(inputs.evaluation), "settings": settings}
     windows = windows_for(rows)
     task = task.resolved(windows)

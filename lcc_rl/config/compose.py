@@ -54,14 +54,9 @@ NOT_IDENTITY = (
 )
 # Extras that install launchers.
 EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps", "ray": "ray"}
-# Settings of later versions, which older runs lack.
-LATER = (
-    *("evaluation.warm_up", "evaluation.front", "evaluation.second_energy"),
-    *("evaluation.terms", "scenario.fleet"),
-    "measures",
-)
 NEEDED = ("data", "split", "drivers", "observation", "calibration")  # required nodes of commands
-NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =
+# Text with =, alone, in a list or behind a name.
+NAMED = re.compile(r"(?:(?<=[\[,])|(?<=: )|^)( *)((?:(?!: )[^\[\],{}])*=[^\[\],{}]*)")
 # Hint on Hydra's keys, which have no quotes.
 NAMES_HINT = (
     "; names before a colon consist of letters, digits, spaces and _-+./%*@?|, begin with a letter "
@@ -151,6 +146,8 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
         ['variant=alcc,hcfs', '++reward.terms.safety.margin=0', 'agent=td3']
         >>> as_meant(["compare=[idm,outputs/seed=0_1f]"])
         ['++compare=[idm,"outputs/seed=0_1f"]']
+        >>> as_meant(["compare={a: outputs/seed=0, b: idm}"])
+        ['++compare={a: "outputs/seed=0", b: idm}']
         >>> as_meant(["compare=['a=1,b=2_1f']"])
         ["++compare=['a=1,b=2_1f']"]
     """
@@ -169,7 +166,8 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
             converted.append(f"{key}{equals}{value.lower()}")
         elif key in ("compare", "policy", "resume"):  # folders of a sweep: seed=0_…
             quoted = "'" in value or '"' in value
-            converted.append(f"++{key}{equals}{value if quoted else NAMED.sub(QUOTED, value)}")
+            meant = value if quoted else NAMED.sub(r'\1"\2"', value)
+            converted.append(f"++{key}{equals}{meant}")
         else:
             setting = key.partition(".")[0] in _top_level() and not _is_choice(item)
             converted.append(f"++{item}" if equals and setting else item)
@@ -433,22 +431,20 @@ def config_hash(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def identity(cfg: Any, *unused: str, changed: bool = False) -> str:
+def identity(cfg: Any, *unused: str) -> str:
     """Return the hash of everything in a configuration that determines the results.
+
+    Defaults of classes do not count, so settings of later versions change no hash.
 
     Args:
         cfg: the configuration.
         *unused: keys of further settings that do not count.
-        changed: only settings that differ from the defaults of classes count.
     """
-    content = without_defaults(cfg) if changed else as_plain(cfg, places=False)
-    for key in (*NOT_IDENTITY, *unused, *LATER):
+    content = without_defaults(cfg)
+    for key in (*NOT_IDENTITY, *unused):
         *path, last = key.split(".")
         node = content
         for name in path:
             node = node.get(name) or {}
-        if key not in LATER or not node.get(last):
-            node.pop(last, None)
-    if not any((content.get("inputs") or {}).values()):
-        content.pop("inputs", None)
+        node.pop(last, None)
     return config_hash(content)

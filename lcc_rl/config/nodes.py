@@ -93,15 +93,9 @@ class Node:
         """Its name in tables: ``ddpg`` for the agent DDPG."""
         return str(self.settings[TARGET]).rpartition(".")[2].lower()
 
-    @property
-    def places(self) -> list[str]:
-        """The settings that name a path to write to; a class lists them as ``WRITES``."""
-        named = getattr(self.kind, "WRITES", ())
-        return [name for name in named if self.settings.get(name) is not None]
-
-    def stored(self, places: bool = True) -> dict[str, Any]:
-        """Return the settings; without ``places``, paths to write to are null."""
-        return {**self.settings, **dict.fromkeys(() if places else self.places)}
+    def stored(self) -> dict[str, Any]:
+        """Return the settings."""
+        return dict(self.settings)
 
     def made(self, needed: type | Sequence[str] = object) -> Any:
         """Return the object; for a class with :class:`Settings` it is always the same one.
@@ -251,9 +245,6 @@ def settings_of(target: Any) -> list[str] | None:
 def with_defaults(value: Any, where: str = "") -> Any:
     """Return a setting in which every mapping with ``_target_`` contains the defaults of its class.
 
-    A class lists as ``LATER`` the settings of later versions with defaults that change nothing.
-    They are contained only if they are given, so the hashes of stored runs are unchanged.
-
     Args:
         value: a setting as plain containers; references to other settings may be unresolved.
         where: its place in the configuration, for messages.
@@ -267,10 +258,7 @@ def _completed(settings: dict[str, Any], where: str) -> dict[str, Any]:
         if str(key).startswith("_") and key != TARGET:
             raise ConfigError(f"{where}.{key} has no effect: a node has {TARGET} and settings")
     if has_settings(kind):
-        later = getattr(kind, "LATER", ())
         for key, default in defaults(kind).items():
-            if key in later and key not in settings:
-                continue
             value = settings.setdefault(key, default)
             if isinstance(value, Mapping) and isinstance(default, Mapping):
                 settings[key] = {**default, **value}

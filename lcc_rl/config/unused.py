@@ -48,12 +48,13 @@ def check_used(
         if observation[TARGET] == OBSERVATION and "behind" not in (observation.get("scales") or ()):
             for key in ("visible", "presence"):
                 reasons[f"observation.{key}"] = "observation.scales names no vehicle behind"
-        keys = {*OF_COMPARISONS[RECORDED in cfg.evaluation.baselines :]}
-        training = type(cfg) is TrainConfig
-        for key in keys & {*map(key_of, overrides)} if training else ():
-            reasons[key] = "a training evaluates its own policy; lcc-rl evaluate compares"
-        if training and cfg.is_fixed() and of_package([cfg.observation, cfg.reward, cfg.agent]):
-            reasons |= dict.fromkeys(("drivers", "evaluation.seed"), FIXED)
+        if type(cfg) is TrainConfig:
+            compares = "a training evaluates its own policy; lcc-rl evaluate compares"
+            reasons |= dict.fromkeys({*OF_COMPARISONS} & {*map(key_of, overrides)}, compares)
+            if RECORDED in cfg.evaluation.baselines:
+                reasons.pop(BASELINES, None)
+            if cfg.is_fixed() and of_package([cfg.observation, cfg.reward, cfg.agent]):
+                reasons |= dict.fromkeys(("drivers", "evaluation.seed"), FIXED)
         reasons["sweep"] = "it names the folder of a sweep, -m"
     if written is not None and cfg.agent is not None and "surrogates" in cfg.agent.settings:
         typed = set().union(*map(typed_keys, overrides))
@@ -108,8 +109,9 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
     for group in ("controllers", "start", "filters", "actuators", "sensors"):
         for role in {*getattr(cfg.scenario, group)} & {*cfg.scenario.controllers}:
             if role not in cfg.scenario.vehicles.names:
-                for key in (f"scenario.{group}.{role}", *["filter"] * (group == "filters")):
-                    yield key, f"no vehicle of the string is {role}"
+                yield f"scenario.{group}.{role}", f"no vehicle of the string is {role}"
+                if group == "filters":
+                    yield "filter", f"no vehicle of the string is {role}"
     if AUTOMATED not in cfg.scenario.vehicles.names:
         for name in ("max_braking", "max_acceleration"):
             yield f"scenario.{name}", "no vehicle of the string is automated"
@@ -135,8 +137,9 @@ def _of_agent(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
         reason = "no vehicle of the string is automated"
     elif driver is not None and not takes_action(driver):
         reason += f": {driver.name} drives the automated vehicles and uses no action of a policy"
-    for key in ("agent", "training", *["policy"] * (cfg.policy is not None)):
-        yield key, reason
+    yield from {"agent": reason, "training": reason}.items()
+    if cfg.policy is not None:
+        yield "policy", reason
 
 
 def _of_objective(

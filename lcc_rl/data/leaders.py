@@ -256,8 +256,6 @@ class DriveLeaders(Settings):
     file. Of a single record the end is held out.
     """
 
-    LATER = ("bridge_s",)
-
     # One or several .csv or .parquet files, a pattern or a folder. A file without the column of
     # drives is one drive with the file's name; a native OpenACC file is that of its first car.
     path: str | Sequence[str]

@@ -64,8 +64,6 @@ class LoadedEpisodes:
 class Source(Settings):
     """Base of sources of recorded episodes."""
 
-    LATER = ("average_s", "bridge_s")
-
     plausible: Plausible | None = None  # None: the defaults
     # Width of a moving average of speeds, gaps and positions, see
     # :func:`lcc_rl.data.smoothing.averaged`; 0: none [s].

@@ -21,7 +21,7 @@ from lcc_rl.drivers.fit_error import (
     FitMeasure,
     intervals,
 )
-from lcc_rl.drivers.genetic import Evolution, Fitness, GeneticSettings, Progress, minimise
+from lcc_rl.drivers.genetic import GeneticSettings, Progress, minimise
 from lcc_rl.drivers.observed import Observed, Selection, observe
 from lcc_rl.drivers.parameters import (
     DEFAULT_BOUNDS,
@@ -46,10 +46,6 @@ from lcc_rl.functional.driver_models import (
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.settings import Positive, Settings
 
-# Genetic algorithms for shared constants: over the constants, and for each over (v0, T).
-OUTER = GeneticSettings(population=12, generations=12, founders=2, patience=4)
-INNER = GeneticSettings(population=16, generations=8)
-
 # Columns of the errors; those of the held-out part end in ``_out``.
 ERROR_COLUMNS = {SPEED_RMSPE: "rmspe", GAP_RMSE: "gap_rmse_m", GAP_NRMSE: "gap_nrmse"}
 OUT = "_out"
@@ -68,7 +64,7 @@ class Calibration:
         compared: returns both attributes below; called when one of them is read.
 
     Attributes:
-        report: lines on dropped episodes, chosen constants and errors.
+        report: lines on dropped episodes and errors.
         twins: results of :func:`lcc_rl.drivers.twins.compare_twins` for the recorded and the
             calibrated drivers, with the column mode.
     """
@@ -95,8 +91,6 @@ class Calibrator(Settings):
     The mode ``local`` fits (v0, T), ``global`` all parameters of the model.
     """
 
-    LATER = ("perception",)
-
     modes: Annotated[Sequence[Mode], Field(min_length=1)] = ("local",)
     model: str = DEFAULT_MODEL  # idm, ovm, fvdm, gipps or the dotted path of your own class
     objective: FitMeasure = "speed_rmspe"  # see lcc_rl.drivers.fit_error.FitError
@@ -112,7 +106,6 @@ class Calibrator(Settings):
     # that of the recorded drivers; see lcc_rl.drivers.twins.
     reaction: bool = False
     perception: bool = False  # try noises of the perceived gap, too; see lcc_rl.drivers.twins
-    choose_constants: bool = False  # local: choose the constants by the mean error of all drivers
     selection: Selection = field(default_factory=Selection)
     local_genetic: GeneticSettings = field(default_factory=GeneticSettings)
     global_genetic: GeneticSettings = field(
@@ -213,76 +206,33 @@ class _Fit:
 
     def drivers(self) -> tuple[pd.DataFrame, list[str]]:
         """Return one row per driver, and the lines of the report."""
-        constants, lines = self.settings.shared, []
-        if self.settings.choose_constants and self.mode == "local":
-            constants = self.chosen_constants()
-            shown = (
-                f"{self.table_of[x].column} {getattr(constants, x):.3g}" for x in constants.shared()
-            )
-            lines.append(f"constants chosen over all drivers: {', '.join(shown)}")
-        error, genetic = self.error(constants), getattr(self.settings, f"{self.mode}_genetic")
-        found = self.search(error, self.names, self.observed.count, genetic, self.progress)
-        drivers = self.table(found.best.to("cpu", torch.float64), constants)
+        settings, lines = self.settings, list[str]()
+        error = FitError(self.simulated, settings.shared, self.names, settings.objective)
+        genetic = getattr(settings, f"{self.mode}_genetic")
+        lower, upper = self.simulated.gaps.new_tensor([self.limits[name] for name in self.names]).T
+        generator = torch.Generator().manual_seed(self.seed)
+        problems = self.observed.count
+        found = minimise(error, lower, upper, problems, generator, genetic, self.progress)
+        drivers = self.table(found.best.to("cpu", torch.float64))
         if falling := int((~found.converged).sum()):
             line = f"{falling} of {len(drivers)} records have not converged: more generations?"
             more = f"{self.mode}_genetic.generations={3 * genetic.generations}"
             lines.append(Concern(f"{line} (calibration.{more})"))
-        what = self.names, self.limits, self.table_of, self.settings.objective
+        what = self.names, self.limits, self.table_of, settings.objective
         return drivers, lines + _findings(drivers, *what)
 
-    def error(self, constants: DriverConstants) -> FitError:
-        """Return the objective as a function of the fitted parameters."""
-        objective = self.settings.objective
-        return FitError(self.simulated, constants, self.names, objective)
-
-    def search(
-        self,
-        error: Fitness,
-        names: Sequence[str],
-        problems: int,
-        genetic: GeneticSettings,
-        progress: Progress | None,
-    ) -> Evolution:
-        """Minimise over some parameters, within their bounds."""
-        lower, upper = self.simulated.gaps.new_tensor([self.limits[name] for name in names]).T
-        generator = torch.Generator().manual_seed(self.seed)
-        return minimise(error, lower, upper, problems, generator, genetic, progress)
-
-    def chosen_constants(self) -> DriverConstants:
-        """Choose the shared constants by the mean error of local fits.
-
-        Candidates have the shape ``[1, candidates, constants]``.
-        """
-        drivers, start = self.observed.count, self.settings.shared
-        shared = start.shared()
-
-        def mean_error(candidates: Tensor) -> Tensor:
-            count = candidates.shape[1]
-
-            def error(genes: Tensor) -> Tensor:
-                # Every pair of driver and candidate is one problem.
-                own = candidates[0].repeat_interleave(genes.shape[1], dim=0).unbind(-1)
-                trial = start.with_(**dict(zip(shared, own, strict=True)))
-                side_by_side = genes.reshape(drivers, -1, genes.shape[-1])
-                return self.error(trial)(side_by_side).reshape(genes.shape[:-1])
-
-            found = self.search(error, self.names, drivers * count, INNER, None)
-            return found.fitness.reshape(drivers, count).mean(0, keepdim=True)
-
-        found = self.search(mean_error, shared, 1, OUTER, self.progress)
-        return start.with_(**dict(zip(shared, found.best[0].tolist(), strict=True)))
-
-    def table(self, best: Tensor, constants: DriverConstants) -> pd.DataFrame:
+    def table(self, best: Tensor) -> pd.DataFrame:
         """Return identities, parameters ``[drivers, names]``, errors and flags, a row per driver.
 
         Raises:
             DataError: if no parameters give a finite error.
         """
+        constants = self.settings.shared
         columns: dict[str, Any] = {str(key): held for key, held in self.observed.identity.items()}
         own = dict(zip(self.names, best.numpy().T, strict=True))
         for name, one in self.table_of.items():
             columns[one.column] = own.get(name, getattr(constants, name, None))
-        columns |= self.equilibrium(own, constants)
+        columns |= self.equilibrium(own)
         objective, exact = self.settings.objective, {}
         for end, part in self.parts.items():
             exact[end] = FitError(part.to("cpu", torch.float64), constants, self.names, objective)
@@ -312,13 +262,13 @@ class _Fit:
         # The episodes are sorted by length; the table has the order of the input.
         return drivers.sort_values("episode", kind="stable", ignore_index=True)
 
-    def equilibrium(self, own: Mapping[str, Any], constants: DriverConstants) -> dict[str, Any]:
+    def equilibrium(self, own: Mapping[str, Any]) -> dict[str, Any]:
         """Return each record's mean speed and gap, and the equilibrium gap at this speed."""
         seen, samples = self.observed, torch.tensor(self.observed.samples)
         speed, gap = (x.cpu().sum(0) / samples for x in (seen.follower_speed, seen.gaps))
         given = {name: torch.tensor(values) for name, values in own.items()}
         v0, headway = (given.pop(name) for name in INDIVIDUAL)
-        steady = constants.with_(**given).equilibrium_gap(speed, v0, headway)
+        steady = self.settings.shared.with_(**given).equilibrium_gap(speed, v0, headway)
         found = {MEAN_SPEED: speed, MEAN_GAP: gap, EQUILIBRIUM: steady}
         return {name: values.numpy() for name, values in found.items()}
 

@@ -40,8 +40,6 @@ class ElectricCar(EnergyModel):
     grade: Grade = 0.0  # of the road [rad]
     power_limit: Positive | None = None  # at the wheels; None: no limit [W]
 
-    LATER = ("power_limit",)
-
     def validate(self) -> None:
         self.resistance = 0.5 * AIR * self.drag * self.area  # of the air [N/(m/s)²]
         lib = torch if isinstance(self.grade, Tensor) else math  # a grade of each sample, or one

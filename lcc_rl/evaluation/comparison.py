@@ -26,8 +26,11 @@ from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import check_present
 from lcc_rl.version import __version__
 
+log = logging.getLogger("lcc_rl")
+
 BLOCKS = "blocks"
 BLOCK_MARK = "lcc_rl.block"  # in the metadata of a block's files
+IDENTITY = "lcc_rl.config"  # in the metadata of a table, hash of its configuration
 Tables = tuple[pd.DataFrame, pd.DataFrame]  # rows, time series of sample episodes
 
 
@@ -106,11 +109,6 @@ class Store:
     def clear(self) -> None:
         """Remove the folder of the blocks."""
         shutil.rmtree(self.folder, ignore_errors=True)
-
-
-log = logging.getLogger("lcc_rl")
-
-IDENTITY = "lcc_rl.config"  # in the metadata of a table, hash of its configuration
 
 
 class Comparison:

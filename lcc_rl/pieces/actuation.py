@@ -32,7 +32,6 @@ class Actuation(RoleTransform):
     # Share of gravity along a slope that engine and brakes do not make up for.
     slope: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
 
-    LATER = ("slope",)
     obeyed = Entry("role.obeyed", "m/s²", "acceleration of engine and brakes for the command")
     kept = Entry("role.actuation", "m/s²", "last acceleration, then commands that do not act yet")
 

@@ -131,7 +131,6 @@ class Action(Controller):
     max_acceleration: Positive = MAX_ACCELERATION  # of action 1, in both directions [m/s²]
     hold: NonNegative = 0.0  # time for which an action is executed [s]; 0: one step
 
-    LATER = ("hold",)
     steady = True
     reads = (".".join(ACTION),)
     held = Entry("role.held", "–", "action of a policy that is executed since its last decision")

@@ -65,7 +65,6 @@ class Drivers(Controller):
     # Standard deviation of a smooth noise of ln(perceived gap); None: that of the population.
     gap_noise: NonNegative | None = None
 
-    LATER = ("delay_range", "acceleration_noise_range", "gap_noise")
     name = HUMAN
     known = (
         Entry("role.driver", "–", "id of each vehicle's driver in the population", option=True),

@@ -43,7 +43,6 @@ class Observation(Feature):
     presence: bool = False  # write which vehicles behind exist, even if all always do
     raw: bool = False  # entries in SI units, without their scale
 
-    LATER = ("presence",)
     measures = True
     gathered = Entry(OBSERVATION, "–", "observed entries, each times its constant")
     factors: ClassVar[Tensor]

@@ -51,7 +51,6 @@ class Sensors(RoleTransform):
     # Time of the last measurement before the target is lost for longest_dropout; None: never [s].
     lost_from: NonNegative | None = None
 
-    LATER = ("scale_error", "lost_from")
     measured = (
         Entry("role.sensed_gap", "m", "gap as measured"),
         Entry("role.sensed_speed", "m/s", "own speed as measured"),

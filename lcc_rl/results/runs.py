@@ -21,7 +21,7 @@ from lcc_rl.config.schemas import SECTIONS, BaseConfig, as_text
 from lcc_rl.errors import LccError, ResultsError
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import parse_yaml, read_text
-from lcc_rl.results.trust import own_modules, trusted
+from lcc_rl.results.trust import LOGS, own_modules, trusted
 from lcc_rl.runs.states import CONFIG, no_run
 from lcc_rl.version import __version__
 
@@ -92,9 +92,10 @@ def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:
     if not files:
         return
     with suppress(ResultsError):  # complete a file of an older version by defaults
-        stored = as_plain(trusted(stored, str(folder / CONFIG), own_modules(cfg))[0], places=False)
-    keys = differing(dict(flatten(stored)), dict(flatten(as_plain(cfg, places=False))))
-    keys = [key for key in keys if not any(f"{key}.".startswith(f"{x}.") for x in (*but, "trust"))]
+        stored = as_plain(trusted(stored, str(folder / CONFIG), own_modules(cfg))[0])
+    keys = differing(dict(flatten(stored)), dict(flatten(as_plain(cfg))))
+    free = tuple(f"{name}." for name in (*but, "trust", LOGS))
+    keys = [key for key in keys if not f"{key}.".startswith(free)]
     if keys:
         names = ", ".join(keys[:3]) + (", …" if len(keys) > 3 else "")
         raise ResultsError(

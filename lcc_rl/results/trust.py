@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lcc_rl.config.nodes import as_nodes, as_plain, nodes_in, settings_at, with_defaults
+from lcc_rl.config.nodes import as_plain, settings_at, with_defaults
 from lcc_rl.config.schemas import parse_config
 from lcc_rl.config.words import DOTTED, FILTERED, YAML, module_named
 from lcc_rl.errors import ConfigError, ResultsError, raised_as
@@ -18,6 +18,7 @@ from lcc_rl.settings import find_target
 ROOMS = "agents data drivers energy evaluation functional pieces runs.loggers synthetic"
 REGISTRY = tuple(f"lcc_rl.{room}" for room in ROOMS.split())
 FUNCTIONS = "lcc_rl.drivers.population"
+LOGS = "logger.where"  # the setting that names a path to write to
 RETIRED = ("objective",)  # removed settings that changed no row
 
 
@@ -45,14 +46,11 @@ def trusted(
     content = {key: value for key, value in content.items() if key not in RETIRED}
     if "trust" in content:
         content["trust"] = list(trust)
+    removed, logger = [], content.get("logger")
+    if isinstance(logger, Mapping) and logger.get("where") is not None:
+        content["logger"], removed = {**logger, "where": None}, [f"{LOGS}={logger['where']}"]
     with raised_as(ResultsError, f"{where}: not the configuration of a run", ConfigError):
-        nodes = as_nodes(with_defaults(content))
-        places = [
-            f"{node.where}.{name}={node.settings[name]}"
-            for node in nodes_in(nodes)
-            for name in node.places
-        ]
-        return parse_config(as_plain(nodes, places=False)), places
+        return parse_config(with_defaults(content)), removed
 
 
 def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] = ()) -> None:

@@ -38,8 +38,6 @@ class RowLogger(Settings):
     resumed run is the same one. Measures of the evaluation are named ``result/…``.
     """
 
-    WRITES = ("where",)  # settings that name a path to write to
-
     kind: Literal["tensorboard", "wandb", "mlflow"]
     where: str | None = None  # folder or tracking address; null: logs in the run's folder
     project: str = "lcc_rl"  # wandb's project, or MLflow's experiment

@@ -346,8 +346,6 @@ class StreamSource(Settings):
     The default size gives 270 pairs in three recordings; the I-80 data have 264 in three.
     """
 
-    WRITES = ("keep",)  # settings that name a path to write to
-
     # Recordings with independent leaders, drivers and vehicle ids.
     recordings: Annotated[int, Field(ge=1, le=1000)] = 3
     platoons: Annotated[int, Field(ge=1, le=10_000)] = 30  # successive platoons per recording
@@ -360,7 +358,7 @@ class StreamSource(Settings):
     drivers: InstanceOf[DriverPopulation] | None = None  # None: the shipped I-80 drivers
     # Criteria of car following; the default is that of real files.
     criteria: Criteria = field(default_factory=Criteria)
-    keep: None = None  # no file is written; the setting remains in the hashes of runs
+    keep: None = None  # no file is written; stored runs name the setting
 
     def generate(self) -> Stream:
         """Simulate all recordings."""

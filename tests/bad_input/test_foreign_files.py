@@ -89,13 +89,11 @@ def test_settings_that_a_run_or_policy_may_not_hold(run, monkeypatch) -> None:
 
 def test_a_stored_configuration_writes_nowhere_but_into_its_folder(run, tmp_path, caplog) -> None:
     logger = {"_target_": "lcc_rl.runs.loggers.RowLogger", "kind": "tensorboard", "where": "x"}
-    change(run, {"data.keep": str(tmp_path / "new.csv"), "logger": logger})
+    change(run, {"logger": logger})
     with caplog.at_level("WARNING", logger="lcc_rl"):
         cfg = load_config(run)
-    assert (cfg.data.made().keep, cfg.logger.made().where) == (None, None)
-    assert cfg.logger.made().kind == "tensorboard"
-    assert "data.keep=" in caplog.text
-    assert "names a path to write to and is left out" in caplog.text
+    assert (cfg.logger.made().kind, cfg.logger.made().where) == ("tensorboard", None)
+    assert "logger.where=x names a path to write to and is left out" in caplog.text
     change(run, {"logger": None})
     run_command("train", f"resume={run}", cwd=tmp_path, check=True)
     assert list(tmp_path.iterdir()) == [run]

@@ -163,18 +163,6 @@ def test_all_parameters_of_known_drivers_are_recovered(model, known_drivers, mak
     assert (free["time_gap_s"] / gaps - 1.0).abs().median() < 0.1
 
 
-@pytest.mark.parametrize("model", ["idm", "fvdm"])
-def test_constants_are_chosen_over_all_drivers(model, make_episodes):
-    known = LAWS[model](**KNOWN[model])
-    episodes = make_episodes([20.0, 25.0, 30.0], [1.0, 1.4, 1.8], known, [20.0] * 3, model)
-    given = fit(episodes, model=model)
-    chosen = fit(episodes, model=model, choose_constants=True)
-    assert chosen.drivers["rmspe"].mean() < 0.5 * given.drivers["rmspe"].mean()
-    for name in LAWS[model].shared():
-        assert chosen.drivers[PARAMETERS[name].column].nunique() == 1
-    assert any("constants chosen" in line for line in chosen.report)
-
-
 def test_the_equilibrium_gap_is_that_at_the_recorded_speed(uneven_lengths):
     rows = quick(uneven_lengths).drivers
     seen = uneven_lengths.groupby("episode")[["follower_speed_mps", "gap_m"]].mean()

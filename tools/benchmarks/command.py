@@ -17,7 +17,6 @@ from shutil import which
 import pandas as pd
 import torch
 
-from benchmarks import harness
 from benchmarks.calibrate import calibrate
 from benchmarks.env import collect, env, gym
 from benchmarks.harness import EXTRA, Row, installed, page, table
@@ -29,7 +28,7 @@ from lcc_rl.errors import how_to_install, require_known
 from lcc_rl.io.atomic import new_file
 from lcc_rl.io.files import processor, read_parquet, write_parquet
 from lcc_rl.runs.arguments import Arguments, typed
-from lcc_rl.settings import Million, Parallel
+from lcc_rl.settings import Million
 
 LISTED = (
     *(read, loading, start, env, string, simulate, gym, collect, update, train, analytic),
@@ -47,10 +46,6 @@ def parse(arguments: Sequence[str] | None) -> Namespace:
     parser.add_argument("names", nargs="*", metavar="name", help=listed)
     parser.add_argument(
         "--compile", action=BooleanOptionalAction, help="compiled cases (default: yes)"
-    )
-    parser.add_argument("--threads", type=typed(Parallel), default=1, help="threads of torch")
-    parser.add_argument(
-        "--clock", choices=[*harness.TIMERS], default="wall", help="processor: for a loaded machine"
     )
     parser.add_argument("--repeats", type=typed(Million), default=5, help="repeats of every case")
     parser.add_argument(
@@ -75,14 +70,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     require_known("benchmark", options.names, BENCHMARKS)
     out = new_file(options.out, "--out", lambda path: "benchmark" in TableFile(path).header)
-    torch.set_num_threads(options.threads)
-    harness.timer = options.clock
+    torch.set_num_threads(1)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     if not installed():
         print(f"left out: {', '.join(EXTRA)} ({how_to_install('bench')})")
     here = {
-        "threads": options.threads,
-        "clock": options.clock,
         "machine": processor(),
         "torch": torch.__version__,
         "date": f"{date.today()}",

@@ -17,17 +17,16 @@ from lcc_rl.synthetic.stream import StreamSource
 
 TOLERANCE = 1e-4  # within which two ways to the same result must agree before they are timed
 EXTRA = ("stable_baselines3", "gymnasium")  # alternatives of the extra bench
-TIMERS = {"wall": time.perf_counter, "processor": time.process_time}
-timer = "wall"  # which of them is read
 HEADINGS = ("case", "batch", "median", "smallest … largest", "unit", "ratio", "to")
 Row = dict[str, Any]
 Run = Callable[[], Any]
 Against = Mapping[str, Sequence[str]]  # names of a case's alternatives
 
 
-def alternate(runs: Mapping[str, Run], repeats: int, clock: str = "") -> dict[str, np.ndarray]:
+def alternate(
+    runs: Mapping[str, Run], repeats: int, read: Callable[[], float] = time.perf_counter
+) -> dict[str, np.ndarray]:
     """Return the seconds of every run, ``repeats`` times in turn; once before that, untimed."""
-    read = TIMERS[clock or timer]
     spent: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(repeats + 1):
         for name, run in runs.items():
@@ -128,7 +127,7 @@ def table(rows: pd.DataFrame) -> str:
 
 def page(rows: pd.DataFrame) -> str:
     """Return the table of rows below a line on where and when they were measured."""
-    kinds = ("machine", "torch", "threads", "clock", "repeats", "date")
+    kinds = ("machine", "torch", "repeats", "date")
     where = (f"{kind} {', '.join(map(str, rows[kind].unique()))}" for kind in kinds)
     load = f"load average {rows['load'].min():.1f} to {rows['load'].max():.1f}."
     return f"{'; '.join(where)}; {load}\n\n{table(rows)}"

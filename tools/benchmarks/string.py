@@ -6,6 +6,7 @@ Tests of the bridge use the ring of one lane in SUMO, too.
 from __future__ import annotations
 
 import math
+import time
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
@@ -246,6 +247,6 @@ def simulate(options: Namespace) -> list[Row]:
             for what, found, ours in zip(("speed", "gap"), run(), motion, strict=True):
                 agree(f"the {what} of {name}", found, ours, 2e-2)
         named = {f"{name}, {count}": run for name, run in {"simulate": own, **others}.items()}
-        spent, (case, *peers) = alternate(named, options.repeats, "processor"), named
+        spent, (case, *peers) = alternate(named, options.repeats, time.process_time), named
         rows += rows_of(spent, "s of the processor", {case: peers}, episodes)
     return rows
