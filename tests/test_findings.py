@@ -4,14 +4,17 @@ import re
 import subprocess
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted((ROOT / "findings").glob("*.sh"))
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
-def test_form(script):
+def test_form(subtests):
+    for script in SCRIPTS:
+        with subtests.test(script.stem):
+            check_form(script)
+
+
+def check_form(script):
     text = script.read_text(encoding="utf-8")
     head = re.match(r"#!/usr/bin/env bash\n((?:# .+\n)+)set -euo pipefail\n", text)
     assert head, "a head of comments, then set -euo pipefail"
