@@ -74,6 +74,7 @@ class OffPolicy(Sampling):
     clip_norm: Positive | None = None  # largest norm of a gradient; None: not clipped
     # Updates per collected transition; not given in the paper.
     updates_per_transition: Annotated[float, Field(gt=0.0, le=1000.0)] = 0.125
+    n_step: Count = 1  # decisions whose rewards a TD target sums; their actions are those stored
     learning_starts: Whole = 0  # transitions in the buffer before the first update
     # Number of episodes whose mean reward selects the run's policy; None: the last policy.
     best_window: Count | None = None
@@ -82,7 +83,7 @@ class OffPolicy(Sampling):
     # less time. False, or networks without ReLU: differentiate the loss automatically.
     fused: bool = True
 
-    LATER = ("activation", "schedule", "clip_norm", *Sampling.LATER)
+    LATER = ("activation", "schedule", "clip_norm", "n_step", *Sampling.LATER)
     loop = ReplayLoop
     critics: ClassVar[int] = 1
     joint: ClassVar[bool] = True  # whether one optimizer steps all networks at once
