@@ -162,7 +162,7 @@ class Analytic(Aiming):
     # Compile the step of the simulator; None: if the training is long enough to pay for it.
     compiled: bool | None = None
 
-    LATER = ("activation", "bound", "schedule", "warm_up")
+    LATER = ("activation", "bound", "schedule", "warm_up", "limit_damping")
     loop = GradientLoop
 
     def validate(self) -> None:

@@ -63,7 +63,7 @@ class Sampling(Aiming):
 
     LATER: ClassVar[Sequence[str]] = (
         *("policy", "constants", "bound", "hold", "horizon", "scale_rewards", "humans_first"),
-        *("surrogates", "regularizers", "limits", "limit_rate"),
+        *("surrogates", "regularizers", "limits", "limit_rate", "limit_damping"),
     )
 
     def state_dict(self) -> dict[str, Any]:

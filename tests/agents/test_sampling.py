@@ -48,9 +48,9 @@ def test_a_decision_sums_the_rewards_up_to_a_collision() -> None:
     assert rows["next", "reward"].flatten().tolist() == [3.0, 7.0, 11.0]
     assert rows[LIMITED].tolist() == [[1.0, 3.0], [5.0, 7.0], [9.0, 11.0]]
     assert rows["next", "observation"].flatten().tolist() == [2.0, 4.0, 6.0]
-    rows = transitions(n_step_returns(batch, 3, 0.5))
+    rows = transitions(n_step_returns(batch, 3, 0.5))  # to the collision, or the batch's end
     assert rows["next", "reward"].flatten().tolist() == [2.0, 2.0, 6.25, 8.0, 8.0, 6.0]
-    assert rows[LIMITED][2].tolist() == [2.0 + 0.5 * 3.0 + 0.25 * 4.0, 6.25]
+    assert rows[LIMITED][2].tolist() == [4.5, 6.25]
     assert rows["next", "observation"].flatten().tolist() == [2.0, 2.0, 5.0, 6.0, 6.0, 6.0]
     assert rows["next", "terminated"].flatten().tolist() == [True, True] + [False] * 4
     assert rows["steps_to_next_obs"].flatten().tolist() == [2, 1, 3, 3, 2, 1]
