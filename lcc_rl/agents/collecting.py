@@ -10,6 +10,7 @@ from itertools import islice
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.utils import expand_as_right
 from torch import nn
 from torchrl.collectors import BaseCollector, Collector
 
@@ -36,6 +37,7 @@ LEARNED_FROM = {
 
 BEGINS = "begins"  # whether a transition begins with a decision, if actions are held
 LIMITED: Key = ("next", "limited")  # terms with limits at price 1, if they are stored
+STEPS_AHEAD = "steps_to_next_obs"  # decisions of a return before a value, TorchRL's key
 
 # Steps of a training from which compiling the environment, 5 to 10 s, pays off.
 COMPILED_TRAINING_STEPS = 40_000
@@ -176,6 +178,34 @@ def decisions(batch: TensorDictBase, every: int) -> TensorDictBase:
     return begun.set("next", reached)
 
 
+def n_step_returns(batch: TensorDictBase, count: int, gamma: float) -> TensorDictBase:
+    """Return transitions over several decisions, with the discounted sums of their rewards.
+
+    They end with their episode or with the batch, if that is earlier.
+
+    Args:
+        batch: transitions of single decisions, ``[environments, decisions]``.
+        count: decisions of a return before a value.
+        gamma: discount of a decision.
+    """
+    if count == 1:
+        return batch
+    after, length = batch.get("next"), batch.shape[1]
+    done, now = after.get("done").squeeze(-1), torch.arange(length, device=batch.device)
+    single = {key: x for key in (REWARD, LIMITED[1:]) if (x := after.get(key, None)) is not None}
+    sums = {key: value.clone() for key, value in single.items()}
+    last, running = now.expand(done.shape), ~done
+    for ahead in range(1, count):
+        place = (now + ahead).clamp(max=length - 1)
+        running = running & (now + ahead < length)
+        for key, total in sums.items():
+            total += gamma**ahead * expand_as_right(running, total) * single[key][:, place]
+        last = torch.where(running, place, last)
+        running = running & ~done[:, place]
+    reached = after.gather(1, last).update(sums)
+    return batch.set("next", reached).set(STEPS_AHEAD, (last - now + 1).unsqueeze(-1))
+
+
 def of_decisions(rows: TensorDictBase) -> TensorDictBase:
     """Return the transitions, ``[rows]``, that begin with a decision."""
     begins = rows.get(BEGINS, None)
@@ -190,7 +220,8 @@ def transitions(batch: TensorDictBase) -> TensorDictBase:
     """
     shape = batch.get(("next", *REWARD)).shape[:-1]
     rows = TensorDict(batch_size=[shape.numel()], device=batch.device)
-    for source, target in {**LEARNED_FROM, LIMITED: LIMITED, (BEGINS,): (BEGINS,)}.items():
+    more = {LIMITED: LIMITED, (BEGINS,): (BEGINS,), (STEPS_AHEAD,): (STEPS_AHEAD,)}
+    for source, target in {**LEARNED_FROM, **more}.items():
         entry = batch.get(source, None)
         if entry is None:
             continue

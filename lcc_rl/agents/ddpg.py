@@ -58,7 +58,7 @@ class DDPG(OffPolicy):
     def _by_hand(self, batch: TensorDictBase, networks: ActorCritic) -> tuple[Tensor, Tensor]:
         """Compute the gradient explicitly (A8–A9, H7–H8); the actor uses the old critic."""
         seen = batch.get("observation")
-        wanted = networks.wanted(batch.get("next"), self._future(batch, networks))
+        wanted = networks.wanted(batch, self._future(batch, networks))
         raw = networks.actor.forward(seen)
         action = raw.tanh()
         values = networks.evaluate(seen, batch.get("action"))

@@ -156,11 +156,13 @@ class ActorCritic:
         both = torch.cat([reached, action], -1)
         return reduce(torch.minimum, [critic.forward(both) for critic in self.target_critics])
 
-    def wanted(self, after: TensorDictBase, future: Tensor) -> Tensor:
+    def wanted(self, batch: TensorDictBase, future: Tensor) -> Tensor:
         """Return the TD target, ``[batch, 1]``."""
+        after, ahead = batch.get("next"), batch.get("steps_to_next_obs", None)
         # Only a collision ends the sum of rewards; a truncated episode would continue.
         future = future.masked_fill(after.get("terminated"), 0.0)
-        return future.mul_(self.gamma).add_(after.get("reward"))
+        discount = self.gamma if ahead is None else self.gamma**ahead
+        return future.mul_(discount).add_(after.get("reward"))
 
     def evaluate(self, seen: Tensor, action: Tensor, count: int | None = None) -> list[Tensor]:
         """Return the values of actions by the first ``count`` critics; None: by all."""

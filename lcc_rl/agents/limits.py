@@ -25,7 +25,6 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError, require
 
 log = logging.getLogger("lcc_rl")
-DAMPING = 2.0  # share of the latest miss in the price of an average, against oscillations
 LEAST = 1e-3  # smaller limits count as this share
 
 
@@ -37,6 +36,7 @@ class Limits:
             recorded drivers, see :meth:`take`.
         rate: largest change of the logarithm of a multiplier per update.
         known: the surrogates by name.
+        damping: factor of the latest miss in the logarithm of the multiplier of an average.
         where: the setting that gives the limits.
 
     Raises:
@@ -48,6 +48,8 @@ class Limits:
         largest: Mapping[str, float | str | None],
         rate: float,
         known: Mapping[str, Any],
+        damping: float = 2.0,
+        *,
         where: str = "agent.limits",
     ) -> None:
         given = {name: share for name, share in largest.items() if share is not None}
@@ -64,7 +66,7 @@ class Limits:
                 )
         self.recorded = {name: known[name] for name, share in given.items() if share == RECORDED}
         self.largest = {name: 0.0 if x == RECORDED else float(x) for name, x in given.items()}
-        self.rate = rate
+        self.rate, self.damping = rate, damping
         self.logarithms = dict.fromkeys(self.largest, 0.0)
         self.widths = {
             name: known[name].limit_width for name in given if hasattr(known[name], "limit_width")
@@ -95,7 +97,7 @@ class Limits:
 
     def price(self, name: str) -> float:
         """Return the multiplier of a limit; 1 for other terms."""
-        return math.exp(self.logarithms.get(name, 0.0) + DAMPING * self.latest.get(name, 0.0))
+        return math.exp(self.logarithms.get(name, 0.0) + self.damping * self.latest.get(name, 0.0))
 
     def update(self, shares: Mapping[str, float]) -> None:
         """Raise the multipliers of missed limits and lower the others.
@@ -136,13 +138,12 @@ class LimitsEach:
     another; here it may not. Such a price adds to that of all episodes.
 
     Args:
-        largest, rate, known: as for :class:`Limits`.
+        largest: largest share of the time of each limit, by name.
+        how: rate, known and damping, as for :class:`Limits`.
     """
 
-    def __init__(
-        self, largest: Mapping[str, float | None], rate: float, known: Mapping[str, Any]
-    ) -> None:
-        self.make = partial(Limits, largest, rate, known, "agent.limits_each")
+    def __init__(self, largest: Mapping[str, float | None], *how: Any) -> None:
+        self.make = partial(Limits, largest, *how, where="agent.limits_each")
         self.largest = self.make().largest
         self.records: list[Limits] = []
         self.profile: list[int] = []  # record of each episode of the batch

@@ -20,7 +20,7 @@ from lcc_rl.functional.finite import any_nonfinite
 from lcc_rl.pieces.base import Key, as_key, next_key
 from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.pieces.world import World
-from lcc_rl.settings import Positive, Share
+from lcc_rl.settings import NonNegative, Positive, Share
 
 
 class Aiming(Agent):
@@ -33,6 +33,8 @@ class Aiming(Agent):
     # the recorded drivers; its weight is the price at the start, see lcc_rl.agents.limits.
     limits: dict[str, Share | Literal["recorded"] | None] = field(default_factory=dict)
     limit_rate: Positive = 0.1  # largest change of the logarithm of such a price at once
+    # Factor of the latest miss in the logarithm of the price of an average, such as the spacing.
+    limit_damping: NonNegative = 2.0
     # Terms of the objective only.
     regularizers: dict[str, InstanceOf[RewardTerm] | None] = field(default_factory=dict)
 
@@ -62,10 +64,9 @@ class Objective:
             }
 
         self.surrogates, self.regularizers = made("surrogates"), made("regularizers")
-        self.limits = Limits(settings.limits, settings.limit_rate, self.surrogates)
-        self.each = LimitsEach(
-            getattr(settings, "limits_each", {}), settings.limit_rate, self.surrogates
-        )
+        how = settings.limit_rate, self.surrogates, settings.limit_damping
+        self.limits = Limits(settings.limits, *how)
+        self.each = LimitsEach(getattr(settings, "limits_each", {}), *how)
         self.terms: list[tuple[RewardTerm, float]] = []
         self.priced = self.terms  # those with a limit of all episodes
 

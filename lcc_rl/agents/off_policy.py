@@ -74,6 +74,7 @@ class OffPolicy(Sampling):
     clip_norm: Positive | None = None  # largest norm of a gradient; None: not clipped
     # Updates per collected transition; not given in the paper.
     updates_per_transition: Annotated[float, Field(gt=0.0, le=1000.0)] = 0.125
+    n_step: Count = 1  # decisions whose rewards a TD target sums; their actions are those stored
     learning_starts: Whole = 0  # transitions in the buffer before the first update
     # Number of episodes whose mean reward selects the run's policy; None: the last policy.
     best_window: Count | None = None

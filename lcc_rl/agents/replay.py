@@ -10,7 +10,13 @@ from torch import Tensor
 from torchrl.collectors import BaseCollector
 
 from lcc_rl.agents.agent import derived_seed
-from lcc_rl.agents.collecting import LIMITED, CollectingLoop, of_decisions, transitions
+from lcc_rl.agents.collecting import (
+    LIMITED,
+    CollectingLoop,
+    n_step_returns,
+    of_decisions,
+    transitions,
+)
 from lcc_rl.io.tensors import check_like
 from lcc_rl.pieces.base import Key, as_key
 
@@ -57,7 +63,8 @@ class ReplayLoop(CollectingLoop[Any]):
 
     def learn(self, batch: TensorDictBase, before: int) -> dict[str, float]:
         """Make the updates that are due after a segment."""
-        new, settings = transitions(batch), self.agent
+        settings = self.agent
+        new = transitions(n_step_returns(batch, settings.n_step, settings.gamma))
         kept = of_decisions(new)
         if settings.lasting:
             kept.set(KNOWN, torch.full((len(kept), 2), -1.0, device=kept.device))

@@ -148,7 +148,7 @@ class SAC(OffPolicy):
         noise = self._noise(whole, 2)
         then = self._sample(reached, noise[0], networks)
         future = networks.future(reached, then.action)
-        wanted = networks.wanted(after, future.sub_(then.log_prob.mul_(alpha)))
+        wanted = networks.wanted(batch, future.sub_(then.log_prob.mul_(alpha)))
         now = self._sample(seen, noise[1], networks)
         values = networks.evaluate(seen, batch.get("action"))
         loss_value = networks.critic_step(values, wanted)

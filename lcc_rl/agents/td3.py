@@ -71,7 +71,7 @@ class TD3(OffPolicy):
         (noise,) = self._noise(action, 1)
         noise.mul_(self.policy_noise).clamp_(-self.noise_clip, self.noise_clip)
         action.add_(noise).clamp_(-1.0, 1.0)
-        wanted = networks.wanted(after, networks.future(reached, action))
+        wanted = networks.wanted(batch, networks.future(reached, action))
         values = networks.evaluate(batch.get("observation"), batch.get("action"))
         return networks.critic_step(values, wanted)
 

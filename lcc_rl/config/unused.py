@@ -164,6 +164,8 @@ def _of_objective(
                 yield f"reward.terms.{name}.{key}", f"{term.kind.__name__} has no gradient"
     if not limited:
         yield "agent.limit_rate", "agent.limits has no limit"
+    if not any(hasattr(x.kind, "limit_width") for n, x in surrogates.items() if n in limited and x):
+        yield "agent.limit_damping", "agent.limits has no limit of an average, such as the spacing"
     for name, surrogate in surrogates.items():
         if name not in terms or surrogate is None:
             continue

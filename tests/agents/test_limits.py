@@ -32,7 +32,7 @@ def test_a_price_rises_until_its_limit_is_kept() -> None:
 
 
 def test_the_price_of_an_average_answers_on_both_sides() -> None:
-    limits = Limits({"spacing": "recorded"}, 0.1, {"spacing": ExcessSpacing(time_gap=2.4)})
+    limits = Limits({"spacing": "recorded"}, 0.1, {"spacing": ExcessSpacing(time_gap=2.4)}, 0.5)
     profiles = followed_profiles()
     limits.take(profiles)
     gap, own = profiles.followers[:, 1].double(), 2.0 + 2.4 * profiles.followers[:, 0].double()
@@ -43,10 +43,10 @@ def test_the_price_of_an_average_answers_on_both_sides() -> None:
     for miss in (0.02, 0.02, -0.02, 0.0):
         limits.update({"spacing": limits.largest["spacing"] + miss})
         prices.append(limits.price("spacing"))
-    # The sum of the misses, and twice the latest one, as shares of the least or the limit's size.
+    # The sum of the misses, and half of the latest one, as shares of the least or the limit's size.
     width = max(0.1, abs(largest))
     sums, latest = torch.tensor([2.0, 4.0, 2.0, 2.0]), torch.tensor([2.0, 2.0, -2.0, 0.0])
-    expected = (0.1 * sums + 2.0 * latest) * 0.01 / width
+    expected = (0.1 * sums + 0.5 * latest) * 0.01 / width
     assert torch.allclose(torch.tensor(prices).log(), expected, atol=1e-5)
     other = Limits({"spacing": 0.0}, 0.1, {"spacing": ExcessSpacing()})
     other.load_state_dict(limits.state_dict())

@@ -39,7 +39,7 @@ EACH = pytest.mark.parametrize("agent", ["td3", "sac"])
 
 @EACH
 def test_resuming_equals_never_having_stopped(tmp_path, agent) -> None:
-    check_resuming(lambda place: small_loop(place, f"agent={agent}", *SMALL), tmp_path)
+    check_resuming(lambda at: small_loop(at, f"agent={agent}", "agent.n_step=3", *SMALL), tmp_path)
 
 
 def batch(size: int = 64, seed: int = 0) -> TensorDict:
@@ -49,6 +49,7 @@ def batch(size: int = 64, seed: int = 0) -> TensorDict:
         {
             "observation": torch.randn(size, 7, generator=draw),
             "action": torch.rand(size, 1, generator=draw) * 1.8 - 0.9,
+            "steps_to_next_obs": torch.randint(1, 4, (size, 1), generator=draw),
             "next": {
                 "observation": torch.randn(size, 7, generator=draw),
                 "reward": torch.randn(size, 1, generator=draw),

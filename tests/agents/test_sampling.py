@@ -17,7 +17,7 @@ from helpers import (
 )
 from tensordict import TensorDict
 
-from lcc_rl.agents.collecting import LIMITED, decisions, of_decisions, transitions
+from lcc_rl.agents.collecting import LIMITED, decisions, n_step_returns, of_decisions, transitions
 from lcc_rl.agents.factory import check_lengths, make_trainer, training_env
 from lcc_rl.agents.sampling import Returns
 from lcc_rl.envs import make_env
@@ -48,6 +48,12 @@ def test_a_decision_sums_the_rewards_up_to_a_collision() -> None:
     assert rows["next", "reward"].flatten().tolist() == [3.0, 7.0, 11.0]
     assert rows[LIMITED].tolist() == [[1.0, 3.0], [5.0, 7.0], [9.0, 11.0]]
     assert rows["next", "observation"].flatten().tolist() == [2.0, 4.0, 6.0]
+    rows = transitions(n_step_returns(batch, 3, 0.5))  # to the collision, or the batch's end
+    assert rows["next", "reward"].flatten().tolist() == [2.0, 2.0, 6.25, 8.0, 8.0, 6.0]
+    assert rows[LIMITED][2].tolist() == [4.5, 6.25]
+    assert rows["next", "observation"].flatten().tolist() == [2.0, 2.0, 5.0, 6.0, 6.0, 6.0]
+    assert rows["next", "terminated"].flatten().tolist() == [True, True] + [False] * 4
+    assert rows["steps_to_next_obs"].flatten().tolist() == [2, 1, 3, 3, 2, 1]
 
 
 def test_an_action_is_executed_until_the_next_decision() -> None:
