@@ -69,10 +69,10 @@ TRUTHS = {*COMPARISONS.values(), "{0} == 0"}  # formulas whose results are truth
 TYPES = {"f32(": "float", "f64(": "double", "i64(": "int64_t", "flag(": "int", "x": "float"}
 
 
-def c_code(module: DrivingProgram, about: str) -> str:
-    """Return the source of a program with its description ``about``: a function ``step`` in C99.
+def c_code(module: DrivingProgram, about: str, name: str) -> str:
+    """Return the source of a program with its description ``about``: ``<name>_step`` in C99.
 
-    It has no dependencies, for a car's control unit. The statements are those that
+    Other characters of the name than letters, digits and ``_`` become ``_``. The function has no dependencies, for a car's control unit. The statements are those that
     :mod:`lcc_rl.functional.recorder` records from the program. Compile with ``-std=c99`` or
     ``-ffp-contract=off``, so that products and sums are not fused.
 
@@ -97,7 +97,8 @@ def c_code(module: DrivingProgram, about: str) -> str:
     comment += f" * memory[{module.width}]: zeros when the car begins{change} its target changes\n"
     comment += " * Returns the acceleration for the next step [m/s^2]. */\n"
     head = comment + HEAD + (LAYER if "layer(" in lines else "") + tables
-    call = "float step(const float *state, float *memory) {\n    (void)memory;\n"
+    word = re.sub(r"^(?=\d)|\W", "_", f"{name}_step", flags=re.ASCII)
+    call = f"float {word}(const float *state, float *memory) {{\n    (void)memory;\n"
     return f"{head}\n{call}{lines}}}\n"
 
 
@@ -152,8 +153,8 @@ def export(
     The ending selects the format. ONNX (``.onnx``) and PyTorch's exported program (``.pt2``) read
     ``state``, ``[batch, inputs]`` in SI units, and return ``acceleration``, ``[batch, 1]`` [m/s²].
     A policy with a memory also has the input ``memory`` (zeros at first) and the output
-    ``next_memory``. C code (``.c``) is one function ``step(state, memory)`` in C99. Names, units
-    and meanings of the inputs are in the file's metadata under ``lcc_rl`` as JSON. A page
+    ``next_memory``. C code (``follow.c``) is one function ``follow_step(state, memory)`` in C99.
+    Names, units and meanings of the inputs are in the file's metadata under ``lcc_rl`` as JSON. A page
     (``.html``) shows the ring road with the policy in any browser, see
     :func:`lcc_rl.interfaces.ring_page.ring_page`.
 
@@ -223,7 +224,8 @@ def _written(
     else:
         changes = (safety, limits)
         module = _rule(policy, trust, *changes) if rule else program(spec, trust, cfg, *changes)
-        content, names = EXPORTERS[path.suffix](module, name), module.names
+        about = described(module, name)
+        content, names = EXPORTERS[path.suffix](module, about, path.stem), module.names
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path, names
@@ -256,13 +258,13 @@ def _program(module: DrivingProgram) -> Any:
     return torch.export.export(module, examples, dynamic_shapes=batch)
 
 
-def _as_pt2(module: DrivingProgram, name: str) -> bytes:
+def _as_pt2(module: DrivingProgram, about: str, _name: str) -> bytes:
     buffer = BytesIO()
-    torch.export.save(_program(module), buffer, extra_files={"lcc_rl": described(module, name)})
+    torch.export.save(_program(module), buffer, extra_files={"lcc_rl": about})
     return buffer.getvalue()
 
 
-def _as_onnx(module: DrivingProgram, name: str) -> bytes:
+def _as_onnx(module: DrivingProgram, about: str, _name: str) -> bytes:
     exported = _program(module)
     count = len(exported.graph_signature.user_inputs)
     with needing("interfaces", "write a .pt2, or install what .onnx needs"):
@@ -282,13 +284,13 @@ def _as_onnx(module: DrivingProgram, name: str) -> bytes:
         )
     assert converted is not None
     proto = converted.model_proto
-    onnx.helper.set_model_props(proto, {"lcc_rl": described(module, name)})
+    onnx.helper.set_model_props(proto, {"lcc_rl": about})
     content: bytes = proto.SerializeToString()
     return content
 
 
-def _as_c(module: DrivingProgram, name: str) -> bytes:
-    return c_code(module, described(module, name)).encode()
+def _as_c(module: DrivingProgram, about: str, name: str) -> bytes:
+    return c_code(module, about, name).encode()
 
 
 PAGE = ".html"

@@ -24,7 +24,7 @@ from lcc_rl.errors import ResultsError, needing, raised_as, require
 from lcc_rl.functional.pattern import MAX_ACCELERATION
 from lcc_rl.pieces.base import Entry, Piece, declared
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, VEHICLES
+from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, TARGET_AGE, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import Positive, Settings, parse
 
@@ -37,7 +37,7 @@ INPUT_UNITS = {
     for view in (SELF, AHEAD, BEHIND)
     for key, entry in declared(Piece).items()
     if key[0] == VEHICLES
-} | {f"{BEHIND}.present": "–"}
+} | {f"{BEHIND}.present": "–", f"{SELF}.{TARGET_AGE}": "s"}
 Short = Annotated[str, Field(max_length=100)]
 
 

@@ -29,7 +29,7 @@ class Sensors(RoleTransform):
 
     Controllers, safety filter, observation and memory of the role read the measurements instead of
     ``self.gap``, ``self.speed``, ``self.relative_speed``, ``ahead.speed`` and
-    ``ahead.acceleration``. Limits, rewards and energy use the true state. The own acceleration,
+    ``ahead.acceleration``, and their age as ``self.target_age``. Limits, rewards and energy use the true state. The own acceleration,
     vehicles behind and messages are exact. Errors are drawn uniformly within their bounds by the
     episode's seed, for each measurement or every ``error_time`` with linear interpolation.
 
@@ -58,6 +58,7 @@ class Sensors(RoleTransform):
         Entry("role.sensed_relative_speed", "m/s", "speed ahead minus own speed, as measured"),
         Entry("role.sensed_ahead_speed", "m/s", "speed of the vehicle ahead as measured"),
         Entry("role.sensed_ahead_acceleration", "m/s²", "acceleration ahead as measured"),
+        Entry("role.target_age", "s", "age of the measurement of gap and vehicle ahead"),
     )
     kept = Entry(
         "role.sensors", "–", "ages of target and own speed [steps], true states to measure"
@@ -141,8 +142,8 @@ class Sensors(RoleTransform):
         )
         speed = (own * speed + speed_error).clamp(min=0.0)
         ahead = (other * ahead + ahead_error).clamp(min=0.0)
-        memory = join([ages, frames], -1)
-        return gap + gap_error, speed, ahead - speed, ahead, acceleration, memory
+        measured = gap + gap_error, speed, ahead - speed, ahead, acceleration
+        return *measured, self.time_step * ages[..., :1], join([ages, frames], -1)
 
     def _error(self, seed: Tensor, step: Tensor, stream: int) -> Tensor:
         """Return the error of a step's measurements as a share of its bound, in [−1, 1]."""

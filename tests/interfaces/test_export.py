@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -131,21 +132,28 @@ class Patient(Controller):
         return 0.1 * (mean - self.aim), mean
 
 
+def built(path: Path, name: str) -> Callable[..., float]:
+    """Return a function of a file in C, of arrays."""
+    if (compiler := shutil.which("cc")) is None:
+        pytest.skip("no C compiler")
+    strict = "-std=c99 -O2 -Wall -Wextra -Wno-unused-function -pedantic -Werror -shared -fPIC"
+    file = path.with_suffix(".so")
+    subprocess.run([compiler, *strict.split(), path, "-o", file, "-lm"], check=True)
+    function = getattr(ctypes.CDLL(str(file)), name)
+    function.restype = ctypes.c_float
+    kind = ctypes.POINTER(ctypes.c_float)
+    return lambda *arrays: function(*(x.ctypes.data_as(kind) for x in arrays))
+
+
 OWN = {"own": Patient(aim=15.0), "mapping": {"mine_filtered": Patient()}}
 
 
 @pytest.mark.parametrize("name", ["pretrained/i24-follow5", "idm_acc_filtered", "idm_acc", *OWN])
 def test_c_code_computes_the_same(name, tmp_path) -> None:
     """With the memory of its own, through NaN, a lost target and another one."""
-    if (compiler := shutil.which("cc")) is None:
-        pytest.skip("no C compiler")
     driver = OWN.get(name, name)
     path = lcc_rl.export(driver, tmp_path / "follow.c")
-    strict = "-std=c99 -O2 -Wall -Wextra -Wno-unused-function -pedantic -Werror -shared -fPIC"
-    built = tmp_path / "follow.so"
-    subprocess.run([compiler, *strict.split(), path, "-o", built, "-lm"], check=True)
-    step = ctypes.CDLL(str(built)).step
-    step.restype = ctypes.c_float
+    step = built(path, "follow_step")
     module = Driver(driver, 0.1).program
     width, chance = len(module.names), np.random.default_rng(0)
     state, kept = 20.0 * chance.random((1, width)), np.zeros((1, module.width), np.float32)
@@ -160,7 +168,7 @@ def test_c_code_computes_the_same(name, tmp_path) -> None:
         expected, *memory = (
             module(torch.from_numpy(seen), *memory) if memory else [module(torch.from_numpy(seen))]
         )
-        found = step(*(x.ctypes.data_as(ctypes.POINTER(ctypes.c_float)) for x in (seen, kept)))
+        found = step(seen, kept)
         assert found == pytest.approx(expected.item(), abs=2e-6, nan_ok=True), k
         assert np.isfinite(found) or np.isnan(seen).any()  # memories stay finite
         for one in memory:
@@ -169,6 +177,54 @@ def test_c_code_computes_the_same(name, tmp_path) -> None:
     assert all(f": {column} [" in head for column in module.names)
     change = " or" if name.startswith("pretrained") else ", not when"
     assert f"]: zeros when the car begins{change} its target changes\n" in head
+
+
+class Ages(Controller):
+    """Follows for 0.4 s without a target, then coasts, from 1.6 s on it brakes by the age."""
+
+    gain: Positive = 0.2  # [1/s²]
+    reads = ("self.speed", "self.gap", "self.relative_speed", "self.target_age")
+
+    def command(self, speed, gap, relative_speed, target_age):
+        command = self.gain * (gap - 2.0 - 1.4 * speed) + 0.8 * relative_speed
+        late = torch.where(target_age >= 1.6, -target_age, -0.1)
+        return torch.where(target_age > 0.4, late, command)
+
+
+def test_the_age_of_a_target_is_the_same_in_simulation_driver_onnx_and_c(tmp_path) -> None:
+    """Also in a simulation of the ONNX file, and with an age that the caller gives."""
+    ort = pytest.importorskip("onnxruntime", reason="extra interfaces")
+    paths = {end: lcc_rl.export(Ages(), tmp_path / f"ages{end}") for end in (".onnx", ".c")}
+    lost = ["+event=lost_target", "drivers=highway", "scenario.sensors.automated.lost_from=5"]
+    lost.append("scenario.sensors.automated.longest_dropout=3")
+    leader = 20.0 + 2.0 * np.sin(0.05 * np.arange(121))
+    driven = [
+        lcc_rl.simulate(leader, "automated", x, overrides=lost).steps
+        for x in (Ages(), paths[".onnx"])
+    ]
+    of_car = [x.drop(columns="role").pivot(index="time_s", columns="vehicle") for x in driven]
+    steps, again = of_car
+    np.testing.assert_allclose(again, steps, atol=1e-4)
+    driver, given, step = Driver(Ages(), 0.1), Driver(Ages(), 0.1), built(paths[".c"], "ages_step")
+    session = ort.InferenceSession(paths[".onnx"])
+    memory, kept = (np.zeros((1, driver.program.width), np.float32) for _ in range(2))
+    for k in range(120):
+        missing = 50 < k <= 80
+        at = {"self.speed": steps["speed_mps"][1].iloc[k], "self.gap": steps["gap_m"][1].iloc[k]}
+        at |= {"ahead.speed": leader[k], "self.target_age": 0.0}
+        held = {"self.gap": steps["gap_m"][1].iloc[50], "ahead.speed": leader[50]}
+        seen = at | dict.fromkeys(held, np.nan) if missing else at
+        age = {"self.target_age": np.float32(0.1) * (k - 50)}
+        state = np.array([[seen[name] for name in driver.names]], np.float32)
+        acceleration, memory = session.run(None, {"state": state, "memory": memory})
+        found = [
+            driver.step({x: seen[x] for x in seen if x != "self.target_age"}),
+            given.step(at | held | age if missing else at),
+            acceleration.item(),
+            step(state, kept),
+        ]
+        expected = steps["acceleration_mps2"][1].iloc[k + 1]
+        assert found == pytest.approx([expected] * 4, abs=1e-5), k
 
 
 def test_a_measurement_that_is_no_number_brakes_or_shows(exported, tmp_path) -> None:
