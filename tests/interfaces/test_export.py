@@ -132,13 +132,13 @@ class Patient(Controller):
         return 0.1 * (mean - self.aim), mean
 
 
-def built(path: Path, name: str) -> Callable[..., float]:
-    """Return a function of a file in C, of arrays."""
+def built(name: str, *paths: Path) -> Callable[..., float]:
+    """Return a function of files in C, of arrays."""
     if (compiler := shutil.which("cc")) is None:
         pytest.skip("no C compiler")
     strict = "-std=c99 -O2 -Wall -Wextra -Wno-unused-function -pedantic -Werror -shared -fPIC"
-    file = path.with_suffix(".so")
-    subprocess.run([compiler, *strict.split(), path, "-o", file, "-lm"], check=True)
+    file = paths[0].with_suffix(".so")
+    subprocess.run([compiler, *strict.split(), *paths, "-o", file, "-lm"], check=True)
     function = getattr(ctypes.CDLL(str(file)), name)
     function.restype = ctypes.c_float
     kind = ctypes.POINTER(ctypes.c_float)
@@ -153,7 +153,7 @@ def test_c_code_computes_the_same(name, tmp_path) -> None:
     """With the memory of its own, through NaN, a lost target and another one."""
     driver = OWN.get(name, name)
     path = lcc_rl.export(driver, tmp_path / "follow.c")
-    step = built(path, "follow_step")
+    step = built("follow_step", path)
     module = Driver(driver, 0.1).program
     width, chance = len(module.names), np.random.default_rng(0)
     state, kept = 20.0 * chance.random((1, width)), np.zeros((1, module.width), np.float32)
@@ -205,7 +205,9 @@ def test_the_age_of_a_target_is_the_same_in_simulation_driver_onnx_and_c(tmp_pat
     of_car = [x.drop(columns="role").pivot(index="time_s", columns="vehicle") for x in driven]
     steps, again = of_car
     np.testing.assert_allclose(again, steps, atol=1e-4)
-    driver, given, step = Driver(Ages(), 0.1), Driver(Ages(), 0.1), built(paths[".c"], "ages_step")
+    with pytest.raises(ConfigError, match="its memory is for steps of 0.1 s, not 0.05 s"):
+        lcc_rl.simulate(leader, "automated", paths[".onnx"], time_step=0.05)
+    driver, given, step = Driver(Ages(), 0.1), Driver(Ages(), 0.1), built("ages_step", paths[".c"])
     session = ort.InferenceSession(paths[".onnx"])
     memory, kept = (np.zeros((1, driver.program.width), np.float32) for _ in range(2))
     for k in range(120):
@@ -225,6 +227,18 @@ def test_the_age_of_a_target_is_the_same_in_simulation_driver_onnx_and_c(tmp_pat
         ]
         expected = steps["acceleration_mps2"][1].iloc[k + 1]
         assert found == pytest.approx([expected] * 4, abs=1e-5), k
+
+
+def test_programs_in_c_with_steps_of_20_ms_share_a_program(tmp_path) -> None:
+    files = [
+        lcc_rl.export("pi_saturation", tmp_path / name, overrides=["time_step=0.02"])
+        for name in ("my-car.c", "2.c")
+    ]
+    assert all('"time_step_s": 0.02' in file.read_text(encoding="utf-8") for file in files)
+    assert built("my_car_step", *files) and built("_2_step", *files)
+    policy = "pretrained/alcc", tmp_path / "x.c"
+    with pytest.raises(ConfigError, match="a policy has the time step of its training"):
+        lcc_rl.export(*policy, overrides=["time_step=0.02"])
 
 
 def test_a_measurement_that_is_no_number_brakes_or_shows(exported, tmp_path) -> None:
