@@ -58,7 +58,7 @@ EXTRAS = {"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "swe
 LATER = (
     *("evaluation.warm_up", "evaluation.front", "evaluation.second_energy"),
     *("evaluation.terms", "scenario.fleet"),
-    "measures",
+    *("measures", "safety"),
 )
 NEEDED = ("data", "split", "drivers", "observation", "calibration")  # required nodes of commands
 NAMED, QUOTED = re.compile(r"(?:(?<=[\[,])|^)([^\[\],{}]*=[^\[\],{}]*)"), r'"\1"'  # text with =

@@ -168,8 +168,8 @@ def export(
         trust: modules outside this package that the policy may name.
         variant, overrides: environment in which a model or module was trained; for a page the
             overrides are settings of its ring, for a trained policy's program those of its filter
-            and of the car, such as ``safety.margin=2``, ``limits.max_braking=6``; ``time_step=0.02``
-            is that of a rule or controller, by default 0.1 s.
+            and of the car, such as ``safety.margin=2``, ``limits.max_braking=6``; a rule takes
+            ``time_step=0.02``, by default 0.1 s.
         normalize: ``VecNormalize`` of a model; by default that of its environment.
         safety: the safety filter of a program, or changed settings of its own, such as
             ``{"margin": 2.0}``.
