@@ -235,7 +235,7 @@ def test_programs_in_c_with_steps_of_20_ms_share_a_program(tmp_path) -> None:
         for name in ("my-car.c", "2.c")
     ]
     assert all('"time_step_s": 0.02' in file.read_text(encoding="utf-8") for file in files)
-    assert built("my_car_step", *files) and built("_2_step", *files)
+    assert all(built(name, *files) for name in ("my_car_step", "_2_step"))
     policy = "pretrained/alcc", tmp_path / "x.c"
     with pytest.raises(ConfigError, match="a policy has the time step of its training"):
         lcc_rl.export(*policy, overrides=["time_step=0.02"])

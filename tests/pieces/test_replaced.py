@@ -44,7 +44,7 @@ def driven(words: list[str], action: float = 0.0, profiles=None) -> dict[str, Te
     } | {"alive": alive}
 
 
-def test_a_vehicle_cuts_in_at_the_given_time_gap_and_speed() -> None:
+def test_a_vehicle_cuts_in_at_the_given_time_gap_and_speed(caplog) -> None:
     for kind, change in (("cut_in", "gap=[9,9]"), ("cut_out", "farther=[30,30]")):
         words = [*event(kind, at=[3, 3], excess=[-2, -2]), f"{LEADER}.{change}"]
         found, gap = driven(words), None
@@ -61,6 +61,7 @@ def test_a_vehicle_cuts_in_at_the_given_time_gap_and_speed() -> None:
         assert found["followed"][28:31, 0, 0, 0].tolist()[1:] == [0.0, 1.0]
     nearer = driven([*event("cut_in", at=[3, 3]), f"{LEADER}.gap=[500,500]"])["gap"]
     assert (nearer[29, :, 0] - nearer[28, :, 0]).abs().max() < 1.0  # never beyond the leader
+    assert caplog.text.count("ReplacedLeader happened in none of 4 episodes: the gap was sh") == 1
 
 
 def test_every_episode_draws_its_own_change() -> None:
