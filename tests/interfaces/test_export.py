@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import json
 import shutil
 import subprocess
+import sys
+import types
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import check_refused, play, small_env
+from page_blocks import ROOT, blocks
 from torch import nn
 
 import lcc_rl
@@ -179,54 +183,51 @@ def test_c_code_computes_the_same(name, tmp_path) -> None:
     assert f"]: zeros when the car begins{change} its target changes\n" in head
 
 
-class Ages(Controller):
-    """Follows for 0.4 s without a target, then coasts, from 1.6 s on it brakes by the age."""
-
-    gain: Positive = 0.2  # [1/s²]
-    reads = ("self.speed", "self.gap", "self.relative_speed", "self.target_age")
-
-    def command(self, speed, gap, relative_speed, target_age):
-        command = self.gain * (gap - 2.0 - 1.4 * speed) + 0.8 * relative_speed
-        late = torch.where(target_age >= 1.6, -target_age, -0.1)
-        return torch.where(target_age > 0.4, late, command)
-
-
 def test_the_age_of_a_target_is_the_same_in_simulation_driver_onnx_and_c(tmp_path) -> None:
-    """Also in a simulation of the ONNX file, and with an age that the caller gives."""
+    """Of the page's controller; also in a simulation of the ONNX file, with ages, and filtered."""
     ort = pytest.importorskip("onnxruntime", reason="extra interfaces")
-    paths = {end: lcc_rl.export(Ages(), tmp_path / f"ages{end}") for end in (".onnx", ".c")}
+    page, pieces = blocks(ROOT / "docs" / "controllers.md"), types.ModuleType("my_page")
+    texts = [x.text for x in page if "# my_pieces" in x.text and "PID" not in x.text]
+    exec("".join(texts), vars(sys.modules.setdefault("my_page", pieces)))
+    paths = {end: lcc_rl.export("my_page.coast", tmp_path / f"to{end}") for end in (".onnx", ".c")}
     lost = ["+event=lost_target", "drivers=highway", "scenario.sensors.automated.lost_from=5"]
     lost.append("scenario.sensors.automated.longest_dropout=3")
     leader = 20.0 + 2.0 * np.sin(0.05 * np.arange(121))
-    driven = [
-        lcc_rl.simulate(leader, "automated", x, overrides=lost).steps
-        for x in (Ages(), paths[".onnx"])
-    ]
-    of_car = [x.drop(columns="role").pivot(index="time_s", columns="vehicle") for x in driven]
-    steps, again = of_car
-    np.testing.assert_allclose(again, steps, atol=1e-4)
+    drive = functools.partial(lcc_rl.simulate, leader, "automated")
+    behind = ["+filter=cbf", "scenario.filters.automated.robust=false"]
+    steps, again, filtered = (
+        drive(x, overrides=[*lost, *words]).steps.query("vehicle == 1").reset_index()
+        for x, words in (
+            ("my_page.coast", []),
+            (paths[".onnx"], []),
+            ({"x_filtered": "my_page.coast"}, behind),
+        )
+    )
+    np.testing.assert_allclose(again["speed_mps"], steps["speed_mps"], atol=1e-5)
     with pytest.raises(ConfigError, match=r"memory is for steps of 0\.1 s"):
-        lcc_rl.simulate(leader, "automated", paths[".onnx"], time_step=0.05)
-    driver, given, step = Driver(Ages(), 0.1), Driver(Ages(), 0.1), built("ages_step", paths[".c"])
+        drive(paths[".onnx"], time_step=0.05)
+    given, safe = Driver("my_page.coast", 0.1), Driver({"x_filtered": "my_page.coast"}, 0.1)
+    driver, step = Driver("my_page.coast", 0.1), built("to_step", paths[".c"])
     session = ort.InferenceSession(paths[".onnx"])
     memory, kept = (np.zeros((1, driver.program.width), np.float32) for _ in range(2))
+
+    def at(steps, k: int, last: int) -> dict[str, float]:
+        age = {"self.target_age": np.float32(0.1) * (k - last), "ahead.speed": leader[last]}
+        ahead = 10.0 * (leader[last] - leader[last - 1]) if last else 0.0
+        own = {"self.speed": steps["speed_mps"][k], "self.gap": steps["gap_m"][last]}
+        return {**own, **age, "ahead.acceleration": ahead}
+
     for k in range(120):
-        missing = 50 < k <= 80
-        at = {"self.speed": steps["speed_mps"][1].iloc[k], "self.gap": steps["gap_m"][1].iloc[k]}
-        at |= {"ahead.speed": leader[k], "self.target_age": 0.0}
-        held = {"self.gap": steps["gap_m"][1].iloc[50], "ahead.speed": leader[50]}
-        seen = at | dict.fromkeys(held, np.nan) if missing else at
-        age = {"self.target_age": np.float32(0.1) * (k - 50)}
+        held = at(steps, k, 50 if 50 < k <= 80 else k)
+        seen = held if held["self.target_age"] == 0.0 else held | {"self.gap": np.nan}
+        seen = seen | {"self.target_age": 0.0}
         state = np.array([[seen[name] for name in driver.names]], np.float32)
         acceleration, memory = session.run(None, {"state": state, "memory": memory})
-        found = [
-            driver.step({x: seen[x] for x in seen if x != "self.target_age"}),
-            given.step(at | held | age if missing else at),
-            acceleration.item(),
-            step(state, kept),
-        ]
-        expected = steps["acceleration_mps2"][1].iloc[k + 1]
-        assert found == pytest.approx([expected] * 4, abs=1e-5), k
+        del seen["self.target_age"]
+        found = [driver.step(seen), given.step(held), acceleration.item(), step(state, kept)]
+        assert found == pytest.approx([steps["acceleration_mps2"][k + 1]] * 4, abs=1e-5), k
+        command = safe.step(at(filtered, k, 50 if 50 < k <= 80 else k))
+        assert command == pytest.approx(filtered["acceleration_mps2"][k + 1], abs=1e-4), k
 
 
 def test_programs_in_c_with_steps_of_20_ms_share_a_program(tmp_path) -> None:
