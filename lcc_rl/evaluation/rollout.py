@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -74,6 +74,7 @@ class Player:
         )
         outputs = written(self.pieces)
         self.events: list[Any] = [piece for piece in self.pieces if piece.event]
+        self.idle: dict[str, bool] = {}  # whether their events happened in no episode so far
         events = [key for piece in self.events for key in piece.event]
         self.kept = [key for key in keys if key in outputs]
         self.reads = [as_key(key) for key in getattr(policy, "in_keys", [])]
@@ -142,11 +143,8 @@ class Player:
             for value in after.values():
                 value.nan_to_num_(0.0, 0.0, 0.0)
         for piece in self.events:
-            if not (piece.happened(*(after[key] for key in piece.event)) & alive).any():
-                text = "%s: the event of %s happened in none of %d episodes%s"
-                why = "" if len(piece.event) < 2 else ": the gap was shorter, or they ended before"
-                log.warning(text, self.label or "the vehicles", piece.title, alive.shape[1], why)
-        self.events = []  # a line at the first batch
+            happened = piece.happened(*(after[key] for key in piece.event)) & alive
+            self.idle[piece.title] = self.idle.get(piece.title, True) and not bool(happened.any())
         return {key: record[key] for key in self.kept}, alive
 
     def _by_rows(self, state: State) -> tuple[Record, Tensor]:
@@ -221,6 +219,15 @@ class Player:
             if key in state:
                 td.set(key, state[key])
         return {ACTION: self.policy(td).get(ACTION)}
+
+
+def warn_of_idle(idle: Iterable[Mapping[str, bool]]) -> None:
+    """Log each event that happened in no episode of several players, from their ``idle``."""
+    given = [item for one in idle for item in one.items()]
+    for title in dict.fromkeys(title for title, _ in given):
+        if all(never for name, never in given if name == title):
+            text = "the event of %s happened in no episode: they ended before it, or the gap of a "
+            log.warning(text + "cut-in is above the present one", title)
 
 
 def reset_options(
