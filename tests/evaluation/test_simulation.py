@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from helpers import POPULATION, check_refused
+from helpers import POPULATION, check_refused, wavy_profiles
 
 import lcc_rl
 from lcc_rl.commands.simulate import main
@@ -62,23 +62,21 @@ def test_the_rows_are_those_of_an_evaluation(policy, monkeypatch) -> None:
 def test_safety_changes_the_filter_that_a_policy_keeps() -> None:
     """Each kept filter, its other settings too; none is no filter to change."""
     cfg = load("evaluate", ["variant=alcc", *QUICK, "safety.margin=2"])
-    profiles = from_records([torch.from_numpy(WAVE).float()], ["a"], ["a"], 0.1)
-    compared = ["idm_acc", "pretrained/alcc_limits", "pretrained/i80-follow"]
-    rows = Entrants(cfg.with_(compare=compared)).strategies(
-        Inputs(no_profiles(0.1), profiles, POPULATION)
-    )
+    cfg = cfg.with_(compare=["idm_acc", "pretrained/alcc_limits", "pretrained/i80-follow"])
+    inputs = Inputs(no_profiles(0.1), wavy_profiles(), POPULATION)
+    rows = Entrants(cfg).strategies(inputs)
     filters = {row.name: row.cfg.scenario.filters.get("automated") for row in rows}
     assert [name for name, node in filters.items() if node is None] == ["idm_acc"]
     for row in (row for row in rows if row.policy):
         assert filters[row.name] == row.own.scenario.filters["automated"].changed(margin=2)
     cases = [
-        (("idm_acc", "safety.margin=2"), "safety.margin=2 has no effect: nothing drives behind"),
-        (("pretrained/alcc", "safety.margin=2"), "safety.margin has no effect: no row has a s"),
-        (("pretrained/alcc_limits", "safety.marge=2"), "unknown setting .* Did you mean 'margin'"),
-        (("pretrained/alcc_limits", f"{MARGIN}=2"), "safety.margin=2 changes the filter that a"),
+        (["idm_acc", "safety.margin=2"], "safety.margin=2 has no effect: nothing drives behind"),
+        (["pretrained/alcc", "safety.margin=2"], "safety.margin has no effect: no row has a s"),
+        (["pretrained/alcc_limits", "safety.marge=2"], "unknown setting .* Did you mean 'margin'"),
+        (["pretrained/alcc_limits", f"{MARGIN}=2"], "safety.margin=2 changes the filter that a"),
     ]
     drive = functools.partial(lcc_rl.simulate, WAVE, "automated human")
-    check_refused(lambda given: drive(given[0], overrides=[given[1]]), cases, ConfigError)
+    check_refused(lambda given: drive(given[0], overrides=given[1:]), cases, ConfigError)
 
 
 def test_the_steps_are_a_motion(subtests) -> None:
