@@ -7,18 +7,13 @@ import gc
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from copy import deepcopy
-from functools import cache
-from io import StringIO
 from pathlib import Path
-from typing import Any
-from unittest.mock import patch
 
 import pytest
 import torch
 from commands import NO_AGENT, run_command, tiny
+from compositions import composed_once
 from matplotlib.figure import Figure
-from omegaconf import OmegaConf
 from PIL import Image
 from streams import driven_once
 
@@ -31,23 +26,10 @@ torch.set_num_threads(1)
 DEFAULT_DATA = Path(__file__).resolve().parents[1] / "../shared/data"
 
 
-read_yaml = OmegaConf.load
-
-
-@cache
-def parsed_yaml(text: str) -> Any:
-    return read_yaml(StringIO(text))
-
-
-def copied_yaml(file: Any) -> Any:
-    """Return what Hydra reads from a file of conf/, a copy for each of a thousand compositions."""
-    return deepcopy(parsed_yaml(file.read())) if hasattr(file, "read") else read_yaml(file)
-
-
 @pytest.fixture(scope="session", autouse=True)
 def work_that_all_tests_share() -> Iterator[None]:
-    """Drive each synthetic stream and parse each text of settings once."""
-    with driven_once(), patch.object(OmegaConf, "load", copied_yaml):
+    """Drive each synthetic stream and compose each choice of files of conf/ once."""
+    with driven_once(), composed_once():
         yield
 
 

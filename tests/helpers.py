@@ -166,8 +166,12 @@ def weights(loop: TrainingLoop[Any]) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in loop.agent.policy.parameters()])
 
 
-def check_resuming(make: Callable[[Path], TrainingLoop[Any]], folder: Path) -> None:
-    """Check that a training of checkpoints every 2 iterations, killed in its fourth, resumes."""
+def check_resuming(make: Callable[[Path], TrainingLoop[Any]], folder: Path) -> pd.DataFrame:
+    """Check that a training of checkpoints every 2 iterations, killed in its fourth, resumes.
+
+    Returns:
+        The rows of the whole training.
+    """
     whole = make(folder / "whole")
     expected = whole.run()
     first = make(folder / "parts")
@@ -188,6 +192,7 @@ def check_resuming(make: Callable[[Path], TrainingLoop[Any]], folder: Path) -> N
     assert torch.equal(weights(second), weights(whole))
     stored = read_parquet(folder / "parts" / "training.parquet")
     pd.testing.assert_frame_equal(stored, expected, check_exact=True)
+    return expected
 
 
 def network(cfg: TrainConfig) -> TensorDictBase:
