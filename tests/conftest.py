@@ -12,10 +12,9 @@ from pathlib import Path
 import pytest
 import torch
 from commands import NO_AGENT, run_command, tiny
-from compositions import composed_once
 from matplotlib.figure import Figure
 from PIL import Image
-from streams import driven_once
+from streams import composed_once, driven_once
 
 from lcc_rl.commands import training
 

@@ -167,11 +167,7 @@ def weights(loop: TrainingLoop[Any]) -> torch.Tensor:
 
 
 def check_resuming(make: Callable[[Path], TrainingLoop[Any]], folder: Path) -> pd.DataFrame:
-    """Check that a training of checkpoints every 2 iterations, killed in its fourth, resumes.
-
-    Returns:
-        The rows of the whole training.
-    """
+    """Check that a training, saved every 2 iterations and killed in its fourth, resumes: its rows."""
     whole = make(folder / "whole")
     expected = whole.run()
     first = make(folder / "parts")
@@ -218,9 +214,7 @@ def slow_but(quick: Iterable[Any], cases: Iterable[Any]) -> list[Any]:
 
 
 def check_refused(
-    call: Callable[..., object],
-    cases: Iterable[tuple[Any, ...]],
-    error: type[Exception] = LccError,
+    call: Callable[..., object], cases: Iterable[tuple[Any, ...]], error: type[Exception] = LccError
 ) -> None:
     """Check that a call ends in one line for every case, and name the cases for which it does not.
 

@@ -8,16 +8,7 @@ import signal
 import pandas as pd
 import pytest
 import torch
-from helpers import (
-    REWARD,
-    TERMS,
-    compose,
-    make_agent,
-    slow_but,
-    small_loop,
-    string,
-    weights,
-)
+from helpers import REWARD, TERMS, compose, make_agent, slow_but, small_loop, string, weights
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.agent import derived_seed

@@ -5,13 +5,7 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 import torch
-from helpers import (
-    ACTION,
-    check_resuming,
-    small_env,
-    small_loop,
-    string,
-)
+from helpers import ACTION, check_resuming, small_env, small_loop, string
 
 from lcc_rl.agents.collecting import transitions
 from lcc_rl.agents.loop import TrainingLoop, episode_statistics
