@@ -167,7 +167,7 @@ def weights(loop: TrainingLoop[Any]) -> torch.Tensor:
 
 
 def check_resuming(make: Callable[[Path], TrainingLoop[Any]], folder: Path) -> pd.DataFrame:
-    """Check that a training, saved every 2 iterations and killed in its fourth, resumes: its rows."""
+    """Check that a training of checkpoints every 2 iterations resumes; return its rows."""
     whole = make(folder / "whole")
     expected = whole.run()
     first = make(folder / "parts")
