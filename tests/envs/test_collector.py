@@ -136,8 +136,8 @@ def test_what_cannot_be_collected_is_refused() -> None:
 
 
 def test_compiled_agrees_and_repeats_itself_past_an_end() -> None:
-    def collector(compiled: bool):
-        env = small_env("alcc", 2, ["scenario.horizon=80"])
+    def collector(compiled: bool, batch: int = 2):
+        env = small_env("alcc", batch, ["scenario.horizon=80"])
         return StringCollector(env, policy(), frames_per_batch=100, keys=KEYS, compiled=compiled)
 
     def played(source: StringCollector):
@@ -154,6 +154,9 @@ def test_compiled_agrees_and_repeats_itself_past_an_end() -> None:
     for key in plain.keys(True, True):
         torch.testing.assert_close(one[key], plain[key], rtol=1e-4, atol=1e-4)
         assert torch.equal(one[key], two[key]), key
+    (alone := collector(False, 1)).collect()  # nor does that of one episode, whose strides differ
+    begun = alone._renewed(alone.state, torch.tensor([0]), torch.tensor([[5]]))
+    assert [x.stride() for x in begun.values()] == [x.stride() for x in alone.state.values()]
 
 
 def crashing(compiled: bool, batch: int = 40, seed: int = 0):
