@@ -1,4 +1,7 @@
-"""Shared fixtures: runs that are made once, real data where this machine has them, one thread."""
+"""Shared fixtures: runs that are made once, real data where this machine has them, one thread.
+
+They import what they need: a process that only hands out tests to others loads no torch.
+"""
 
 from __future__ import annotations
 
@@ -7,59 +10,40 @@ import gc
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from copy import deepcopy
-from functools import cache
-from io import StringIO
 from pathlib import Path
-from typing import Any
-from unittest.mock import patch
 
 import pytest
-import torch
-from commands import NO_AGENT, run_command, tiny
-from matplotlib.figure import Figure
-from omegaconf import OmegaConf
-from PIL import Image
-from streams import driven_once
-
-from lcc_rl.commands import training
 
 gc.disable()  # until all modules are loaded, see pytest_collection_finish
-# Several test processes share a machine's cores; more threads each would only slow them down.
-torch.set_num_threads(1)
 
 DEFAULT_DATA = Path(__file__).resolve().parents[1] / "../shared/data"
 
 
-read_yaml = OmegaConf.load
-
-
-@cache
-def parsed_yaml(text: str) -> Any:
-    return read_yaml(StringIO(text))
-
-
-def copied_yaml(file: Any) -> Any:
-    """Return what Hydra reads from a file of conf/, a copy for each of a thousand compositions."""
-    return deepcopy(parsed_yaml(file.read())) if hasattr(file, "read") else read_yaml(file)
-
-
 @pytest.fixture(scope="session", autouse=True)
 def work_that_all_tests_share() -> Iterator[None]:
-    """Drive each synthetic stream and parse each text of settings once."""
-    with driven_once(), patch.object(OmegaConf, "load", copied_yaml):
+    """Drive each synthetic stream and compose each choice of files of conf/ once."""
+    import torch
+    from streams import composed_once, driven_once
+
+    # Several test processes share a machine's cores; more threads would only slow them down.
+    torch.set_num_threads(1)
+    with driven_once(), composed_once():
         yield
 
 
 @pytest.fixture(autouse=True)
 def the_same_draws_in_any_order() -> None:
     """Begin torch's own generator anew: what a test draws does not depend on those before it."""
+    import torch
+
     torch.manual_seed(0)
 
 
 @pytest.fixture
 def double() -> Iterator[None]:
     """Compute in double precision, in which ways and kernels differ by less than any fault."""
+    import torch
+
     torch.set_default_dtype(torch.float64)
     yield
     torch.set_default_dtype(torch.float32)
@@ -98,6 +82,10 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny training of the variant alcc. Tests that change it copy it."""
+    from commands import tiny
+
+    from lcc_rl.commands import training
+
     cfg = tiny("train", "variant=alcc")
     return made_once(tmp_path_factory, "alcc", lambda to: training.run(cfg, to, quiet=True))
 
@@ -105,6 +93,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def evaluated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What lcc-rl train leaves of the rule idm, tiny. Tests that change it copy it."""
+
+    from commands import NO_AGENT, run_command
 
     def make(to: Path) -> None:
         words = ("variant=idm", *NO_AGENT, f"hydra.run.dir={to}")
@@ -120,7 +110,10 @@ def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     Tests of results, and of a pipeline and a platoon as a whole, draw them.
     """
 
-    def savefig(self: Figure, path: str | Path, **how: object) -> None:
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+    def savefig(self: object, path: str | Path, **how: object) -> None:
         Image.new("RGB", (1, 1)).save(path, format="PNG")
 
     monkeypatch.setattr(Figure, "savefig", savefig)

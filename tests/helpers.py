@@ -166,8 +166,8 @@ def weights(loop: TrainingLoop[Any]) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in loop.agent.policy.parameters()])
 
 
-def check_resuming(make: Callable[[Path], TrainingLoop[Any]], folder: Path) -> None:
-    """Check that a training of checkpoints every 2 iterations, killed in its fourth, resumes."""
+def check_resuming(make: Callable[[Path], TrainingLoop[Any]], folder: Path) -> pd.DataFrame:
+    """Check that a training of checkpoints every 2 iterations resumes; return its rows."""
     whole = make(folder / "whole")
     expected = whole.run()
     first = make(folder / "parts")
@@ -188,6 +188,7 @@ def check_resuming(make: Callable[[Path], TrainingLoop[Any]], folder: Path) -> N
     assert torch.equal(weights(second), weights(whole))
     stored = read_parquet(folder / "parts" / "training.parquet")
     pd.testing.assert_frame_equal(stored, expected, check_exact=True)
+    return expected
 
 
 def network(cfg: TrainConfig) -> TensorDictBase:
@@ -213,9 +214,7 @@ def slow_but(quick: Iterable[Any], cases: Iterable[Any]) -> list[Any]:
 
 
 def check_refused(
-    call: Callable[..., object],
-    cases: Iterable[tuple[Any, ...]],
-    error: type[Exception] = LccError,
+    call: Callable[..., object], cases: Iterable[tuple[Any, ...]], error: type[Exception] = LccError
 ) -> None:
     """Check that a call ends in one line for every case, and name the cases for which it does not.
 

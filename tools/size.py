@@ -9,12 +9,14 @@ of all packages that it imports; a circle is a group of modules that import each
 from __future__ import annotations
 
 import ast
+import gc
 import io
 import re
 import subprocess
 import sys
 import tokenize
 from collections.abc import Iterable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +49,9 @@ def tracked() -> list[str]:
     return [name for name in done.stdout.splitlines() if (ROOT / name).is_file()]
 
 
+tree_of = cache(ast.parse)  # of a module's text
+
+
 def lines_of(nodes: Iterable[Any]) -> set[int]:
     """Return the lines of nodes of a syntax tree."""
     return {n for node in nodes for n in range(node.lineno, node.end_lineno + 1)}
@@ -63,7 +68,7 @@ def is_guard(node: ast.AST) -> bool:
 
 def measured(text: str) -> dict[str, int]:
     """Return the numbers of one module."""
-    nodes = list(ast.walk(ast.parse(text)))
+    nodes = list(ast.walk(tree_of(text)))
     documented = (x.body[0] for x in nodes if isinstance(x, DOCUMENTED) and ast.get_docstring(x))
     tokens = tokenize.generate_tokens(io.StringIO(text).readline)
     filled = (range(x.start[0], x.end[0] + 1) for x in tokens if x.type not in SPACE and x.string)
@@ -193,7 +198,7 @@ def structure(names: Iterable[str]) -> dict[str, int]:
     files = [x for x in names if x.startswith("lcc_rl/") and x.endswith(".py")]
     dotted = (x.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for x in files)
     texts = ((ROOT / x).read_text(encoding="utf-8") for x in files)
-    trees = {module: ast.parse(text) for module, text in zip(dotted, texts, strict=True)}
+    trees = {module: tree_of(text) for module, text in zip(dotted, texts, strict=True)}
     arrows = imports(trees)
     high = max(floors(arrows).values(), default=0)
     reads = sum(takes_configuration(node) for tree in trees.values() for node in ast.walk(tree))
@@ -203,6 +208,7 @@ def structure(names: Iterable[str]) -> dict[str, int]:
 
 def main(words: Sequence[str]) -> int:
     """Print table and structure; or check them, and return 1 if one is above its ceiling."""
+    gc.disable()  # its passes over half a million nodes of trees would take most of the time
     names, check = tracked(), "--check" in words
     found, shape = table(names, {} if check else cases()), structure(names)
     lines = above(found, shape)

@@ -58,7 +58,7 @@ def test_every_vehicle_is_a_trajectory_of_its_own(tmp_path, monkeypatch, hold, d
 
     monkeypatch.setattr(PPO, "update", seeing)
     string = "scenario.string='automated human automated human'"
-    loop = make(tmp_path, "ppo", string, f"agent.hold={hold}")
+    loop = make(tmp_path, "ppo", string, f"agent.hold={hold}", "training.episodes=4")
     loop.run()
     data = seen[0]
     assert data.batch_size == (8, decisions)  # 4 environments × 2 vehicles

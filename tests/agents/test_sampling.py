@@ -108,8 +108,7 @@ def test_prices_of_limits_are_recorded_and_resume(tmp_path, agent: str, terms: s
         "training.episodes=24",
         "training.checkpoint_every=2",
     )
-    check_resuming(lambda folder: small_loop(folder, *words, *sizes), tmp_path)
-    record = small_loop(tmp_path, *words, *sizes).run()
+    record = check_resuming(lambda folder: small_loop(folder, *words, *sizes), tmp_path)
     assert {"limit_efficiency", "share_efficiency", "reward_cav_energy"} <= {*record.columns}
     assert record["price_efficiency"].nunique() > 1
 

@@ -5,14 +5,7 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 import torch
-from helpers import (
-    ACTION,
-    check_resuming,
-    small_env,
-    small_loop,
-    string,
-    weights,
-)
+from helpers import ACTION, check_resuming, small_env, small_loop, string
 
 from lcc_rl.agents.collecting import transitions
 from lcc_rl.agents.loop import TrainingLoop, episode_statistics
@@ -33,17 +26,10 @@ def make(folder, *overrides: str) -> TrainingLoop:
     return small_loop(folder, *SMALL, *overrides)
 
 
-def test_same_seed_same_rows_and_weights(tmp_path) -> None:
-    one, two = make(tmp_path / "a"), make(tmp_path / "b")
-    pd.testing.assert_frame_equal(one.run(), two.run(), check_exact=True)
-    assert torch.equal(weights(one), weights(two))
-    other = make(tmp_path / "c", "seed=1")
-    other.run()
-    assert not torch.equal(weights(one), weights(other))
-
-
-def test_resuming_equals_never_having_stopped(tmp_path) -> None:
-    check_resuming(make, tmp_path)
+def test_a_seed_is_one_training_whole_or_resumed(tmp_path) -> None:
+    rows = check_resuming(make, tmp_path)
+    other = make(tmp_path / "other", "seed=1").run()
+    assert (other["episode_reward"] != rows["episode_reward"]).all()
 
 
 # Everything that the paper's learner as printed differs in, at the size of a test.
@@ -72,7 +58,7 @@ def test_learning_starts_and_noise_falls_with_every_update(tmp_path) -> None:
 
 
 def test_the_best_policy_is_that_of_its_iteration(tmp_path) -> None:
-    trainer = make(tmp_path, *LITERAL)
+    trainer = make(tmp_path, *LITERAL, "training.episodes=11")
     seen = {}
     iterate = trainer._iterate
 

@@ -136,21 +136,27 @@ def test_what_cannot_be_collected_is_refused() -> None:
 
 
 def test_compiled_agrees_and_repeats_itself_past_an_end() -> None:
-    def collector(compiled: bool):
-        env = small_env("alcc", 1, ["scenario.horizon=80"])
-        return StringCollector(env, policy(), frames_per_batch=50, keys=KEYS, compiled=compiled)
+    def collector(compiled: bool, batch: int = 2):
+        env = small_env("alcc", batch, ["scenario.horizon=80"])
+        return StringCollector(env, policy(), frames_per_batch=100, keys=KEYS, compiled=compiled)
 
-    collectors = [collector(compiled) for compiled in (False, True, True)]
-    begun = [source.collect() for source in collectors]
-    graphs = counters["stats"]["unique_graphs"]
-    assert graphs
-    ended = [source.collect() for source in collectors]
-    assert counters["stats"]["unique_graphs"] == graphs  # a reset needs no other graph
-    assert ended[0]["next", "done"].sum() == 1
-    for plain, one, two in (begun, ended):
-        for key in plain.keys(True, True):
-            torch.testing.assert_close(one[key], plain[key], rtol=1e-4, atol=1e-4)
-            assert torch.equal(one[key], two[key]), key
+    def played(source: StringCollector):
+        source.set_seed(1)  # both episodes last to the horizon
+        begun, graphs = source.collect(), counters["stats"]["unique_graphs"]
+        whole = torch.cat([begun, source.collect()], -1)
+        assert counters["stats"]["unique_graphs"] == graphs  # a reset needs no other graph
+        return whole
+
+    plain, fast = played(collector(False)), collector(True)
+    one, two = played(fast), played(fast)
+    assert counters["stats"]["unique_graphs"]
+    assert plain["next", "done"].sum() == 2
+    for key in plain.keys(True, True):
+        torch.testing.assert_close(one[key], plain[key], rtol=1e-4, atol=1e-4)
+        assert torch.equal(one[key], two[key]), key
+    (alone := collector(False, 1)).collect()  # nor does that of one episode, whose strides differ
+    begun = alone._renewed(alone.state, torch.tensor([0]), torch.tensor([[5]]))
+    assert [x.stride() for x in begun.values()] == [x.stride() for x in alone.state.values()]
 
 
 def crashing(compiled: bool, batch: int = 40, seed: int = 0):

@@ -400,12 +400,12 @@ def test_models_of_stable_baselines3_are_compared_and_exported(sb3, tmp_path) ->
         "evaluation.drivers=2",
     ]
     for kind, more in (
-        *((name, {"n_steps": 20}) for name in ("PPO", "A2C")),
+        *((name, {"n_steps": 10}) for name in ("PPO", "A2C")),
         *((name, {"learning_starts": 10}) for name in ("SAC", "TD3", "DDPG")),
     ):
         env = VecNormalize(make_vec_env(NAME, 2, env_kwargs={"overrides": SHORT}), clip_obs=2.0)
         model = getattr(sb3, kind)("MlpPolicy", env, device="cpu", seed=0, **more)
-        model.learn(60)
+        model.learn(20)
         seen = 10.0 * np.random.default_rng(0).normal(size=(50, 7)).astype(np.float32)
         action, _ = model.predict(env.normalize_obs(seen), deterministic=True)
         network = network_of(model)

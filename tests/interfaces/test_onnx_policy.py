@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 import warnings
 from dataclasses import replace
@@ -37,8 +36,6 @@ onnx = pytest.importorskip("onnx", reason="extra interfaces")
 pytest.importorskip("onnxruntime", reason="extra interfaces")
 GAP = {"name": "self.gap", "unit": "m"}
 ABOUT = {"inputs": [GAP], "output": "acceleration [m/s²]"}
-# An import of the package fails, and no test's settings are inherited.
-ALONE = "import sys; sys.modules['lcc_rl'] = None; exec(open('example.py').read())"
 
 
 def written(path: Path, nodes, takes, makes, about=ABOUT, more=()) -> str:
@@ -64,13 +61,17 @@ def tenth(path: Path, about=ABOUT, takes=(("state", 1),)) -> str:
     return written(path, [node], takes, [("acceleration", 1)], about, [number])
 
 
-def test_the_example_of_the_page_needs_no_lcc_rl_and_drives(tmp_path) -> None:
+def test_the_example_of_the_page_needs_no_lcc_rl_and_drives(tmp_path, monkeypatch) -> None:
     pytest.importorskip("onnxscript", reason="extra interfaces")
     page = blocks(ROOT / "docs" / "interfaces.md")
     (text,) = (block.text for block in page if "torch.onnx.export" in block.text)
     assert len([line for line in text.splitlines() if line.strip()]) <= 24
-    (tmp_path / "example.py").write_text(text)
-    subprocess.run([sys.executable, "-W", "ignore", "-c", ALONE], cwd=tmp_path, check=True)
+    with monkeypatch.context() as alone, warnings.catch_warnings():
+        for name in [name for name in sys.modules if name.partition(".")[0] == "lcc_rl"]:
+            alone.setitem(sys.modules, name, None)  # an import of the package fails
+        alone.chdir(tmp_path)
+        warnings.simplefilter("ignore")
+        exec(text, {})
     bound = OnnxPolicy(path=str(tmp_path / "follow.onnx")).bind(name=AUTOMATED)
     assert bound.names == ("self.gap", "self.speed", "ahead.speed")
     gap, speed, ahead = (torch.rand(5, 1, 1) * 20.0 for _ in range(3))

@@ -20,7 +20,7 @@ from lcc_rl.pieces.cruise import IDMACC
 from lcc_rl.pieces.world import World
 from lcc_rl.results.policies import SHIPPED_POLICIES, load_policy
 
-STRONG = ("scenario.max_braking=6", "scenario.horizon=250")
+STRONG = ("scenario.max_braking=6", "scenario.horizon=160")
 FILTERED = (*STRONG, "+filter=cbf", "scenario.filters.automated.braking_ahead=6")
 RULES = ("acc", "idm_acc", "follower_stopper", "pi_saturation", "calm", "constant", "idm", "gipps")
 MORE = ("ovm", "fvdm", *["mpc"] * bool(find_spec("osqp")))
@@ -29,9 +29,9 @@ AUTO = "scenario.controllers.automated"
 
 
 def braking_leaders(time_step: float) -> Profiles:
-    """Leaders that brake by 6 m/s² to standstill after 10 s at 12, 24 and 36 m/s."""
+    """Leaders that brake by 6 m/s² to standstill after 5 s at 12, 24 and 36 m/s."""
     time = torch.arange(1 + round(30.0 / time_step)) * time_step
-    records = [(v - 6.0 * (time - 10.0).clamp(min=0.0)).clamp(min=0.0) for v in (12.0, 24.0, 36.0)]
+    records = [(v - 6.0 * (time - 5.0).clamp(min=0.0)).clamp(min=0.0) for v in (12.0, 24.0, 36.0)]
     names = [f"braking/{i}@0s" for i in range(3)]
     return from_records(records, names, ["braking"] * 3, time_step)
 

@@ -15,16 +15,7 @@ from itertools import product
 
 import pytest
 import torch
-from helpers import (
-    ACTION,
-    MIXED,
-    POPULATION,
-    REWARD,
-    TERMS,
-    followed_profiles,
-    slow_but,
-    small_env,
-)
+from helpers import ACTION, MIXED, POPULATION, REWARD, TERMS, followed_profiles, slow_but, small_env
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage, ReplayBuffer

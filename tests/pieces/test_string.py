@@ -14,14 +14,7 @@ from lcc_rl.envs import build_env
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.pattern import VehicleString
 from lcc_rl.functional.string import advance_string
-from lcc_rl.pieces import (
-    Calm,
-    Collision,
-    FollowerStopper,
-    Observation,
-    PISaturation,
-    parse_string,
-)
+from lcc_rl.pieces import Calm, Collision, FollowerStopper, Observation, PISaturation, parse_string
 from lcc_rl.pieces.sections import Sections
 from lcc_rl.pieces.views import Views
 from lcc_rl.pieces.world import World
