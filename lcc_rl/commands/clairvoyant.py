@@ -55,6 +55,7 @@ SET_BY_BOUND = (
     "variant",
     "policy",
     "compare",
+    "safety",
     "seed",
     "knowledge",
     "agent",

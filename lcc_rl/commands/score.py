@@ -78,6 +78,7 @@ SET_BY_SCORE = (
     "variant",
     "policy",
     "compare",
+    "safety",
     "agent",
     "observation",
     "reward",

@@ -57,7 +57,8 @@ def _described(node: Any) -> Any:
 def _all_described(nodes: dict[str, Any]) -> Mapping[str, Any]:
     for name, node in nodes.items():
         if isinstance(node, Mapping):
-            added = "none; +filter=cbf or a task adds a filter, +faults=all actuators and sensors"
+            added = "none; +filter=cbf or a task adds a filter, +faults=all actuators and sensors, "
+            added += "safety.margin=2 changes the filter that a policy keeps"
             known = ", ".join(x for x in nodes if x != name) or added
             raise ValueError(f"unknown name {name!r}, which has no {TARGET}; valid: {known}")
         if node is not None and not isinstance(node, Node):
@@ -337,6 +338,8 @@ class EvaluateConfig(StudyConfig):
 
     # Policies and controllers, see lcc_rl.evaluation.named, optionally by name.
     compare: list[Any] | dict[str, Any] = dataclasses.field(default_factory=list)
+    # Changed settings of every row's safety filter, also of one that a policy keeps.
+    safety: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
 class PipelineConfig(TrainConfig):

@@ -46,6 +46,7 @@ class Cases:
         full = inputs.full_length if cfg.evaluation.full_length else ()
         cases = (*inputs.cases, windows, *full)
         self.drives = [CaseRuns(strategy, case, inputs, cfg.device) for case in cases]
+        self.idle = [drive.player.idle for drive in self.drives]
         self.largest = max((drive.size for drive in self.drives), key=math.prod)
         # Size of the time series of the cases in a file, which hardly compress [bytes].
         steps = sum(case.horizon * (case.followers + 1) for case in inputs.cases)

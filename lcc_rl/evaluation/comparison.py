@@ -17,6 +17,7 @@ from lcc_rl.envs.inputs import Inputs
 from lcc_rl.errors import ResultsError
 from lcc_rl.evaluation.cases import Cases
 from lcc_rl.evaluation.episodes import Episodes, plan_of
+from lcc_rl.evaluation.rollout import warn_of_idle
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import Rows, as_rows, parquet_metadata, read_parquet, write_parquet
 from lcc_rl.io.memory import require_memory
@@ -160,8 +161,10 @@ class Comparison:
         """
         metadata = {IDENTITY: identity(self.cfg)}
         store = Store(folder, self.strategies, self.blocks)
+        idle = [one for player in self.players for one in player.idle]
         for index in range(len(self.strategies)):
             self._play_missing(index, self.players.pop(0), store, folder)
+        warn_of_idle(idle)
         check_present(folder)
         write_parquet(store.steps(), folder / STEPS, metadata)
         # Last, because it marks a finished run.

@@ -26,6 +26,7 @@ from lcc_rl.evaluation.strategies import (
     TrainedPolicy,
     applies,
     baselines,
+    behind,
     beside_filtered,
     front_of,
     studied,
@@ -173,7 +174,7 @@ class Entrants:
         if self.own:
             rows += studied(cfg, self.policy, inputs.population)
         rows += [self._given(name, policy, inputs) for name, policy in self.further.items()]
-        rows = named_apart(beside_filtered(cfg, rows) + rows)
+        rows = behind(named_apart(beside_filtered(cfg, rows) + rows), cfg.safety)
         check_distinct(rows)
         rows += front_of(rows, cfg.evaluation.front)
         for strategy in (s for s in rows if s.source):
@@ -225,7 +226,7 @@ def check_effective(
     if not learned and not any(str(x).endswith(FILTERED) for x in specs):
         reason = f"nothing drives behind the filter ({', '.join(rows)}); "
         reason += f"it needs a name that ends in {FILTERED}"
-        unused |= dict.fromkeys(("filter", "scenario.filters"), reason)
+        unused |= dict.fromkeys(("filter", "scenario.filters", "safety"), reason)
     refuse(typed, unused)
 
 

@@ -179,6 +179,7 @@ class Episodes:
         read = (key for term in self.terms for _, key in term.needs)
         keys = list(dict.fromkeys([*self.keys, *read]))
         self.player = Player(env, strategy.policy, keys, strategy.title, compiled, rowwise)
+        self.idle = [self.player.idle]
         count = min(sample_episodes, len(plan))
         self.samples = set(np.linspace(0, len(plan) - 1, count).round().astype(int).tolist())
         # Size of their time series in a file, which hardly compress [bytes].

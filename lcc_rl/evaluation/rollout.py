@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +25,8 @@ from lcc_rl.pieces.base import ACTION, SEED, STEP, Key, State, as_key
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.leader import PROFILE, PROFILE_START
 from lcc_rl.pieces.string import COMMAND, WANTED
+
+log = logging.getLogger("lcc_rl")
 
 # Reads and writes a TensorDict; None for a rule.
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -69,9 +73,12 @@ class Player:
             "choose an agent or another controller",
         )
         outputs = written(self.pieces)
+        self.events: list[Any] = [piece for piece in self.pieces if piece.event]
+        self.idle: dict[str, bool] = {}  # whether their events happened in no episode so far
+        events = [key for piece in self.events for key in piece.event]
         self.kept = [key for key in keys if key in outputs]
         self.reads = [as_key(key) for key in getattr(policy, "in_keys", [])]
-        needed = closure(self.pieces, {*self.kept, *self.reads, TERMINATED})
+        needed = closure(self.pieces, {*self.kept, *self.reads, *events, TERMINATED})
         self.step = Step(needed, self.horizon)
         # Actions, commands before the safety filter and memories are checked, too.
         wishes = [
@@ -82,7 +89,7 @@ class Player:
             or (isinstance(piece, Controller) and key[1] in piece.remembers)
         ]
         driven = [] if policy is None else [ACTION]
-        self.checked = list(dict.fromkeys([*driven, *wishes, *self.kept]))
+        self.checked = list(dict.fromkeys([*driven, *wishes, *events, *self.kept]))
         self.record: Record = {}
         self.start: State = {}  # before the first step
         # Compiled code is for one layout in memory.
@@ -135,6 +142,9 @@ class Player:
         if require_finite(after, alive, label=self.label, named=named):
             for value in after.values():
                 value.nan_to_num_(0.0, 0.0, 0.0)
+        for piece in self.events:
+            happened = piece.happened(*(after[key] for key in piece.event)) & alive
+            self.idle[piece.title] = self.idle.get(piece.title, True) and not bool(happened.any())
         return {key: record[key] for key in self.kept}, alive
 
     def _by_rows(self, state: State) -> tuple[Record, Tensor]:
@@ -209,6 +219,15 @@ class Player:
             if key in state:
                 td.set(key, state[key])
         return {ACTION: self.policy(td).get(ACTION)}
+
+
+def warn_of_idle(idle: Iterable[Mapping[str, bool]]) -> None:
+    """Log each event that happened in no episode of several players, from their ``idle``."""
+    given = [item for one in idle for item in one.items()]
+    for title in dict.fromkeys(title for title, _ in given):
+        if all(never for name, never in given if name == title):
+            text = "the event of %s happened in no episode: they ended before it, or the gap of a "
+            log.warning(text + "cut-in is above the present one", title)
 
 
 def reset_options(

@@ -35,7 +35,7 @@ from lcc_rl.evaluation.metrics import (
     safety_measures,
 )
 from lcc_rl.evaluation.named import controller_of, is_policy, one_of
-from lcc_rl.evaluation.rollout import Player, Record, reset_options
+from lcc_rl.evaluation.rollout import Player, Record, reset_options, warn_of_idle
 from lcc_rl.evaluation.rows import INDEX, highest
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
@@ -223,6 +223,7 @@ def _simulated(strategy: Strategy, inputs: Inputs, repeats: int, seed: int) -> S
     player = Player(env, strategy.policy, keys, strategy.title, long and not rows, rows)
     options = reset_options(env, profile, repeat % people, seed, people, repeat // people)
     record, alive = player.play(options)
+    warn_of_idle([player.idle])
     return _Motion(cfg, record, player.start, alive).tables()
 
 

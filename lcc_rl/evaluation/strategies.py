@@ -118,6 +118,21 @@ def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[St
     return [baseline(cfg, name) for name in cfg.evaluation.behind_filter if name not in names]
 
 
+def behind(strategies: Sequence[Strategy], safety: Mapping[str, Any]) -> list[Strategy]:
+    """Return strategies with changed settings of their safety filters.
+
+    Raises:
+        ConfigError: if there is no safety filter, or a setting is unknown or wrong.
+    """
+    if not safety:
+        return [*strategies]
+    nodes = [s.cfg.scenario.filters.get(AUTOMATED) for s in strategies]
+    require(any(nodes), f"safety.{next(iter(safety))} has no effect: no row has a safety filter")
+    others = [{"filters": {AUTOMATED: node and node.changed(**safety)}} for node in nodes]
+    pairs = zip(strategies, others, strict=True)
+    return [replace(s, cfg=s.cfg.with_(scenario=other)) for s, other in pairs]
+
+
 def front_of(strategies: Sequence[Strategy], time_gaps: Sequence[float]) -> list[Strategy]:
     """Build policies and the tuned rule behind filters with other longest time gaps [s].
 

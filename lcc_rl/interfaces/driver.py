@@ -24,6 +24,7 @@ from lcc_rl.functional.machine_code import kept
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.recorder import Untranslatable
 from lcc_rl.interfaces.exported import (
+    AGE,
     BEHIND_PRESENT,
     DrivingProgram,
     Safety,
@@ -42,7 +43,7 @@ MEASURED = (
     *("self.speed", "self.gap", "self.acceleration", "ahead.speed", "ahead.acceleration"),
     *("behind.speed", "behind.gap", "behind.acceleration", BEHIND_PRESENT),
 )
-KNOWN = set(MEASURED)
+KNOWN = {*MEASURED, AGE}
 WIDEST = 200  # largest memory in machine code
 
 
@@ -124,7 +125,7 @@ class Driver:
 
     def _check(self) -> None:
         for name in self.names:
-            if name not in MEASURED:
+            if name not in KNOWN:
                 measurable = ", ".join(MEASURED)
                 raise ConfigError(
                     f"{self.name} reads {name}, which is not measured here, only {measurable}"
@@ -217,6 +218,7 @@ class Driver:
             raise unknown_name("measurement", str(min(unknown, key=str)), MEASURED)
         try:
             measured = self._completed(measured) if self.behind else measured
+            measured = {AGE: 0.0, **measured} if AGE in self.names else measured
             columns = [np.asarray(measured[name]) for name in self.names]
             for name, column in zip(self.names, columns, strict=True):
                 if column.dtype.kind not in "biuf":

@@ -21,7 +21,7 @@ import torch
 from omegaconf import OmegaConf
 
 from lcc_rl.config import load
-from lcc_rl.config.words import key_of, with_variant
+from lcc_rl.config.words import with_variant
 from lcc_rl.envs.rowwise import Array, recorded
 from lcc_rl.errors import ConfigError, needing, require, require_known
 from lcc_rl.evaluation.foreign import network_of
@@ -69,10 +69,11 @@ TRUTHS = {*COMPARISONS.values(), "{0} == 0"}  # formulas whose results are truth
 TYPES = {"f32(": "float", "f64(": "double", "i64(": "int64_t", "flag(": "int", "x": "float"}
 
 
-def c_code(module: DrivingProgram, about: str) -> str:
-    """Return the source of a program with its description ``about``: a function ``step`` in C99.
+def c_code(module: DrivingProgram, about: str, name: str) -> str:
+    """Return the source of a program with its description ``about``: ``<name>_step`` in C99.
 
-    It has no dependencies, for a car's control unit. The statements are those that
+    Other characters of the name than letters, digits and ``_`` become ``_``. It has no
+    dependencies, for a car's control unit. The statements are those that
     :mod:`lcc_rl.functional.recorder` records from the program. Compile with ``-std=c99`` or
     ``-ffp-contract=off``, so that products and sums are not fused.
 
@@ -97,7 +98,8 @@ def c_code(module: DrivingProgram, about: str) -> str:
     comment += f" * memory[{module.width}]: zeros when the car begins{change} its target changes\n"
     comment += " * Returns the acceleration for the next step [m/s^2]. */\n"
     head = comment + HEAD + (LAYER if "layer(" in lines else "") + tables
-    call = "float step(const float *state, float *memory) {\n    (void)memory;\n"
+    word = re.sub(r"^(?=\d)|\W", "_", f"{name}_step", flags=re.ASCII)
+    call = f"float {word}(const float *state, float *memory) {{\n    (void)memory;\n"
     return f"{head}\n{call}{lines}}}\n"
 
 
@@ -152,21 +154,22 @@ def export(
     The ending selects the format. ONNX (``.onnx``) and PyTorch's exported program (``.pt2``) read
     ``state``, ``[batch, inputs]`` in SI units, and return ``acceleration``, ``[batch, 1]`` [m/s²].
     A policy with a memory also has the input ``memory`` (zeros at first) and the output
-    ``next_memory``. C code (``.c``) is one function ``step(state, memory)`` in C99. Names, units
-    and meanings of the inputs are in the file's metadata under ``lcc_rl`` as JSON. A page
-    (``.html``) shows the ring road with the policy in any browser, see
+    ``next_memory``. C code (``follow.c``) is one function ``follow_step(state, memory)`` in C99.
+    Names, units and meanings of the inputs are in the file's metadata under ``lcc_rl`` as JSON. A
+    page (``.html``) shows the ring road with the policy in any browser, see
     :func:`lcc_rl.interfaces.ring_page.ring_page`.
 
     Args:
-        policy: a run folder, a policy file, or ``pretrained/<name>``; a rule by name, with steps of
-            0.1 s (``"idm_acc_filtered"``); a controller as for :func:`lcc_rl.simulate`; or a model
+        policy: a run folder, a policy file, or ``pretrained/<name>``; a rule by name
+            (``"idm_acc_filtered"``); a controller as for :func:`lcc_rl.simulate`; or a model
             of stable-baselines3 or a torch module from observations ``[batch, n]`` to actions
             ``[batch, 1]``.
         path: the file to write.
         trust: modules outside this package that the policy may name.
         variant, overrides: environment in which a model or module was trained; for a page the
             overrides are settings of its ring, for a trained policy's program those of its filter
-            and of the car, such as ``safety.margin=2``, ``limits.max_braking=6``.
+            and of the car, such as ``safety.margin=2``, ``limits.max_braking=6``; a rule takes
+            ``time_step=0.02``, by default 0.1 s.
         normalize: ``VecNormalize`` of a model; by default that of its environment.
         safety: the safety filter of a program, or changed settings of its own, such as
             ``{"margin": 2.0}``.
@@ -204,34 +207,46 @@ def _written(
     network = None if isinstance(policy, Controller) else network_of(policy, normalize)
     name, spec = one_of(policy) if network is None else (type(policy).__name__, network)
     cfg = None if network is None else load("train", with_variant(variant, overrides))
+    time_step: Any = 0.1  # of a rule [s]
     rule = cfg is None and not is_policy(spec)
     text = f"{name}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
     require(not page or (cfg is None and not (safety or limits or rule)), text)
     if cfg is None and not page and overrides:
         own = "settings of a controller are in its yaml file or, in Python, its object"
         text = f"{' '.join(overrides)}: a program ({path.suffix}) takes safety.… and limits.…, "
-        text += f"no road; {own}" if rule else "no road"
-        prefixes = ("safety.", "limits.")
-        require(all(key_of(override).startswith(prefixes) for override in overrides), text)
+        text += (
+            f"no road; a rule takes time_step; {own}"
+            if rule
+            else "no road; a policy has the time step of its training"
+        )
+        prefixes = ("safety.", "limits.", *["time_step="] * rule)
+        require(all(word.lstrip("+").startswith(prefixes) for word in overrides), text)
         text = "overrides: safety.… and limits.… are given as arguments, too"
         require(safety is None and limits is None, text)
         changed: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)))
         safety, limits = changed.get("safety"), changed.get("limits")
+        time_step = changed.get("time_step", time_step)
     names: list[str] = []
     if page:
         content = ring_page(policy, trust, overrides).encode()
     else:
         changes = (safety, limits)
-        module = _rule(policy, trust, *changes) if rule else program(spec, trust, cfg, *changes)
-        content, names = EXPORTERS[path.suffix](module, name), module.names
+        if rule:
+            module = _rule(policy, time_step, trust, *changes)
+        else:
+            module = program(spec, trust, cfg, *changes)
+        about = described(module, name)
+        content, names = EXPORTERS[path.suffix](module, about, path.stem), module.names
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path, names
 
 
-def _rule(given: Any, trust: Sequence[str], safety: Safety, limits: Any) -> DrivingProgram:
-    """Return the program of a rule with steps of 0.1 s."""
-    driver = Driver(given, 0.1, trust, safety, limits=limits)
+def _rule(
+    given: Any, time_step: Any, trust: Sequence[str], safety: Safety, limits: Any
+) -> DrivingProgram:
+    """Return the program of a rule."""
+    driver = Driver(given, time_step, trust, safety, limits=limits)
     noisy = SEED in driver.program.kept
     require(not noisy, f"{driver.name} draws noise from seeds: it cannot be exported")
     return driver.program
@@ -256,13 +271,13 @@ def _program(module: DrivingProgram) -> Any:
     return torch.export.export(module, examples, dynamic_shapes=batch)
 
 
-def _as_pt2(module: DrivingProgram, name: str) -> bytes:
+def _as_pt2(module: DrivingProgram, about: str, _name: str) -> bytes:
     buffer = BytesIO()
-    torch.export.save(_program(module), buffer, extra_files={"lcc_rl": described(module, name)})
+    torch.export.save(_program(module), buffer, extra_files={"lcc_rl": about})
     return buffer.getvalue()
 
 
-def _as_onnx(module: DrivingProgram, name: str) -> bytes:
+def _as_onnx(module: DrivingProgram, about: str, _name: str) -> bytes:
     exported = _program(module)
     count = len(exported.graph_signature.user_inputs)
     with needing("interfaces", "write a .pt2, or install what .onnx needs"):
@@ -282,13 +297,13 @@ def _as_onnx(module: DrivingProgram, name: str) -> bytes:
         )
     assert converted is not None
     proto = converted.model_proto
-    onnx.helper.set_model_props(proto, {"lcc_rl": described(module, name)})
+    onnx.helper.set_model_props(proto, {"lcc_rl": about})
     content: bytes = proto.SerializeToString()
     return content
 
 
-def _as_c(module: DrivingProgram, name: str) -> bytes:
-    return c_code(module, described(module, name)).encode()
+def _as_c(module: DrivingProgram, about: str, name: str) -> bytes:
+    return c_code(module, about, name).encode()
 
 
 PAGE = ".html"
@@ -301,7 +316,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("policy", help="run folder, policy.pt, pretrained/<name> or a rule")
     parser.add_argument("path", help="file: a program (.onnx, .pt2, .c) or a page (.html)")
     parser.add_trust()
-    text = "of a page's ring (drivers=i80), of a program (safety.margin=2 limits.max_braking=6)"
+    text = "of a page's ring (drivers=i80), of a program (safety.margin=2 limits.max_braking=6), "
+    text += "of a rule or a controller of your own (time_step=0.02)"
     parser.add_argument("settings", nargs="*", default=[], help=text)
     options = parser.parse_args(arguments)
     args = options.policy, options.path, options.trust

@@ -43,7 +43,7 @@ from lcc_rl.pieces.base import (
 )
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.knowledge import ObservationMemory
-from lcc_rl.pieces.views import BEHIND, SELF, VEHICLES
+from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, TARGET_AGE, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.results.policies import load_policy
 from lcc_rl.settings import Positive, Settings, parse, values
@@ -54,6 +54,7 @@ DERIVED_INPUTS = {
     "behind.relative_speed": ("self.speed", "behind.speed"),
 }
 BEHIND_PRESENT = "behind.present"
+AGE = f"{SELF}.{TARGET_AGE}"
 COMMAND_KEY = (AUTOMATED, "command")
 
 
@@ -106,6 +107,8 @@ class DrivingProgram(nn.Module):
     ``behind.`` that are not finite get their stand-ins. With a safety filter, an input ahead that
     is not finite, or a gap that is not positive, is no measurement. After one such step the last
     measurements are used again. In further ones the filter brakes fully, then it starts anew.
+    Without a filter, a controller that reads ``self.target_age`` gets the last gap and motion ahead
+    for any time, and this age, which grows by a step each.
 
     Args:
         pieces: a policy's memory and observation, the controller, the safety filter, in this order
@@ -118,6 +121,9 @@ class DrivingProgram(nn.Module):
         kept: shapes and types of the remembered entries.
         width: size of the memory, 0 if there is none.
     """
+
+    held: Tensor  # inputs without which there is no measurement
+    aged: Tensor  # a step's duration in the column of the age, else 0 [s]
 
     def __init__(self, pieces: Sequence[Piece]) -> None:
         super().__init__()
@@ -138,8 +144,14 @@ class DrivingProgram(nn.Module):
         self.inputs = {key: self._inputs(".".join(key)) for key in needs if key not in written}
         self.names = list(dict.fromkeys(name for names in self.inputs.values() for name in names))
         self.stand_ins = self._stand_ins()
-        # The last measurements, and whether the step before had none.
-        self.sizes += [len(self.names), 1] if self.safety is not None else []
+        target = [x == f"{SELF}.gap" or x == AGE or x.startswith(AHEAD) for x in self.names]
+        steps = [self.controller.time_step * (x == AGE) for x in self.names]
+        held = [self.safety is not None or x for x in target]
+        self.register_buffer("held", torch.tensor(held), persistent=False)
+        self.register_buffer("aged", torch.tensor(steps), persistent=False)
+        # The last measurements, and the number of steps since then.
+        self.holds = self.safety is not None or AGE in self.names
+        self.sizes += [len(self.names), 1] if self.holds else []
         self.width = 1 + sum(self.sizes) if self.sizes else 0
 
     def _inputs(self, name: str) -> tuple[str, ...]:
@@ -177,7 +189,7 @@ class DrivingProgram(nn.Module):
         for piece in self.pieces:
             if isinstance(piece, StepTransform):
                 piece.begin(TensorDict(), start)
-        nothing = [] if self.safety is None else [state, torch.ones_like(state[:, :1])]
+        nothing = [state, torch.ones_like(state[:, :1])] if self.holds else []
         return self._packed({key: start.get(key) for key in self.kept}, state, nothing)
 
     def step(
@@ -190,7 +202,7 @@ class DrivingProgram(nn.Module):
         state = self._with_stand_ins(state)
         last: Sequence[Tensor] = ()
         values = () if memory is None else memory[:, 1:].split(self.sizes, -1)
-        if self.safety is not None:
+        if self.holds:
             state, *last = self._held(state, *values[-2:])
         reached = self.measured(state)
         before = dict(reached)
@@ -222,12 +234,17 @@ class DrivingProgram(nn.Module):
         return torch.cat([columns[name] for name in self.names], -1)
 
     def _held(self, state: Tensor, last: Tensor, missed: Tensor) -> tuple[Tensor, ...]:
-        """Return the inputs of a step, those to keep, and whether there was no measurement."""
-        gap = state[:, self.names.index("self.gap")].unsqueeze(-1)
-        measured = state.isfinite().all(-1, keepdim=True) & (gap > 0.0)
-        lost = torch.where(missed > 0.0, torch.nan, last.to(state.dtype))
-        inputs = torch.where(measured, state, lost)
-        return inputs, inputs, (~measured).to(state.dtype)
+        """Return the inputs of a step, those to keep, and the steps since the last measurement."""
+        measured = (state.isfinite() | ~self.held).all(-1, keepdim=True)
+        if "self.gap" in self.names:
+            gap = state[:, self.names.index("self.gap")].unsqueeze(-1)
+            measured = measured & (gap > 0.0)
+        lost = last.to(state.dtype)
+        if self.safety is not None:
+            lost = torch.where(missed > 0.0, torch.nan, lost)
+        kept = torch.where(measured | ~self.held, state, lost)
+        missed = torch.where(measured, 0.0, missed.to(state.dtype) + 1.0)
+        return (kept + missed * self.aged if AGE in self.names else kept), kept, missed
 
     def _packed(self, entries: State, like: Tensor, last: Sequence[Tensor]) -> Tensor:
         rows = [torch.ones_like(like[:, :1])]

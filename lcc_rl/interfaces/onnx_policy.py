@@ -24,7 +24,7 @@ from lcc_rl.errors import ResultsError, needing, raised_as, require
 from lcc_rl.functional.pattern import MAX_ACCELERATION
 from lcc_rl.pieces.base import Entry, Piece, declared
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, VEHICLES
+from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, TARGET_AGE, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import Positive, Settings, parse
 
@@ -37,7 +37,7 @@ INPUT_UNITS = {
     for view in (SELF, AHEAD, BEHIND)
     for key, entry in declared(Piece).items()
     if key[0] == VEHICLES
-} | {f"{BEHIND}.present": "–"}
+} | {f"{BEHIND}.present": "–", f"{SELF}.{TARGET_AGE}": "s"}
 Short = Annotated[str, Field(max_length=100)]
 
 
@@ -64,6 +64,7 @@ class ProgramFacts(Settings):
 
     inputs: Annotated[tuple[ProgramInput, ...], Field(min_length=1)]
     output: Literal["acceleration [m/s²]"]
+    time_step_s: Positive | None = None  # of its memory
 
 
 class Program:
@@ -94,7 +95,8 @@ class Program:
             content = Path(path).read_bytes()
             self.session = ort.InferenceSession(content, options, ["CPUExecutionProvider"])
         about = self.session.get_modelmeta().custom_metadata_map.get(ABOUT, "{}")
-        self.names = tuple(column.name for column in _facts(about, path).inputs)
+        facts = _facts(about, path)
+        self.names, self.time_step = tuple(x.name for x in facts.inputs), facts.time_step_s
         self.memory = self._check_shapes()
 
     def __reduce__(self) -> Any:
@@ -147,7 +149,7 @@ def _facts(text: str, path: str) -> ProgramFacts:
         "(Policies made elsewhere) shows how to write them",
     )
     require(isinstance(about, dict), f"{path}: its metadata {ABOUT} must be a JSON object")
-    facts = {key: about[key] for key in ("inputs", "output") if key in about}
+    facts = {key: about[key] for key in ("inputs", "output", "time_step_s") if key in about}
     return parse(ProgramFacts, facts, f"{path}, metadata {ABOUT}")
 
 
@@ -166,7 +168,9 @@ class OnnxPolicy(Controller):
         self.program = Program(self.path)
 
     def setup(self, world: World) -> None:
-        width = self.program.memory
+        width, step = self.program.memory, self.program.time_step
+        text = f"{self.path}: its memory is for steps of {step} s, not {world.time_step:g} s"
+        require(not width or abs((step or world.time_step) - world.time_step) < 1e-9, text)
         memory = [Entry("role.program", "–", "memory of the program", width)] * bool(width)
         self.declare(world, self.program.names, remembers=memory)
 

@@ -123,6 +123,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
     # Results of compute, in order; a plain key holds one number per row.
     writes: ClassVar[Sequence[Entry | NestedKey]] = ()
     keeps: ClassVar[Sequence[Entry]] = ()  # constants of an episode, which begin sets at reset
+    event: ClassVar[Sequence[Key]] = ()  # arguments of its method happened: steps of an event
     measures: ClassVar[bool] = False  # whether measured values are read where the role has sensors
     # Maps the entries read to the entries written; a pure function of tensors.
     compute: ClassVar[Callable[..., Any]]

@@ -38,6 +38,7 @@ class ReplacedLeader(NGSIMLeader):
     settling: Positive = 5.0  # time constant with which the excess decays [s]
 
     replaces = True
+    event = (PLACEMENT, ("vehicles", "gap"))
     more = (Entry(PLACEMENT, "–, m, m", "1 if the leader is replaced; largest gap; added gap", 3),)
 
     def validate(self) -> None:
@@ -85,6 +86,11 @@ class ReplacedLeader(NGSIMLeader):
         none = (torch.zeros_like(near), torch.full_like(near, FAR), torch.zeros_like(near))
         placement = [torch.where(changed, x, y) for x, y in zip(numbers, none, strict=True)]
         return (reached, torch.where(changed, own, acceleration), *more, join(placement, -1))
+
+    def happened(self, placement: Tensor, gap: Tensor) -> Tensor:
+        """Return the steps of a change, ``[*batch, 1]``; a cut-in must shorten the gap."""
+        changed, near, _ = placement.split(1, -1)
+        return (changed > 0.0) & ((near >= FAR) | (gap[..., 0, :] > 0.999 * near))
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> Any:
         super().begin(given, start)

@@ -14,7 +14,7 @@ from lcc_rl.functional.layout import join, reverse
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.functional.sensing import Sensing
 from lcc_rl.pieces.base import Entry, RoleTransform
-from lcc_rl.pieces.views import Views
+from lcc_rl.pieces.views import Key, Views
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Share
 
@@ -29,9 +29,10 @@ class Sensors(RoleTransform):
 
     Controllers, safety filter, observation and memory of the role read the measurements instead of
     ``self.gap``, ``self.speed``, ``self.relative_speed``, ``ahead.speed`` and
-    ``ahead.acceleration``. Limits, rewards and energy use the true state. The own acceleration,
-    vehicles behind and messages are exact. Errors are drawn uniformly within their bounds by the
-    episode's seed, for each measurement or every ``error_time`` with linear interpolation.
+    ``ahead.acceleration``, and their age as ``self.target_age``. Limits, rewards and energy use the
+    true state. The own acceleration, vehicles behind and messages are exact. Errors are drawn
+    uniformly within their bounds by the episode's seed, for each measurement or every
+    ``error_time`` with linear interpolation.
 
     A drop-out keeps all of a measurement, a lost target gap, speed and acceleration ahead: the own
     speed is measured at the wheels. The memory holds the ages of the target's measurement and of
@@ -57,6 +58,7 @@ class Sensors(RoleTransform):
         Entry("role.sensed_relative_speed", "m/s", "speed ahead minus own speed, as measured"),
         Entry("role.sensed_ahead_speed", "m/s", "speed of the vehicle ahead as measured"),
         Entry("role.sensed_ahead_acceleration", "m/s²", "acceleration ahead as measured"),
+        Entry("role.target_age", "s", "age of the measurement of gap and vehicle ahead"),
     )
     kept = Entry(
         "role.sensors", "–", "ages of target and own speed [steps], true states to measure"
@@ -118,6 +120,15 @@ class Sensors(RoleTransform):
         ages = torch.where(kept, ages + 1.0, float(self.sensing.late))
         return self._measured(frames, ages, seed, step)
 
+    @property
+    def event(self) -> list[Key]:  # type: ignore[override]
+        """The age of the target, if it is lost at a time."""
+        return [(self.role, "target_age")] * (self.lost_from is not None)
+
+    def happened(self, age: Tensor) -> Tensor:
+        """Return the steps without a new measurement of the target, ``[*batch, 1]``."""
+        return (age > self.time_step * (self.sensing.late + 0.5)).any(-2)
+
     def _measured(
         self, frames: Tensor, ages: Tensor, seed: Tensor, step: Tensor
     ) -> tuple[Tensor, ...]:
@@ -140,8 +151,8 @@ class Sensors(RoleTransform):
         )
         speed = (own * speed + speed_error).clamp(min=0.0)
         ahead = (other * ahead + ahead_error).clamp(min=0.0)
-        memory = join([ages, frames], -1)
-        return gap + gap_error, speed, ahead - speed, ahead, acceleration, memory
+        measured = gap + gap_error, speed, ahead - speed, ahead, acceleration
+        return *measured, self.time_step * ages[..., :1], join([ages, frames], -1)
 
     def _error(self, seed: Tensor, step: Tensor, stream: int) -> Tensor:
         """Return the error of a step's measurements as a share of its bound, in [−1, 1]."""

@@ -5,6 +5,7 @@
 ``ahead.x``             entry x of the vehicle ahead, in the string or the leader
 ``behind.x``            entry x of the vehicle behind; zeros if there is none
 ``behind.present``      1 if there is a vehicle behind, else 0
+``self.target_age``     age of the measurement of gap and vehicle ahead [s], 0 without sensors
 ``leader.x``            entry x of the leader, ahead of the whole string
 ``episode.x``           entry of the episode: seed or step
 ``role.action``         the action, clamped to [−1, 1]
@@ -36,6 +37,7 @@ NEXT = "next"
 VEHICLES, LEADER, EPISODE = "vehicles", "leader", "episode"
 SELF, AHEAD, BEHIND = "self", "ahead", "behind"
 PRESENT = "present"
+TARGET_AGE = "target_age"
 MOTION_READS = ("self.speed", "self.gap", "self.relative_speed")
 
 
@@ -105,6 +107,8 @@ class Views:
         if self.string.measured and space in (SELF, AHEAD, BEHIND, LEADER):
             group = AHEAD if space == LEADER else space
             return partial(_as_it_is, self._place((*prefix, group, entry)))
+        if name[-2:] == (SELF, TARGET_AGE):  # of a role without sensors
+            return partial(_fresh, self._at((*prefix, VEHICLES, "speed"), 0))
         if space in (SELF, AHEAD):
             return self._at((*prefix, VEHICLES, entry), -1 if space == AHEAD else 0)
         if space == BEHIND:
@@ -172,6 +176,10 @@ def _selected(
 
 def _row(index: int, entries: Sequence[Tensor]) -> Tensor:
     return entries[index].unsqueeze(-2)
+
+
+def _fresh(own: Resolver, entries: Sequence[Tensor]) -> Tensor:
+    return torch.zeros_like(own(entries))
 
 
 def _as_it_is(index: int, entries: Sequence[Tensor]) -> Tensor:

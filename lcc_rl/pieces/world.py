@@ -20,6 +20,7 @@ SENSED = {
     "self.relative_speed": "sensed_relative_speed",
     "ahead.speed": "sensed_ahead_speed",
     "ahead.acceleration": "sensed_ahead_acceleration",
+    "self.target_age": "target_age",
 }
 
 

@@ -163,7 +163,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
     (
         "episodes",
         csv(APART),
-        r"row 1, column 'follower_speed_mps' is blank or NaN; no row has .*set_index\('time_s'\).inter",
+        r"row 1, column 'follower_speed_mps' is blank or NaN; no row has .*set_index\('time_s'\).i",
     ),
     (
         "episodes",

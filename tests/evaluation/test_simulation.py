@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from helpers import POPULATION, check_refused
+from helpers import POPULATION, check_refused, wavy_profiles
 
 import lcc_rl
 from lcc_rl.commands.simulate import main
@@ -15,6 +17,7 @@ from lcc_rl.data.profiles import from_records, no_profiles
 from lcc_rl.data.sources import ASSETS
 from lcc_rl.drivers.population import SHIPPED_DRIVERS, bootstrap
 from lcc_rl.envs import Inputs
+from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.metrics import METRICS
@@ -54,6 +57,26 @@ def test_the_rows_are_those_of_an_evaluation(policy, monkeypatch) -> None:
     leader = found.vehicles[found.vehicles["vehicle"] == 0]
     assert leader["max_deceleration_mps2"].notna().all()
     assert leader["min_gap_m"].isna().all()
+
+
+def test_safety_changes_the_filter_that_a_policy_keeps() -> None:
+    """Each kept filter, its other settings too; none is no filter to change."""
+    cfg = load("evaluate", ["variant=alcc", *QUICK, "safety.margin=2"])
+    cfg = cfg.with_(compare=["idm_acc", "pretrained/alcc_limits", "pretrained/i80-follow"])
+    inputs = Inputs(no_profiles(0.1), wavy_profiles(), POPULATION)
+    rows = Entrants(cfg).strategies(inputs)
+    filters = {row.name: row.cfg.scenario.filters.get("automated") for row in rows}
+    assert [name for name, node in filters.items() if node is None] == ["idm_acc"]
+    for row in (row for row in rows if row.policy):
+        assert filters[row.name] == row.own.scenario.filters["automated"].changed(margin=2)
+    cases = [
+        (["idm_acc", "safety.margin=2"], "safety.margin=2 has no effect: nothing drives behind"),
+        (["pretrained/alcc", "safety.margin=2"], "safety.margin has no effect: no row has a s"),
+        (["pretrained/alcc_limits", "safety.marge=2"], "unknown setting .* Did you mean 'margin'"),
+        (["pretrained/alcc_limits", f"{MARGIN}=2"], "safety.margin=2 changes the filter that a"),
+    ]
+    drive = functools.partial(lcc_rl.simulate, WAVE, "automated human")
+    check_refused(lambda given: drive(given[0], overrides=given[1:]), cases, ConfigError)
 
 
 def test_the_steps_are_a_motion(subtests) -> None:

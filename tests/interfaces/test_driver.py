@@ -20,7 +20,6 @@ from lcc_rl.config import load
 from lcc_rl.drivers.population import fixed
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError, Diverged
-from lcc_rl.evaluation.simulation import simulate
 from lcc_rl.evaluation.strategies import baseline, trained
 from lcc_rl.interfaces.driver import MEASURED, Driver
 from lcc_rl.interfaces.sumo import Bridge
@@ -129,26 +128,6 @@ def test_one_bad_sample_is_held_and_a_car_begins_anew_after_more() -> None:
         np.testing.assert_allclose(found[[0, 2, 3]], expected[[0, 2, 3]], atol=1e-5)
         near = 0.3 if step == 5 else 1e-5  # it computes with measurements of a step before
         assert found[1] == pytest.approx(-3.0 if step in (6, 7) else expected[1], abs=near)
-
-
-def test_held_values_of_a_lost_target_drive_as_an_evaluation_whose_filter_trusts_them() -> None:
-    lost = ["+filter=cbf", "+event=lost_target", "scenario.sensors.automated.lost_from=5"]
-    lost += ["scenario.filters.automated.robust=false", "drivers=highway"]
-    leader = 20.0 + 2.0 * np.sin(0.05 * np.arange(121))
-    steps = simulate(leader, "automated", "idm_acc_filtered", overrides=lost).steps
-    own, ahead = (steps[steps["vehicle"] == number].reset_index() for number in (1, 0))
-    driver = Driver("idm_acc_filtered", 0.1)
-    for step in range(120):
-        held = 50 if 50 < step <= 70 else step
-        found = driver.step(
-            {
-                "self.speed": own["speed_mps"][step],
-                "self.gap": own["gap_m"][held],
-                "ahead.speed": ahead["speed_mps"][held],
-                "ahead.acceleration": ahead["acceleration_mps2"].fillna(0.0)[held],
-            }
-        )
-        assert found == pytest.approx(own["acceleration_mps2"][step + 1], abs=1e-4), step
 
 
 STEADY = {

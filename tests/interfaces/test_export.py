@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import json
 import shutil
 import subprocess
+import sys
+import types
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from helpers import check_refused, play, small_env
+from page_blocks import ROOT, blocks
 from torch import nn
 
 import lcc_rl
@@ -131,21 +136,28 @@ class Patient(Controller):
         return 0.1 * (mean - self.aim), mean
 
 
+def built(name: str, *paths: Path) -> Callable[..., float]:
+    """Return a function of files in C, of arrays."""
+    if (compiler := shutil.which("cc")) is None:
+        pytest.skip("no C compiler")
+    strict = "-std=c99 -O2 -Wall -Wextra -Wno-unused-function -pedantic -Werror -shared -fPIC"
+    file = paths[0].with_suffix(".so")
+    subprocess.run([compiler, *strict.split(), *paths, "-o", file, "-lm"], check=True)
+    function = getattr(ctypes.CDLL(str(file)), name)
+    function.restype = ctypes.c_float
+    kind = ctypes.POINTER(ctypes.c_float)
+    return lambda *arrays: function(*(x.ctypes.data_as(kind) for x in arrays))
+
+
 OWN = {"own": Patient(aim=15.0), "mapping": {"mine_filtered": Patient()}}
 
 
 @pytest.mark.parametrize("name", ["pretrained/i24-follow5", "idm_acc_filtered", "idm_acc", *OWN])
 def test_c_code_computes_the_same(name, tmp_path) -> None:
     """With the memory of its own, through NaN, a lost target and another one."""
-    if (compiler := shutil.which("cc")) is None:
-        pytest.skip("no C compiler")
     driver = OWN.get(name, name)
     path = lcc_rl.export(driver, tmp_path / "follow.c")
-    strict = "-std=c99 -O2 -Wall -Wextra -Wno-unused-function -pedantic -Werror -shared -fPIC"
-    built = tmp_path / "follow.so"
-    subprocess.run([compiler, *strict.split(), path, "-o", built, "-lm"], check=True)
-    step = ctypes.CDLL(str(built)).step
-    step.restype = ctypes.c_float
+    step = built("follow_step", path)
     module = Driver(driver, 0.1).program
     width, chance = len(module.names), np.random.default_rng(0)
     state, kept = 20.0 * chance.random((1, width)), np.zeros((1, module.width), np.float32)
@@ -160,7 +172,7 @@ def test_c_code_computes_the_same(name, tmp_path) -> None:
         expected, *memory = (
             module(torch.from_numpy(seen), *memory) if memory else [module(torch.from_numpy(seen))]
         )
-        found = step(*(x.ctypes.data_as(ctypes.POINTER(ctypes.c_float)) for x in (seen, kept)))
+        found = step(seen, kept)
         assert found == pytest.approx(expected.item(), abs=2e-6, nan_ok=True), k
         assert np.isfinite(found) or np.isnan(seen).any()  # memories stay finite
         for one in memory:
@@ -169,6 +181,56 @@ def test_c_code_computes_the_same(name, tmp_path) -> None:
     assert all(f": {column} [" in head for column in module.names)
     change = " or" if name.startswith("pretrained") else ", not when"
     assert f"]: zeros when the car begins{change} its target changes\n" in head
+
+
+def test_the_age_of_a_target_is_the_same_in_simulation_driver_onnx_and_c(tmp_path) -> None:
+    """Of the page's controller; also in a simulation of the ONNX file, with ages, and filtered."""
+    ort = pytest.importorskip("onnxruntime", reason="extra interfaces")
+    texts = [x.text for x in blocks(ROOT / "docs" / "controllers.md") if "# my_pieces" in x.text]
+    exec("".join(texts), vars(sys.modules.setdefault("my_page", types.ModuleType("my_page"))))
+    paths = {end: lcc_rl.export("my_page.coast", tmp_path / f"to{end}") for end in (".onnx", ".c")}
+    lost, behind = ["+event=lost_target"], ["+filter=cbf", "safety.robust=false"]
+    lost += [f"scenario.sensors.automated.{x}" for x in ("lost_from=5", "longest_dropout=3")]
+    leader = 20.0 + 2.0 * np.sin(0.05 * np.arange(121))
+    drive = functools.partial(lcc_rl.simulate, leader, "automated")
+    driven = {"my_page.coast": [], paths[".onnx"]: [], "my_page.coast_filtered": behind}
+    steps, again, filtered = (
+        drive(x, overrides=lost + words).steps.query("vehicle == 1").reset_index()
+        for x, words in driven.items()
+    )
+    np.testing.assert_allclose(again["speed_mps"], steps["speed_mps"], atol=1e-5)
+    with pytest.raises(ConfigError, match=r"memory is for steps of 0\.1 s"):
+        drive(paths[".onnx"], time_step=0.05)
+    given, safe = Driver("my_page.coast", 0.1), Driver("my_page.coast_filtered", 0.1)
+    driver, step = Driver("my_page.coast", 0.1), built("to_step", paths[".c"])
+    session = ort.InferenceSession(paths[".onnx"])
+    memory, kept = (np.zeros((1, driver.program.width), np.float32) for _ in range(2))
+
+    def at(steps, k: int, last: int) -> dict[str, float]:
+        age = {"self.target_age": np.float32(0.1) * (k - last), "ahead.speed": leader[last]}
+        ahead = 10.0 * (leader[last] - leader[last - 1]) if last else 0.0
+        own = {"self.speed": steps["speed_mps"][k], "self.gap": steps["gap_m"][last]}
+        return {**own, **age, "ahead.acceleration": ahead}
+
+    for k in range(120):
+        held = at(steps, k, 50 if 50 < k <= 80 else k)
+        seen = held if held["self.target_age"] == 0.0 else held | {"self.gap": np.nan}
+        seen = seen | {"self.target_age": 0.0}
+        state = np.array([[seen[name] for name in driver.names]], np.float32)
+        acceleration, memory = session.run(None, {"state": state, "memory": memory})
+        del seen["self.target_age"]
+        found = [driver.step(seen), given.step(held), acceleration.item(), step(state, kept)]
+        assert found == pytest.approx([steps["acceleration_mps2"][k + 1]] * 4, abs=1e-5), k
+        command = safe.step(at(filtered, k, 50 if 50 < k <= 80 else k))
+        assert command == pytest.approx(filtered["acceleration_mps2"][k + 1], abs=1e-4), k
+
+
+def test_programs_in_c_with_steps_of_20_ms_share_a_program(tmp_path) -> None:
+    files = [tmp_path / name for name in ("my-car.c", "2.c")]
+    for file in files:
+        lcc_rl.export(Patient(), file, overrides=["time_step=0.02"])
+        assert '"time_step_s": 0.02' in file.read_text(encoding="utf-8")
+    assert all(built(name, *files) for name in ("my_car_step", "_2_step"))
 
 
 def test_a_measurement_that_is_no_number_brakes_or_shows(exported, tmp_path) -> None:
@@ -215,6 +277,7 @@ def test_bad_input_is_one_clear_error() -> None:
             ["idm_acc", "x.c", "scenario.max_braking=6"],
             r"a program \(.c\) takes safety.… and limits.…, no road; .* yaml file",
         ),
+        (["pretrained/alcc", "x.c", "time_step=0.02"], "has the time step of its training"),
         (["idm_ac", "x.onnx"], "idm_acc"),
         (["idm_acc", "x.html"], r"idm_acc: a page \(.html\) needs a run or a policy file"),
         (["human", "x.c"], "human draws noise from seeds: it cannot be exported"),

@@ -12,6 +12,8 @@ from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import build_pieces, world_of
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.metrics import safety_measures
+from lcc_rl.evaluation.rollout import warn_of_idle
+from lcc_rl.evaluation.simulation import simulate
 from lcc_rl.evaluation.strategies import applies
 from lcc_rl.pieces import ReplacedLeader
 
@@ -61,6 +63,20 @@ def test_a_vehicle_cuts_in_at_the_given_time_gap_and_speed() -> None:
         assert found["followed"][28:31, 0, 0, 0].tolist()[1:] == [0.0, 1.0]
     nearer = driven([*event("cut_in", at=[3, 3]), f"{LEADER}.gap=[500,500]"])["gap"]
     assert (nearer[29, :, 0] - nearer[28, :, 0]).abs().max() < 1.0  # never beyond the leader
+
+
+def test_an_event_that_never_happens_is_one_line(caplog) -> None:
+    """Of cut-ins that change no gap, of all strategies together; a lost target happens here."""
+    words = event("[cut_in,lost_target]", at=[3, 3], gap=[500, 500])
+    words.append("scenario.sensors.automated.lost_from=4")
+    simulate([15.0] * 101, "automated", "idm_acc", overrides=words)
+    assert caplog.text.count("happened in no episode") == caplog.text.count("ReplacedLeader") == 1
+    warn_of_idle([{"A": True, "B": True}, {}, {"A": True, "B": False}])
+    assert [x for x in "AB" if f"event of {x}" in caplog.text] == ["A"]
+    caplog.clear()
+    words[2] = f"{LEADER}.gap=[5,5]"
+    simulate([15.0] * 101, "automated", "idm_acc", overrides=words)
+    assert "happened in no episode" not in caplog.text
 
 
 def test_every_episode_draws_its_own_change() -> None:
