@@ -160,7 +160,10 @@ def mistakes(units: Units) -> Iterator[tuple[bool, str, str, float, float]]:
         Whether the mistake is a wrong SI unit, the signal at fault, a question to the user, and the
         coefficients of leader and follower in :func:`agreement`.
     """
-    yield True, "follower", "are leader and follower exchanged?", -1.0, -1.0
+    if OF_LOGS in units:
+        yield True, "leader", "is relative_speed the own speed minus the leader's?", -1.0, -1.0
+    else:
+        yield True, "follower", "are leader and follower exchanged?", -1.0, -1.0
     for signal, subject, quantity, keys, leader, follower in (
         ("gap", "is the gap", "length", ("gap", "position"), -1, -1),
         ("leader", "is the relative speed", "speed", (OF_LOGS,), 1, 1),
@@ -216,7 +219,9 @@ def check_pairs(
         """Yield a line on the middle one of several cases."""
         for row, signal, text in cases[len(cases) // 2 :][:1]:
             count = f"; {len(cases):,} of {len(pairs):,} pairs" if len(pairs) > 1 else ""
-            yield f"{place(row, PAIR_SIGNALS[signal])}: {text}{count}"
+            of_log = signal == "leader" and OF_LOGS in units
+            key = OF_LOGS if of_log else PAIR_SIGNALS[signal]
+            yield f"{place(row, key)}: {text}{count}"
 
     wrong = [
         fit

@@ -50,15 +50,21 @@ def read_speed_record(
         Time [s], increasing, and speed [m/s], both ``[samples]``, float64.
 
     Raises:
-        DataError: naming the file and the row or column, if a value is malformed or implausible.
+        DataError: naming the file and the row or column, if a value is malformed or implausible, or
+            samples are missing.
     """
     cycles = {name: file for name, file in SHIPPED_FILES.items() if file.endswith(".csv")}
     file = cycles.get(path, path)
     if not Path(expanduser(file)).is_file():
-        names = ", ".join(sorted(cycles))
-        raise DataError(f"{path}: no such file, and none of the package ({names})")
-    samples, _ = _read(TableFile(file), {**DRIVE_COLUMNS, "drive": None}, plausible, {})
-    return samples[TIME_COLUMN].to_numpy(), samples[SPEED_COLUMN].to_numpy()
+        known = ", ".join(sorted(cycles))
+        raise DataError(f"{path}: no such file, and none of the package ({known})")
+    names = {**DRIVE_COLUMNS, "drive": None}
+    samples, _ = _read(TableFile(file), names, plausible, {}, bridge=BRIDGE_S)
+    time = samples[TIME_COLUMN].to_numpy()
+    for last in np.flatnonzero(np.diff(samples["episode"]))[:1]:
+        hole = f"a hole of {time[last + 1] - time[last]:.3g} s after {TIME_COLUMN} {time[last]:g}"
+        raise DataError(f"{path}: {hole}; expected one record without holes")
+    return time, samples[SPEED_COLUMN].to_numpy()
 
 
 def read_drives(

@@ -39,8 +39,9 @@ class VehicleClass(Settings):
     bounded: bool = True  # False: it accelerates as commanded, without limits of power
 
     def validate(self) -> None:
-        kind, mass = type(self.energy).__name__, self.energy.mass
+        kind, mass, share = type(self.energy).__name__, self.energy.mass, self.energy.efficiency
         require(mass > 0.0, f"{kind}: an energy model needs its mass [kg], got {mass!r}")
+        require(0.0 < share <= 1.0, f"{kind}: efficiency must lie from 0 to 1, got {share!r}")
 
     def at(self, grade: Tensor) -> Self:
         """Return the class on a road with a grade at each sample [rad]."""

@@ -215,7 +215,7 @@ class Driver:
         text = f"measured must name measurements, such as self.gap, got {type(measured).__name__}"
         require(isinstance(measured, Mapping), text)
         if unknown := measured.keys() - KNOWN:
-            raise unknown_name("measurement", str(min(unknown, key=str)), MEASURED)
+            raise unknown_name("measurement", str(min(unknown, key=str)), KNOWN)
         try:
             measured = self._completed(measured) if self.behind else measured
             measured = {AGE: 0.0, **measured} if AGE in self.names else measured

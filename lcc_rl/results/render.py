@@ -238,20 +238,21 @@ def for_print(report: Report, names: Sequence[str] = ()) -> pd.DataFrame:
     Raises:
         ConfigError: for an unknown column, naming the nearest.
     """
-    table = chosen(report.short, names or [column.key for column in report.shown])
+    keys = [column.key for column in report.shown]
+    table = chosen(report.short, names or keys, "column of the short table (--all has all)")
     ends = ("", "_low", "_high")
     headings = {f"{one.key}{end}": f"{one.words}{end}" for one in report.shown for end in ends}
     return table.rename(columns=headings)
 
 
-def chosen(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
-    """Return columns of a table with their intervals, all by default.
+def chosen(table: pd.DataFrame, names: Sequence[str], what: str = "column") -> pd.DataFrame:
+    """Return columns of a table with their intervals, all by default; ``what`` they are called.
 
     Raises:
         ConfigError: for an unknown column, naming the nearest.
     """
     known = [str(key) for key in table]
-    require_known("column", names, known)
+    require_known(what, names, known)
     keys = names or known
     shown = [name for key in keys for name in (key, f"{key}_low", f"{key}_high") if name in known]
     return table[list(dict.fromkeys(shown))]

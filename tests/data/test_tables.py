@@ -536,6 +536,11 @@ def test_a_log_with_one_speed_in_another_unit_is_refused(tmp_path) -> None:
     other = r"is the relative speed in m/s \(data\.units\.relative_speed=m/s\)\?"
     cases = [("follower_speed", words), ("relative_speed", other)]
     check_refused(lambda key: read(**{key: "km/h"}).load(), cases, DataError)
+    log.assign(ok=1, range_rate=-log["range_rate"], id=found["episode"] + 1).to_csv(
+        tmp_path / "log.csv", index=False
+    )
+    with pytest.raises(DataError, match=r"'range_rate': .* own speed minus the leader's\?"):
+        read().load()
 
 
 def test_episodes_named_by_texts_name_their_drivers(tmp_path) -> None:

@@ -93,6 +93,10 @@ class Weightless(EnergyModel):
         return speed * acceleration
 
 
+class Lossless(Weightless):
+    mass, efficiency = 1500.0, 1.3
+
+
 def test_mistakes_are_named() -> None:
     check_refused(
         lambda make: make(),
@@ -106,6 +110,10 @@ def test_mistakes_are_named() -> None:
             (
                 lambda: Fleet({"x": Weightless()}),
                 "Weightless: an energy model needs its mass .* nan",
+            ),
+            (
+                lambda: Fleet({"x": Lossless()}),
+                "Lossless: efficiency must lie from 0 to 1, got 1.3",
             ),
             (
                 lambda: lcc_rl.make_env("alcc", 1, [*MIXED, "+energy.roles.lorry={class8: 1}"]),
