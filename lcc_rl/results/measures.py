@@ -42,7 +42,8 @@ SUFFIX_UNITS = {
     "ms": "ms",
 }
 SUFFIX_UNITS |= {"m": "m", "s": "s", "vph": "1/h", "g_per_km": "g/km", "s_per_km": "s/km"}
-SUFFIX_UNITS |= {"l_per_100km": "L/100 km", "per_100km": "1/100 km"}
+SUFFIX_UNITS |= {"wh_per_km": "Wh/km", "kwh_per_100km": "kWh/100 km", "l_per_100km": "L/100 km"}
+SUFFIX_UNITS |= {"per_100km": "1/100 km"}
 INITIALS = ("cav", "hdv", "ttc", "sd")
 
 
@@ -315,8 +316,8 @@ def heading(column: str) -> str:
     """Return the heading of a column: its words, and the unit of its measure or of its name.
 
     Examples:
-        >>> heading("total_energy_kj"), heading("cav_saving_pct")
-        ('total energy [kJ]', 'CAV saving [%]')
+        >>> heading("energy_kwh_per_100km"), heading("cav_saving_pct")
+        ('energy [kWh/100 km]', 'CAV saving [%]')
     """
     if column.endswith("]"):
         return column
