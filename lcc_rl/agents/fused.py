@@ -15,6 +15,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from lcc_rl.agents.collecting import STEPS_AHEAD
+
 Layers = list[tuple[Tensor, Tensor, Tensor]]  # weights, transposed weights, biases
 
 LEAST_ROWS = 1000  # of a batch, from which its products are worth other operations
@@ -158,7 +160,7 @@ class ActorCritic:
 
     def wanted(self, batch: TensorDictBase, future: Tensor) -> Tensor:
         """Return the TD target, ``[batch, 1]``."""
-        after, ahead = batch.get("next"), batch.get("steps_to_next_obs", None)
+        after, ahead = batch.get("next"), batch.get(STEPS_AHEAD, None)
         # Only a collision ends the sum of rewards; a truncated episode would continue.
         future = future.masked_fill(after.get("terminated"), 0.0)
         discount = self.gamma if ahead is None else self.gamma**ahead

@@ -59,7 +59,7 @@ def read_speed_record(
         known = ", ".join(sorted(cycles))
         raise DataError(f"{path}: no such file, and none of the package ({known})")
     names = {**DRIVE_COLUMNS, "drive": None}
-    samples, _ = _read(TableFile(file), names, plausible, {}, bridge=BRIDGE_S)
+    samples, _ = _read(TableFile(file), names, plausible, {}, BRIDGE_S)
     time = samples[TIME_COLUMN].to_numpy()
     for last in np.flatnonzero(np.diff(samples["episode"]))[:1]:
         hole = f"a hole of {time[last + 1] - time[last]:.3g} s after {TIME_COLUMN} {time[last]:g}"
@@ -100,7 +100,7 @@ def read_drives(
     records: dict[str, tuple[str, Tensor, Tensor | None]] = {}
     lines: list[str] = []
     for table in tables_of(files):
-        samples, report = _read(table, columns, plausible, units or {}, average_s, bridge, "leader")
+        samples, report = _read(table, columns, plausible, units or {}, bridge, average_s, "leader")
         loaded = dict(_records(samples, time_step))
         if twice := loaded.keys() & records.keys():
             raise DataError(f"{path}: drive {min(twice)!r} is in several files; expected one")
@@ -136,8 +136,8 @@ def _read(
     columns: Names,
     plausible: Plausible | None,
     units: Units,
+    bridge: float,
     average_s: float = 0.0,
-    bridge: float = np.inf,
     node: str = "",
 ) -> tuple[pd.DataFrame, list[str]]:
     """Return recording, episode and motion of the plausible samples of a file, and the report.

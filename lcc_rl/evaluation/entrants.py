@@ -26,11 +26,11 @@ from lcc_rl.evaluation.strategies import (
     TrainedPolicy,
     applies,
     baselines,
-    behind,
     beside_filtered,
     front_of,
     studied,
     trained,
+    with_safety,
 )
 from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import load_policy, of_task
@@ -174,7 +174,7 @@ class Entrants:
         if self.own:
             rows += studied(cfg, self.policy, inputs.population)
         rows += [self._given(name, policy, inputs) for name, policy in self.further.items()]
-        rows = behind(named_apart(beside_filtered(cfg, rows) + rows), cfg.safety)
+        rows = with_safety(named_apart(beside_filtered(cfg, rows) + rows), cfg.safety)
         check_distinct(rows)
         rows += front_of(rows, cfg.evaluation.front)
         for strategy in (s for s in rows if s.source):

@@ -118,7 +118,7 @@ def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[St
     return [baseline(cfg, name) for name in cfg.evaluation.behind_filter if name not in names]
 
 
-def behind(strategies: Sequence[Strategy], safety: Mapping[str, Any]) -> list[Strategy]:
+def with_safety(strategies: Sequence[Strategy], safety: Mapping[str, Any]) -> list[Strategy]:
     """Return strategies with changed settings of their safety filters.
 
     Raises:

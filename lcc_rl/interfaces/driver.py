@@ -43,7 +43,7 @@ MEASURED = (
     *("self.speed", "self.gap", "self.acceleration", "ahead.speed", "ahead.acceleration"),
     *("behind.speed", "behind.gap", "behind.acceleration", BEHIND_PRESENT),
 )
-KNOWN = {*MEASURED, AGE}
+KNOWN = (*MEASURED, AGE)
 WIDEST = 200  # largest memory in machine code
 
 
@@ -126,7 +126,7 @@ class Driver:
     def _check(self) -> None:
         for name in self.names:
             if name not in KNOWN:
-                measurable = ", ".join(MEASURED)
+                measurable = ", ".join(KNOWN)
                 raise ConfigError(
                     f"{self.name} reads {name}, which is not measured here, only {measurable}"
                 )

@@ -219,7 +219,7 @@ def _written(
             if rule
             else "no road; a policy has the time step of its training"
         )
-        prefixes = ("safety.", "limits.", *["time_step="] * rule)
+        prefixes = ("safety.", "limits.", "time_step=") if rule else ("safety.", "limits.")
         require(all(word.lstrip("+").startswith(prefixes) for word in overrides), text)
         text = "overrides: safety.… and limits.… are given as arguments, too"
         require(safety is None and limits is None, text)
