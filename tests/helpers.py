@@ -186,6 +186,7 @@ def check_resuming(make: Callable[[Path], TrainingLoop[Any]], folder: Path) -> p
     assert second.iteration == 2  # the last checkpoint
     pd.testing.assert_frame_equal(second.run(), expected, check_exact=True)
     assert torch.equal(weights(second), weights(whole))
+    assert repr(second.best) == repr(whole.best)
     stored = read_parquet(folder / "parts" / "training.parquet")
     pd.testing.assert_frame_equal(stored, expected, check_exact=True)
     return expected

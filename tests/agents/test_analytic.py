@@ -73,10 +73,10 @@ def test_resuming_equals_never_having_stopped(tmp_path, overrides) -> None:
 
 
 def test_the_record_is_that_of_the_literal_reward(tmp_path) -> None:
-    one_update = ("training.episodes=8", "training.segment=20")
+    one_update = ("training.episodes=8", "training.segment=20", "seed=3")
     row = make(tmp_path, *one_update).run().iloc[0]
     fresh = make(tmp_path / "again", *one_update)
-    fresh.env.set_seed(derived_seed(0, 0, "episodes"))
+    fresh.env.set_seed(derived_seed(3, 0, "episodes"))
     with torch.no_grad():
         played = fresh.env.rollout(20, shared_policy(fresh.agent.policy), break_when_any_done=False)
     terms = played["next", *TERMS].sum(1).mean(0)

@@ -27,8 +27,8 @@ def make(folder, *overrides: str) -> TrainingLoop:
 
 
 def test_a_seed_is_one_training_whole_or_resumed(tmp_path) -> None:
-    rows = check_resuming(make, tmp_path)
-    other = make(tmp_path / "other", "seed=1").run()
+    rows = check_resuming(lambda at: make(at, "agent.best_window=4", "seed=1"), tmp_path)
+    other = make(tmp_path / "other").run()
     assert (other["episode_reward"] != rows["episode_reward"]).all()
 
 
@@ -57,8 +57,10 @@ def test_learning_starts_and_noise_falls_with_every_update(tmp_path) -> None:
     assert min(expected) == 0.1 < max(expected)
 
 
-def test_the_best_policy_is_that_of_its_iteration(tmp_path) -> None:
-    trainer = make(tmp_path, *LITERAL, "training.episodes=11")
+@pytest.mark.parametrize(("window", "episodes", "seed"), [(4, 11, 0), (3, 6, 1)])
+def test_the_best_policy_is_that_of_its_iteration(tmp_path, window, episodes, seed) -> None:
+    words = f"agent.best_window={window}", f"training.episodes={episodes}", f"seed={seed}"
+    trainer = make(tmp_path, *LITERAL, *words)
     seen = {}
     iterate = trainer._iterate
 
@@ -71,8 +73,9 @@ def test_the_best_policy_is_that_of_its_iteration(tmp_path) -> None:
 
     trainer._iterate = watched
     rows = trainer.run()
-    # Windows of four episodes that were played once learning had begun.
-    scores = rows["episode_reward"].rolling(4).mean()[rows["updates"].shift(3) > 0]
+    # Windows of episodes that were played once learning had begun.
+    since = rows["updates"].shift(window - 1) > 0
+    scores = rows["episode_reward"].rolling(window).mean()[since]
     assert trainer.best["iteration"] == rows["iteration"][scores.idxmax()]
     assert trainer.best["score"] == pytest.approx(scores.max())
     best = seen[trainer.best["iteration"]]
