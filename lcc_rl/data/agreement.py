@@ -217,7 +217,8 @@ def check_pairs(
 
     def middle(cases: list[tuple[int, str, str]]) -> Iterator[str]:
         """Yield a line on the middle one of several cases."""
-        for row, signal, text in cases[len(cases) // 2 :][:1]:
+        if cases:
+            row, signal, text = cases[len(cases) // 2]
             count = f"; {len(cases):,} of {len(pairs):,} pairs" if len(pairs) > 1 else ""
             of_log = signal == "leader" and OF_LOGS in units
             key = OF_LOGS if of_log else PAIR_SIGNALS[signal]

@@ -61,7 +61,8 @@ def read_speed_record(
     names = {**DRIVE_COLUMNS, "drive": None}
     samples, _ = _read(TableFile(file), names, plausible, {}, BRIDGE_S)
     time = samples[TIME_COLUMN].to_numpy()
-    for last in np.flatnonzero(np.diff(samples["episode"]))[:1]:
+    if len(holes := np.flatnonzero(np.diff(samples["episode"]))):
+        last = holes[0]
         hole = f"a hole of {time[last + 1] - time[last]:.3g} s after {TIME_COLUMN} {time[last]:g}"
         raise DataError(f"{path}: {hole}; expected one record without holes")
     return time, samples[SPEED_COLUMN].to_numpy()

@@ -81,9 +81,7 @@ def build_env(
     if (dtype := torch.get_default_dtype()) != torch.float32:  # in which inputs are stored
         pieces = [piece.to(dtype) for piece in pieces]
     acts = any(key == ACTION for piece in pieces for _, key in piece.needs)
-    actions: dict[NestedKey, tuple[int, ...]] = {}
-    if acts:
-        actions[ACTION] = (cfg.automated, 1)
+    actions: dict[NestedKey, tuple[int, ...]] = {ACTION: (cfg.automated, 1)} if acts else {}
     size = MOMENTS * moment_bytes(pieces) * math.prod(batch_shape(batch_size))
     require_memory({f"batch_size={batch_size}": size}, device or "cpu")
     check_pieces(pieces, scenario.horizon, actions)
@@ -192,7 +190,8 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
     pieces = _leader(scenario, named.pop("leader", None), world)
     named.pop("slope", None)
     slopes = [world.slope.bind(world, x) for x in (LEADER, VEHICLES)] if world.slope else []
-    drivers = _drivers(scenario, world)
+    driving = [x for group in ("controllers", "filters") for x in _by_role(scenario, group)]
+    drivers: list[Any] = [node.made(Piece).bind(world, role) for role, node in driving]
     for name, kind in energy.classes.items():
         roles = kind.roles if kind.share else ()
         require_known(f"role (scenario.fleet.{name}.roles)", roles, scenario.controllers)
@@ -229,18 +228,10 @@ def _watchers(drivers: Sequence[Controller | CBFFilter], world: World) -> list[P
 
 def _leader(scenario: ScenarioConfig, node: Any, world: World) -> list[Piece]:
     """Build the leader of an open road; a ring road has none."""
-    if (node is None) != (scenario.road == RING):
-        raise ConfigError(
-            "scenario.pieces.leader: a ring road has no leader, an open road needs one, got "
-            f"scenario.road={scenario.road} and leader={node}"
-        )
+    text = "scenario.pieces.leader: a ring road has no leader that drives or is replaced "
+    text += "(+event=cut_in, +event=cut_out), an open road needs one"
+    require((node is None) == (scenario.road == RING), text)
     return [] if node is None else [node.made(Piece).bind(world, "leader")]
-
-
-def _drivers(scenario: ScenarioConfig, world: World) -> list[Any]:
-    """Build the controllers of the roles in the string, and their safety filters."""
-    nodes = [*_by_role(scenario, "controllers"), *_by_role(scenario, "filters")]
-    return [node.made(Piece).bind(world, role) for role, node in nodes]
 
 
 def _motion(scenario: ScenarioConfig, world: World) -> StringMotion:

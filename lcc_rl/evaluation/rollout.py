@@ -134,6 +134,13 @@ class Player:
                 record[key][step + first] = value
         return self._checked(record, torch.stack(alive), named)
 
+    def draws(self, given: TensorDictBase, other: TensorDictBase) -> bool:
+        """Return whether episodes depend on the drivers and seeds in which two options differ."""
+        first, second = (self._begin(options) for options in (given, other))
+        same = all(torch.equal(first[key], second[key]) for key in first if key != SEED)
+        seeded = [x for x, _ in self.step.pieces if SEED in [key for _, key in x.needs]]
+        return not same or not all({**vars(type(x)), **vars(x)}.get("steady") for x in seeded)
+
     def _checked(
         self, record: Record, alive: Tensor, named: Callable[[int], str]
     ) -> tuple[Record, Tensor]:
@@ -224,7 +231,7 @@ class Player:
 def warn_of_idle(idle: Iterable[Mapping[str, bool]]) -> None:
     """Log each event that happened in no episode of several players, from their ``idle``."""
     given = [item for one in idle for item in one.items()]
-    for title in dict.fromkeys(title for title, _ in given):
+    for title in dict(given):
         if all(never for name, never in given if name == title):
             text = "the event of %s happened in no episode: they ended before it, or the gap of a "
             log.warning(text + "cut-in is above the present one", title)

@@ -17,7 +17,7 @@ from lcc_rl.arrays import times
 from lcc_rl.config import load
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import RewardConfig, StudyConfig, TimeStep
-from lcc_rl.config.words import check_overrides, quoted
+from lcc_rl.config.words import check_overrides, quoted, top_key
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
@@ -53,7 +53,7 @@ log = logging.getLogger("lcc_rl")
 LONG, SHORT_STRING = 2_000, 40
 BLOCK = 2**20  # numbers of each entry that are measured at a time
 LEADER: Key = ("leader", "speed")
-SCENE = {f"scenario.{name}" for name in ("string", "time_step", "horizon")}
+SCENE = {"experiment", *(f"scenario.{name}" for name in ("string", "time_step", "horizon"))}
 OF_FILES = {"leader", "data"}
 OF_ARGUMENTS = SCENE | {"split", "compare", "policy", "seed", "evaluation", "reward"}
 # Nothing reads the reward; this term fits any scenario.
@@ -133,6 +133,9 @@ def simulate(
     check_overrides(overrides, OF_ARGUMENTS | chosen, reason)
     check_overrides(overrides, OF_FILES, f"{reason}; files have time_s [s], speed_mps [m/s]")
     profiles = _profiles(leader, time_step, seconds)
+    mix = f"'{string}'"
+    if not isinstance(string, str):
+        mix = f"{{{', '.join(f'{key}: {value}' for key, value in string.items())}}}"
     name, spec = ("", None) if controller is None else one_of(controller)
     reads = () if spec is None or is_policy(spec) else controller_of(spec).kind.reads
     settings = (
@@ -140,7 +143,7 @@ def simulate(
         f"variant={'alcc' if is_policy(spec) else 'idm'}",
         *(["drivers=calibrated", f"drivers.path={quoted(drivers)}"] if table else []),
         *(["scenario=platoon"] * (not MESSAGES.isdisjoint(reads)) + list(overrides)),
-        *(f"scenario.string={_words(string)}", f"scenario.time_step={float(time_step)!r}"),
+        *(f"scenario.string={mix}", f"scenario.time_step={float(time_step)!r}"),
         f"scenario.horizon={int(profiles.lengths[0]) - 1}",
     )
     cfg = load("evaluate", settings).with_(compare={name: spec} if spec else [], reward=UNREAD)
@@ -154,13 +157,8 @@ def simulate(
     require(fits, f"drivers: not a population: {in_short(people)}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
     strategy = Entrants(cfg, spec is None, typed=overrides).strategies(inputs)[-1]
-    return _simulated(strategy, inputs, repeats, seed)
-
-
-def _words(string: str | Mapping[str, Any]) -> str:
-    if isinstance(string, str):
-        return f"'{string}'"
-    return f"{{{', '.join(f'{key}: {value}' for key, value in string.items())}}}"
+    given = [word for word in overrides if top_key(word) == "drivers"]
+    return _driven(strategy, inputs, repeats, seed, given + ["drivers"] * (drivers is not None))
 
 
 def _profiles(leader: Any, time_step: float, seconds: float | None) -> Profiles:
@@ -174,12 +172,10 @@ def _profiles(leader: Any, time_step: float, seconds: float | None) -> Profiles:
     listed = isinstance(leader, (list, tuple)) and len(leader) > 0
     several = listed and not all(isinstance(x, (int, float, np.number)) for x in leader)
     records = [_record(speeds, time_step) for speeds in (leader if several else [leader])]
-    most = min((len(record) for record in records), default=0) - 1
+    most = min(map(len, records)) - 1
     require(most > 0, "simulate: leader needs at least two speeds [m/s]")
-    message = (
-        f"simulate: seconds={seconds or 0.0:g}, and the leader drives for {most * time_step:g} s"
-    )
-    require(round(steps) <= most, message)
+    text = f"simulate: seconds={seconds or 0:g}, and the leader drives for {most * time_step:g} s"
+    require(round(steps) <= most, text)
     steps = round(steps) or most
     names = [f"leader {number}" for number in range(len(records))]
     return from_records([x[: steps + 1] for x in records], names, names, time_step)
@@ -187,31 +183,36 @@ def _profiles(leader: Any, time_step: float, seconds: float | None) -> Profiles:
 
 def _record(leader: Any, time_step: float) -> Tensor:
     """Return a leader's speed at every step, ``[steps + 1]`` [m/s]."""
+    hard = Plausible(max_hard=1.0)  # tests of brakes; the column names the unit
     if isinstance(leader, (str, PathLike)):
-        hard = Plausible(max_hard=1.0)  # tests of brakes; the column names the unit
         return resample(*read_speed_record(fspath(leader), hard), time_step)
     message = "simulate: leader must be speeds [m/s], a shipped cycle or a file"
     with raised_as(ConfigError, message, ValueError, TypeError):
-        speeds = np.asarray(np.ma.filled(leader, np.nan), dtype=np.float32)
-        if speeds.ndim != 1:
-            raise ValueError(f"got an array of shape {list(speeds.shape)}")
-        if (speeds > Plausible().max_speed).any():
-            raise ValueError(f"got {speeds.max():g} m/s; is it in km/h?")
-        record, most = torch.from_numpy(speeds.copy()), Plausible().max_acceleration
+        record = torch.from_numpy(np.array(np.ma.filled(leader, np.nan), dtype=np.float32))
+        if record.ndim != 1:
+            raise ValueError(f"got an array of shape {list(record.shape)}; give a column of speeds")
         rate = record.diff().abs() / time_step
-        if (record >= 0.0).all() and (rate > most).any():
-            changes = f"changes by {rate.max():.3g} m/s², max_acceleration={most:g}"
-            raise ValueError(f"{changes}; give the time between two speeds, time_step=…")
+        hint = "max_acceleration={:g}; give the time between two speeds, time_step=…"
+        for text, values, most in (
+            ("is {:g}, not from 0 to {:g} m/s: missing, or in km/h?", record, hard.max_speed),
+            (f"changes by {{:.3g}} m/s², {hint}", rate, hard.max_acceleration),
+        ):
+            fits = (values >= 0.0) & (values <= most)
+            if not fits.all():
+                at = int(fits.int().argmin())
+                text = text.format(float(values[at]), most)
+                raise ValueError(f"speed {at}, at {at * time_step:g} s, {text}")
         return record
 
 
-def _simulated(strategy: Strategy, inputs: Inputs, repeats: int, seed: int) -> Simulation:
-    """Drive a strategy behind all leaders side by side."""
+def _driven(
+    strategy: Strategy, inputs: Inputs, repeats: int, seed: int, given: Sequence[str]
+) -> Simulation:
+    """Drive a strategy behind all leaders side by side; ``given``: the settings of the drivers."""
     cfg, leaders, people = strategy.cfg, len(inputs.evaluation), len(inputs.population.time_gap)
     number = torch.arange(leaders * repeats)
     profile, repeat, batch = number // repeats, number % repeats, len(number)
-    desired = inputs.population.desired_speed
-    slow = int((desired < inputs.evaluation.speeds.max()).sum())
+    slow = int((inputs.population.desired_speed < inputs.evaluation.speeds.max()).sum())
     if slow and len(cfg.scenario.vehicles) > cfg.automated:
         text = "the leader exceeds the desired speed of %d of %d human drivers, who fall behind; "
         log.warning(text + "drivers=highway in overrides has faster ones", slow, people)
@@ -221,7 +222,15 @@ def _simulated(strategy: Strategy, inputs: Inputs, repeats: int, seed: int) -> S
     ahead = [("leader", name) for name in ("speed", "acceleration", PLACE, GRADE)]
     keys = [*ahead, CLASS, INDEX, *(("vehicles", name) for name in (*MOTION, *SERIES))]
     player = Player(env, strategy.policy, keys, strategy.title, long and not rows, rows)
-    options = reset_options(env, profile, repeat % people, seed, people, repeat // people)
+    options, other = (
+        reset_options(env, profile, (repeat + k) % people, seed + k, people, repeat // people)
+        for k in (0, 1)
+    )
+    drawn = [f"repeats={repeats}"] * (repeats > 1) + [f"seed={seed}"] * (seed > 0)
+    read = (x.reads_drivers or x.setup.__module__[:7] != "lcc_rl." for x, _ in player.step.pieces)
+    idle = [*given] * (not any(read)) + ([] if drawn and player.draws(options, other) else drawn)
+    if idle:
+        log.warning("without effect on these vehicles: %s", ", ".join(idle))
     record, alive = player.play(options)
     warn_of_idle([player.idle])
     return _Motion(cfg, record, player.start, alive).tables()
@@ -290,12 +299,7 @@ class _Motion:
         return Simulation(pd.DataFrame(columns, copy=False), summary)
 
     def _rows(self, name: str, parts: Sequence[slice]) -> np.ndarray:
-        """Return a quantity of all vehicles, ``[rows, n]``, NaN where unknown.
-
-        Args:
-            name: the quantity.
-            parts: the rows of each episode.
-        """
+        """Return a quantity of all vehicles in the rows of each episode, NaN where unknown."""
         found = np.empty((parts[-1].stop, len(self.vehicles)), np.float32)
         first = 0
         for group in self.groups:
@@ -344,9 +348,8 @@ class _Motion:
             mean = Reductions(running, self.time_step).mean(series["speed"][1:])
             measured = safety_measures(series, running, self.time_step, metrics)
             found.append({"mean_speed_mps": mean} | known | measured)
-        lacking = [torch.full_like(known["distance_m"], torch.nan) for known in found]
         return {
-            name: torch.cat([x.get(name, y) for x, y in zip(found, lacking, strict=True)], -2)
+            name: torch.cat([x.get(name, torch.nan * x["distance_m"]) for x in found], -2)
             for name in found[-1]
         }
 

@@ -122,10 +122,8 @@ def _statement(i: int, formula: str, reads: tuple[int, ...], types: dict[int, st
     if formula.startswith("rectified("):
         units, types[i] = f"sizeof {args[0]} / sizeof *{args[0]}", "layer"
         line = f"v{i}[unit] = {args[0]}[unit] < 0 ? 0 : {args[0]}[unit];"
-        return [
-            f"float v{i}[{units}];",
-            f"for (int unit = 0; unit < (int)({units}); unit++) {line}",
-        ]
+        loop = f"for (int unit = 0; unit < (int)({units}); unit++) {line}"
+        return [f"float v{i}[{units}];", loop]
     if "**" in formula:
         formula = "powf({0}, {1})"
     elif re.search("ndtri|read|searchsorted", formula):
@@ -202,51 +200,46 @@ def _written(
 ) -> tuple[Path, list[str]]:
     """Write the file, see :func:`export`; return its path and the inputs of its program."""
     path = new_file(path, "name")
-    require_known("ending", path.suffix, [*EXPORTERS, PAGE])
-    page = path.suffix == PAGE
+    require_known("ending", path.suffix, [*EXPORTERS, CODE, PAGE])
     network = None if isinstance(policy, Controller) else network_of(policy, normalize)
     name, spec = one_of(policy) if network is None else (type(policy).__name__, network)
     cfg = None if network is None else load("train", with_variant(variant, overrides))
-    time_step: Any = 0.1  # of a rule [s]
-    rule = cfg is None and not is_policy(spec)
-    text = f"{name}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
-    require(not page or (cfg is None and not (safety or limits or rule)), text)
-    if cfg is None and not page and overrides:
-        own = "settings of a controller are in its yaml file or, in Python, its object"
-        text = f"{' '.join(overrides)}: a program ({path.suffix}) takes safety.… and limits.…, "
-        text += (
-            f"no road; a rule takes time_step; {own}"
-            if rule
-            else "no road; a policy has the time step of its training"
-        )
-        prefixes = ("safety.", "limits.", "time_step=") if rule else ("safety.", "limits.")
-        require(all(word.lstrip("+").startswith(prefixes) for word in overrides), text)
-        text = "overrides: safety.… and limits.… are given as arguments, too"
-        require(safety is None and limits is None, text)
-        changed: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(overrides)))
-        safety, limits = changed.get("safety"), changed.get("limits")
-        time_step = changed.get("time_step", time_step)
-    names: list[str] = []
-    if page:
+    rule, names = cfg is None and not is_policy(spec), list[str]()
+    given: dict[str, Any] = {"safety": safety, "limits": limits}
+    if path.suffix == PAGE:
+        text = f"{name}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
+        require(cfg is None and not (safety or limits or rule), text)
         content = ring_page(policy, trust, overrides).encode()
     else:
-        changes = (safety, limits)
-        if rule:
-            module = _rule(policy, time_step, trust, *changes)
+        if cfg is None and overrides:
+            text = "overrides: safety.… and limits.… are given as arguments, too"
+            require(safety is None and limits is None, text)
+            given = _changes(overrides, rule, path.suffix)
+        module = _rule(policy, trust, **given) if rule else program(spec, trust, cfg, **given)
+        about, names = described(module, name), module.names
+        if path.suffix == CODE:
+            content = c_code(module, about, path.stem).encode()
         else:
-            module = program(spec, trust, cfg, *changes)
-        about = described(module, name)
-        content, names = EXPORTERS[path.suffix](module, about, path.stem), module.names
+            content = EXPORTERS[path.suffix](module, about)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path, names
 
 
-def _rule(
-    given: Any, time_step: Any, trust: Sequence[str], safety: Safety, limits: Any
-) -> DrivingProgram:
-    """Return the program of a rule."""
-    driver = Driver(given, time_step, trust, safety, limits=limits)
+def _changes(overrides: Sequence[str], rule: bool, ending: str) -> Any:
+    """Return the settings of a program's filter and car and, of a rule, its time step."""
+    words, kinds = [word.lstrip("+") for word in overrides], ("safety.", "limits.", "time_step=")
+    text = f"{' '.join(overrides)}: a program ({ending}) takes safety.… and limits.…, no road; "
+    own = "settings of a controller are in its yaml file or, in Python, its object"
+    text += f"a rule takes time_step; {own}" * rule
+    text += "a policy has the time step of its training" * (not rule)
+    require(all(word.startswith(kinds[: 2 + rule]) for word in words), text)
+    return OmegaConf.to_container(OmegaConf.from_dotlist(words))
+
+
+def _rule(given: Any, trust: Sequence[str], time_step: Any = 0.1, **more: Any) -> DrivingProgram:
+    """Return the program of a rule; ``time_step`` [s]; ``more`` as for a :class:`Driver`."""
+    driver = Driver(given, time_step, trust, **more)
     noisy = SEED in driver.program.kept
     require(not noisy, f"{driver.name} draws noise from seeds: it cannot be exported")
     return driver.program
@@ -259,9 +252,8 @@ def described(module: DrivingProgram, name: str) -> str:
         if column["name"] in module.stand_ins:
             column["stand_in"] = str(module.stand_ins[column["name"]])
     about: dict[str, Any] = {"policy": name, "lcc_rl": __version__, "inputs": inputs}
-    about["time_step_s"] = module.controller.time_step
-    about |= {"output": "acceleration [m/s²]", "filter": module.safety is not None}
-    return json.dumps(about, ensure_ascii=False)
+    about |= {"time_step_s": module.controller.time_step, "output": "acceleration [m/s²]"}
+    return json.dumps(about | {"filter": module.safety is not None}, ensure_ascii=False)
 
 
 def _program(module: DrivingProgram) -> Any:
@@ -271,13 +263,13 @@ def _program(module: DrivingProgram) -> Any:
     return torch.export.export(module, examples, dynamic_shapes=batch)
 
 
-def _as_pt2(module: DrivingProgram, about: str, _name: str) -> bytes:
+def _as_pt2(module: DrivingProgram, about: str) -> bytes:
     buffer = BytesIO()
     torch.export.save(_program(module), buffer, extra_files={"lcc_rl": about})
     return buffer.getvalue()
 
 
-def _as_onnx(module: DrivingProgram, about: str, _name: str) -> bytes:
+def _as_onnx(module: DrivingProgram, about: str) -> bytes:
     exported = _program(module)
     count = len(exported.graph_signature.user_inputs)
     with needing("interfaces", "write a .pt2, or install what .onnx needs"):
@@ -298,16 +290,11 @@ def _as_onnx(module: DrivingProgram, about: str, _name: str) -> bytes:
     assert converted is not None
     proto = converted.model_proto
     onnx.helper.set_model_props(proto, {"lcc_rl": about})
-    content: bytes = proto.SerializeToString()
-    return content
+    return bytes(proto.SerializeToString())
 
 
-def _as_c(module: DrivingProgram, about: str, name: str) -> bytes:
-    return c_code(module, about, name).encode()
-
-
-PAGE = ".html"
-EXPORTERS = {".onnx": _as_onnx, ".pt2": _as_pt2, ".c": _as_c}
+CODE, PAGE = ".c", ".html"
+EXPORTERS = {".onnx": _as_onnx, ".pt2": _as_pt2}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -320,8 +307,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     text += "of a rule or a controller of your own (time_step=0.02)"
     parser.add_argument("settings", nargs="*", default=[], help=text)
     options = parser.parse_args(arguments)
-    args = options.policy, options.path, options.trust
-    path, names = _written(*args, overrides=options.settings)
+    path, names = _written(options.policy, options.path, options.trust, overrides=options.settings)
     if path.suffix == PAGE:
         print(f"{path}: the ring road in the browser, with {options.policy}")
         return 0

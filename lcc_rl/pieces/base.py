@@ -124,6 +124,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
     writes: ClassVar[Sequence[Entry | NestedKey]] = ()
     keeps: ClassVar[Sequence[Entry]] = ()  # constants of an episode, which begin sets at reset
     event: ClassVar[Sequence[Key]] = ()  # arguments of its method happened: steps of an event
+    reads_drivers = False  # whether it depends on the population of drivers
     measures: ClassVar[bool] = False  # whether measured values are read where the role has sensors
     # Maps the entries read to the entries written; a pure function of tensors.
     compute: ClassVar[Callable[..., Any]]

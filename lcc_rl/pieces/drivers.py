@@ -65,6 +65,7 @@ class Drivers(Controller):
     # Standard deviation of a smooth noise of ln(perceived gap); None: that of the population.
     gap_noise: NonNegative | None = None
 
+    reads_drivers = True
     name = HUMAN
     known = (
         Entry("role.driver", "–", "id of each vehicle's driver in the population", option=True),
@@ -101,6 +102,8 @@ class Drivers(Controller):
         self.soonest, self.late = delays or (late, late)
         self.noise_least, self.noise_spread = noises or (noise, noise)
         self.gap_spread = reaction.gap_noise if sight is None else sight
+        drawn = self.noise, self.wiener, self.noise_spread, self.gap_spread
+        self.steady = not any(drawn) and self.soonest == self.late
         self.noise_step = NoiseStep.of(world.time_step)
         self.gap_noise_step = NoiseStep.of(world.time_step, GAP_NOISE_TIME)
         self.starts = self.tells_gap and not world.string.ring
@@ -299,6 +302,7 @@ class DriverModel(Drivers):
         shared = shared and (single or not getattr(world.population, "models", None))
         own = f"controller@scenario.controllers.{HUMAN}=calibrated drives each by its own"
         require(shared, f"{where}: drivers differ in model, a, b or s0; {own}")
+        self.reads_drivers = not single or constants != self.law()
         return (*drivers[:2], constants)
 
 

@@ -35,6 +35,7 @@ class DriverEstimator(StepTransform):
         Entry("role.estimate", "–, s", "estimated (q, T), q = (15 m/s / v0)^δ", 2),
         Entry("role.covariance", "–, s, s²", "its covariance (C_qq, C_qT, C_TT)", 3),
     )
+    reads_drivers = True
     prior_estimate: ClassVar[Tensor]
     prior_covariance: ClassVar[Tensor]
 

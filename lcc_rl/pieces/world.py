@@ -147,8 +147,8 @@ class Part(Settings):
 
     name: ClassVar[str] = ""  # default; a part in an environment has its own name
     # Whether this class, not those derived from it, draws nothing in an evaluation and reads no
-    # drivers.
-    steady: ClassVar[bool] = False
+    # drivers; of human drivers, whether these have no noise.
+    steady = False
 
     def bind(self, world: World | None = None, name: str | None = None) -> Self:
         """Return a copy that is bound to a world.

@@ -215,30 +215,14 @@ def test_a_configuration_that_does_not_fit_is_refused() -> None:
     check_refused(
         lambda variant, overrides: small_env(variant, 2, overrides),
         [
+            ("alcc", ["scenario.pieces.time_gap=null"], r"reads vehicles\.time_gap, which no"),
+            ("alcc", ["scenario.pieces.estimator=null"], r"reads human\.predicted_acceleration"),
+            ("ddpg", ["scenario.pieces.communication=null"], r"reads vehicles\.gap_error, "),
+            ("alcc", [string("automated truck")], "has the role 'truck', but scenario.con"),
             (
                 "alcc",
-                ["scenario.pieces.time_gap=null"],
-                r"reads vehicles\.time_gap, which no piece",
-            ),
-            (
-                "alcc",
-                ["scenario.pieces.estimator=null"],
-                r"reads human\.predicted_acceleration, which",
-            ),
-            (
-                "ddpg",
-                ["scenario.pieces.communication=null"],
-                r"reads vehicles\.gap_error, which no",
-            ),
-            (
-                "alcc",
-                [string("automated truck")],
-                "has the role 'truck', but scenario.controllers nam",
-            ),
-            (
-                "alcc",
-                [string("automated human"), "scenario.road=ring"],
-                "a ring road has no leader",
+                ["scenario.road=ring", "+event=cut_in"],
+                r"no leader .*cut_out\), an open road needs one$",
             ),
             (
                 "alcc",

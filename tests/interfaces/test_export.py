@@ -271,11 +271,14 @@ def test_bad_input_is_one_clear_error() -> None:
         (["pretrained/alcc", "x.tflite"], "ending"),
         (["pretrained/nobody", "x.onnx"], "nobody"),
         (["pretrained/alcc", "x.onnx", "safety.margin=2"], "alcc has no safety filter"),
-        (["pretrained/i80-follow", "x.onnx", "safety.margin=-2"], r"safety.margin must be greater"),
+        (
+            ["pretrained/i80-follow", "x.onnx", "+safety.margin=-2"],
+            r"safety.margin must be greater",
+        ),
         (["idm_acc", "x.c", "limits.max_braking=0"], "limits.max_braking must be greater than 0"),
         (
             ["idm_acc", "x.c", "scenario.max_braking=6"],
-            r"a program \(.c\) takes safety.… and limits.…, no road; .* yaml file",
+            r"\(.c\) takes safety.*no road; .*yaml file",
         ),
         (["pretrained/alcc", "x.c", "time_step=0.02"], "has the time step of its training"),
         (["idm_ac", "x.onnx"], "idm_acc"),
