@@ -117,7 +117,7 @@ def test_limits_without_effect_are_refused() -> None:
     none = "scenario.max_braking=6 has no effect: "
     words = {
         "variant=direct scenario.max_braking=6": f"{none}no vehicle of the string is automated",
-        "+faults=actuation scenario.max_braking=6": rf"{none}scenario.*automated.braking=2\.8 is less",
+        "+faults=actuation scenario.max_braking=6": rf"{none}.*automated.braking=2\.8 is less",
         "scenario.max_braking=-1": "max_braking must be greater than 0",
     }
     check_refused(lambda given: load("train", given.split()), words.items(), ConfigError)
