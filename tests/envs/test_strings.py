@@ -207,10 +207,8 @@ REFUSED = {  # by variant and settings
     "ddpg; scenario.pieces.communication=null": r"reads vehicles\.gap_error, which no",
     f"alcc; {string('automated truck')}": "has the role 'truck', but scenario.controllers nam",
     f"alcc; {string('automated human')}; scenario.road=ring": "a ring road has no leader",
-    "alcc; scenario.circumference=100": "circumference=100 has no effect: it belongs to",
     "alcc; scenario.filters={auto: null}": r"unknown role \(scenario\.filters\) 'auto'",
     "alcc; scenario.start.human=null": r"scenario\.start has no entry for human",
-    f"alcc; {string('automated (human')}": "this bracket is never closed at character 11",
     "alcc; reward.terms=null": "terms",
 }
 
