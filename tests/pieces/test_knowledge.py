@@ -11,7 +11,7 @@ from helpers import OBSERVATION, small_env, steady, wavy_profiles
 from lcc_rl.pieces import LeaderPreview
 from lcc_rl.pieces.world import World
 
-FIRST = ("scenario.pieces.leader.start=first", "scenario.pieces.leader.profile=1")
+FIRST = ("scenario.pieces.leader.start=first", "scenario.pieces.leader.profile=2")
 
 
 def played(*overrides: str):

@@ -219,7 +219,7 @@ def test_follower_stopper_by_region() -> None:
         (5.0, 6.0, 5.0, 8.0),
         (5.0, 99.0, 5.0, 8.0),
         (5.0, 5.25, 20.0, 8.0),  # never faster than the desired speed
-        (5.0, 5.0, -1.0, 0.0),  # nor backwards
+        (0.0, 5.0, -1.0, 0.0),  # nor backwards
         # Closing at 3 m/s the gaps grow by 9/(2·1.5) = 3, 9/2 = 4.5 and 9/1 = 9 m.
         (8.0, 7.4, 5.0, 0.0),
         (8.0, 0.5 * (7.5 + 9.75), 5.0, 2.5),
