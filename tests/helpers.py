@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path
@@ -24,7 +25,7 @@ from lcc_rl.data.episodes import SCHEMA
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.drivers.population import bootstrap, from_table
 from lcc_rl.envs import Inputs, SingleAgent, build_env, load_inputs
-from lcc_rl.errors import LccError
+from lcc_rl.errors import Interrupted, LccError
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.rollout import Player, Record
 from lcc_rl.evaluation.strategies import Strategy
@@ -52,6 +53,12 @@ MIXED = from_table(
 )
 ACTION, REWARD = ("automated", "action"), ("automated", "reward")
 OBSERVATION, TERMS = ("automated", "observation"), ("automated", "reward_terms")
+# Sizes of a training of seconds, and of one from a buffer of transitions.
+SMALL = (
+    *("training.episodes=16", "training.environments=4", "training.checkpoint_every=2"),
+    *("training.segment=10", "agent.hidden=[16,16]"),
+)
+REPLAYED = (*SMALL, "agent.batch_size=32", "agent.buffer_size=200")
 
 
 def t(*values: float) -> torch.Tensor:
@@ -166,24 +173,31 @@ def weights(loop: TrainingLoop[Any]) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in loop.agent.policy.parameters()])
 
 
-def check_resuming(make: Callable[[Path], TrainingLoop[Any]], folder: Path) -> pd.DataFrame:
-    """Check that a training of checkpoints every 2 iterations resumes; return its rows."""
+def check_resuming(
+    make: Callable[[Path], TrainingLoop[Any]], folder: Path, said: str | None = None
+) -> pd.DataFrame:
+    """Check that a training of checkpoints every 2 iterations resumes; return its rows.
+
+    With the words of its error it is asked to stop during the third iteration, which it saves.
+    """
     whole = make(folder / "whole")
     expected = whole.run()
     first = make(folder / "parts")
     iterate = first._iterate
 
-    def dies(source):
+    def stops(source):
         if first.iteration == 3:
             raise MemoryError  # as sudden as SIGKILL: nothing is saved on the way out
+        if said and first.iteration == 2:
+            signal.raise_signal(signal.SIGTERM)
         return iterate(source)
 
-    first._iterate = dies
-    with pytest.raises(MemoryError):
+    first._iterate = stops
+    with pytest.raises(Interrupted if said else MemoryError, match=said):
         first.run()
     second = make(folder / "parts")
     second.load()
-    assert second.iteration == 2  # the last checkpoint
+    assert second.iteration == (3 if said else 2)  # the last checkpoint
     pd.testing.assert_frame_equal(second.run(), expected, check_exact=True)
     assert torch.equal(weights(second), weights(whole))
     assert repr(second.best) == repr(whole.best)

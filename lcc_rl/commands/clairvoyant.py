@@ -127,20 +127,8 @@ def block_rows(
     rival = baseline(cfg, task.against if task else "idm")
     yield from (drive(strategy) for strategy in (rival, *learned))
     for alone in (False, True) if options.regard else (False,):
-        plans = [
-            clairvoyant(
-                strategy,
-                block,
-                size.drivers,
-                size.seed,
-                options.iterations,
-                not options.no_compile,
-                alone,
-                hold,
-                update,
-            )
-            for strategy in learned
-        ]
+        how = size.drivers, size.seed, options.iterations, not options.no_compile, alone, hold
+        plans = [clairvoyant(strategy, block, *how, update) for strategy in learned]
         yield best([drive(planned) for planned in plans])
 
 

@@ -20,7 +20,6 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.agents.checks import check_batch
 from lcc_rl.config.schemas import StudyConfig
-from lcc_rl.energy import Fleet, as_fleet
 from lcc_rl.envs import DifferentiableRollout, build_env
 from lcc_rl.envs.inputs import Inputs, build_energy
 from lcc_rl.errors import require
@@ -149,32 +148,6 @@ def _descend(optimizer: torch.optim.Optimizer, price: Tensor, share: float, leng
     optimizer.step()
 
 
-def path_energy(
-    data: TensorDictBase,
-    time_step: float,
-    string: VehicleString | None = None,
-    energy: Fleet | None = None,
-    exact: bool = False,
-) -> Tensor:
-    """Return the path energy of all vehicles, or of a string's automated ones, ``[batch]`` [kJ].
-
-    If ``exact``, it is the energy drawn net of kinetic energy, which has jumps.
-    """
-    now, then = data.get((VEHICLES, "speed")), data.get(("next", VEHICLES, "speed"))
-    if string is not None:
-        now, then = Views(string, AUTOMATED, ["self.speed", "next.self.speed"]).of(data)
-    kind = data.get(CLASS, None)
-    if string is not None and kind is not None:
-        (kind,) = Views(string, AUTOMATED, ["self.energy_class"]).of(data)
-    fleet, motion = as_fleet(energy), (now, (then - now) / time_step)
-    if exact:
-        stored = fleet.stored_energy(then, kind) - fleet.stored_energy(now, kind)
-        power = fleet.power(*motion, kind) - stored / time_step
-    else:
-        power = fleet.path_power(*motion, kind)
-    return power.flatten(1).sum(1) * time_step * KILO
-
-
 class Goal:
     """Objective of a plan and the price of its limits, each ``[batch]`` [kJ].
 
@@ -192,14 +165,12 @@ class Goal:
         scenario = cfg.scenario
         self.task, self.string = cfg.task is not None, scenario.vehicles
         self.length, self.time_step = scenario.vehicle_length, scenario.time_step
-        own_string = self.string if own else None
-        self.fleet = build_energy(cfg)
-        self.counted = (self.time_step, own_string, self.fleet, exact and self.task)
+        self.fleet, self.own, self.exact = build_energy(cfg), own, exact and self.task
         self.first: tuple[Tensor, Tensor] | None = None
 
     def __call__(self, data: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return objective and price for a drive."""
-        energy = path_energy(data, *self.counted)
+        energy = self.energy(data)
         if not self.task:
             return energy, misses(data, self.string)
         speed, gap = (data.get(next_key((VEHICLES, x))).flatten(1) for x in ("speed", "gap"))
@@ -213,6 +184,24 @@ class Goal:
         worth = per_metre * distance
         lost = (1.0 - flow / least).clamp(min=0.0)
         return energy - worth, FLOW_PRICE * worth.detach() * lost
+
+    def energy(self, data: TensorDictBase) -> Tensor:
+        """Return the path energy of the counted vehicles, ``[batch]`` [kJ].
+
+        If ``exact``, it is the energy drawn net of kinetic energy, which has jumps.
+        """
+        now, then = data.get((VEHICLES, "speed")), data.get(("next", VEHICLES, "speed"))
+        kind = data.get(CLASS, None)
+        if self.own:
+            names = ["self.speed", "next.self.speed"] + ["self.energy_class"] * (kind is not None)
+            now, then, *kinds = Views(self.string, AUTOMATED, names).of(data)
+            kind = kinds[0] if kinds else None
+        fleet, motion = self.fleet, (now, (then - now) / self.time_step)
+        power = fleet.power(*motion, kind) if self.exact else fleet.path_power(*motion, kind)
+        if self.exact:
+            stored = fleet.stored_energy(then, kind) - fleet.stored_energy(now, kind)
+            power = power - stored / self.time_step
+        return power.flatten(1).sum(1) * self.time_step * KILO
 
 
 def misses(data: TensorDictBase, string: VehicleString) -> Tensor:

@@ -29,75 +29,61 @@ from lcc_rl.results.report import AGAINST, UNTRAINED, Report
 PACKAGES = ("lcc_rl", "torch", "torchrl", "tensordict", "numpy", "pandas", "scipy", "matplotlib")
 
 
-class Page:
-    """A page of results, without scripts or network.
+def section(
+    heading: str,
+    text: str = "",
+    tables: Iterable[tuple[str, pd.DataFrame]] = (),
+    figures: Iterable[tuple[str, Path]] = (),
+    details: Sequence[tuple[str, str]] = (),
+) -> dict[str, Any]:
+    """Return a section of a page.
 
     Args:
-        folder: folder of ``report.html``.
+        heading: its title.
+        text: plain paragraphs, separated by blank lines.
+        tables: caption and rows, see :func:`lcc_rl.results.render.columns`.
+        figures: caption and file.
+        details: titles and long texts, collapsed.
     """
+    shown = [(_line(caption), columns(worded(frame))) for caption, frame in tables]
+    drawn = [(_line(caption), _webp(path)) for caption, path in figures]
+    paragraphs = [_line(part) for part in text.split("\n\n") if part.strip()]
+    parts = {"heading": heading, "paragraphs": paragraphs, "tables": shown}
+    return parts | {"figures": drawn, "details": details}
 
-    def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
-        self.sections: list[dict[str, Any]] = []
 
-    def add(
-        self,
-        heading: str,
-        text: str = "",
-        tables: Iterable[tuple[str, pd.DataFrame]] = (),
-        figures: Iterable[tuple[str, Path]] = (),
-        details: Sequence[tuple[str, str]] = (),
-    ) -> None:
-        """Add a section.
+def write_sections(
+    folder: Path, title: str, sections: Sequence[dict[str, Any]], commands: Sequence[str] = ()
+) -> Path:
+    """Write ``report.html``, without scripts or network; its end is the origin of the results.
 
-        Args:
-            heading: its title.
-            text: plain paragraphs, separated by blank lines.
-            tables: caption and rows, see :func:`lcc_rl.results.render.columns`.
-            figures: caption and file.
-            details: titles and long texts, collapsed.
-        """
-        shown = [(_line(caption), columns(worded(frame))) for caption, frame in tables]
-        drawn = [(_line(caption), _webp(path)) for caption, path in figures]
-        paragraphs = [_line(part) for part in text.split("\n\n") if part.strip()]
-        section = {"heading": heading, "paragraphs": paragraphs, "tables": shown}
-        self.sections.append(section | {"figures": drawn, "details": details})
+    Args:
+        folder: folder of the page.
+        title: title of the page.
+        sections: its sections.
+        commands: the commands, oldest first.
 
-    def write(self, title: str, commands: Sequence[str] = ()) -> Path:
-        """Add the origin of the results, and write ``report.html``.
-
-        Args:
-            title: title of the page.
-            commands: the commands, oldest first.
-
-        Returns:
-            The path of the page.
-
-        Raises:
-            ResultsError: if the page cannot be written.
-        """
-        rows = [(name, version(name)) for name in PACKAGES]
-        rows += [("Python", platform.python_version()), ("machine", platform.machine())]
-        written = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-        text = f"This page was written on {written} from parquet files alone."
-        runs = sorted(self.folder.rglob("training.parquet"))
-        places = Counter(parquet_metadata(run).get(PROCESSOR, "not recorded") for run in runs)
-        if places:
-            counted = (f"{place} ({count})" for place, count in places.most_common())
-            text += f" Its trainings ran on: {', '.join(counted)}."
-        versions = pd.DataFrame(rows, columns=["package", "version"])
-        listing = [("Commands", "\n".join(commands))] if commands else []
-        made = [("Versions that wrote this page", versions)]
-        self.add("How it was made", text, made, details=listing)
-        pages = Environment(
-            loader=PackageLoader("lcc_rl", "assets"), autoescape=True, trim_blocks=True
-        )
-        path = self.folder / "report.html"
-        with atomic_path(path) as temporary:
-            template = pages.get_template("page.html")
-            html = template.render(title=title, sections=self.sections)
-            temporary.write_text(html, encoding="utf-8")
-        return path
+    Raises:
+        ResultsError: if the page cannot be written.
+    """
+    rows = [(name, version(name)) for name in PACKAGES]
+    rows += [("Python", platform.python_version()), ("machine", platform.machine())]
+    written = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    text = f"This page was written on {written} from parquet files alone."
+    runs = sorted(folder.rglob("training.parquet"))
+    places = Counter(parquet_metadata(run).get(PROCESSOR, "not recorded") for run in runs)
+    if places:
+        counted = (f"{place} ({count})" for place, count in places.most_common())
+        text += f" Its trainings ran on: {', '.join(counted)}."
+    versions = pd.DataFrame(rows, columns=["package", "version"])
+    listing = [("Commands", "\n".join(commands))] if commands else []
+    made = [("Versions that wrote this page", versions)]
+    last = section("How it was made", text, made, details=listing)
+    pages = Environment(loader=PackageLoader("lcc_rl", "assets"), autoescape=True, trim_blocks=True)
+    with atomic_path(folder / "report.html") as temporary:
+        html = pages.get_template("page.html").render(title=title, sections=[*sections, last])
+        temporary.write_text(html, encoding="utf-8")
+    return folder / "report.html"
 
 
 def _line(text: str) -> str:
@@ -149,7 +135,7 @@ def held_to(trainings: Iterable[StudyConfig]) -> str:
     return AS_RECORDED.format(what) if held else HELD_TO.format(limit=", ".join(limits))
 
 
-def write_page(folder: str | Path, commands: Sequence[str], report: Report, size: str) -> Path:
+def write_page(folder: Path, commands: Sequence[str], report: Report, size: str) -> Path:
     """Write ``report.html`` of a job: headline, figures, drivers, commands and versions.
 
     Args:
@@ -164,14 +150,13 @@ def write_page(folder: str | Path, commands: Sequence[str], report: Report, size
     Raises:
         ResultsError: if the page cannot be written.
     """
-    page = Page(folder)
 
     def figures(names: dict[str, str]) -> list[tuple[str, Path]]:
-        paths = {page.folder / f"{name}.png": caption for name, caption in names.items()}
+        paths = {folder / f"{name}.png": caption for name, caption in names.items()}
         return [(caption, path) for path, caption in paths.items() if path.exists()]
 
     words = f"{report.verdict}\n\n{report.note}"
-    page.add("Results", words, [(size, for_print(report))], figures(RESULT_FIGURES))
+    sections = [section("Results", words, [(size, for_print(report))], figures(RESULT_FIGURES))]
     learned = [str(name) for name in report.short["strategy"] if name not in UNTRAINED]
     improvements = {
         f"evaluation/figures/improvement_{own}_vs_{in_file(name)}": (
@@ -182,9 +167,9 @@ def write_page(folder: str | Path, commands: Sequence[str], report: Report, size
     }
     for heading, names in {"By driver": improvements, "Drivers": DRIVER_FIGURES}.items():
         if drawn := figures(names):
-            page.add(heading, figures=drawn)
+            sections.append(section(heading, figures=drawn))
     cells = [[label.strip(), *row] for label, row in full_rows(report)]
     columns = ["measure", *(in_words(str(name)) for name in report.table["strategy"])]
     every = pd.DataFrame(cells, columns=columns)
-    page.add("All measures", tables=[("Means per strategy", every)])
-    return page.write(MAIN_TITLE, commands)
+    sections.append(section("All measures", tables=[("Means per strategy", every)]))
+    return write_sections(folder, MAIN_TITLE, sections, commands)

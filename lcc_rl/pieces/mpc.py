@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from importlib.util import find_spec
 from typing import Annotated, Any
 
@@ -79,7 +79,8 @@ class MPC(MPCSettings, Controller):
         self.check_installed()
         self.declare(world)
         settings = {field.name: getattr(self, field.name) for field in fields(MPCSettings)}
-        self.solver = Solver(MPCSettings(**settings), self.limits)
+        assert self.limits is not None
+        self.program = FollowingProgram(MPCSettings(**settings), self.limits)
 
     @staticmethod
     def check_installed() -> None:
@@ -96,26 +97,65 @@ class MPC(MPCSettings, Controller):
         """Return the commands, and 1 where there was no solution."""
         speed = entries[0]
         rows = torch.stack([x.detach().expand_as(speed).flatten() for x in entries], -1)
-        first, unsolved = self.solver(rows.double().cpu().numpy())
+        first, unsolved = self.program(rows.double().cpu().numpy())
         results = (torch.as_tensor(x).to(speed).view_as(speed) for x in (first, unsolved))
         return tuple(results)  # type: ignore[return-value]
 
 
-class Solver:
-    """Solves the programs of many states one after the other with one factorisation.
+class FollowingProgram:
+    """min ½ xᵀPx + qᵀx, l ≤ Ax ≤ u; x: N accelerations and N slacks of each of three limits.
+
+    The plan's speeds and gaps are linear in its accelerations, so P and A depend on settings only,
+    and the programs of many states are solved one after the other with one factorisation. The
+    objective is the loss by acceleration (the part of A2 with a²) plus ``steady_price`` times the
+    steady power, linearised at the present speed; both in units of the loss of 1 m/s² at this
+    speed. The limits of gap and time-to-collision are soft, so a solution always exists.
 
     Args:
         settings: settings of the controller.
-        limits: least and largest command [m/s²]; None: ± the settings' ``max_acceleration``.
+        limits: least and largest command [m/s²].
     """
 
-    def __init__(self, settings: MPCSettings, limits: tuple[float, float] | None = None) -> None:
+    def __init__(self, settings: MPCSettings, limits: tuple[float, float]) -> None:
         self.settings, self.limits = settings, limits
-        self.program = FollowingProgram(settings, limits)
-        self.osqp = _set_up(self.program)
+        self.steps = round(settings.horizon / settings.step)
+        h, n = settings.step, self.steps
+        self.times = h * np.arange(1, n + 1)
+        sums = np.tril(np.ones((n, n)))
+        self.speeds = h * sums  # speeds of the plan by its accelerations
+        # The trapezoidal rule of the simulator (A18).
+        self.ways = h * sums @ (self.speeds - 0.5 * h * np.eye(n))
+        changes = (np.eye(n) - np.eye(n, k=-1)) / h
+        prices = (settings.near_price, settings.far_price, settings.ttc_price)
+        quadratic = 2.0 * np.diag(np.repeat([0.0, *prices], n))
+        quadratic[:n, :n] = 2.0 * (np.eye(n) + settings.jerk_price * changes.T @ changes)
+        self.osqp = self._set_up(quadratic)
+
+    def _set_up(self, quadratic: Array) -> Any:
+        """Return OSQP's solver with P ``[4 N, 4 N]`` and A."""
+        from osqp import OSQP
+        from scipy.sparse import csc_matrix, triu
+
+        linear, lower, upper = (x[0] for x in self.vectors(*np.zeros((5, 1))))
+        solver = OSQP()
+        solver.setup(
+            triu(csc_matrix(quadratic), format="csc"),
+            linear,
+            csc_matrix(self._constraints()),
+            lower,
+            upper,
+            verbose=False,
+            warm_starting=False,  # a result must not depend on earlier programs
+            adaptive_rho=0,
+            eps_abs=self.settings.tolerance,
+            eps_rel=self.settings.tolerance,
+            max_iter=self.settings.iterations,
+            check_termination=10,
+        )
+        return solver
 
     def __reduce__(self) -> Any:
-        return Solver, (self.settings, self.limits)  # OSQP's own object cannot be copied
+        return FollowingProgram, (self.settings, self.limits)  # OSQP's object cannot be copied
 
     def __call__(self, rows: Array) -> tuple[Array, Array]:
         """Return the first accelerations, and 1 where there was no solution, ``[rows]``.
@@ -124,98 +164,20 @@ class Solver:
             rows: speed, gap, acceleration, speed and acceleration ahead, ``[rows, 5]``.
         """
         distinct, inverse = np.unique(rows, axis=0, return_inverse=True)
-        first, unsolved = self._each(distinct)
-        return first[inverse.ravel()], unsolved[inverse.ravel()]
-
-    def _each(self, rows: Array) -> tuple[Array, Array]:
-        first, unsolved = np.full(len(rows), np.nan), np.zeros(len(rows))
-        finite = np.flatnonzero(np.isfinite(rows).all(1))
-        least, largest = self.program.limits
-        speed, gap, *rest = rows[finite].T
-        vectors = self.program.vectors(speed, gap.clip(-LONGEST_GAP, LONGEST_GAP), *rest)
-        programs = zip(finite, vectors.linear, vectors.lower, vectors.upper, strict=True)
-        for row, linear, lower, upper in programs:
+        first, unsolved = np.full(len(distinct), np.nan), np.zeros(len(distinct))
+        finite = np.flatnonzero(np.isfinite(distinct).all(1))
+        speed, gap, *rest = distinct[finite].T
+        vectors = self.vectors(speed, gap.clip(-LONGEST_GAP, LONGEST_GAP), *rest)
+        for row, linear, lower, upper in zip(finite, *vectors, strict=True):
             self.osqp.update(q=linear, l=lower, u=upper)
             result = self.osqp.solve(raise_error=False)
             solved = result.info.status_val == 1
-            first[row] = np.clip(result.x[0], least, largest) if solved else least
+            first[row] = np.clip(result.x[0], *self.limits) if solved else self.limits[0]
             unsolved[row] = not solved
-        return first, unsolved
-
-
-def _set_up(program: FollowingProgram) -> Any:
-    from osqp import OSQP
-    from scipy.sparse import csc_matrix, triu
-
-    settings, still = program.settings, np.zeros(1)
-    vectors = program.vectors(still, still, still, still, still)
-    solver = OSQP()
-    solver.setup(
-        triu(csc_matrix(program.quadratic), format="csc"),
-        vectors.linear[0],
-        csc_matrix(program.constraints),
-        vectors.lower[0],
-        vectors.upper[0],
-        verbose=False,
-        warm_starting=False,  # a result must not depend on earlier programs
-        adaptive_rho=0,
-        eps_abs=settings.tolerance,
-        eps_rel=settings.tolerance,
-        max_iter=settings.iterations,
-        check_termination=10,
-    )
-    return solver
-
-
-@dataclass(frozen=True)
-class Vectors:
-    """The parts of the program that depend on the state, one row per vehicle.
-
-    Args:
-        linear: q, ``[rows, 4 N]``.
-        lower, upper: bounds of A x, ``[rows, 5 N]``.
-    """
-
-    linear: Array
-    lower: Array
-    upper: Array
-
-
-class FollowingProgram:
-    """min ½ xᵀPx + qᵀx, l ≤ Ax ≤ u; x: N accelerations and N slacks of each of three limits.
-
-    The plan's speeds and gaps are linear in its accelerations, so P and A depend on settings only.
-    The objective is the loss by acceleration (the part of A2 with a²) plus ``steady_price`` times
-    the steady power, linearised at the present speed; both in units of the loss of 1 m/s² at this
-    speed. The limits of gap and time-to-collision are soft, so a solution always exists.
-
-    Args:
-        settings: settings of the controller.
-        limits: see :class:`Solver`.
-
-    Attributes:
-        quadratic: P, ``[4 N, 4 N]``.
-        constraints: A, ``[5 N, 4 N]``.
-    """
-
-    def __init__(self, settings: MPCSettings, limits: tuple[float, float] | None = None) -> None:
-        self.limits = limits or (-settings.max_acceleration, settings.max_acceleration)
-        self.settings, self.steps = settings, round(settings.horizon / settings.step)
-        h, n = settings.step, self.steps
-        self.times = h * np.arange(1, n + 1)
-        sums = np.tril(np.ones((n, n)))
-        self.speeds = h * sums  # speeds of the plan by its accelerations
-        # The trapezoidal rule of the simulator (A18).
-        self.ways = h * sums @ (self.speeds - 0.5 * h * np.eye(n))
-        changes = (np.eye(n) - np.eye(n, k=-1)) / h
-        block = np.eye(n) + settings.jerk_price * changes.T @ changes
-        prices = (settings.near_price, settings.far_price, settings.ttc_price)
-        self.quadratic = 2.0 * np.diag(np.repeat([0.0, *prices], n))
-        self.quadratic[:n, :n] = 2.0 * block
-        self.constraints = self._constraints()
+        return first[inverse.ravel()], unsolved[inverse.ravel()]
 
     def _constraints(self) -> Array:
-        """Return A: gap too short, too long, too short for the speeds; speed; acceleration."""
+        """Return A ``[5 N, 4 N]``: gaps too short, too long, short for the speeds; speed; plan."""
         n, s = self.steps, self.settings
         rows = np.zeros((5 * n, 4 * n))
         closing = [
@@ -231,8 +193,8 @@ class FollowingProgram:
 
     def vectors(
         self, speed: Array, gap: Array, acceleration: Array, ahead: Array, ahead_change: Array
-    ) -> Vectors:
-        """Return the vectors of a state.
+    ) -> tuple[Array, Array, Array]:
+        """Return q, ``[rows, 4 N]``, and the bounds l and u, ``[rows, 5 N]``, of states.
 
         Args:
             speed, gap, acceleration: of the vehicle, ``[rows]`` [m/s], [m], [m/s²].
@@ -256,7 +218,7 @@ class FollowingProgram:
         linear = np.zeros((len(free), 4 * n))
         linear[:, :n] = s.steady_price * _steady_slope(speed) * self.speeds.sum(0)
         linear[:, 0] -= 2.0 * s.jerk_price * acceleration / s.step**2
-        return Vectors(linear, lower, np.concatenate(upper, 1))
+        return linear, lower, np.concatenate(upper, 1)
 
     def predicted(self, speed: Array, acceleration: Array) -> tuple[Array, Array]:
         """Return speeds and distances of the vehicle ahead, ``[rows, N]`` [m/s], [m]."""

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import math
-import signal
 
 import pandas as pd
 import pytest
 import torch
-from helpers import REWARD, TERMS, compose, make_agent, slow_but, small_loop, string, weights
+from helpers import (
+    REWARD,
+    TERMS,
+    check_resuming,
+    compose,
+    make_agent,
+    slow_but,
+    small_loop,
+    string,
+    weights,
+)
 
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.agent import derived_seed
 from lcc_rl.agents.loop import TrainingLoop
 from lcc_rl.config import load
-from lcc_rl.errors import Diverged, Interrupted
-from lcc_rl.io.files import read_parquet
+from lcc_rl.errors import Diverged
 
 SMALL = (
     "agent=analytic",
@@ -50,26 +58,8 @@ def test_same_seed_same_rows_and_weights(tmp_path, variant, vehicles) -> None:
 
 @pytest.mark.parametrize("overrides", [(), pytest.param(WHOLE, marks=pytest.mark.slow)])
 def test_resuming_equals_never_having_stopped(tmp_path, overrides) -> None:
-    whole = make(tmp_path / "whole", *overrides)
-    expected = whole.run()
-    stopped = make(tmp_path / "parts", *overrides)
-    iterate = stopped._iterate
-
-    def interrupted(source):
-        if stopped.iteration == 2:
-            signal.raise_signal(signal.SIGTERM)
-        return iterate(source)
-
-    stopped._iterate = interrupted
-    with pytest.raises(Interrupted, match=r"after iteration 3 of 5; .*resume="):
-        stopped.run()
-    again = make(tmp_path / "parts", *overrides)
-    again.load()
-    assert again.iteration == 3
-    pd.testing.assert_frame_equal(again.run(), expected, check_exact=True)
-    assert torch.equal(weights(again), weights(whole))
-    stored = read_parquet(tmp_path / "parts" / "training.parquet")
-    pd.testing.assert_frame_equal(stored, expected, check_exact=True)
+    said = r"after iteration 3 of 5; .*resume="
+    check_resuming(lambda folder: make(folder, *overrides), tmp_path, said)
 
 
 def test_the_record_is_that_of_the_literal_reward(tmp_path) -> None:

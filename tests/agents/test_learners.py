@@ -8,7 +8,7 @@ from typing import Any
 from zlib import crc32
 
 import pytest
-from helpers import check_refused, check_resuming, slow_but, small_env, small_loop, weights
+from helpers import SMALL, check_refused, check_resuming, slow_but, small_env, small_loop, weights
 from page_blocks import ROOT
 from tensordict import TensorDict
 from torch import nn
@@ -17,10 +17,6 @@ from lcc_rl.agents import PPO, TrainingLoop
 from lcc_rl.agents.agent import Scene
 from lcc_rl.errors import ConfigError, ResultsError
 
-SMALL = (
-    *("training.episodes=16", "training.environments=4", "training.checkpoint_every=2"),
-    *("training.segment=10", "agent.hidden=[16,16]"),
-)
 AGENTS = {
     "ppo": ("agent=ppo", "agent.batch_size=16", "agent.epochs=2", "agent.entropy=0.01"),
     "own": ("agent._target_=my_learner.Reinforce",),

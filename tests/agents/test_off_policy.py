@@ -7,6 +7,7 @@ import torch
 from helpers import (
     ACTION,
     POPULATION,
+    REPLAYED,
     check_resuming,
     compose,
     make_agent,
@@ -23,17 +24,7 @@ from lcc_rl.agents.off_policy import leaves
 from lcc_rl.agents.replay import KNOWN, Replay
 from lcc_rl.envs import build_env
 
-SMALL = (
-    "training.episodes=16",
-    "training.environments=4",
-    "training.checkpoint_every=2",
-    "training.segment=10",
-    "agent.batch_size=32",
-    "agent.buffer_size=200",
-    "agent.hidden=[16,16]",
-    "agent.policy=network",
-    "agent.actor_lr=1e-3",
-)
+SMALL = (*REPLAYED, "agent.policy=network", "agent.actor_lr=1e-3")
 EACH = pytest.mark.parametrize("agent", ["td3", "sac"])
 
 

@@ -5,25 +5,15 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 import torch
-from helpers import ACTION, check_resuming, small_env, small_loop, string
+from helpers import ACTION, REPLAYED, check_resuming, small_env, small_loop, string
 
 from lcc_rl.agents.collecting import transitions
 from lcc_rl.agents.loop import TrainingLoop, episode_statistics
 from lcc_rl.errors import ResultsError
 
-SMALL = (
-    "training.episodes=20",
-    "training.environments=4",
-    "training.checkpoint_every=2",
-    "training.segment=10",
-    "agent.batch_size=32",
-    "agent.buffer_size=200",
-    "agent.hidden=[16,16]",
-)
-
 
 def make(folder, *overrides: str) -> TrainingLoop:
-    return small_loop(folder, *SMALL, *overrides)
+    return small_loop(folder, *REPLAYED, "training.episodes=20", *overrides)
 
 
 def test_a_seed_is_one_training_whole_or_resumed(tmp_path) -> None:

@@ -20,7 +20,7 @@ from lcc_rl.commands import training
 from lcc_rl.config import load
 from lcc_rl.errors import ResultsError
 from lcc_rl.figures.drawing import new_figure, save
-from lcc_rl.figures.page import Page
+from lcc_rl.figures.page import section, write_sections
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.files import write_parquet
 from lcc_rl.io.tensors import read_torch, write_torch
@@ -49,9 +49,7 @@ def figure(path: Path) -> None:
 
 
 def page(path: Path) -> None:
-    made = Page(path.parent)
-    made.add("h", "x" * 20_000)
-    made.write("t")
+    write_sections(path.parent, "t", [section("h", "x" * 20_000)])
 
 
 WRITERS: dict[str, Callable[[Path], object]] = {

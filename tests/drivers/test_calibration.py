@@ -305,9 +305,8 @@ def test_a_model_of_ones_own_is_calibrated_and_drives(make_episodes):
     assert drivers["desired_speed_mps"].tolist() == pytest.approx([15.0, 25.0], rel=0.01)
     assert drivers["time_gap_s"].tolist() == pytest.approx([1.0, 1.5], rel=0.01)
     assert (drivers["gap_gain_hz2"] == 0.2).all()
-    cfg = compose("alcc", "controller@scenario.controllers.human=calibrated")
-    human = cfg.scenario.controllers["human"].changed(noise=0.0)
-    cfg = cfg.with_(scenario={"controllers": {"human": human}})
+    quiet = "scenario.controllers.human.noise=0"
+    cfg = compose("alcc", "controller@scenario.controllers.human=calibrated", quiet)
     data = build_env(cfg, wavy_profiles(), from_table(drivers), 4).rollout(20)
     speed, gap, rate = (data["vehicles", x][..., 1:, :] for x in ("speed", "gap", "relative_speed"))
     own = (data["human", "desired_speed"], data["human", "desired_time_gap"])

@@ -98,30 +98,21 @@ class Lossless(Weightless):
 
 
 def test_mistakes_are_named() -> None:
-    check_refused(
-        lambda make: make(),
-        [
-            (lambda: Fleet({}), "energy.models is empty"),
-            (lambda: Fleet(MODELS, {"cart": 1.0}), r"energy.shares.*'cart'.*car"),
-            (lambda: Fleet(MODELS, {"car": 0.0}), "energy.shares: shares"),
-            (lambda: Fleet(MODELS, None, {"human": {"bus": 1.0}}), r"energy.roles.human.*'bus'"),
-            (lambda: build_energy(load("train", ["energy._target_=builtins.dict"])), "energy"),
-            (lambda: CirclesFuel(vehicle="van"), "van"),
-            (
-                lambda: Fleet({"x": Weightless()}),
-                "Weightless: an energy model needs its mass .* nan",
-            ),
-            (
-                lambda: Fleet({"x": Lossless()}),
-                "Lossless: efficiency must lie from 0 to 1, got 1.3",
-            ),
-            (
-                lambda: lcc_rl.make_env("alcc", 1, [*MIXED, "+energy.roles.lorry={class8: 1}"]),
-                r"energy.roles.*lorry.*automated, human",
-            ),
-        ],
-        ConfigError,
-    )
+    cases = [
+        ({}, "energy.models is empty"),
+        (MODELS, {"cart": 1.0}, r"energy.shares.*'cart'.*car"),
+        (MODELS, {"car": 0.0}, "energy.shares: shares"),
+        (MODELS, None, {"human": {"bus": 1.0}}, r"energy.roles.human.*'bus'"),
+        ({"x": Weightless()}, "Weightless: an energy model needs its mass .* nan"),
+        ({"x": Lossless()}, "Lossless: efficiency must lie from 0 to 1, got 1.3"),
+    ]
+    check_refused(Fleet, cases, ConfigError)
+    cases = [
+        (["energy._target_=builtins.dict"], "energy"),
+        (["energy=fuel", "energy.vehicle=van"], "vehicle .energy.vehicle. 'van'"),
+        ([*MIXED, "+energy.roles.lorry={class8: 1}"], r"energy.roles.*lorry.*automated, human"),
+    ]
+    check_refused(lambda words: lcc_rl.make_env("alcc", 1, words), cases, ConfigError)
 
 
 def test_fuel_and_carbon_dioxide_are_those_of_each_class() -> None:
@@ -286,42 +277,21 @@ def test_what_does_not_use_classes_is_what_it_was() -> None:
 
 
 def test_mistakes_in_classes_are_named() -> None:
-    def built(*words):
-        return lambda: small_env("alcc", 1, words)
-
-    check_refused(
-        lambda make: make(),
-        [
-            (built(*TRUCKS, "scenario.fleet.truck.share=2"), "scenario.fleet.truck.share must be"),
-            (built(*TRUCKS, "scenario.fleet.truck.length=0"), "scenario.fleet.truck.length must"),
-            (
-                built(*TRUCKS, "scenario.fleet.truck.roles=[human,lorry]"),
-                r"role \(scenario.fleet.truck.roles\).*lorry.*automated, human",
-            ),
-            (
-                built(*TRUCKS, string("automated")),
-                "fleet.truck.speed_limit=9.0 has no effect: no vehicle of the string is human",
-            ),
-            (built("scenario.fleet={truck: {share: 0.1}}"), r"scenario.fleet.*truck.*_target_"),
-            (
-                lambda: classes(load("train", ["+scenario.fleet.t={_target_: builtins.dict}"])),
-                r"scenario\.fleet\.t: expected a subclass of .*VehicleClass",
-            ),
-            (
-                built(
-                    *HALF,
-                    "+scenario.fleet.van=${scenario.fleet.truck}",
-                    "scenario.fleet.truck.share=0.8",
-                ),
-                "scenario.fleet: the shares of human must not exceed 1, got 1.6",
-            ),
-            (
-                built("energy=mixture", "+scenario.fleet.suv=${scenario.fleet.truck}", *TRUCKS),
-                "scenario.fleet: energy has a class suv, too",
-            ),
-        ],
-        ConfigError,
-    )
+    truck, suv = "scenario.fleet.truck", "+scenario.fleet.suv=${scenario.fleet.truck}"
+    both = [*HALF, "+scenario.fleet.van=${scenario.fleet.truck}", f"{truck}.share=0.8"]
+    cases = [
+        ([*TRUCKS, f"{truck}.share=2"], f"{truck}.share must be"),
+        ([*TRUCKS, f"{truck}.length=0"], f"{truck}.length must"),
+        (
+            [*TRUCKS, f"{truck}.roles=[human,lorry]"],
+            rf"role \({truck}.roles\).*lorry.*automated, h",
+        ),
+        ([*TRUCKS, string("automated")], "truck.speed_limit=9.0 has no effect: .* is human"),
+        (["scenario.fleet={truck: {share: 0.1}}"], r"scenario.fleet.*truck.*_target_"),
+        (both, "scenario.fleet: the shares of human must not exceed 1, got 1.6"),
+        (["energy=mixture", suv, *TRUCKS], "scenario.fleet: energy has a class suv, too"),
+    ]
+    check_refused(lambda words: small_env("alcc", 1, words), cases, ConfigError)
     cfg = compose("alcc", *ALL)
     with pytest.raises(ConfigError, match=r"class truck \(scenario.fleet\).*cannot drive in SUMO"):
         program(make_agent(cfg).policy.module, cfg=cfg)

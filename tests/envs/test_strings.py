@@ -185,61 +185,40 @@ class Broken(Feature):
 
 
 def test_a_piece_that_does_not_fit_is_refused() -> None:
-    check_refused(
-        lambda piece: check(piece),
-        [
-            (Wide().bind(WORLD), r"Wide writes vehicles\.wide as \[4, 4, 1\] .* expected \[4, 1\]"),
-            (
-                Misnamed().bind(WORLD),
-                r"Misnamed writes vehicles\.vehicles, but 'vehicles' is a group .* another name",
-            ),
-            (Broken().bind(WORLD), "Broken does not fit the string of vehicles"),
-            (
-                MOTION.bind(WORLD),
-                r"vehicles\.speed is written by more than one piece: \['StringMotion', 'StringMot",
-            ),
-            (
-                TimeToCollision().bind(World(parse_string("automated*3"))),
-                r"TimeToCollision writes vehicles\.ttc as \[4, 1\] .* expected \[3, 1\]",
-            ),
-            (
-                Action().bind(WORLD, "other"),
-                r"Action reads other\.action, but only automated vehicles have an action",
-            ),
-        ],
-        ConfigError,
-    )
+    three = World(parse_string("automated*3"))
+    cases = {
+        Wide().bind(WORLD): r"Wide writes vehicles\.wide as \[4, 4, 1\] .* expected \[4, 1\]",
+        Misnamed().bind(
+            WORLD
+        ): r"Misnamed writes vehicles\.vehicles, but 'vehicles' is a group .* a",
+        Broken().bind(WORLD): "Broken does not fit the string of vehicles",
+        MOTION.bind(
+            WORLD
+        ): r"vehicles\.speed is written by more than one piece: \['StringMotion', ",
+        TimeToCollision().bind(three): r"vehicles\.ttc as \[4, 1\] .* expected \[3, 1\]",
+        Action().bind(WORLD, "other"): r"reads other\.action, but only automated vehicles have an",
+    }
+    check_refused(check, cases.items(), ConfigError)
+
+
+REFUSED = {  # by variant and settings
+    "alcc; scenario.pieces.time_gap=null": r"reads vehicles\.time_gap, which no piece",
+    "alcc; scenario.pieces.estimator=null": r"reads human\.predicted_acceleration, which",
+    "ddpg; scenario.pieces.communication=null": r"reads vehicles\.gap_error, which no",
+    f"alcc; {string('automated truck')}": "has the role 'truck', but scenario.controllers nam",
+    "alcc; scenario.road=ring; +event=cut_in": r"no leader .*cut_out\), an open road needs one$",
+    "alcc; scenario.filters={auto: null}": r"unknown role \(scenario\.filters\) 'auto'",
+    "alcc; scenario.start.human=null": r"scenario\.start has no entry for human",
+    "alcc; reward.terms=null": "terms",
+}
 
 
 def test_a_configuration_that_does_not_fit_is_refused() -> None:
-    check_refused(
-        lambda variant, overrides: small_env(variant, 2, overrides),
-        [
-            ("alcc", ["scenario.pieces.time_gap=null"], r"reads vehicles\.time_gap, which no"),
-            ("alcc", ["scenario.pieces.estimator=null"], r"reads human\.predicted_acceleration"),
-            ("ddpg", ["scenario.pieces.communication=null"], r"reads vehicles\.gap_error, "),
-            ("alcc", [string("automated truck")], "has the role 'truck', but scenario.con"),
-            (
-                "alcc",
-                ["scenario.road=ring", "+event=cut_in"],
-                r"no leader .*cut_out\), an open road needs one$",
-            ),
-            (
-                "alcc",
-                ["scenario.circumference=100"],
-                "circumference=100 has no effect: it belongs to",
-            ),
-            (
-                "alcc",
-                ["scenario.filters={auto: null}"],
-                r"unknown role \(scenario\.filters\) 'auto'",
-            ),
-            ("alcc", ["scenario.start.human=null"], r"scenario\.start has no entry for human"),
-            ("alcc", [string("automated (human")], "this bracket is never closed at character 11"),
-            ("alcc", ["reward.terms=null"], "terms"),
-        ],
-        ConfigError,
-    )
+    def build(words: str) -> None:
+        variant, *overrides = words.split("; ")
+        small_env(variant, 2, overrides)
+
+    check_refused(build, REFUSED.items(), ConfigError)
 
 
 def test_a_role_without_vehicles_has_no_pieces() -> None:

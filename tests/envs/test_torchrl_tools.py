@@ -6,7 +6,7 @@ tried.
 
 from __future__ import annotations
 
-from functools import cache, partial
+from functools import partial
 
 import pytest
 import torch
@@ -281,19 +281,6 @@ def env_of(*transforms):
     return env
 
 
-@cache
-def forked() -> dict:
-    """Play two environments in two processes each: batches by the kind of collector."""
-    found = {}
-    for kind in (MultiSyncCollector, MultiAsyncCollector, AsyncCollector):
-        several = kind is not AsyncCollector
-        collector = kind([make, make] if several else make, None, **SIZE)
-        batches = [batch.clone() for batch in collector]
-        collector.shutdown()
-        found[kind.__name__] = batches
-    return found
-
-
 @pytest.fixture
 def fork(monkeypatch):
     before = mp.get_start_method(allow_none=True)
@@ -373,13 +360,15 @@ def test_workers_play_different_episodes() -> None:
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.usefixtures("fork")
 def test_collectors_in_processes(subtests) -> None:
-    for kind in ["MultiSyncCollector", "MultiAsyncCollector", "AsyncCollector"]:
-        with subtests.test(kind=kind):
-            batches = forked()[kind]
+    for kind in (MultiSyncCollector, MultiAsyncCollector, AsyncCollector):
+        with subtests.test(kind=kind.__name__):
+            collector = kind(make if kind is AsyncCollector else [make, make], None, **SIZE)
+            batches = [batch.clone() for batch in collector]
+            collector.shutdown()
             assert sum(batch.numel() for batch in batches) == SIZE["total_frames"]
             seeds = torch.cat([batch[SEED].flatten() for batch in batches])
             # Where workers do not wait for each other, one may have played all batches.
-            assert len(seeds.unique()) >= (2 if kind == "MultiSyncCollector" else 1)
+            assert len(seeds.unique()) >= (2 if kind is MultiSyncCollector else 1)
 
 
 @pytest.mark.filterwarnings("ignore")

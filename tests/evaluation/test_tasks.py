@@ -87,29 +87,23 @@ def test_the_share_0_of_a_task_is_a_table_of_humans(name, tmp_path, capsys, capl
 
 def test_mistakes_are_named_before_the_data_are_read(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(evaluation, "load_inputs", lambda cfg: pytest.fail("data were read"))
-    cases = [
-        ("task=i80-follow compare=[idm] task.unit=mpg", "unit=mpg"),
-        (
-            "task.unit=kWh/100km compare=[idm]",
-            "task.name is required: choose a task, such as task=",
-        ),
-        ("task=i80-follow compare=[idm] +task.limits.gap=3", "task.limits 'gap'"),
-        (
-            "task=i80-follow compare=[idm] +task.limits.flow_vph=recorded",
-            "flow_vph=recorded: add recorded to evaluation.baselines",
-        ),
-        (
-            "task=i80-follow compare=[idm] +task.limits.flow_vph=-5",
-            r"flow_vph: must be a number of at least 0, recorded, or a share .*, got -5",
-        ),
-        ("variant=idm compare=[follower_stoper]", "follower_stopper"),
-        ("variant=idm compare=[hcfs]", "variant hcfs is learned: compare the run folder"),
-        ("variant=alcc", "variant alcc is learned: give policy="),
-        ("variant=idm evaluation.shards=2 evaluation.shard=2", "shard must lie from 0 to"),
-        ("variant=cacc evaluation.warm_up=5", "warm_up needs evaluation.rows=episodes"),
-    ]
+    task, flow = "task=i80-follow compare=[idm]", "+task.limits.flow_vph"
+    cases = {
+        f"{task} task.unit=mpg": "unit=mpg",
+        "task.unit=kWh/100km compare=[idm]": "task.name is required: choose a task, such as task=",
+        f"{task} +task.limits.gap=3": "task.limits 'gap'",
+        f"{task} {flow}=recorded": "flow_vph=recorded: add recorded to evaluation.baselines",
+        f"{task} {flow}=-5": r"flow_vph: must be a number of .* 0, recorded, or a share .*, got -5",
+        "variant=idm compare=[follower_stoper]": "follower_stopper",
+        "variant=idm compare=[hcfs]": "variant hcfs is learned: compare the run folder",
+        "variant=alcc": "variant alcc is learned: give policy=",
+        "variant=idm evaluation.shards=2 evaluation.shard=2": "shard must lie from 0 to",
+        "variant=cacc evaluation.warm_up=5": "warm_up needs evaluation.rows=episodes",
+    }
     check_refused(
-        lambda words: evaluation.run(load("evaluate", words.split()), tmp_path), cases, ConfigError
+        lambda words: evaluation.run(load("evaluate", words.split()), tmp_path),
+        cases.items(),
+        ConfigError,
     )
 
 

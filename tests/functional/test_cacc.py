@@ -25,6 +25,7 @@ from lcc_rl.functional.hcfs import (
 )
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.string import entries_ahead
+from lcc_rl.studies.hcfs.tables import weight_table
 
 T, A_MAX = 0.2, 3.0
 NAMED = {
@@ -58,10 +59,8 @@ def test_errors_from_positions() -> None:
     torch.testing.assert_close(errors.speed, column(1.0, -3.0))
     torch.testing.assert_close(errors.leader_gap, column(2.0, x0 - x2 - 2 * 10.0))
     torch.testing.assert_close(errors.leader_speed, column(1.0, -2.0))
-
-
-def test_delay_acts_on_what_is_received() -> None:
-    gap, v0, v = column(5.0, 5.0), torch.tensor([10.0], dtype=torch.float64), column(8.0, 8.0)
+    # The delay acts on what is received.
+    gap, v = column(5.0, 5.0), column(8.0, 8.0)
     late, now = (errors_behind(v0, v, gap, 5.0, delay) for delay in (0.005, 0.0))
     torch.testing.assert_close(late.gap - now.gap, column(-0.05, -0.04))
     torch.testing.assert_close(late.leader_gap - now.leader_gap, column(-0.05, -0.05))
@@ -81,19 +80,14 @@ def test_chains_of_a_mixed_string() -> None:
 # -- CACC ------------------------------------------------------------------------------------------
 
 
-def test_the_law_is_a_speed_command() -> None:
+def test_the_law_is_a_speed_command_and_as_printed_an_acceleration() -> None:
     errors = Errors(column(1.0), column(0.5), column(2.0), column(-0.25))
     gains = Gains(0.1, 0.2, 0.03, 0.4)
     change = 0.1 * 1.0 + 0.2 * 0.5 + 0.03 * 2.0 - 0.4 * 0.25
     torch.testing.assert_close(cacc_acceleration(errors, gains, T), column(change / T))
-
-
-def test_the_law_as_printed_is_an_acceleration() -> None:
-    # 2 + 0.1·1 + 0.2·0.5 + 0.03·2 − 0.4·0.25 = 2.16; at 10 m/s it is 10.16.
-    errors = Errors(column(1.0, 1.0), column(0.5, 0.5), column(2.0, 2.0), column(-0.25, -0.25))
-    gains, speed = Gains(0.1, 0.2, 0.03, 0.4), column(2.0, 10.0)
-    printed = cacc_acceleration(errors, gains, T, speed)
-    torch.testing.assert_close(printed, column(2.16, 10.16))
+    for speed in (2.0, 10.0):  # the law as printed adds the change to the speed
+        printed = cacc_acceleration(errors, gains, T, column(speed))
+        torch.testing.assert_close(printed, column(speed + change))
 
 
 def closed_loop(gains: Gains, followers: int = 3) -> torch.Tensor:
@@ -153,20 +147,10 @@ def test_named_gains_are_stable_and_as_described() -> None:
 # -- reward ----------------------------------------------------------------------------------------
 
 
-TABLE_IV = {  # strategy: Σ|e_v|, Σ|jerk|, Σ reward
-    "CACC": (159.39, 720.06, -59.70),
-    "DDPG": (146.22, 2344.60, -56.81),
-    "HCFS": (25.26, 192.19, -9.64),
-}
-
-
-def test_weights_reproduce_table_iv(subtests) -> None:
-    for strategy in TABLE_IV:
-        with subtests.test(strategy=strategy):
-            speed_error, jerk, printed = TABLE_IV[strategy]
-            # The reward is additive in both absolute values, so sums go in as they are.
-            got = PlatoonReward()(torch.tensor(speed_error), torch.tensor(jerk))
-            assert abs(float(got) - printed) < 0.1
+def test_weights_reproduce_table_iv() -> None:
+    table = weight_table()  # the reward is additive in both absolute values: sums go in as they are
+    assert table["reward_printed"].tolist() == [-59.70, -56.81, -9.64]
+    assert table["reward_computed"].sub(table["reward_printed"]).abs().max() < 0.1
 
 
 def test_one_step_reward() -> None:

@@ -9,10 +9,7 @@ from helpers import t
 from lcc_rl.functional.driver_models import simulate_follower
 from lcc_rl.functional.gipps import GippsConstants
 from lcc_rl.functional.laws import LAWS
-from lcc_rl.functional.ovm import (
-    FVDMConstants,
-    OVMConstants,
-)
+from lcc_rl.functional.ovm import FVDMConstants, OVMConstants
 
 EACH = pytest.mark.parametrize("model", list(LAWS))
 
@@ -75,18 +72,15 @@ def test_nobody_accelerates_at_the_equilibrium_gap(model) -> None:
     assert (nearer < 0).all()
 
 
-def test_stops_behind_a_standing_leader(subtests) -> None:
-    for time_gap in [0.9, 1.2, 2.0]:
-        for model in ["idm", "fvdm", "gipps"]:
-            with subtests.test(time_gap=time_gap, model=model):
-                law = LAWS[model]
-                leader = torch.zeros(1801, 3, dtype=torch.float64)
-                start = t(8.0, 15.0, 20.0)
-                speed, gap, _ = simulate_follower(
-                    leader, start, t(60.0, 90.0, 150.0), t(25.0), t(time_gap), law(), 0.1
-                )
-                assert gap.min().item() > 0.5
-                assert speed[-1].max().item() < 0.05
+def test_stops_behind_a_standing_leader() -> None:
+    leader, time_gap = torch.zeros(1801, 9), t(0.9, 1.2, 2.0).repeat_interleave(3)
+    start = (t(8.0, 15.0, 20.0).repeat(3), t(60.0, 90.0, 150.0).repeat(3))
+    for model in ("idm", "fvdm", "gipps"):
+        speed, gap, _ = simulate_follower(
+            leader.double(), *start, t(25.0), time_gap, LAWS[model](), 0.1
+        )
+        assert gap.min() > 0.5, model
+        assert speed[-1].max() < 0.05, model
 
 
 @EACH

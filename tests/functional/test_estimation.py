@@ -32,22 +32,27 @@ def simulated(population, noise: float):
     return leader, speed, gaps, executed
 
 
+def learned(population, leader, speed, gap):
+    """Yield the state, the prediction of it and what is then believed, step by step."""
+    start, drivers = prior(population.desired_speed, population.time_gap), speed.shape[1]
+    belief = Belief(start.estimate.expand(drivers, 2), start.covariance.expand(drivers, 3))
+    for step in range(300):
+        state = speed[step], gap[step], speed[step] - leader[step]
+        predicted, belief = predict_and_update(
+            *state, speed[step + 1], belief, population.constants, T, 0.05
+        )
+        yield state, predicted, belief
+
+
 def test_prediction_after_15_s_beats_the_population_mean() -> None:
     population = bootstrap()
-    leader, speed, gap, executed = simulated(population, noise=0.05)
+    *motion, executed = simulated(population, noise=0.05)
     mean = PopulationMean(population.desired_speed, population.time_gap, population.constants)
-    start = prior(population.desired_speed, population.time_gap)
-    shape = speed[0].shape
-    belief = Belief(start.estimate.expand(*shape[:-1], 2), start.covariance.expand(*shape[:-1], 3))
     fitted, average = [], []
-    for step in range(300):
-        rate = speed[step] - leader[step]
-        predicted, belief = predict_and_update(
-            speed[step], gap[step], rate, speed[step + 1], belief, population.constants, T, 0.05
-        )
+    for step, (state, predicted, _) in enumerate(learned(population, *motion)):
         if step >= 150:
             fitted.append((predicted - executed[step]).abs())
-            average.append((mean(speed[step], gap[step], rate) - executed[step]).abs())
+            average.append((mean(*state) - executed[step]).abs())
     error, by_mean = torch.stack(fitted), torch.stack(average)
     assert error.median() <= 0.05
     better = error.median(0).values < by_mean.median(0).values
@@ -56,34 +61,16 @@ def test_prediction_after_15_s_beats_the_population_mean() -> None:
 
 def test_recovers_the_driver_without_noise() -> None:
     population = bootstrap()
-    leader, speed, gap, _ = simulated(population, noise=0.0)
-    start = prior(population.desired_speed, population.time_gap)
-    belief = Belief(
-        start.estimate.expand(*speed[0].shape[:-1], 2),
-        start.covariance.expand(*speed[0].shape[:-1], 3),
-    )
-    for step in range(300):
-        _, belief = predict_and_update(
-            speed[step],
-            gap[step],
-            speed[step] - leader[step],
-            speed[step + 1],
-            belief,
-            population.constants,
-            T,
-            0.05,
-        )
+    *motion, _ = simulated(population, noise=0.0)
+    *_, (_, _, belief) = learned(population, *motion)
     error = (belief.estimate[:, 1] - population.time_gap).abs() / population.time_gap
     assert error.median() < 0.02
 
 
-def test_population_mean_is_the_mean_over_drivers(subtests) -> None:
-    for v, s, rate in [(4.0, 12.0, 0.5), (2.0, 4.0, -3.0), (0.0, 3.0, 0.0)]:
-        with subtests.test(v=v):
-            population = bootstrap()
-            mean = PopulationMean(
-                population.desired_speed, population.time_gap, population.constants
-            )
-            state = [torch.tensor([x]) for x in (v, s, rate)]
-            each = population.constants(*state, population.desired_speed, population.time_gap)
-            torch.testing.assert_close(mean(*state), each.mean().unsqueeze(0), rtol=1e-4, atol=1e-4)
+def test_population_mean_is_the_mean_over_drivers() -> None:
+    population = bootstrap()
+    drivers = population.desired_speed, population.time_gap
+    states = torch.tensor([[4.0, 12.0, 0.5], [2.0, 4.0, -3.0], [0.0, 3.0, 0.0]]).T  # v, s, rate
+    found = PopulationMean(*drivers, population.constants)(*states)
+    each = population.constants(*states.unsqueeze(-1), *drivers)
+    torch.testing.assert_close(found, each.mean(-1), rtol=1e-4, atol=1e-4)

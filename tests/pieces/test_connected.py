@@ -74,9 +74,8 @@ def test_gains_behave_as_described() -> None:
 def test_cacc_closes_its_gaps() -> None:
     # From disturbed gaps behind a steady leader back to equilibrium: h plus what the delay hides.
     steady = leader(torch.full((401,), 10.0))
-    cfg = composed("variant=cacc", "scenario.horizon=400")
-    node = cfg.scenario.pieces["leader"].changed(perturbation=0.0)
-    cfg = cfg.with_(scenario={"pieces": {"leader": node}})
+    exact = "scenario.pieces.leader.perturbation=0"
+    cfg = composed("variant=cacc", "scenario.horizon=400", exact)
     env = build_env(cfg, steady, POPULATION, 4)
     td = env.reset()
     assert (td["vehicles", "gap"] - 5.0).abs().max() > 0.5
@@ -275,15 +274,8 @@ def test_the_hybrid_of_good_parents_is_about_as_good_as_the_better() -> None:
 def test_the_hybrid_brakes_where_what_it_measures_is_no_number(choice) -> None:
     hybrid = HCFS(rule=CACC(), choice=choice).bind(World(parse_string("automated*2"), T))
     unused = {"first": "action"}  # that of the second vehicle
-    measured = (
-        "action",
-        "speed",
-        "acceleration",
-        "received_gap",
-        "speed_error",
-        "leader_gap_error",
-    )
-    for name in measured:
+    errors = ("speed_error", "leader_gap_error")
+    for name in ("action", "speed", "acceleration", "received_gap", *errors):
         entries = []
         for key in hybrid.names:
             value = torch.full((1, 2, 1), 20.0 if key == "self.received_gap" else 0.0)

@@ -414,16 +414,10 @@ def test_a_step_lays_out_what_the_next_one_reads_as_a_reset_does(road) -> None:
 
 
 @each_piece
-def test_offline_on_a_stored_rollout_equals_online(road, name) -> None:
+def test_offline_on_a_stored_rollout_also_inside_a_sequential_equals_online(road, name) -> None:
     piece, data = made(road)[name], played(road)
     part = moment(piece, data)
     assert_results_equal(piece, piece(without_results(piece, part)), part)
-
-
-@each_piece
-def test_inside_a_sequential(road, name) -> None:
-    piece, data = made(road)[name], played(road)
-    part = moment(piece, data)
     if isinstance(piece, RewardPiece):  # a sequence of modules works on one moment
         got = TensorDictSequential(piece)(without_results(piece, part)["next"])
         for key in piece.out_keys:

@@ -88,13 +88,12 @@ def test_a_delay_makes_a_string_less_stable() -> None:
     time = torch.arange(600) * 0.1
     dip = 15.0 - 3.0 * torch.exp(-(((time - 15.0) / 3.0) ** 2))
     profiles = from_records([dip], ["dip"], ["dip"], 0.1)
-    base = ["scenario.string=human*8", "scenario.horizon=500", QUIET]
+    first = "scenario.pieces.leader.start=first"
+    base = ["scenario.string=human*8", "scenario.horizon=500", QUIET, first]
     one = ["scenario.controllers.human.desired_speed=30", "scenario.controllers.human.time_gap=1.2"]
     lowest = []
     for delay in (0, 8):
         cfg = compose("direct", *base, *one, f"scenario.controllers.human.delay={delay}")
-        node = cfg.scenario.pieces["leader"].changed(start="first")
-        cfg = cfg.with_(scenario={"pieces": {"leader": node}})
         speed = rolled(cfg, profiles, steps=500, batch=1)["next", "vehicles", "speed"]
         lowest.append(float(speed[..., -1, :].min()))
     assert lowest[1] < lowest[0] - 0.3

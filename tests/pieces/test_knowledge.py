@@ -11,7 +11,7 @@ from helpers import OBSERVATION, small_env, steady, wavy_profiles
 from lcc_rl.pieces import LeaderPreview
 from lcc_rl.pieces.world import World
 
-FIRST = ("scenario.pieces.leader.start=first", "scenario.pieces.leader.profile=1")
+FIRST = ("scenario.pieces.leader.start=first", "scenario.pieces.leader.profile=2")
 
 
 def played(*overrides: str):
@@ -69,39 +69,27 @@ def test_noise_is_as_large_as_stated_and_repeats_with_the_seed() -> None:
     assert torch.equal(error, again)
 
 
-def test_stacked_memory_is_what_was_measured() -> None:
-    settings = ["scenario.pieces.memory.kind=stacked", "scenario.pieces.memory.seconds=[0.5]"]
-    data = played("+knowledge=memory", *settings)
-    past, leader = data["memory", "entries"][0, :, 0, 0], data["leader", "speed"][0, :, 0]
-    assert torch.equal(past[5:], leader[:-5])
-    assert (past[:5] == leader[0]).all()
-
-
-def test_filtered_memory_is_the_exponential_average() -> None:
-    data = played("+knowledge=memory", "scenario.pieces.memory.seconds=[2.0]")
-    average, leader = data["memory", "entries"][0, :, 0, 0], data["leader", "speed"][0, :, 0]
-    share, expected = 1.0 - math.exp(-0.05), [leader[0].item()]
-    for speed in leader[1:].tolist():
-        expected.append(expected[-1] + share * (speed - expected[-1]))
-    assert torch.allclose(average, torch.tensor(expected), atol=1e-4)
-
-
-def test_every_vehicle_of_a_string_remembers_what_it_saw() -> None:
+def test_stacked_memory_is_what_every_vehicle_of_a_string_saw() -> None:
     settings = ["scenario.pieces.memory.kind=stacked", "scenario.pieces.memory.seconds=[0.5]"]
     mixed = "scenario.string='automated human automated'"
     data = played("+knowledge=memory", *settings, mixed)
     past, speed = data["memory", "entries"][0, ..., 0], data["vehicles", "speed"][0, ..., 0]
+    leader = data["leader", "speed"][0, :, 0]
     assert torch.equal(past[5:, 1], speed[:-5, 1])
-    assert torch.equal(past[5:, 0], data["leader", "speed"][0, :-5, 0])
+    assert torch.equal(past[5:, 0], leader[:-5])
+    assert (past[:5, 0] == leader[0]).all()
 
 
-def test_the_spread_is_the_average_distance_from_the_average() -> None:
-    data = played("+knowledge=spread", "scenario.pieces.spread.seconds=[2.0]")
-    spread, leader = data["spread", "entries"][0, :, 0, 0], data["leader", "speed"][0, :, 0]
-    share, average, expected = 1.0 - math.exp(-0.05), leader[0].item(), [0.0]
+def test_filtered_memory_is_an_average_and_the_spread_the_average_distance_from_it() -> None:
+    seconds = (f"scenario.pieces.{name}.seconds=[2.0]" for name in ("memory", "spread"))
+    data = played("+knowledge=[memory,spread]", *seconds)
+    average, spread = (data[name, "entries"][0, :, 0, 0] for name in ("memory", "spread"))
+    leader, share = data["leader", "speed"][0, :, 0], 1.0 - math.exp(-0.05)
+    means, distances = [leader[0].item()], [0.0]
     for speed in leader[1:].tolist():
-        expected.append(expected[-1] + share * (abs(speed - average) - expected[-1]))
-        average += share * (speed - average)
-    assert torch.allclose(spread, torch.tensor(expected), atol=1e-4)
-    assert expected[-1] > 0.01
+        distances.append(distances[-1] + share * (abs(speed - means[-1]) - distances[-1]))
+        means.append(means[-1] + share * (speed - means[-1]))
+    assert torch.allclose(average, torch.tensor(means), atol=1e-4)
+    assert torch.allclose(spread, torch.tensor(distances), atol=1e-4)
+    assert distances[-1] > 0.01
     assert torch.allclose(data[OBSERVATION][0, :, 0, -1], 0.5 * spread)

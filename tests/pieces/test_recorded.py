@@ -28,20 +28,23 @@ from lcc_rl.evaluation.strategies import applies, baseline, baselines
 from lcc_rl.results.measures import FASTER
 
 
-def drive(*overrides: str):
-    """Play 20 steps behind two leaders from a chosen sample."""
-    cfg = compose("idm", "controller@scenario.controllers.automated=recorded", *overrides)
-    node = cfg.scenario.pieces["leader"].changed(start="first")
-    cfg = cfg.with_(scenario={"pieces": {"leader": node}})
-    profiles = followed_profiles()
+def drive(profiles, steps: int):
+    """Play behind leaders from their first samples, all of the episode."""
+    choice = "controller@scenario.controllers.automated=recorded"
+    first = "scenario.pieces.leader.start=first"
+    start = "scenario.start.automated={_target_: lcc_rl.pieces.TimeGapStart}"
+    cfg = compose("idm", choice, start, first, f"scenario.horizon={steps}")
     env = build_env(cfg, profiles, POPULATION, 4, 0, nominal=True)
-    return env.rollout(20, break_when_any_done=False), profiles
+    return env.rollout(steps, break_when_any_done=False)
 
 
-def test_every_recorded_speed_is_reached() -> None:
-    data, profiles = drive("scenario.start.automated={_target_: lcc_rl.pieces.TimeGapStart}")
+def test_vehicles_start_as_recorded_and_reach_every_recorded_speed() -> None:
+    profiles = followed_profiles()
+    data = drive(profiles, 20)
     for episode in range(4):
         own = profiles.follower(int(data["leader", "profile"][episode, 0]))
+        assert data["vehicles", "speed"][episode, 0, 0, 0] == own[0, 0]
+        assert data["vehicles", "gap"][episode, 0, 0, 0] == own[0, 1]
         torch.testing.assert_close(
             data["next", "vehicles", "speed"][episode, 1:, 0, 0], own[2:21, 0], rtol=0, atol=1e-5
         )
@@ -52,26 +55,11 @@ def test_a_speedometer_that_errs_leads_nobody_away() -> None:
     fast = [profiles.follower(number) + torch.tensor([0.2, 0.0]) for number in range(len(profiles))]
     each = [profiles.record(number) for number in range(len(profiles))]
     biased = from_records(each, profiles.names, profiles.recordings, 0.1, fast)
-    cfg = compose(
-        "idm",
-        "controller@scenario.controllers.automated=recorded",
-        "scenario.start.automated={_target_: lcc_rl.pieces.TimeGapStart}",
-    )
-    node = cfg.scenario.pieces["leader"].changed(start="first")
-    cfg = cfg.with_(scenario={"pieces": {"leader": node}, "horizon": 250})
-    data = build_env(cfg, biased, POPULATION, 4, 0, nominal=True).rollout(250)
+    data = drive(biased, 250)
     for episode in range(4):
         recorded = biased.follower(int(data["leader", "profile"][episode, 0]))[:250, 1]
         off = data["vehicles", "gap"][episode, :, 0, 0] - recorded
         assert -2.0 < off.min() < -1.5  # 0.2 m/s times 10 s, instead of 5 m
-
-
-def test_vehicles_start_as_recorded() -> None:
-    data, profiles = drive("scenario.start.automated={_target_: lcc_rl.pieces.TimeGapStart}")
-    for episode in range(4):
-        own = profiles.follower(int(data["leader", "profile"][episode, 0]))
-        assert data["vehicles", "speed"][episode, 0, 0, 0] == own[0, 0]
-        assert data["vehicles", "gap"][episode, 0, 0, 0] == own[0, 1]
 
 
 def test_the_strategy_starts_and_drives_as_recorded() -> None:

@@ -141,20 +141,16 @@ def test_what_does_not_fit_is_refused() -> None:
         cfg = config(*words)
         build_pieces(cfg, world_of(cfg, STEADY, POPULATION))
 
-    cases = [
-        (["+event=cut_in", f"{LEADER}.at=[20,30]"], r"leader.at=\[20.* 15 s \(scenario.hor"),
-        (["+event=cut_in", f"+{LEADER}.farther=[1,2]"], r"give gap \(cut-in\) or farther"),
-        (["+event=cut_in", f"{LEADER}.at=[2,3]", "+knowledge=preview"], "a preview reads the rec"),
-        (
-            ["+event=lost_target", "scenario.sensors.automated.longest_dropout=0"],
-            "lost_from and longest_dropout belong together",
-        ),
-        (
-            ["+event=lost_target"],
-            r"lost_from=30.0 must lie within the episode of 15 s .*lost_from=2",
-        ),
-    ]
-    check_refused(lambda words: built(*words), cases, ConfigError)
+    cut, lost = "+event=cut_in", "+event=lost_target"
+    never = f"{lost} scenario.sensors.automated.longest_dropout=0"
+    cases = {
+        f"{cut} {LEADER}.at=[20,30]": r"leader.at=\[20.* 15 s \(scenario.hor",
+        f"{cut} +{LEADER}.farther=[1,2]": r"give gap \(cut-in\) or farther",
+        f"{cut} {LEADER}.at=[2,3] +knowledge=preview": "a preview reads the rec",
+        never: "lost_from and longest_dropout belong together",
+        lost: r"lost_from=30.0 must lie within the episode of 15 s .*lost_from=2",
+    }
+    check_refused(lambda words: built(*words.split()), cases.items(), ConfigError)
     with pytest.raises(ConfigError, match="must not fall"):
         ReplacedLeader(gap=(5.0, 4.0))
     assert applies(config(), "recorded")

@@ -64,25 +64,17 @@ POWER = torch.tensor([1.0, 10.0, 100.0, 2.0, 20.0, 200.0]).view(1, 6, 1) * 1000.
 GAPS = torch.full((1, 6, 1), 5.0)
 
 
-def test_whose_energy_counts(subtests) -> None:
-    for of, earned in [
-        ("self", (1.0, 2.0)),
-        ("behind", (110.0, 220.0)),
-        ("string", (333.0, 333.0)),
-    ]:
-        with subtests.test(of=of):
-            term = EnergyReward(of=of, scale=1000.0).bind(World(STRING))
-            torch.testing.assert_close(term.computed([POWER]), -0.1 * t(*earned).unsqueeze(0))
-
-
-def test_estimated_energy_of_the_human_drivers_behind() -> None:
-    # The same section, of an entry that only human drivers have.
-    term = EnergyReward(of="behind", scale=1000.0, power="human.predicted_power").bind(
-        World(STRING)
-    )
-    humans = POWER[:, [1, 2, 4, 5]]
+def test_whose_energy_counts() -> None:
+    humans = {"power": "human.predicted_power"}  # of an entry that only human drivers have
+    for settings, power, earned in (
+        ({"of": "self"}, POWER, (1.0, 2.0)),
+        ({"of": "behind"}, POWER, (110.0, 220.0)),
+        ({"of": "string"}, POWER, (333.0, 333.0)),
+        ({"of": "behind", **humans}, POWER[:, [1, 2, 4, 5]], (110.0, 220.0)),
+    ):
+        term = EnergyReward(scale=1000.0, **settings).bind(World(STRING))
+        torch.testing.assert_close(term.computed([power]), -0.1 * t(*earned).unsqueeze(0))
     assert term.in_keys == [("human", "predicted_power")]
-    torch.testing.assert_close(term.computed([humans]), -0.1 * t(110.0, 220.0).unsqueeze(0))
 
 
 def test_what_is_ahead_of_the_first_is_behind_the_last_on_a_ring() -> None:
@@ -112,6 +104,4 @@ def test_who_pays_for_a_collision(subtests) -> None:
             gaps = GAPS.clone()
             gaps[:, list(hit)] = -0.1
             term = CollisionPenalty(weight=100.0, behind=behind).bind(World(STRING))
-            entries = {("vehicles", "gap"): gaps}
-            got = term.computed([entries[key] for key in term.in_keys])
-            torch.testing.assert_close(got, -100.0 * t(*pays).unsqueeze(0))
+            torch.testing.assert_close(term.computed([gaps]), -100.0 * t(*pays).unsqueeze(0))

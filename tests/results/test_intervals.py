@@ -207,30 +207,24 @@ def test_fleets_are_compared_at_equal_flow() -> None:
         energy = 50.0 * (8.0 + drive)
         rows.append({**own, "policy": "learned", "limit": 0.0, NET: energy, FLOW: 1900.0})
     frame = pd.DataFrame(rows).assign(variant="fleet")
-    sides = ("fleet", "learned"), ("fleet", "rule")
-    saved = compare_fronts(frame, *sides, columns=FLEET, measure=saved_at_flow)
-    assert saved.value == pytest.approx(
-        1.0 / (9.0 + frame[frame.policy == "learned"][NET].mean() / 50.0 - 8.0)
-    )
+
+    def compared(**changes):
+        sides = ("fleet", "learned"), ("fleet", "rule")
+        changed = frame.assign(**changes).dropna(axis=1)
+        return compare_fronts(changed, *sides, columns=FLEET, measure=saved_at_flow)
+
+    saved = compared()
+    learned = frame[frame.policy == "learned"][NET].mean() / 50.0
+    assert saved.value == pytest.approx(1.0 / (9.0 + learned - 8.0))
     assert saved.high - saved.low < 0.03  # what drives differ by is on both sides
     # At a flow that the rule does not reach there is nothing to compare with.
     fast = frame[FLOW].where(frame.policy == "rule", 3000.0)
-    none = compare_fronts(
-        frame.assign(**{FLOW: fast}), *sides, columns=FLEET, measure=saved_at_flow
-    )
+    none = compared(**{FLOW: fast})
     assert np.isnan([none.value, none.low, none.high]).all()
     # Drives that the fleet saves unlike are resampled as wholes.
-    unlike = frame[NET] * np.where(
-        frame.policy == "rule", 1.0, 1.0 + 0.1 * frame.drive.astype(float)
-    )
-    whole = compare_fronts(
-        frame.assign(**{NET: unlike}), *sides, columns=FLEET, measure=saved_at_flow
-    )
-    alone = compare_fronts(
-        frame.drop(columns="drive").assign(**{NET: unlike}),
-        *sides,
-        columns=FLEET,
-        measure=saved_at_flow,
+    more = 0.1 * frame.drive.astype(float).where(frame.policy != "rule", 0.0)
+    whole, alone = (
+        compared(**{NET: frame[NET] * (1.0 + more)}, **x) for x in ({}, {"drive": np.nan})
     )
     assert whole.value == alone.value
     assert whole.high - whole.low > 1.5 * (alone.high - alone.low)

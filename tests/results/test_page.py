@@ -18,7 +18,7 @@ from lcc_rl.api import Run
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError
 from lcc_rl.figures.drawing import new_figure, save
-from lcc_rl.figures.page import Page
+from lcc_rl.figures.page import section, write_sections
 from lcc_rl.io.files import processor, read_parquet, write_parquet
 from lcc_rl.results.measures import WAYS, heading
 from lcc_rl.results.names import in_words, worded
@@ -44,16 +44,15 @@ TABLE = pd.DataFrame(
 def page(tmp_path_factory):
     figure = new_figure(2.0, 1.0)
     figure.subplots().plot([0, 1], [0, 1])
-    made = Page(tmp_path_factory.mktemp("page"))
-    write_parquet(pd.DataFrame({"a": [1]}), made.folder / "run" / "training.parquet")
-    drawn = save(figure, made.folder / "line.png")
-    made.add("First & last", "One < two.\n\nNext.", [("A table", TABLE)], [("A line", drawn)])
-    made.write("A job", ["lcc-rl run"])
-    return made
+    folder = tmp_path_factory.mktemp("page")
+    write_parquet(pd.DataFrame({"a": [1]}), folder / "run" / "training.parquet")
+    drawn, text = save(figure, folder / "line.png"), "One < two.\n\nNext."
+    made = section("First & last", text, [("A table", TABLE)], [("A line", drawn)])
+    return write_sections(folder, "A job", [made], ["lcc-rl run"])
 
 
 def test_a_page_holds_everything_and_fetches_nothing(page) -> None:
-    html = (page.folder / "report.html").read_text()
+    html = page.read_text()
     links = re.findall(r'(?:src|href|action)="([^"]*)"', html)
     assert all(link.startswith(("#", "data:image/")) for link in links)
     assert not re.search(r"<script|<link|url\(|@import|https?://", html)
@@ -71,7 +70,7 @@ def test_a_page_holds_everything_and_fetches_nothing(page) -> None:
 
 
 def test_cells_are_formatted_for_readers(page) -> None:
-    html = (page.folder / "report.html").read_text()
+    html = page.read_text()
     for cell in ("4.38 (4.10 … 4.60)", "−1.00", "4,980", "270.1"):
         assert f'<td class="number">{cell}</td>' in html
     for cell in ("<th>strategy</th>", "saving [%]</th>", "<td>yes</td>", ">–</td>", "&lt;b&gt;"):
@@ -84,10 +83,10 @@ def test_cells_are_formatted_for_readers(page) -> None:
 
 
 def test_pictures_keep_every_pixel(page) -> None:
-    html = (page.folder / "report.html").read_text()
+    html = page.read_text()
     (data,) = re.findall(r"data:image/webp;base64,([^\"]+)", html)
     shown = Image.open(BytesIO(base64.b64decode(data))).convert("RGBA")
-    assert shown.tobytes() == Image.open(page.folder / "line.png").convert("RGBA").tobytes()
+    assert shown.tobytes() == Image.open(page.with_name("line.png")).convert("RGBA").tobytes()
 
 
 def test_a_study_writes_files_and_fills_marked_tables(tmp_path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -72,28 +73,16 @@ def ways(
         for _ in range(steps):
             state, _ = advance(state, action)
 
-    collect = collecting(again, zero, steps, bool(ending))
-    runs = {"rollout": rollout, "StringCollector": collect, "step": step, "plain loop": loop}
+    policy = TensorDictModule(lambda _: zero, [OBSERVATION], [ACTION])
+    source = string_collector(again, policy, steps, [("next", *REWARD)], bool(ending))
+    begun = source.state_dict()
+
+    def collected() -> None:
+        source.load_state_dict(begun)
+        source.collect()
+
+    runs = {"rollout": rollout, "StringCollector": collected, "step": step, "plain loop": loop}
     return {f"{name}{ending}": run for name, run in runs.items()}
-
-
-def collecting(env: TransformedEnv, action: torch.Tensor, steps: int, compiled: bool) -> Run:
-    """Return so many steps of the training's own collector with one action, keeping rewards."""
-    collector = StringCollector(
-        env,
-        TensorDictModule(lambda _: action, [OBSERVATION], [ACTION]),
-        frames_per_batch=env.batch_size.numel() * steps,
-        keys=[("next", *REWARD)],
-        compiled=compiled,
-    )
-
-    begun = collector.state_dict()
-
-    def run() -> None:
-        collector.load_state_dict(begun)
-        collector.collect()
-
-    return run
 
 
 # -- collection: steps with the policy in the loop -------------------------------------------------
@@ -145,15 +134,18 @@ def in_training(options: Namespace, policy: Any, batch: int, steps: int, ending:
 
 def collector(env: TransformedEnv, policy: Any, steps: int, compiled: bool) -> Run:
     """Return the training's collection; one call collects so many steps of every environment."""
-    source = StringCollector(
-        env,
-        shared_policy(policy),
-        frames_per_batch=env.batch_size.numel() * steps,
-        keys=(*LEARNED_FROM, *REPORTED),
-        compiled=compiled,
-    )
+    keys = (*LEARNED_FROM, *REPORTED)
+    source = string_collector(env, shared_policy(policy), steps, keys, compiled)
     source.resets = PLAIN_RESETS  # as late in a training
     return source.collect
+
+
+def string_collector(
+    env: TransformedEnv, policy: Any, steps: int, keys: Sequence[Any], compiled: bool
+) -> StringCollector:
+    """Return the training's own collector of so many steps, which keeps some entries."""
+    frames = env.batch_size.numel() * steps
+    return StringCollector(env, policy, frames_per_batch=frames, keys=keys, compiled=compiled)
 
 
 def torchrl_collector(env: TransformedEnv, policy: Any, steps: int, compiled: bool) -> Run:
