@@ -156,6 +156,7 @@ def reports(
     rows: Rows, cfg: StudyConfig, against: str | None = None, unit: str | None = None
 ) -> Iterator[Report]:
     """Yield the report of each source of leaders or case of a platoon, energy in a unit."""
+    unit = unit or cfg.unit
     if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":
         require(unit is None, f"unit={unit}: tables of platoons have no energy per distance")
         for source, group in by_source(rows):

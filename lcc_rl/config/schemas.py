@@ -275,6 +275,7 @@ class StudyConfig(BaseConfig):
     sweep: str | None = None
     policy: str | None = None
     table: Literal["short", "all"] = "short"  # printed table: six columns, or all measures
+    unit: str | None = None  # of energy per distance in printed tables, see lcc_rl.results.task
     # Modules that register measures, see lcc_rl.evaluation.metrics.register.
     measures: list[str] = dataclasses.field(default_factory=list)
 
