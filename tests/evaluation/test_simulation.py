@@ -167,7 +167,7 @@ def test_wrong_arguments_are_named(tmp_path) -> None:
     (late := tmp_path / "late.csv").write_text("time_s,speed_mps\n0,9\n5000,9\n")
     (fast := tmp_path / "fast.csv").write_text("time_s,speed_kmh\n0,9\n1,9\n")
     cases = [
-        ({"leader": late}, r"5000 s apart; .*, in ms \(convert it\), or"),
+        ({"leader": late}, r"samples of each drive are 5000 s apart; .*, in ms \(convert it\), or"),
         ({"leader": fast}, "it has time_s, speed_kmh .*convert them to SI"),
         ({"leader": fast, "overrides": ["leader.units.speed=km/h"]}, r"files have time_s \[s\]"),
         ({"leader": fast, "overrides": ["seed=3"]}, "simulate: see the arguments$"),
@@ -176,10 +176,10 @@ def test_wrong_arguments_are_named(tmp_path) -> None:
         ({"leader": WAVE, "overrides": ["scenario=ring"]}, "an open road has a leader"),
         ({"leader": [3.0]}, "at least two speeds"),
         ({"leader": []}, "at least two speeds"),
-        ({"leader": [3.0, -1.0]}, "speeds must be finite and not negative"),
+        ({"leader": [3.0, -1.0]}, "sample 1, from 0, is -1; speeds must be finite and not"),
         ({"leader": np.ones((2, 3))}, r"leader must be speeds .*shape \[2, 3\]"),
         ({"leader": 12.0 * WAVE}, r"leader must be speeds .*got 132 m/s; is it in km/h"),
-        ({"leader": np.ma.masked_greater(WAVE, 9.0)}, "speeds must be finite"),
+        ({"leader": np.ma.masked_greater(WAVE, 9.0)}, r"sample \d+, from 0, is nan; speeds must"),
         ({"leader": WAVE, "drivers": {"a": 1}}, "drivers: not a population: "),
         *(
             ({"leader": WAVE, "overrides": [f"{key}=2"]}, f"{key}=2: has no effect .*arguments$")
