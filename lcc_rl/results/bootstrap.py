@@ -18,7 +18,7 @@ RESAMPLES = 9999
 LEAST_DRIVES = 5  # least number of drives that are resampled
 STUDENT = (12.706, 4.303, 3.182)  # 97.5 % quantiles of Student's t by degrees of freedom, from 1
 RESAMPLING_SEED = 0  # equal rows give equal intervals
-ENDS = ("", "_low", "_high")  # of the names of a value and of the bounds of its interval
+BOUNDED = ("", "_low", "_high")  # of the names of a value and of the bounds of its interval
 WITHOUT_WINDOWS = -1  # stream for seeds that are resampled without windows
 
 Side = Mapping[str, Floats]  # columns of one side of a comparison, each ``[..., windows, seeds]``
@@ -38,7 +38,7 @@ class Estimate:
 
     def columns(self, name: str, factor: float = 1.0) -> dict[str, float]:
         """Return ``name``, ``name_low`` and ``name_high``, scaled."""
-        values = zip(ENDS, (self.value, self.low, self.high), strict=True)
+        values = zip(BOUNDED, (self.value, self.low, self.high), strict=True)
         return {f"{name}{end}": factor * value for end, value in values}
 
 

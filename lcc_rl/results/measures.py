@@ -33,15 +33,15 @@ AGGREGATES = ("mean", "sum", "min", "max")
 SIGNS = {"at least": "≥", "at most": "≤"}
 SHARE, COUNT = "%", "{:.0f}"
 # Units of columns by the end of their names.
-SUFFIX_UNITS = {
-    "kj_per_km": "kJ/km",
-    "mps3": "m/s³",
-    "mps": "m/s",
-    "pct": "%",
-    "kj": "kJ",
+SUFFIX_UNITS = {"kj_per_km": "kJ/km", "mps3": "m/s³", "mps": "m/s", "pct": "%", "kj": "kJ"}
+SUFFIX_UNITS |= {
     "ms": "ms",
+    "m": "m",
+    "s": "s",
+    "vph": "1/h",
+    "g_per_km": "g/km",
+    "s_per_km": "s/km",
 }
-SUFFIX_UNITS |= {"m": "m", "s": "s", "vph": "1/h", "g_per_km": "g/km", "s_per_km": "s/km"}
 SUFFIX_UNITS |= {"wh_per_km": "Wh/km", "kwh_per_100km": "kWh/100 km", "l_per_100km": "L/100 km"}
 SUFFIX_UNITS |= {"per_100km": "1/100 km"}
 INITIALS = ("cav", "hdv", "ttc", "sd")
@@ -172,6 +172,7 @@ _least = partial(Measure, aggregate="min", bound="at least")
 _least_mean = partial(_least, aggregate="mean", interval=True)
 _largest = partial(Measure, aggregate="max", bound="at most")
 _average = partial(Measure, interval=True)
+_varied = partial(_average, unit="m/s")
 _braking = partial(Measure, unit="m/s²", form="{:.1f}", aggregate="max")
 # Ratios of a column of all vehicles and their distance.
 _per = partial(Measure, per=DISTANCE, factor=1e3, interval=True)
@@ -207,10 +208,8 @@ MEASURES = [
     _per("travel_time_s_per_km", "travel time", unit="s/km", of="vehicle_time_s"),
     _per("delay_s_per_km", "  delay against v0", unit="s/km", of="delay_s"),
     _least_mean("mean_speed_mps", "mean speed", unit="m/s", limit="mean\nspeed"),
-    _average(SPEED_STD, "deviation of a speed in time", unit="m/s", score=SPEED_STD),
-    _average(
-        FINAL_SPREAD, "spread of speeds at the end", unit="m/s", score=FINAL_SPREAD, least=CALM
-    ),
+    _varied(SPEED_STD, "deviation of a speed in time", score=SPEED_STD),
+    _varied(FINAL_SPREAD, "spread of speeds at the end", score=FINAL_SPREAD, least=CALM),
     _least_mean(FLOW, "flow", unit="1/h", form=COUNT),
     _average("string_ratio", "string ratio", score="string_ratio"),
     Measure("damped", "episodes that end calm", form="{:.0%}"),

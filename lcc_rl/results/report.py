@@ -15,7 +15,7 @@ from lcc_rl.errors import require, require_known
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import Rows
 from lcc_rl.results import measures
-from lcc_rl.results.bootstrap import ENDS, LEAST_DRIVES, NOTHING
+from lcc_rl.results.bootstrap import BOUNDED, LEAST_DRIVES, NOTHING
 from lcc_rl.results.fronts import at_equal_flow
 from lcc_rl.results.measures import (
     DISTANCE,
@@ -214,7 +214,7 @@ def summary(
     base = table[table["strategy"] == against]
     for key, (_, lost) in LOST.items():
         table[key] = 1.0 - table[lost] / (base[lost].iloc[0] if len(base) else np.nan)
-    table.loc[crashed(table), [*LOST, *(f"{FLOW}{end}" for end in ENDS)]] = np.nan
+    table.loc[crashed(table), [*LOST, *(f"{FLOW}{end}" for end in BOUNDED)]] = np.nan
     if task:
         table["kept"] = table["collisions"] == 0
         for limit, bound in task.bounds.items():
@@ -287,11 +287,8 @@ def report(
         task = replace(task, against=against) if against else task.among(windows["strategy"])
         task = replace(task, unit=unit or task.unit).resolved(windows)
     table = summary(windows, task, energy, against)
-    percent = {
-        f"{shown}{end}": 100.0 * table[f"{key}{end}"]
-        for key, shown in SAVINGS.items()
-        for end in ENDS
-    }
+    names = [(f"{shown}{x}", f"{key}{x}") for key, shown in SAVINGS.items() for x in BOUNDED]
+    percent = {shown: 100.0 * table[key] for shown, key in names}
     units = [unit] if unit else [KJ, *["g/km"] * (energy is not None and burns_one_fuel(energy))]
     for one in units if task is None else ():
         percent |= in_units(table, PATH_PER_KM, _energy_in(one).key, one, energy)
@@ -317,6 +314,10 @@ def report(
 def _rows(task: Task | None, against: str | None, score: Shown | None) -> list[Measure]:
     """Return the rows of the full table; ``score``: the first number of the short one, if any."""
     bounds = task.bounds if task else {}
+    limits = [
+        replace(x, label=f"limit: {' '.join(x.bounded(bounds[x]).split())}", unit="", form=x.number)
+        for x in sorted(bounds, key=lambda x: x.unit == SHARE)
+    ]
     kept = [Measure("kept", "keeps the limits (1: yes)", form="{:d}")] if task else []
     return [
         *([Measure(score.key, score.words)] if score else ()),
@@ -331,15 +332,7 @@ def _rows(task: Task | None, against: str | None, score: Shown | None) -> list[M
         Measure(WAY.key, "distance against the baseline", form="{:+.2f}%"),
         Measure(FLOW_SHARE.key, "flow against the baseline", form="{:+.2f}%"),
         *(measure for measure in MEASURES if measure.label),
-        *(
-            replace(
-                measure,
-                label=f"limit: {' '.join(measure.bounded(bounds[measure]).split())}",
-                unit="",
-                form=measure.number,
-            )
-            for measure in sorted(bounds, key=lambda measure: measure.unit == SHARE)
-        ),
+        *limits,
         *kept,
         *(Measure(key, label, form="{:.0f}") for key, label in COUNTS.items()),
     ]
@@ -444,7 +437,9 @@ def shortened(
     table = table.assign(driver=[x + MARK * y + ONE * z for x, y, z in rows])
     shown = (Shown("driver", "driven by"), *shown)
     ranged = {*SAVINGS.values(), *spread}
-    names = [f"{x.key}{end}" for x in shown for end in (ENDS if x.key in ranged else ENDS[:1])]
+    names = [
+        f"{x.key}{end}" for x in shown for end in (BOUNDED if x.key in ranged else BOUNDED[:1])
+    ]
     names += [key for key in COUNTS if key not in names]
     return table[["strategy", *(x for x in names if x in table)]], shown
 

@@ -15,7 +15,7 @@ from lcc_rl.config.words import RECORDED
 from lcc_rl.energy import Fleet
 from lcc_rl.errors import ConfigError, require, require_known
 from lcc_rl.results import measures
-from lcc_rl.results.bootstrap import ENDS
+from lcc_rl.results.bootstrap import BOUNDED
 from lcc_rl.results.measures import Measure, heading
 from lcc_rl.results.names import HUMAN
 from lcc_rl.settings import Settings
@@ -113,18 +113,13 @@ def in_units(
     table: Mapping[str, Any] | pd.DataFrame, key: str, name: str, unit: str, energy: Fleet | None
 ) -> dict[str, Any]:
     """Return a column [kJ/km] of a row or a table and its interval in a unit, under a name."""
-    low, high = ENDS[:0:-1] if unit == "mpg" else ENDS[1:]
-    ends = zip(ENDS, ("", low, high), strict=True)
+    low, high = BOUNDED[:0:-1] if unit == "mpg" else BOUNDED[1:]
+    ends = zip(BOUNDED, ("", low, high), strict=True)
     return {f"{name}{x}": in_unit(table.get(f"{key}{y}", np.nan), unit, energy) for x, y in ends}
 
 
 def in_unit(kj_per_km: Any, unit: str, energy: Fleet | None) -> Any:
-    """Convert energy per distance [kJ/km] to one of :data:`ENERGY_UNITS`.
-
-    Args:
-        kj_per_km: the energy per distance [kJ/km], a number or an array.
-        unit: one of :data:`ENERGY_UNITS`.
-        energy: the energy models.
+    """Convert energy per distance [kJ/km], of any shape, to one of :data:`ENERGY_UNITS`.
 
     Raises:
         ConfigError: if the unit is unknown, or one of fuel and not all vehicles burn the same fuel.

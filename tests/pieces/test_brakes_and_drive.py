@@ -121,9 +121,6 @@ def test_limits_without_effect_are_refused() -> None:
             r"brake by at most 3 m/s² \(limits\.max_braking\)",
         ),
         (lambda: load("train", ["scenario.max_braking=-1"]), "max_braking must be greater than 0"),
-        (
-            lambda: load("train", ["scenario.max_acceleration=60"]),
-            r"less than or equal to 12, got 60",
-        ),
+        (lambda: load("train", ["scenario.max_acceleration=60"]), "less than or equal to 12, got"),
     ]
     check_refused(lambda call: call(), cases, ConfigError)
