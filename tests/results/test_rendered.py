@@ -152,8 +152,7 @@ def test_energies_come_in_the_unit_asked_for(tmp_path, capsys) -> None:
         table.main([str(tmp_path / name), "--all", "--unit", "kWh/100km"])
         assert "[kWh/100km]" in capsys.readouterr().out
     (made,) = reports(noisy(), load("evaluate", [*SETTINGS["episodes"], "unit=Wh/km"]))
-    assert made.score == "energy_wh_per_km"
-    assert made.score in made.short
+    assert made.score in {*made.short} & {"energy_wh_per_km"}
     cases = [
         ("episodes", "mpg", r"unit=mpg \(task.unit, --unit\) needs vehicles that all burn one"),
         ("ring", "Wh/km", "the score of this task is no energy per distance"),
