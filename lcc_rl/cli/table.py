@@ -52,8 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--all", action="store_true", help="all measures, as table=all")
     parser.add_argument("--columns", help="names of columns of --format csv, separated by commas")
     parser.add_argument("--against", help="baseline of savings, a name of the table")
-    unit = "energy per distance, such as kWh/100km"
-    parser.add_argument("--unit", choices=ENERGY_UNITS, help=unit)
+    parser.add_argument("--unit", choices=ENERGY_UNITS, help="energy per distance")
     new = "another name of a row, in all formats; may be repeated"
     parser.add_argument("--rename", nargs=2, action="append", metavar=("ROW", "NAME"), help=new)
     ending = typed(Annotated[str, Field(pattern=r"\.(png|pdf|svg)$")])
@@ -70,7 +69,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.run.suffix == ".parquet":
         table = chosen(worded(read_parquet(options.run)), names)
     else:
-        run = replace(read_run(options.run, options.trust), unit=options.unit)
+        run = read_run(options.run, options.trust)
+        if options.unit:
+            run = replace(run, cfg=run.cfg.with_(unit=options.unit))
         for row, label in options.rename or ():
             rename(row, label, names_of(run.rows))
         if options.figure:

@@ -6,7 +6,7 @@ import dataclasses
 import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import pandas as pd
@@ -39,6 +39,7 @@ from lcc_rl.results.runs import (
     save_config,
 )
 from lcc_rl.results.windows import by_source
+from lcc_rl.runs.output import log_report
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import UNDRAWN, claim, forget
 
@@ -88,8 +89,7 @@ def run(
         check_measured(cfg)
         entrants = Entrants(cfg, own, given, typed)
         inputs = load_inputs(cfg)
-        for line in filter(None, [*inputs.report, other_drivers(cfg), classes(cfg)]):
-            log.info(line)
+        log_report(filter(None, [*inputs.report, other_drivers(cfg), classes(cfg)]))
         comparison = Comparison(cfg, inputs, entrants.strategies(inputs))
         if replace:  # rows of other settings must not be in a folder with this configuration
             (folder / EPISODES).unlink(missing_ok=True)
@@ -152,29 +152,22 @@ def evaluate_and_write(comparison: Comparison, inputs: Inputs, folder: Path, qui
     return rows
 
 
-def reports(
-    rows: Rows, cfg: StudyConfig, against: str | None = None, unit: str | None = None
-) -> Iterator[Report]:
-    """Yield the report of each source of leaders or case of a platoon, energy in a unit."""
+def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterator[Report]:
+    """Yield the report of each source of leaders or case of a platoon."""
     if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":
-        require(unit is None, f"unit={unit}: tables of platoons have no energy per distance")
+        require(
+            cfg.unit is None, f"unit={cfg.unit}: tables of platoons have no energy per distance"
+        )
         for source, group in by_source(rows):
             of = f"{source}: " if source else ""
             for case in dict.fromkeys(group["case"]):
                 yield case_report(group, case, f"{of}{case}")
         return
     notes = list(filter(None, [other_drivers(cfg), classes(cfg)]))
+    made = partial(report, task=task_of(cfg), energy=build_energy(cfg), against=against)
     of_sweep = rows.attrs.get("remarks", ()) if isinstance(rows, pd.DataFrame) else ()
     for source, group in by_source(windows_for(rows)):
-        result = report(
-            group,
-            task_of(cfg),
-            build_energy(cfg),
-            source,
-            against=against,
-            second=second_energy(cfg),
-            unit=unit,
-        )
+        result = made(group, of=source, second=second_energy(cfg), unit=cfg.unit)
         windows, drivers = group["profile_id"].nunique(), int(group["drivers"].max())
         size = size_in_words(cfg, windows, drivers)
         yield dataclasses.replace(result, remarks=[*result.remarks, *notes, *of_sweep], size=size)
@@ -215,8 +208,6 @@ class Run:
         rows: one row per episode, or vehicle of an episode, as in episodes.parquet; many rows as a
             dataset, which is read on demand.
         cfg: its configuration.
-        unit: energy per distance of its tables, ``"kWh/100km"``; by default that of the task, or
-            kJ/km, and g/km for one fuel.
 
     ``print(run)`` shows the tables that commands print. A run stands for the path of its folder.
     """
@@ -224,7 +215,6 @@ class Run:
     folder: Path
     rows: Rows
     cfg: StudyConfig
-    unit: str | None = None
 
     def __fspath__(self) -> str:
         return str(self.folder)
@@ -246,7 +236,7 @@ class Run:
         Args:
             against: the baseline of savings; by default that of tables.
         """
-        return list(reports(self.rows, self.cfg, against, self.unit))
+        return list(reports(self.rows, self.cfg, against))
 
     @cached_property
     def table(self) -> pd.DataFrame:

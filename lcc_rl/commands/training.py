@@ -30,6 +30,7 @@ from lcc_rl.results.report import summary, windows_for
 from lcc_rl.results.runs import EPISODES, POLICY, RECORD, check_folder, resumed_config, save_config
 from lcc_rl.results.trust import trust_option
 from lcc_rl.runs.loggers import RowLogger, Silent
+from lcc_rl.runs.output import log_report
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import working
 
@@ -96,8 +97,7 @@ def _run(cfg: TrainConfig, folder: Path, quiet: bool, resume: bool) -> Rows:
     prepare_torch(cfg)
     check_settings(cfg, folder)
     inputs = load_inputs(cfg)
-    for line in inputs.report:
-        log.info(line)
+    log_report(inputs.report)
     agent = weights = None
     if not cfg.learns:
         strategy = rule(cfg)

@@ -49,7 +49,7 @@ log = logging.getLogger("lcc_rl")
 CONF = "lcc_rl.conf"
 # Settings that change no row of a result.
 NOT_IDENTITY = (
-    *("resume", "jobs", "sweep", "logger", "trust", "figure_formats", "table"),
+    *("resume", "jobs", "sweep", "logger", "trust", "figure_formats", "table", "unit"),
     "training.keep_every",
 )
 # Extras that install launchers.

@@ -27,6 +27,7 @@ from lcc_rl.functional.pattern import (
 )
 from lcc_rl.settings import (
     TARGET,
+    Acceleration,
     Count,
     Million,
     NonNegative,
@@ -129,8 +130,8 @@ class ScenarioConfig(Section):
     vehicle_length: Positive  # [m]
     initial_speed: Speed  # on a ring [m/s]
     # Limits of automated vehicles, for every controller, filter and policy [m/s²].
-    max_braking: Positive = MAX_ACCELERATION
-    max_acceleration: Positive = MAX_ACCELERATION
+    max_braking: Acceleration = MAX_ACCELERATION
+    max_acceleration: Acceleration = MAX_ACCELERATION
     controllers: Nodes
     start: Nodes
     filters: Nodes
@@ -275,6 +276,7 @@ class StudyConfig(BaseConfig):
     sweep: str | None = None
     policy: str | None = None
     table: Literal["short", "all"] = "short"  # printed table: six columns, or all measures
+    unit: str | None = None  # of energy per distance in printed tables, see lcc_rl.results.task
     # Modules that register measures, see lcc_rl.evaluation.metrics.register.
     measures: list[str] = dataclasses.field(default_factory=list)
 

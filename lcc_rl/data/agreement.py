@@ -31,7 +31,7 @@ NEAR_MISTAKE, ALIKE = 1.25, 1.05  # largest factors to a mistake's coefficients;
 STRAY = 0.2  # largest distance left of a relative speed, as a share of the follower's
 LOUD, LOUD_RATE, LOUD_FACTOR = 0.3, 0.3, 1.15  # reported: lag [s], bias of a speed [m/s], factor
 STANDING, LEAST_STANDING = 0.5, 300  # speed [m/s], samples
-FAR_STANDING = 15.0  # gap that may be in feet [m]
+FAR_STANDING, BEHIND = 15.0, 0.5  # gap that may be in feet [m]; time gap of speeds in km/h [s]
 OF_LOGS = "relative_speed"  # key of a log's column from which the leader's speed is computed
 RATES = (5, 10, 15, 20, 25, 30, 50, 60)  # frames per second of recordings
 
@@ -352,6 +352,8 @@ def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Unit
         f"medians: speed {speed.median():.3g} m/s, gap {gap.median():.3g} m, time gap "
         f"{behind:.2g} s above 1 m/s; {', '.join(phrases)}"
     )
+    if OF_LOGS in units and behind < BEHIND:  # gaps agree with relative speeds whatever the own one
+        return Concern(f"{line}; is the own speed in km/h (data.units.follower_speed=km/h)?")
     stand = gap[episodes[["follower_speed_mps", "leader_speed_mps"]].max(axis=1) < STANDING]
     if len(stand) < LEAST_STANDING or stand.median() < FAR_STANDING or "ft" in units.values():
         return line

@@ -192,7 +192,7 @@ def _usual_steps(
         fix = f"{node}.units.time={unit}" if node else "convert it"
         span = "from {:.15g} to {:.15g}".format(*samples["time_s"].agg(["min", "max"]))
         raise DataError(
-            f"{source}: samples of a {what} are {step:g} s apart; expected {SHORTEST_STEP:g} to "
+            f"{source}: samples of each {what} are {step:g} s apart; expected {SHORTEST_STEP:g} to "
             f"{LONGEST_STEP:g} s; is the time, {span}, in {unit} ({fix})"
             f"{', or are rows missing' * (unit != 's')}?"
         )

@@ -27,6 +27,7 @@ MOST_JUMPS = 0.5  # largest share of samples that jumps of gaps may cost
 WORDS = {
     "max_speed": "holds {:g} m/s (is it km/h or ft/s?)",
     "min_speed": "holds {:g} m/s (is it relative to another car, or against an axis?)",
+    "max_gap": "holds {:g} m (is it in cm, data.units.gap=cm, or a value for no target?)",
 }
 # Column, words with a place for a number, the numbers ``[rows]``, name of the threshold, and the
 # samples outside of it ``[rows]``.

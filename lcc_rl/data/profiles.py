@@ -174,8 +174,9 @@ def from_records(
     if not records:
         raise DataError(NONE_LEFT)
     for name, record in zip(names, records, strict=True):
-        if not bool(torch.isfinite(record).all()) or bool((record < 0).any()):
-            raise DataError(f"profile {name}: speeds must be finite and not negative")
+        for sample in (~(record.isfinite() & (record >= 0))).nonzero()[:1, 0].tolist():
+            wrong = f"sample {sample}, from 0, is {record[sample]:g}"
+            raise DataError(f"profile {name}: {wrong}; speeds must be finite and not negative")
     lengths = torch.tensor([len(record) for record in records])
     return Profiles(
         speeds=torch.cat([record.to(torch.float32) for record in records]),

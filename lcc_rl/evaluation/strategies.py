@@ -223,11 +223,11 @@ def _of_training(cfg: StudyConfig, own: StudyConfig, path: str) -> StudyConfig:
         log.info("the policy of variant %s keeps the filter of its training", own.variant)
         changes["scenario"] = {"filters": {AUTOMATED: trained}}
     elif given is not None and trained is not None:
-        mine = given.settings
-        other = [f"{key}={x}" for key, x in trained.settings.items() if x != mine.get(key)]
-        text = "the policy of variant %s drives behind the given filter, not that of its training"
+        pairs = [(key, x, given.settings.get(key)) for key, x in trained.settings.items()]
+        other = [f"{key}={mine} in place of {x}" for key, x, mine in pairs if x != mine]
+        text = "%s: the filter of this command replaces that of the policy's training: %s"
         if other:
-            log.warning(f"{text}: %s", own.variant, ", ".join(other))
+            log.warning(text, path, ", ".join(other))
     return cfg.with_(**changes)
 
 

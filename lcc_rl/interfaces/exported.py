@@ -46,7 +46,7 @@ from lcc_rl.pieces.knowledge import ObservationMemory
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, TARGET_AGE, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.results.policies import load_policy
-from lcc_rl.settings import Positive, Settings, parse, values
+from lcc_rl.settings import Acceleration, Positive, Settings, parse, values
 
 # Entries that are computed from other measurements: v_ahead − v.
 DERIVED_INPUTS = {
@@ -64,8 +64,8 @@ Safety = CBFFilter | Mapping[str, Any] | None  # a filter, or changed settings o
 class CarLimits(Settings):
     """Brakes and drive of the vehicle; None: those of the training, 3 m/s² for a rule."""
 
-    max_braking: Positive | None = None  # [m/s²]
-    max_acceleration: Positive | None = None  # [m/s²]
+    max_braking: Acceleration | None = None  # [m/s²]
+    max_acceleration: Acceleration | None = None  # [m/s²]
 
     def of(self, world: World) -> World:
         """Return a world with these limits of automated vehicles."""

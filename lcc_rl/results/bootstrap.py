@@ -18,6 +18,7 @@ RESAMPLES = 9999
 LEAST_DRIVES = 5  # least number of drives that are resampled
 STUDENT = (12.706, 4.303, 3.182)  # 97.5 % quantiles of Student's t by degrees of freedom, from 1
 RESAMPLING_SEED = 0  # equal rows give equal intervals
+BOUNDED = ("", "_low", "_high")  # of the names of a value and of the bounds of its interval
 WITHOUT_WINDOWS = -1  # stream for seeds that are resampled without windows
 
 Side = Mapping[str, Floats]  # columns of one side of a comparison, each ``[..., windows, seeds]``
@@ -37,8 +38,8 @@ class Estimate:
 
     def columns(self, name: str, factor: float = 1.0) -> dict[str, float]:
         """Return ``name``, ``name_low`` and ``name_high``, scaled."""
-        values = {"": self.value, "_low": self.low, "_high": self.high}
-        return {f"{name}{end}": factor * value for end, value in values.items()}
+        values = zip(BOUNDED, (self.value, self.low, self.high), strict=True)
+        return {f"{name}{end}": factor * value for end, value in values}
 
 
 NOTHING = Estimate(np.nan)
@@ -111,13 +112,14 @@ def _over_drives(
 
 def resampled(table: Floats, stream: int, drives: Sequence[object] | None = None) -> Floats:
     """Return the resampled means of ``[..., windows, seeds]``; ``stream`` draws the seeds."""
-    drawn = drawn_windows(table.shape[-2], drives) @ table
+    drawn = drawn_windows(table.shape[-2], tuple(drives or ())) @ table
     return np.asarray((drawn * resample_weights(table.shape[-1], stream)).sum(-1))
 
 
-def drawn_windows(count: int, drives: Sequence[object] | None = None) -> Floats:
+@lru_cache(maxsize=1)  # all measures of a strategy have the same windows
+def drawn_windows(count: int, drives: tuple[object, ...] = ()) -> Floats:
     """Return the weights of windows in every resample, ``[RESAMPLES, count]``."""
-    if drives is None or len(set(drives)) < LEAST_DRIVES:
+    if len(set(drives)) < LEAST_DRIVES:
         return resample_weights(count, 0)
     names = {name: code for code, name in enumerate(dict.fromkeys(drives))}
     drawn = resample_weights(len(names), 0)[:, [names[name] for name in drives]]

@@ -33,15 +33,15 @@ AGGREGATES = ("mean", "sum", "min", "max")
 SIGNS = {"at least": "≥", "at most": "≤"}
 SHARE, COUNT = "%", "{:.0f}"
 # Units of columns by the end of their names.
-SUFFIX_UNITS = {
-    "kj_per_km": "kJ/km",
-    "mps3": "m/s³",
-    "mps": "m/s",
-    "pct": "%",
-    "kj": "kJ",
+SUFFIX_UNITS = {"kj_per_km": "kJ/km", "mps3": "m/s³", "mps": "m/s", "pct": "%", "kj": "kJ"}
+SUFFIX_UNITS |= {
     "ms": "ms",
+    "m": "m",
+    "s": "s",
+    "vph": "1/h",
+    "g_per_km": "g/km",
+    "s_per_km": "s/km",
 }
-SUFFIX_UNITS |= {"m": "m", "s": "s", "vph": "1/h", "g_per_km": "g/km", "s_per_km": "s/km"}
 SUFFIX_UNITS |= {"wh_per_km": "Wh/km", "kwh_per_100km": "kWh/100 km", "l_per_100km": "L/100 km"}
 SUFFIX_UNITS |= {"per_100km": "1/100 km"}
 INITIALS = ("cav", "hdv", "ttc", "sd")
@@ -79,6 +79,7 @@ class Measure:
         factor: factor on a ratio.
         score: its name as a task's score.
         least: mean of a baseline below which no share of it is given: it is noise.
+        interval: whether tables have its 95 % interval; extremes and sums have none.
 
     Raises:
         ConfigError: if aggregate or bound is unknown.
@@ -99,6 +100,7 @@ class Measure:
     factor: float = 1.0
     score: str = ""
     least: float = 0.0
+    interval: bool = False
 
     def __post_init__(self) -> None:
         require_known(f"aggregate of {self.key}", self.aggregate, AGGREGATES)
@@ -165,14 +167,17 @@ class Measure:
 
 
 _kj = partial(Measure, unit="kJ", form="{:.1f}")
-_share = partial(Measure, unit=SHARE, bound="at most")  # of the time
+_share = partial(Measure, unit=SHARE, bound="at most", interval=True)  # of the time
 _least = partial(Measure, aggregate="min", bound="at least")
+_least_mean = partial(_least, aggregate="mean", interval=True)
 _largest = partial(Measure, aggregate="max", bound="at most")
+_average = partial(Measure, interval=True)
+_varied = partial(_average, unit="m/s")
 _braking = partial(Measure, unit="m/s²", form="{:.1f}", aggregate="max")
 # Ratios of a column of all vehicles and their distance.
-_per = partial(Measure, per=DISTANCE, factor=1e3)
+_per = partial(Measure, per=DISTANCE, factor=1e3, interval=True)
 _kj_per_km = partial(_per, unit="kJ", form="{:.1f}")
-_per_100km = partial(Measure, per=DISTANCE, factor=1e5, unit="1/100 km")
+_per_100km = partial(_per, factor=1e5, unit="1/100 km")
 
 MEASURES = [
     _kj(PATH, "path energy"),
@@ -202,16 +207,14 @@ MEASURES = [
     _per("co2_g_per_km", "carbon dioxide of it", unit="g/km", form="{:.1f}", of="all_co2_g"),
     _per("travel_time_s_per_km", "travel time", unit="s/km", of="vehicle_time_s"),
     _per("delay_s_per_km", "  delay against v0", unit="s/km", of="delay_s"),
-    _least("mean_speed_mps", "mean speed", unit="m/s", aggregate="mean", limit="mean\nspeed"),
-    Measure(SPEED_STD, "deviation of a speed in time", unit="m/s", score=SPEED_STD),
-    Measure(
-        FINAL_SPREAD, "spread of speeds at the end", unit="m/s", score=FINAL_SPREAD, least=CALM
-    ),
-    _least(FLOW, "flow", unit="1/h", form=COUNT, aggregate="mean"),
-    Measure("string_ratio", "string ratio", score="string_ratio"),
+    _least_mean("mean_speed_mps", "mean speed", unit="m/s", limit="mean\nspeed"),
+    _varied(SPEED_STD, "deviation of a speed in time", score=SPEED_STD),
+    _varied(FINAL_SPREAD, "spread of speeds at the end", score=FINAL_SPREAD, least=CALM),
+    _least_mean(FLOW, "flow", unit="1/h", form=COUNT),
+    _average("string_ratio", "string ratio", score="string_ratio"),
     Measure("damped", "episodes that end calm", form="{:.0%}"),
     Measure(DAMPING, "  from when on, mean", unit="s", form=COUNT, of="damped_s", per="damped"),
-    Measure(GAP, "mean gap", unit="m", form="{:.1f}"),
+    _average(GAP, "mean gap", unit="m", form="{:.1f}"),
     Measure("gap_opened_m", "  opened during the counted time", unit="m", form="{:+.1f}"),
     _least("min_gap_m", "smallest gap", unit="m", limit="gap"),
     _largest("max_gap_m", "largest gap", unit="m", limit="gap"),
@@ -244,11 +247,11 @@ MEASURES = [
     _per_100km("brakings_below_3_per_100km", "  < −3 m/s²", of="brakings_below_3"),
     _largest("max_deceleration_mps2", "largest deceleration", unit="m/s²", limit="braking"),
     _largest("max_deceleration_1s_mps2", "  mean of 1 s", unit="m/s²", limit="braking\n1 s"),
-    Measure("rms_jerk_mps3", "RMS jerk of an episode, mean", unit="m/s³"),
+    _average("rms_jerk_mps3", "RMS jerk of an episode, mean", unit="m/s³"),
     _largest("max_jerk_mps3", "  largest jerk", unit="m/s³", limit="jerk"),
     _largest("max_jerk_1s_mps3", "  largest mean of 1 s", unit="m/s³", limit="jerk\n1 s"),
     _least("standstill_gap_m", "smallest gap at standstill", unit="m", limit="gap\nat rest"),
-    Measure("standstill_s", "time to standstill", unit="s", form="{:.1f}"),
+    _average("standstill_s", "time to standstill", unit="s", form="{:.1f}"),
     Measure("speed_overshoot_mps", "speed above the leader's highest", unit="m/s", aggregate="max"),
     _share(FASTER, "time with a leader faster than v0", form="{:.1%}", limit="leader\nfaster"),
     Measure(REACH[0], "CAV beyond the energy model's reach", form="{:.1%}"),

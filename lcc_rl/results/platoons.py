@@ -95,6 +95,6 @@ def case_report(rows: pd.DataFrame, case: str, of: str = "") -> Report:
     """Return the report of a case of a platoon, from rows of episodes.parquet."""
     table = with_drivers(case_table(rows, case)).astype({"collisions": int})
     shown = [Shown(one.key, one.short) for one in PLATOON if one.short]
-    short = shortened(table.drop(columns=["reward_low", "reward_high"]), shown)
+    short = shortened(table, shown)
     caption = f"{BELOW}; {ALL}"
     return Report(of, table, *short, PLATOON, caption, BELOW)

@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lcc_rl.errors import require_known
+from lcc_rl.results.bootstrap import BOUNDED
 from lcc_rl.results.measures import Shown, between, heading, signed
 from lcc_rl.results.names import in_words
 from lcc_rl.results.report import Report
@@ -105,7 +106,7 @@ def as_latex(frame: pd.DataFrame) -> str:
 
 def column_cells(frame: pd.DataFrame, name: str) -> list[str]:
     """Return the cells of a column as text, with its interval if the table has one."""
-    keys = [key for key in (name, f"{name}_low", f"{name}_high") if key in frame]
+    keys = [f"{name}{end}" for end in BOUNDED if f"{name}{end}" in frame]
     most = 2 if heading(name).endswith("[%]") else 4
     places = frame.attrs.get("decimals", min(most, *(_places(frame[key]) for key in keys)))
     cells = [_cell(value, places) for value in frame[name]]
@@ -180,7 +181,7 @@ def as_rich(table: pd.DataFrame, shown: Sequence[Shown], title: str, caption: st
 def _short_cells(table: pd.DataFrame, name: str) -> list[str]:
     if f"{name}_low" not in table or not name.endswith("_pct"):
         return column_cells(table, name)
-    bounds = zip(*(table[f"{name}{end}"] for end in ("", "_low", "_high")), strict=True)
+    bounds = zip(*(table[f"{name}{end}"] for end in BOUNDED), strict=True)
     return [saved_text(*row) for row in bounds]
 
 
@@ -240,8 +241,7 @@ def for_print(report: Report, names: Sequence[str] = ()) -> pd.DataFrame:
     """
     keys = [column.key for column in report.shown]
     table = chosen(report.short, names or keys, "column of the short table (--all has all)")
-    ends = ("", "_low", "_high")
-    headings = {f"{one.key}{end}": f"{one.words}{end}" for one in report.shown for end in ends}
+    headings = {f"{one.key}{end}": f"{one.words}{end}" for one in report.shown for end in BOUNDED}
     return table.rename(columns=headings)
 
 
@@ -254,7 +254,7 @@ def chosen(table: pd.DataFrame, names: Sequence[str], what: str = "column") -> p
     known = [str(key) for key in table]
     require_known(what, names, known)
     keys = names or known
-    shown = [name for key in keys for name in (key, f"{key}_low", f"{key}_high") if name in known]
+    shown = [name for key in keys for name in (f"{key}{end}" for end in BOUNDED) if name in known]
     return table[list(dict.fromkeys(shown))]
 
 

@@ -15,13 +15,12 @@ from lcc_rl.errors import require, require_known
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import Rows
 from lcc_rl.results import measures
-from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING
+from lcc_rl.results.bootstrap import BOUNDED, LEAST_DRIVES, NOTHING
 from lcc_rl.results.fronts import at_equal_flow
 from lcc_rl.results.measures import (
     DISTANCE,
     FILTER_ACTS,
     FLOW,
-    GAP,
     MEASURES,
     PATH,
     PATH_PER_KM,
@@ -46,7 +45,7 @@ from lcc_rl.results.remarks import (
     seeds_note,
     verdict,
 )
-from lcc_rl.results.task import ELECTRIC, Task, burns_one_fuel, check_unit, in_unit
+from lcc_rl.results.task import ELECTRIC, KJ, Task, burns_one_fuel, in_units
 from lcc_rl.results.windows import DRIVE, TRAINED, ratio, savings, seeds_left_out, windows_of
 
 # Baselines of tables and verdicts; the first one that was evaluated is used.
@@ -199,21 +198,23 @@ def summary(
         row |= {"drivers": int(frame["drivers"].max())} if "drivers" in frame else {}
         row["left_out"], seeds = seeds_left_out(windows, name, against)
         row["single"] = seeds == 1
+        values: dict[str, Any] = {}
+        for one in MEASURES:
+            values |= ratio(frame, one).columns(one.key, one.factor) if one.interval else {}
+            values[one.key] = one.value(frame)
         if task:
-            row |= {SCORE: score_of(task, frame, energy)}
+            unit = task.unit if task.measure.per and energy is not None else KJ
+            row |= in_units(values, task.measure.key, SCORE, unit, energy)
         hit = bool(frame.get("collisions", pd.Series(dtype=float)).sum())
         row |= _savings(windows, name, (column, per), None if hit else against)
-        row |= ratio(windows, "all_path_energy_kj", name, [DISTANCE]).columns(PATH_PER_KM, 1e3)
-        row |= ratio(windows, GAP, name, []).columns(GAP)
-        row |= {measure.key: measure.value(frame) for measure in MEASURES}
-        rows.append(row)
+        rows.append(row | values)
     table = pd.DataFrame(rows)
-    table = table.astype({"collisions": int, "episodes": int})
+    table = table.astype({"collisions": int, "episodes": int}).copy()  # has few blocks
     table["single"] &= table["seeds"].max() > 1
     base = table[table["strategy"] == against]
     for key, (_, lost) in LOST.items():
         table[key] = 1.0 - table[lost] / (base[lost].iloc[0] if len(base) else np.nan)
-    table.loc[crashed(table), [*LOST, FLOW]] = np.nan
+    table.loc[crashed(table), [*LOST, *(f"{FLOW}{end}" for end in BOUNDED)]] = np.nan
     if task:
         table["kept"] = table["collisions"] == 0
         for limit, bound in task.bounds.items():
@@ -253,15 +254,6 @@ def _savings(
     return row
 
 
-def score_of(task: Task, part: pd.DataFrame, energy: Fleet | None) -> float:
-    """Return the score of a strategy's windows in the task's unit."""
-    value = task.measure.value(part)
-    if not task.measure.per or energy is None:
-        return value
-    check_unit(task.unit, energy)
-    return in_unit(value, task.unit, energy)
-
-
 def report(
     windows: pd.DataFrame,
     task: Task | None = None,
@@ -295,14 +287,14 @@ def report(
         task = replace(task, against=against) if against else task.among(windows["strategy"])
         task = replace(task, unit=unit or task.unit).resolved(windows)
     table = summary(windows, task, energy, against)
-    percent = {
-        f"{shown}{end}": 100.0 * table[f"{key}{end}"]
-        for key, shown in SAVINGS.items()
-        for end in ("", "_low", "_high")
-    }
+    names = [(f"{shown}{x}", f"{key}{x}") for key, shown in SAVINGS.items() for x in BOUNDED]
+    percent = {shown: 100.0 * table[key] for shown, key in names}
+    units = [unit] if unit else [KJ, *["g/km"] * (energy is not None and burns_one_fuel(energy))]
+    for one in units if task is None else ():
+        percent |= in_units(table, PATH_PER_KM, _energy_in(one).key, one, energy)
     percent |= {shown: -100.0 * table[lost] for lost, (shown, _) in LOST.items()}
     every = with_drivers(pd.concat([table, pd.DataFrame(percent)], axis=1))
-    fields = _of_task(every, task) if task else _of_energy(every, energy, second, unit)
+    fields = _of_task(every, task) if task else _of_energy(every, units, second)
     short, shown = fields.pop("short")
     rows = _rows(task, table["against"].iloc[0], shown[1] if task or unit else None)
     text = "" if task else verdict(windows, table, few)
@@ -322,6 +314,10 @@ def report(
 def _rows(task: Task | None, against: str | None, score: Shown | None) -> list[Measure]:
     """Return the rows of the full table; ``score``: the first number of the short one, if any."""
     bounds = task.bounds if task else {}
+    limits = [
+        replace(x, label=f"limit: {' '.join(x.bounded(bounds[x]).split())}", unit="", form=x.number)
+        for x in sorted(bounds, key=lambda x: x.unit == SHARE)
+    ]
     kept = [Measure("kept", "keeps the limits (1: yes)", form="{:d}")] if task else []
     return [
         *([Measure(score.key, score.words)] if score else ()),
@@ -336,47 +332,27 @@ def _rows(task: Task | None, against: str | None, score: Shown | None) -> list[M
         Measure(WAY.key, "distance against the baseline", form="{:+.2f}%"),
         Measure(FLOW_SHARE.key, "flow against the baseline", form="{:+.2f}%"),
         *(measure for measure in MEASURES if measure.label),
-        *(
-            replace(
-                measure,
-                label=f"limit: {' '.join(measure.bounded(bounds[measure]).split())}",
-                unit="",
-                form=measure.number,
-            )
-            for measure in sorted(bounds, key=lambda measure: measure.unit == SHARE)
-        ),
+        *limits,
         *kept,
         *(Measure(key, label, form="{:.0f}") for key, label in COUNTS.items()),
     ]
 
 
-def _of_energy(
-    table: pd.DataFrame,
-    energy: Fleet | None,
-    second: Fleet | None,
-    unit: str | None,
-) -> dict[str, Any]:
+def _of_energy(table: pd.DataFrame, units: Sequence[str], second: Fleet | None) -> dict[str, Any]:
     """Return the parts of a report that are specific to one without a task, most energy first."""
     # A string without automated vehicles has fewer vehicles and is not comparable.
     cars = table[table[PATH].notna()] if table[PATH].notna().any() else table
     cars = cars.sort_values(PATH_PER_KM, ascending=False, kind="stable").reset_index(drop=True)
     against = (cars["against"].iloc[0] or None) if len(cars) > 1 else None
-    ends = ("", "_low", "_high") if against is None and len(cars) > 1 else ("",)
+    shown = [*map(_energy_in, units)]
+    spread = [one.key for one in shown if against is None and len(cars) > 1]
     loss, basis = FLOW_SHARE, f"flow against {in_words(str(against))}"
     if cars[FLOW_SHARE.key].isna().all():
         loss, basis = WAY, "distance against theirs"
     note = "" if against is None else f"{saved_against(cars, against)}; {basis}; "
-    note += f"{with_interval(cars, 'energy')}; " * (len(ends) > 1)
+    note += f"{with_interval(cars, 'energy')}; " * bool(spread)
     short = [one for one in MEASURES if one.short]
-    columns = {f"energy_kj_per_km{end}": cars.get(f"{PATH_PER_KM}{end}") for end in ends}
-    columns |= {one.shown.key: one.scale * cars[one.key] for one in short}
-    shown = [Shown("energy_kj_per_km", "energy\n[kJ/km]")] * (unit is None)
-    if energy is not None and (unit or burns_one_fuel(energy)):
-        unit = unit or "g/km"
-        name = "energy" if unit in ELECTRIC else "fuel"
-        key = f"{name}_{unit.replace('/', '_per_').lower()}"
-        columns[key] = cars[PATH_PER_KM].map(lambda value: in_unit(value, unit, energy))
-        shown.append(Shown(key, f"{name}\n[{unit}]"))
+    columns = {one.shown.key: one.scale * cars[one.key] for one in short}
     fronts = [one for one in AT_FLOW if cars[one.key].notna().any()]
     seconds = [SECOND_SAVED] * bool(cars[SECOND_SAVED.key].notna().any() and not fronts)
     shown += [] if against is None else [SAVED, *seconds, loss]
@@ -385,12 +361,18 @@ def _of_energy(
     shown = [Shown(key, heading.format(of)) for key, heading in [*shown, COLLISIONS]]
     note += SHARES * (not fronts)
     return {
-        "short": shortened(cars.assign(**columns), shown),
+        "short": shortened(cars.assign(**columns), shown, spread),
         "caption": CAPTION.format(note + behind_filter(cars)),
         "against": against,
-        "score": "energy_kj_per_km",
-        "label": "path energy per km [kJ/km]",
+        "score": shown[0].key,
+        "label": f"path energy per km [{units[0]}]",
     }
+
+
+def _energy_in(unit: str) -> Shown:
+    """Return the column of energies or fuel per distance in a unit."""
+    name = "energy" if unit in ELECTRIC else "fuel"
+    return Shown(f"{name}_{unit.replace('/', '_per_').lower()}", f"{name}\n[{unit}]")
 
 
 def behind_filter(found: pd.DataFrame) -> str:
@@ -423,7 +405,7 @@ def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
         note += task.measure.unit
     saved = f"{note}; " * (len(table) > 1)
     caption = f"{saved}kept: all limits, without a collision; {ALL}"
-    short, headed = shortened(table.copy().assign(**columns), shown)  # a copy has few blocks
+    short, headed = shortened(table.assign(**columns), shown)
     unit = task.unit if task.measure.per else task.measure.unit
     short = short.assign(unit=unit)  # in CSV, where the score has no heading
     return {
@@ -435,12 +417,13 @@ def _of_task(table: pd.DataFrame, task: Task) -> dict[str, Any]:
 
 
 def shortened(
-    table: pd.DataFrame, shown: Sequence[Shown]
+    table: pd.DataFrame, shown: Sequence[Shown], spread: Iterable[str] = ()
 ) -> tuple[pd.DataFrame, tuple[Shown, ...]]:
-    """Return columns of a :func:`with_drivers` table with intervals, and the columns.
+    """Return columns of a :func:`with_drivers` table, and the columns.
 
-    Strategies that lose more than 2 % of the flow, and single trainings beside several, are marked.
-    With several seeds, collisions are means of a training.
+    Savings and the columns ``spread`` have their intervals. Strategies that lose more than 2 % of
+    the flow, and single trainings beside several, are marked. With several seeds, collisions are
+    means of a training.
     """
     if table.get("seeds", pd.Series([0])).max() > 1:
         per = Shown(f"{COLLISIONS.key}_per_seed", f"{COLLISIONS.heading}\n/ seed")
@@ -453,7 +436,10 @@ def shortened(
     rows = zip(table["driver"], lost, single, strict=True)
     table = table.assign(driver=[x + MARK * y + ONE * z for x, y, z in rows])
     shown = (Shown("driver", "driven by"), *shown)
-    names = [f"{one.key}{end}" for one in shown for end in ("", "_low", "_high")]
+    ranged = {*SAVINGS.values(), *spread}
+    names = [
+        f"{x.key}{end}" for x in shown for end in (BOUNDED if x.key in ranged else BOUNDED[:1])
+    ]
     names += [key for key in COUNTS if key not in names]
     return table[["strategy", *(x for x in names if x in table)]], shown
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 from typing import Annotated, Any
 
+import numpy as np
 import pandas as pd
 from pydantic import BeforeValidator
 
@@ -14,6 +15,7 @@ from lcc_rl.config.words import RECORDED
 from lcc_rl.energy import Fleet
 from lcc_rl.errors import ConfigError, require, require_known
 from lcc_rl.results import measures
+from lcc_rl.results.bootstrap import BOUNDED
 from lcc_rl.results.measures import Measure, heading
 from lcc_rl.results.names import HUMAN
 from lcc_rl.settings import Settings
@@ -101,18 +103,23 @@ class Task(Settings):
 
 KJ_PER_WH = 3.6
 MPG = 235.215  # miles per US gallon times litres per 100 km
-ELECTRIC = {"kJ/km": 1.0, "Wh/km": 1.0 / KJ_PER_WH, "kWh/100km": 0.1 / KJ_PER_WH}
+KJ = "kJ/km"
+ELECTRIC = {KJ: 1.0, "Wh/km": 1.0 / KJ_PER_WH, "kWh/100km": 0.1 / KJ_PER_WH}
 OF_FUEL = ("g/km", "L/100km", "mpg")  # units for vehicles that all burn one fuel
 ENERGY_UNITS = (*ELECTRIC, *OF_FUEL)
 
 
-def in_unit(kj_per_km: float, unit: str, energy: Fleet) -> float:
-    """Convert energy per distance [kJ/km] to one of :data:`ENERGY_UNITS`.
+def in_units(
+    table: Mapping[str, Any] | pd.DataFrame, key: str, name: str, unit: str, energy: Fleet | None
+) -> dict[str, Any]:
+    """Return a column [kJ/km] of a row or a table and its interval in a unit, under a name."""
+    low, high = BOUNDED[:0:-1] if unit == "mpg" else BOUNDED[1:]
+    ends = zip(BOUNDED, ("", low, high), strict=True)
+    return {f"{name}{x}": in_unit(table.get(f"{key}{y}", np.nan), unit, energy) for x, y in ends}
 
-    Args:
-        kj_per_km: the energy per distance [kJ/km].
-        unit: one of :data:`ENERGY_UNITS`.
-        energy: the energy models.
+
+def in_unit(kj_per_km: Any, unit: str, energy: Fleet | None) -> Any:
+    """Convert energy per distance [kJ/km], of any shape, to one of :data:`ENERGY_UNITS`.
 
     Raises:
         ConfigError: if the unit is unknown, or one of fuel and not all vehicles burn the same fuel.
@@ -120,7 +127,7 @@ def in_unit(kj_per_km: float, unit: str, energy: Fleet) -> float:
     check_unit(unit, energy)
     if unit in ELECTRIC:
         return kj_per_km * ELECTRIC[unit]
-    model = energy.models[0]
+    model = energy.models[0]  # type: ignore[union-attr]  # see check_unit
     grams = kj_per_km * 1e3 / model.heating_value
     if unit == "g/km":
         return grams
@@ -128,10 +135,10 @@ def in_unit(kj_per_km: float, unit: str, energy: Fleet) -> float:
     return litres if unit == "L/100km" else MPG / litres
 
 
-def check_unit(unit: str, energy: Fleet) -> None:
+def check_unit(unit: str, energy: Fleet | None) -> None:
     """Check that a unit is known and valid for all vehicles, see :func:`in_unit`."""
-    require_known("unit (task.unit, --unit)", unit, ENERGY_UNITS)
-    if unit in OF_FUEL and not burns_one_fuel(energy):
+    require_known("unit (unit, task.unit, --unit)", unit, ENERGY_UNITS)
+    if unit in OF_FUEL and not (energy and burns_one_fuel(energy)):
         raise ConfigError(
             f"unit={unit} (task.unit, --unit) needs vehicles that all burn one fuel; here they "
             "burn several or no fuel (energy=…): choose kJ/km or Wh/km"

@@ -15,7 +15,7 @@ from lcc_rl.arrays import per_distance
 from lcc_rl.energy import AVERAGED, BURNT, SECOND
 from lcc_rl.io.files import Rows, read_parquet
 from lcc_rl.results.bootstrap import NOTHING, Estimate, equal_seeds, estimate, saving, share_saved
-from lcc_rl.results.measures import DAMPING, DISTANCE, MEASURES, SHARE, WAYS, aggregates
+from lcc_rl.results.measures import DAMPING, DISTANCE, MEASURES, SHARE, WAYS, Measure, aggregates
 from lcc_rl.results.names import in_words, size_of
 from lcc_rl.results.runs import EPISODES
 
@@ -220,13 +220,14 @@ def savings(
     return saving(ours[0], theirs[0], paired, drives, ways=(ours[1], theirs[1]))
 
 
-def ratio(rows: pd.DataFrame, column: str, strategy: str, per: Sequence[str]) -> Estimate:
-    """Return a strategy's mean energy per distance with its interval, as :func:`savings`."""
-    if column not in rows:
+def ratio(rows: pd.DataFrame, measure: Measure) -> Estimate:
+    """Return a measure, without its factor, of a strategy's rows, with its interval."""
+    column, *per = measure.columns
+    if not {column, *per} <= set(rows):
         return NOTHING
-    energy, distance, drives = _by_window(rows[rows[STRATEGY] == strategy], column, per)
-    side = {"energy": energy.to_numpy(), "way": distance.to_numpy()}
-    return estimate(lambda x: per_distance(**x), side, drives=drives) if distance.size else NOTHING
+    total, by, drives = _by_window(rows, column, per)
+    side = {"energy": total.to_numpy(), "way": by.to_numpy()}
+    return estimate(lambda x: per_distance(**x), side, drives=drives) if by.size else NOTHING
 
 
 def with_equal_seeds(rows: pd.DataFrame, strategy: str, baseline: str) -> pd.DataFrame:

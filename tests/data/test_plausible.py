@@ -27,7 +27,7 @@ FLAWS = [
     ("follower_speed_mps", 60.0, r"changes by 400 m/s², data\.plausible\.max_acceleration=10"),
     ("leader_length_m", 1.4, r"holds 1\.4 m, data\.plausible\.min_length=2"),
     ("leader_length_m", 60.0, r"holds 60 m, data\.plausible\.max_length=30"),
-    ("gap_m", 4000.0, r"holds 4000 m, data\.plausible\.max_gap=500"),
+    ("gap_m", 4000.0, r"holds 4000 m \(is it in cm, data\.units\.gap=cm, .*max_gap=500"),
 ]
 
 
@@ -437,6 +437,10 @@ def test_a_biased_speed_or_a_slow_clock_is_reported_with_its_remedy() -> None:
 
 
 def test_a_relative_speed_is_no_leaders_speed() -> None:
+    table = wavy()
+    table[SPEEDS] = table[SPEEDS].add(2.6 * table["follower_speed_mps"], axis=0)  # own in km/h
+    *_, last = judged(table, {"relative_speed": "m/s"})
+    assert (type(last), last[-32:]) == (Concern, "data.units.follower_speed=km/h)?")
     table = irregular()
     relative = table["leader_speed_mps"] - table["follower_speed_mps"]
     cases = [

@@ -207,6 +207,7 @@ REFUSED = {  # by variant and settings
     "ddpg; scenario.pieces.communication=null": r"reads vehicles\.gap_error, which no",
     f"alcc; {string('automated truck')}": "has the role 'truck', but scenario.controllers nam",
     "alcc; scenario.road=ring; +event=cut_in": r"no leader .*cut_out\), an open road needs one$",
+    "alcc; scenario.circumference=100": "circumference=100 has no effect: it belongs to",
     "alcc; scenario.filters={auto: null}": r"unknown role \(scenario\.filters\) 'auto'",
     "alcc; scenario.start.human=null": r"scenario\.start has no entry for human",
     "alcc; reward.terms=null": "terms",

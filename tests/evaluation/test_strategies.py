@@ -28,8 +28,9 @@ from lcc_rl.results.policies import load_policy
 
 
 @pytest.mark.parametrize("name", TUNED)
-def test_a_tuned_rule_behind_the_filter_is_called_so_and_has_constants_for_it(name) -> None:
-    cfg = compose("alcc", "+filter=cbf")
+def test_a_tuned_rule_behind_the_filter_is_called_so_and_has_constants_for_it(name, caplog) -> None:
+    margin = "scenario.filters.automated.margin"
+    cfg, other = (compose("alcc", "+filter=cbf", f"{margin}={x}") for x in (0.2, 2))
     free, filtered = (baseline(cfg, one).cfg.scenario for one in (name, f"{name}_filtered"))
     assert free.filters.get(AUTOMATED) is None
     assert filtered.filters[AUTOMATED].settings["time_gap"] == 2.45
@@ -38,6 +39,9 @@ def test_a_tuned_rule_behind_the_filter_is_called_so_and_has_constants_for_it(na
     named = baseline(cfg, "behind the filter", f"{name}_filtered").cfg.scenario
     assert named.filters[AUTOMATED]
     assert named.controllers[AUTOMATED] == two
+    strategies._of_training(cfg, other, "mine")
+    assert "mine: the filter of this command replaces" in caplog.text
+    assert "training: margin=0.2 in place of 2" in caplog.text
     # A human driver has no filter.
     human = baseline(compose("alcc", "+filter=cbf"), "idm").cfg.scenario
     assert human.filters.get(AUTOMATED) is None

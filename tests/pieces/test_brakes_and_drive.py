@@ -119,5 +119,6 @@ def test_limits_without_effect_are_refused() -> None:
         "variant=direct scenario.max_braking=6": f"{none}no vehicle of the string is automated",
         "+faults=actuation scenario.max_braking=6": rf"{none}.*automated.braking=2\.8 is less",
         "scenario.max_braking=-1": "max_braking must be greater than 0",
+        "scenario.max_acceleration=60": "less than or equal to 12, got",
     }
     check_refused(lambda given: load("train", given.split()), words.items(), ConfigError)

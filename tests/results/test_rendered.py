@@ -143,16 +143,18 @@ def test_energies_come_in_the_unit_asked_for(tmp_path, capsys) -> None:
         asked, short = shown(name, "--unit", "kWh/100km"), shown(name)
         np.testing.assert_allclose(asked[after], short[before] / 36.0)
         every = shown(name, "--all", "--unit", "kWh/100km").set_index("strategy")
+        first = shown(name, "--all").set_index("strategy").filter(regex=f"^{before}(_|$)")
+        np.testing.assert_allclose(every.filter(regex=f"^{after}(_|$)"), first / 36.0)
+        assert first.notna().all(axis=None) & (first.shape[1] == 3)
+        assert every.filter(like="rms_jerk").notna().all(axis=None)  # with its interval
         every = every.loc[asked["strategy"], [*asked][1:]]  # all that the short table has
         pd.testing.assert_frame_equal(every, asked.set_index("strategy"), check_dtype=False)
         table.main([str(tmp_path / name), "--all", "--unit", "kWh/100km"])
         assert "[kWh/100km]" in capsys.readouterr().out
+    (made,) = reports(noisy(), load("evaluate", [*SETTINGS["episodes"], "unit=Wh/km"]))
+    assert made.score in {*made.short} & {"energy_wh_per_km"}
     cases = [
-        (
-            "episodes",
-            "mpg",
-            r"unit=mpg \(task.unit, --unit\) needs vehicles that all burn one fuel",
-        ),
+        ("episodes", "mpg", r"unit=mpg \(task.unit, --unit\) needs vehicles that all burn one"),
         ("ring", "Wh/km", "the score of this task is no energy per distance"),
         ("platoons", "Wh/km", "tables of platoons have no energy per distance"),
     ]

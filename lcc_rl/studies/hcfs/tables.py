@@ -28,7 +28,7 @@ CASE_3 = {"CACC": -4.78, "DDPG": -5.81, "HCFS": -1.90}  # Σ reward in Table VI
 GAINED = {
     f"{old}{end}": f"{new}{end}"
     for old, new in {"wins_pct": "HCFS wins_pct", "gain_pct": "HCFS gains_pct"}.items()
-    for end in ("", "_low", "_high")
+    for end in bootstrap.BOUNDED
 }
 RUN = ["strategy", "training_seed", "case", "profile", "run_id"]
 SUMS = ["speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "reward", "frames"]
@@ -185,7 +185,7 @@ def over_cases(episodes: pd.DataFrame, cases: Sequence[str], like: Sequence[str]
     for name in like:
         row: dict[str, object] = {"strategy": in_words(name)}
         for case, table in tables.items():
-            row |= {f"{case}{end}": table.at[name, f"reward{end}"] for end in ("", "_low", "_high")}
+            row |= {f"{case}{end}": table.at[name, f"reward{end}"] for end in bootstrap.BOUNDED}
         rows.append(row)
     for name, (*_, reward) in TABLE_IV.items():
         rows.append({"strategy": f"{name}, paper", "case 1": reward, "case 3": CASE_3[name]})
