@@ -6,6 +6,8 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike, fspath
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -104,8 +106,8 @@ def simulate(
 
     Args:
         leader: speeds [m/s] at every time step; a shipped cycle (``"udds"``, ``"us06"``,
-            ``"wltc_3b"``, ``"hwfet"``) or a file with ``time_s`` and ``speed_mps``; a list of
-            these, each an episode of the length of the shortest; None on a ring.
+            ``"wltc_3b"``, ``"hwfet"``); a file or a data frame with ``time_s`` and ``speed_mps``; a
+            list of these, each an episode of the length of the shortest; None on a ring.
         string: the vehicles behind the leader from front to back, see docs/strings.md.
         controller: controller or policy of the automated vehicles, as for
             :func:`lcc_rl.compare`, or a mapping of one by its name, with ``_filtered`` to put it
@@ -184,6 +186,10 @@ def _profiles(leader: Any, time_step: float, seconds: float | None) -> Profiles:
 def _record(leader: Any, time_step: float) -> Tensor:
     """Return a leader's speed at every step, ``[steps + 1]`` [m/s]."""
     hard = Plausible(max_hard=1.0)  # tests of brakes; the column names the unit
+    if isinstance(leader, pd.DataFrame):  # is read as its file
+        with TemporaryDirectory() as folder:
+            leader.to_parquet(file := Path(folder) / "leader.parquet")
+            return _record(file, time_step)
     if isinstance(leader, (str, PathLike)):
         return resample(*read_speed_record(fspath(leader), hard), time_step)
     message = "simulate: leader must be speeds [m/s], a shipped cycle or a file"

@@ -80,8 +80,9 @@ def test_safety_changes_the_filter_that_a_policy_keeps() -> None:
 
 
 def test_the_steps_are_a_motion(subtests) -> None:
+    frame = pd.DataFrame({"time_s": 0.1 * np.arange(len(WAVE)), "speed_mps": WAVE})
     cases = {
-        "humans": {"leader": WAVE, "string": "human*3"},
+        "humans": {"leader": frame, "string": "human*3"},
         "a car between": {"leader": WAVE, "string": "human automated human"},
         "drawn": {"leader": WAVE, "string": {"size": 4, "penetration": 0.5}, "repeats": 2},
         "ring": {"leader": None, "string": "human*22", "seconds": 5.0},
@@ -93,6 +94,8 @@ def test_the_steps_are_a_motion(subtests) -> None:
             by = ["episode", "vehicle"]
             assert (steps["time_s"] == steps["time_s"].round(3)).all()  # 0.3, not 0.30…04
             assert not steps.duplicated([*by, "time_s"]).any()
+            if name == "humans":
+                np.testing.assert_allclose(steps["speed_mps"][steps["vehicle"] == 0], WAVE, 1e-6)
             speed = steps.groupby(by)["speed_mps"].diff()
             np.testing.assert_allclose(
                 10.0 * speed.dropna(), steps.loc[speed.notna(), "acceleration_mps2"], atol=2e-3
@@ -178,7 +181,8 @@ def test_wrong_arguments_are_named(tmp_path) -> None:
         ({"leader": []}, "at least two speeds"),
         ({"leader": [3.0, -1.0]}, "speed 1, at 0.1 s, is -1, not from 0 to 70 m/s"),
         ({"leader": [3.0, np.inf], "time_step": 0.2}, "speed 1, at 0.2 s, is inf, not from 0"),
-        ({"leader": pd.DataFrame(np.ones((2, 3)))}, r"speeds .*shape \[2, 3\]; give a column"),
+        ({"leader": np.ones((2, 3))}, r"speeds .*shape \[2, 3\]; give a column"),
+        ({"leader": pd.DataFrame({"v": WAVE})}, r"leader\.parquet: .*time_s"),
         ({"leader": 12.0 * WAVE}, r"leader must be speeds .*is 96, not .*in km/h"),
         ({"leader": np.ma.masked_greater(WAVE, 9.0)}, "speed 14, at 1.4 s, is nan, not from 0"),
         ({"leader": WAVE, "drivers": {"a": 1}}, "drivers: not a population: "),
