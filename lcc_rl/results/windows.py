@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -210,7 +210,8 @@ def savings(
         (:func:`lcc_rl.results.bootstrap.estimate`), for the windows of both; NaN if one of them is
         missing, or the baseline is below the measure's ``least``.
     """
-    energy, distance, drives = _by_window(with_equal_seeds(rows, strategy, baseline), column, per)
+    chosen = with_equal_seeds(rows, strategy, baseline)
+    energy, distance, drives = _over(_by_window(chosen, [column, *per]), column, per)
     if energy.empty or not {strategy, baseline} <= set(energy.columns.get_level_values(0)):
         return NOTHING
     ours, theirs = ((energy[x].to_numpy(), distance[x].to_numpy()) for x in (strategy, baseline))
@@ -220,14 +221,16 @@ def savings(
     return saving(ours[0], theirs[0], paired, drives, ways=(ours[1], theirs[1]))
 
 
-def ratio(rows: pd.DataFrame, measure: Measure) -> Estimate:
-    """Return a measure, without its factor, of a strategy's rows, with its interval."""
-    column, *per = measure.columns
-    if not {column, *per} <= set(rows):
-        return NOTHING
-    total, by, drives = _by_window(rows, column, per)
-    side = {"energy": total.to_numpy(), "way": by.to_numpy()}
-    return estimate(lambda x: per_distance(**x), side, drives=drives) if by.size else NOTHING
+def measured(rows: pd.DataFrame, measures: Iterable[Measure]) -> dict[str, Estimate]:
+    """Return measures of a strategy's rows by key, without factors, with their intervals."""
+    found = {one.key: one.columns for one in measures if {*one.columns} <= set(rows)}
+    table, estimates = _by_window(rows, [name for names in found.values() for name in names]), {}
+    for key, (column, *per) in found.items():
+        total, by, drives = _over(table, column, per)
+        side = {"energy": total.to_numpy(), "way": by.to_numpy()}
+        if by.size:
+            estimates[key] = estimate(lambda x: per_distance(**x), side, drives=drives)
+    return estimates
 
 
 def with_equal_seeds(rows: pd.DataFrame, strategy: str, baseline: str) -> pd.DataFrame:
@@ -253,24 +256,24 @@ def seeds_left_out(rows: pd.DataFrame, strategy: str, baseline: str | None) -> t
     return " and ".join(phrases), int((compared[STRATEGY] == strategy).sum())
 
 
-def _by_window(
-    chosen: pd.DataFrame, column: str, per: Sequence[str]
+def _by_window(chosen: pd.DataFrame, columns: Iterable[str]) -> dict[str, pd.DataFrame]:
+    """Return columns by window, of each strategy and seed; ``drive`` of a window likewise."""
+    names = [name for name in dict.fromkeys(columns) if name in chosen]
+    drives = {DRIVE: chosen.groupby("profile_id")[[DRIVE]].first()} if DRIVE in chosen else {}
+    keyed = chosen.assign(**{TRAINED: chosen[TRAINED].astype(object).fillna(-1)})
+    means = keyed.groupby(["profile_id", *WINDOW_KEYS[:2]], observed=True)[names].mean()
+    return drives | {x: means[x].unstack(WINDOW_KEYS[:2]).sort_index(axis=1) for x in names}
+
+
+def _over(
+    tables: dict[str, pd.DataFrame], column: str, per: Sequence[str]
 ) -> tuple[pd.DataFrame, pd.DataFrame, list[object] | None]:
     """Return energy and distance by window, strategy and seed, and the drives of the windows."""
-    distances = [name for name in per if name in chosen]
-    groups = chosen.groupby([*WINDOW_KEYS[:2], "profile_id"], dropna=False, sort=False)
-    means = groups[list(dict.fromkeys([column, *distances]))].mean().reset_index()
-    means[TRAINED] = means[TRAINED].astype(object).fillna(-1)
-    means["way"] = means[distances].sum(axis=1) if distances else 1.0
-    energy, distance = (
-        means.pivot(index="profile_id", columns=[STRATEGY, TRAINED], values=name)
-        for name in (column, "way")
-    )
-    energy = energy.sort_index(axis=1).dropna(axis=1, how="all").dropna()
-    drives = None
-    if DRIVE in chosen:
-        drives = chosen.groupby("profile_id")[DRIVE].first().reindex(energy.index).tolist()
-    return energy, distance.loc[energy.index, energy.columns], drives
+    energy = tables[column].dropna(axis=1, how="all").dropna()
+    ways = [tables[name].reindex_like(energy).fillna(0.0) for name in per if name in tables]
+    way = sum(ways, 0.0 * energy) + float(not ways)
+    drives = tables[DRIVE].loc[energy.index, DRIVE].tolist() if DRIVE in tables else None
+    return energy, way, drives
 
 
 def by_driver(drivers: pd.DataFrame, column: str) -> pd.DataFrame:
