@@ -31,7 +31,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
     "lcc_rl + tools": {"lines": 44_141, "code": 29_277},
-    "tests": {"lines": 26356},
+    "tests": {"lines": 26_356},
     "conf": {"yaml": 165},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py
