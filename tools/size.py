@@ -30,13 +30,13 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 44_225, "code": 29_330},
-    "tests": {"lines": 26_680},
+    "lcc_rl + tools": {"lines": 44_141, "code": 29_277},
+    "tests": {"lines": 26_356},
     "conf": {"yaml": 165},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {
-    "names in several modules": 57,
+    "names in several modules": 56,
     "floors": 10,
     "circles": 0,
     "functions with a configuration": 128,

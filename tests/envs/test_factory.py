@@ -1,4 +1,4 @@
-"""Environments: specs, physics, determinism, gradients, compilation."""
+"""Environments: specs, physics, determinism, compilation."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ from torchrl.envs import check_env_specs
 from torchrl.envs.utils import step_mdp
 
 from lcc_rl.drivers.population import DriverPopulation, fixed
-from lcc_rl.envs import build_env, load_inputs
-from lcc_rl.envs.step import Step, closure, entries_of, pieces_of
+from lcc_rl.envs import load_inputs
 from lcc_rl.functional.power import motor_power
 
 T = 0.1
@@ -155,39 +154,6 @@ def test_horizon_truncates() -> None:
     assert last["truncated"].all()
     assert last["done"].all()
     assert not last["terminated"].any()
-
-
-def test_gradient_from_energies_to_actions_matches_finite_differences() -> None:
-    # Over 300 steps, in double precision; actions small enough not to collide.
-    cfg = compose("alcc", "scenario.horizon=300", "scenario.controllers.human.noise=0")
-    env = build_env(cfg, wavy_profiles(), POPULATION, 2, seed=5)
-    for piece in env.transform:
-        piece.double()
-    start = env.reset().apply(lambda x: x.double() if x.is_floating_point() else x)
-    actions = 0.05 * torch.sin(torch.arange(300, dtype=torch.float64) / 7.0)
-    actions = actions.view(-1, 1, 1, 1).repeat(1, 2, 1, 1)
-    # The motion and the power are all that the energies depend on.
-    advance = Step(closure(pieces_of(env), {("vehicles", "power")}), 300)
-
-    def energy(chosen):
-        state, total = entries_of(start), 0.0
-        for action in chosen:
-            reached = advance({**state, ACTION: action})
-            total = total + reached["vehicles", "power"].sum() * T / 1e3
-            state = {key: reached.get(key, value) for key, value in state.items()}
-        return total
-
-    chosen = actions.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(energy(chosen), chosen)
-    assert torch.isfinite(gradient).all()
-    assert (gradient.abs() > 0).all()
-    for step in (0, 100, 250):
-        shifted = [actions.clone() for _ in range(2)]
-        shifted[0][step, 1] += 1e-4
-        shifted[1][step, 1] -= 1e-4
-        with torch.no_grad():
-            difference = (energy(shifted[0]) - energy(shifted[1])) / 2e-4
-        torch.testing.assert_close(gradient[step, 1, 0, 0], difference, rtol=1e-2, atol=1e-3)
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from torchrl.collectors import (
 )
 from torchrl.data import Unbounded
 from torchrl.data.vla import UniformActionTokenizer
-from torchrl.envs import AsyncEnvPool, ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
+from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
 from torchrl.envs import transforms as room
 from torchrl.envs.transforms import Compose
 from torchrl.envs.utils import RandomPolicy, step_mdp
@@ -153,15 +153,14 @@ def test_a_transform(subtests) -> None:
 def test_the_environment_alone(subtests) -> None:
     for batch in [(), 2]:
         with subtests.test(batch=batch):
-            for env in (single_env("alcc", batch), TransformedEnv(single_env("alcc", batch))):
+            one = partial(single_env, "alcc", batch)
+            for env in (one(), TransformedEnv(one()), SerialEnv(2, one)):
+                check_env_specs(env)
                 assert (env.reward_key, env.action_key) == ("reward", "action")
                 assert list(env.full_reward_spec.keys(True, True)) == ["reward"]
                 assert env.rand_action()["action"].shape == env.action_spec.shape
-                for policy in (
-                    None,
-                    RandomPolicy(env.full_action_spec),
-                    AnyAction(env.action_spec),
-                ):
+                known = RandomPolicy(env.full_action_spec), AnyAction(env.action_spec)
+                for policy in (None, pushing(), *known):
                     assert env.rollout(4, policy)["next", "reward"].isfinite().all()
             assert single_env("alcc", batch).rand_step()["next", *STEP].unique() == 1
             group = small_env("alcc", batch, ["scenario.string='automated human automated'"])
@@ -317,26 +316,6 @@ def test_a_collector(subtests) -> None:
             frames = sum(batch.numel() if mask is None else mask.sum() for batch, mask in counted)
             assert frames == SIZE["total_frames"]
             assert all(batch["next", "reward"].isfinite().all() for batch in batches)
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_environments_side_by_side(subtests) -> None:
-    for wrap in [
-        lambda: SerialEnv(2, make),
-        lambda: SerialEnv(2, lambda: single_env("alcc", 3)),
-        lambda: TransformedEnv(SerialEnv(2, make), Compose(room.RewardSum(), room.StepCounter())),
-        lambda: AsyncEnvPool([make, make], backend="threading"),
-        lambda: ParallelEnv(2, make, mp_start_method="fork"),
-    ]:
-        with subtests.test(wrap=wrap):
-            env = wrap()
-            if not isinstance(env, AsyncEnvPool):
-                check_env_specs(env)
-            for policy in (None, pushing()):
-                played = env.rollout(4, policy)
-                assert played.shape[0] == 2
-                assert played["next", "reward"].isfinite().all()
-            env.close(raise_if_closed=False)
 
 
 def first_seeds(env) -> torch.Tensor:

@@ -8,7 +8,6 @@ import pytest
 
 import lcc_rl
 from lcc_rl.envs import factory
-from lcc_rl.errors import LccError
 
 SMALL = ("evaluation.profiles=2", "evaluation.drivers=2", "scenario.horizon=40")
 SMALL += ("evaluation.warm_up=0",)
@@ -40,18 +39,3 @@ def test_a_training_builds_a_trial_its_own_environment_and_that_of_the_evaluatio
 ) -> None:
     lcc_rl.learn("alcc", ["experiment=smoke", "training.episodes=20"], tmp_path / "run")
     assert len(built) == 3
-
-
-class TooWide(lcc_rl.pieces.Controller):
-    """It commands two accelerations of each vehicle."""
-
-    reads = ("self.speed",)
-
-    def command(self, speed):
-        return speed.repeat_interleave(2, -1)
-
-
-def test_a_controller_that_does_not_fit_leaves_no_files(tmp_path) -> None:
-    with pytest.raises(LccError, match="TooWide"):
-        lcc_rl.compare(TooWide, "idm", SMALL, tmp_path / "run")
-    assert not any((tmp_path / "run").rglob("*.*"))

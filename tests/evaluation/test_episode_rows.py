@@ -27,14 +27,8 @@ def strategy(variant: str, *overrides: str) -> Strategy:
 
 
 def run(variant: str, *overrides: str, drivers=5, batch_size=64, seed=1, sample_episodes=0):
-    return evaluate(
-        strategy(variant, *overrides),
-        INPUTS,
-        drivers,
-        batch_size,
-        seed,
-        sample_episodes,
-    )
+    driven = strategy(variant, *overrides)
+    return evaluate(driven, INPUTS, drivers, batch_size, seed, sample_episodes)
 
 
 def test_batch_size_does_not_change_a_row() -> None:
@@ -83,15 +77,6 @@ def test_what_the_leader_does_is_in_every_row_of_its_window() -> None:
     assert path == pytest.approx(drawn - (linear[1] - linear[0]), rel=0.03)
 
 
-def test_collisions_end_the_count() -> None:
-    cfg = compose("alcc", "scenario.horizon=100")
-    rammer = steady(1.0, build_env(cfg, PROFILES, POPULATION, len(PROFILES) * 3))
-    rows, _ = evaluate(Strategy("rammer", cfg, rammer), INPUTS, 3, 64, 1)
-    assert rows["collided"].all()
-    assert (rows["duration_s"] < 10.0).all()
-    assert (rows["min_ttc_s"] < 0.1).all()
-
-
 def test_what_many_automated_vehicles_do_is_added_up() -> None:
     # Two IDM drivers in the place of automated vehicles, and one of them: distances add up, and
     # what is safe is that of the worst.
@@ -125,11 +110,17 @@ def test_a_warm_up_is_driven_and_not_counted() -> None:
     assert late["leader_speed_mps"].iloc[0] == pytest.approx(float(PROFILES.record(0)[40:].mean()))
 
 
-def test_a_collision_counts_in_the_warm_up() -> None:
-    cfg = compose("alcc", "scenario.horizon=100", "evaluation.warm_up=9.5")
-    rammer = steady(1.0, build_env(cfg, PROFILES, POPULATION, len(PROFILES) * 3))
+def test_a_collision_ends_the_count_and_counts_in_the_warm_up() -> None:
+    def rammed(warm_up: float) -> tuple[pd.DataFrame, pd.DataFrame]:
+        cfg = compose("alcc", "scenario.horizon=100", f"evaluation.warm_up={warm_up}")
+        rammer = steady(1.0, build_env(cfg, PROFILES, POPULATION, count))
+        return evaluate(Strategy("rammer", cfg, rammer), INPUTS, 3, 64, 1, count)
+
     count = len(PROFILES) * 3
-    rows, steps = evaluate(Strategy("rammer", cfg, rammer), INPUTS, 3, 64, 1, count)
+    whole, (rows, steps) = rammed(0)[0], rammed(9.5)
+    assert (whole["duration_s"] < 10.0).all()
+    assert (whole["min_ttc_s"] < 0.1).all()
+    assert whole["collided"].all()
     assert rows["collided"].all()
     assert (rows["steps"] == 0).any()
     assert rows.loc[rows["steps"] == 0, ["min_gap_m", "total_energy_kj"]].isna().all(axis=None)

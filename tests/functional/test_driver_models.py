@@ -79,7 +79,7 @@ def test_stops_behind_a_standing_leader() -> None:
         speed, gap, _ = simulate_follower(
             leader.double(), *start, t(25.0), time_gap, LAWS[model](), 0.1
         )
-        assert gap.min() > 0.5, model
+        assert 1.5 < gap.min() <= gap[-1].max() < 2.1, model  # about s0
         assert speed[-1].max() < 0.05, model
 
 

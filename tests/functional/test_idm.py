@@ -32,15 +32,6 @@ def test_equilibrium_gap_is_equilibrium_and_capped() -> None:
     torch.testing.assert_close(acceleration, t(0.0), rtol=0, atol=1e-9)
 
 
-def test_stops_one_standstill_gap_before_an_obstacle() -> None:
-    # A standing leader 100 m ahead: the follower must come to rest about s0 behind it.
-    leader = torch.zeros(1201, 1, dtype=torch.float64)
-    speeds, gaps, _ = simulate_follower(leader, t(15.0), t(100.0), t(20.0), t(1.2), KNOWN, 0.1)
-    assert speeds[-1].item() < 0.01
-    assert gaps.min().item() > 1.8
-    assert abs(gaps[-1].item() - 2.0) < 0.2
-
-
 def test_string_with_long_time_gap_damps_a_disturbance() -> None:
     # With T = 2 s > 1 s the IDM string is stable: the dip in speed shrinks from car to car.
     time = torch.arange(1201) * 0.1
