@@ -46,7 +46,7 @@ from lcc_rl.results.remarks import (
     verdict,
 )
 from lcc_rl.results.task import ELECTRIC, KJ, Task, burns_one_fuel, in_units
-from lcc_rl.results.windows import DRIVE, TRAINED, ratios, savings, seeds_left_out, windows_of
+from lcc_rl.results.windows import DRIVE, TRAINED, savings, seeds_left_out, windows_of, with_bounds
 
 # Baselines of tables and verdicts; the first one that was evaluated is used.
 AGAINST = (RECORDED, HUMAN, "idm", "idm_acc_filtered", "idm_acc", "rule", "reference")
@@ -199,7 +199,7 @@ def summary(
         row["left_out"], seeds = seeds_left_out(windows, name, against)
         row["single"] = seeds == 1
         values: dict[str, Any] = {}
-        drawn = ratios(frame, [one for one in MEASURES if one.interval])
+        drawn = with_bounds(frame, [one for one in MEASURES if one.interval])
         for one in MEASURES:
             if one.interval:
                 values |= drawn.get(one.key, NOTHING).columns(one.key, one.factor)

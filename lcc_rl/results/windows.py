@@ -221,7 +221,7 @@ def savings(
     return saving(ours[0], theirs[0], paired, drives, ways=(ours[1], theirs[1]))
 
 
-def ratios(rows: pd.DataFrame, measures: Iterable[Measure]) -> dict[str, Estimate]:
+def with_bounds(rows: pd.DataFrame, measures: Iterable[Measure]) -> dict[str, Estimate]:
     """Return measures of a strategy's rows by key, without factors, with their intervals."""
     found = {one.key: one.columns for one in measures if {*one.columns} <= set(rows)}
     table, estimates = _by_window(rows, [name for names in found.values() for name in names]), {}
