@@ -121,10 +121,12 @@ def make_policy(
         ``[*batch, 1]``, on the device of the scene.
 
     Raises:
-        ConfigError: if the kind is unknown, constants are given without a rule, or the acceleration
-            of action 1 is unknown for a rule.
+        ConfigError: if the kind is unknown, constants are given without a rule or a bound without
+            a network on top of one, or the acceleration of action 1 is unknown for a rule.
     """
     size, seed = scene.observation_size, scene.seed
+    idle = f"agent.bound={bound:g} has no effect: it is of agent.policy={RESIDUAL}…, not {kind}"
+    require(bound == 1.0 or kind.startswith(RESIDUAL), idle)
     if kind == NETWORK_ALONE:
         require(not constants, "agent.constants belong to a rule: use agent.policy=idm or acc")
         return make_actor(size, 1, hidden, seed, activation).to(scene.device)

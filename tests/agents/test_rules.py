@@ -68,12 +68,15 @@ class Scaled(Controller):
         return action * self.scale
 
 
-def test_a_rule_whose_actions_have_an_unknown_scale_is_refused() -> None:
+def test_a_rule_of_unknown_scale_and_a_bound_of_no_residual_are_refused() -> None:
     cfg = tiny("train", "variant=alcc", "agent=analytic", "agent.policy=idm", agent=False)
     node = Node.of({"_target_": f"{__name__}.Scaled", "scale": 2.0}, "automated")
     cfg = cfg.with_(scenario={"controllers": {"automated": node}})
     with pytest.raises(ConfigError, match="needs the acceleration of action 1"):
         make_agent(cfg)
+    bounded = tiny("train", "variant=alcc", "agent=analytic", "agent.bound=0.5", agent=False)
+    with pytest.raises(ConfigError, match=r"agent\.bound=0\.5 has no effect: .* not network"):
+        make_agent(bounded)
 
 
 def test_a_residual_begins_at_the_rule_and_leaves_it_alone(subtests) -> None:
