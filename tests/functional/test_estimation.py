@@ -5,6 +5,7 @@ import torch
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.functional.driver_models import simulate_follower
 from lcc_rl.functional.estimation import Belief, PopulationMean, predict_and_update, prior
+from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.random import uniform
 
 T = 0.1
@@ -65,6 +66,28 @@ def test_recovers_the_driver_without_noise() -> None:
     *_, (_, _, belief) = learned(population, *motion)
     error = (belief.estimate[:, 1] - population.time_gap).abs() / population.time_gap
     assert error.median() < 0.02
+
+
+def test_an_update_is_the_best_linear_one_whatever_the_curvature() -> None:
+    mean, error = torch.tensor([0.4, 1.6]), 0.3
+    spread = torch.tensor([[0.0100, 0.0120], [0.0120, 0.0900]])
+    draw = (
+        mean
+        + torch.randn(1_000_000, 2, dtype=torch.float64) @ torch.linalg.cholesky(spread).T.double()
+    )
+    v, gap, rate, constants = 9.0, 15.0, 0.5, IDMConstants()
+    wanted = 2.0 + v * (draw[:, 1] + rate / 1.5**0.5 / 2.0)
+    seen = 1.0 - draw[:, 0] * (v / 15.0) ** 4 - (wanted / gap) ** 2
+    seen += error * torch.randn(len(seen), dtype=torch.float64)
+    joint = torch.cov(torch.cat([draw, seen.unsqueeze(1)], 1).T)
+    gain = joint[:2, 2] / joint[2, 2]
+    state = (torch.tensor([x]) for x in (v, gap, rate, v - 0.2 * T))  # brakes by 0.2 m/s²
+    before = Belief(mean, torch.tensor([spread[0, 0], spread[0, 1], spread[1, 1]]))
+    _, after = predict_and_update(*state, before, constants, T, error)
+    best = draw.mean(0) + gain * (-0.2 - seen.mean())
+    torch.testing.assert_close(after.estimate.double(), best, rtol=0.0, atol=2e-3)
+    left = (joint[:2, :2] - torch.outer(gain, joint[2, :2]))[[0, 0, 1], [0, 1, 1]]
+    torch.testing.assert_close(after.covariance.double(), left, rtol=0.0, atol=2e-4)
 
 
 def test_population_mean_is_the_mean_over_drivers() -> None:
