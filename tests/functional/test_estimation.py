@@ -71,10 +71,8 @@ def test_recovers_the_driver_without_noise() -> None:
 def test_an_update_is_the_best_linear_one_whatever_the_curvature() -> None:
     mean, error = torch.tensor([0.4, 1.6]), 0.3
     spread = torch.tensor([[0.0100, 0.0120], [0.0120, 0.0900]])
-    draw = (
-        mean
-        + torch.randn(1_000_000, 2, dtype=torch.float64) @ torch.linalg.cholesky(spread).T.double()
-    )
+    root = torch.linalg.cholesky(spread).T.double()
+    draw = mean + torch.randn(1_000_000, 2, dtype=torch.float64) @ root
     v, gap, rate, constants = 9.0, 15.0, 0.5, IDMConstants()
     wanted = 2.0 + v * (draw[:, 1] + rate / 1.5**0.5 / 2.0)
     seen = 1.0 - draw[:, 0] * (v / 15.0) ** 4 - (wanted / gap) ** 2
