@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
+from types import FunctionType, ModuleType
 from typing import Any
 
 import torch
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 
 from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, entries_of, tick, written
 from lcc_rl.errors import ConfigError, LccError, require
@@ -19,6 +21,7 @@ from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
 
 BATCH = 2
+PACKAGE = "lcc_rl"
 # Options that add pieces, by the entries, or the group of them, that these write.
 ADDED_BY = {
     **{f"{x}.{y}": "+slope=hills" for x in ("vehicles", "leader") for y in ("place", "grade")},
@@ -42,12 +45,7 @@ def check_pieces(
     """
     _check_wiring(pieces, [as_key(key) for key in actions])
     episodes = torch.arange(BATCH).unsqueeze(-1)
-    _play(pieces, horizon, actions, episodes)
-    # Values that the first step computed and stored may be kept.
-    before = [_kept(piece) for piece in pieces]
-    _play(pieces, horizon, actions, episodes + BATCH)
-    for piece, attributes in zip(pieces, before, strict=True):
-        _check_forgets(piece, attributes)
+    check_forgets(pieces, lambda n: _play(pieces, horizon, actions, episodes + n * BATCH))
 
 
 def _play(
@@ -93,36 +91,71 @@ def check_step(piece: Piece, before: State, reached: State) -> None:
 
 
 def _kept(piece: Piece) -> dict[str, list[Any]]:
-    """Return the attributes of a piece and its modules, with counts or items that show changes."""
-    attributes = {}
+    """Return what a piece may remember in, with counts or items that show changes."""
+    kept: dict[str, Any] = {}
     for path, module in piece.named_modules():
-        for name, value in {**vars(module), **dict(module.named_buffers(recurse=False))}.items():
-            if name == "_buffers":
+        attributes = {**vars(module), **dict(module.named_buffers(recurse=False))}
+        attributes.pop("_buffers")
+        at = f"{path}." if path else ""
+        kept |= {f"attribute '{at}{name}'": value for name, value in attributes.items()}
+        kept |= {f"variable {name!r}": value for name, value in _variables(module).items()}
+    return {name: _contents(value) for name, value in kept.items()}
+
+
+def _contents(value: Any) -> list[Any]:
+    """Return a value, its items, and counts of changes of its tensors."""
+    values = [value]
+    if isinstance(value, Mapping):
+        values += value.values()
+    elif isinstance(value, (list, set, deque)):
+        values += value
+    return values + changes([x for x in values if isinstance(x, Tensor)])
+
+
+def _variables(module: nn.Module) -> dict[str, Any]:
+    """Return the variables outside of a user's functions that these read, by name."""
+    waiting, found = [*vars(module).values(), *vars(type(module)).values()], {}
+    while waiting:
+        function = waiting.pop()
+        home = getattr(function, "__module__", None) or PACKAGE
+        if not isinstance(function, FunctionType) or home.partition(".")[0] == PACKAGE:
+            continue
+        known = inspect.getclosurevars(function)
+        for name, value in {**known.globals, **known.nonlocals}.items():
+            if name in found or isinstance(value, ModuleType):
                 continue
-            values = [value]
-            if isinstance(value, Mapping):
-                values += value.values()
-            elif isinstance(value, (list, set, deque)):
-                values += value
-            values += changes([x for x in values if isinstance(x, Tensor)])
-            attributes[f"{path}.{name}" if path else name] = values
-    return attributes
+            found[name] = value
+            if home in (getattr(value, "__module__", ""), type(value).__module__):
+                waiting.append(value)  # a function of the same module
+                found |= {f"{name}.{key}": x for key, x in getattr(value, "__dict__", {}).items()}
+    return found
 
 
-def _check_forgets(piece: Piece, before: Mapping[str, list[Any]]) -> None:
-    """Refuse a piece that stores state in an attribute, which all episodes would share."""
-    after = _kept(piece)
-    for name, values in after.items():
-        old = before.get(name, [])
-        if len(values) != len(old) or not all(
-            new is stored or (isinstance(new, int) and new == stored)
-            for new, stored in zip(values, old, strict=True)
-        ):
-            raise ConfigError(
-                f"{type(piece).__name__} remembers in its attribute {name!r}, which all episodes "
-                "share; a state must be an entry, which a controller names in remembers, see "
-                "docs/extend.md"
-            )
+def check_forgets(pieces: Sequence[Piece], play: Callable[[int], object]) -> None:
+    """Refuse pieces that store state where all episodes would share it.
+
+    Args:
+        pieces: the pieces.
+        play: lets them act on values that differ by a number, 0 and 1.
+
+    Raises:
+        ConfigError: naming the piece, and the attribute or variable that changes.
+    """
+    play(0)
+    before = [_kept(piece) for piece in pieces]  # what the first step stored may be kept
+    play(1)
+    for piece, kept in zip(pieces, before, strict=True):
+        for name, values in _kept(piece).items():
+            old = kept.get(name, [])
+            if len(values) != len(old) or not all(
+                new is stored or (isinstance(new, int) and new == stored)
+                for new, stored in zip(values, old, strict=True)
+            ):
+                raise ConfigError(
+                    f"{piece.title} remembers in its {name}, which all episodes share; a state "
+                    "must be an entry, which a controller of a class names in remembers, see "
+                    "docs/controllers.md"
+                )
 
 
 def _attempt(piece: Piece, action: object) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 from lcc_rl.config import load
 from lcc_rl.config.words import FILTERED
 from lcc_rl.drivers.population import bootstrap
-from lcc_rl.envs.checks import BATCH, check_step
+from lcc_rl.envs.checks import BATCH, check_forgets, check_step
 from lcc_rl.envs.clock import checked_seed
 from lcc_rl.envs.rowwise import Array, Rowwise
 from lcc_rl.errors import ConfigError, Diverged, raised_as, require, unknown_name
@@ -130,10 +130,11 @@ class Driver:
                 raise ConfigError(
                     f"{self.name} reads {name}, which is not measured here, only {measurable}"
                 )
-        self.program.step(*self._examples(BATCH), apply=check_step)  # type: ignore[misc]
+        step, pieces = partial(self.program.step, apply=check_step), self.program.pieces
+        check_forgets(pieces, lambda n: step(*self._examples(BATCH, 1.0 + n)))
 
-    def _examples(self, count: int) -> list[Tensor]:
-        state, seeds = torch.ones(count, len(self.names)), torch.zeros(count, 1).long()
+    def _examples(self, count: int, value: float = 1.0) -> list[Tensor]:
+        state, seeds = torch.full((count, len(self.names)), value), torch.zeros(count, 1).long()
         return [state, self.program.begin(state.double(), seeds)] if self.program.width else [state]
 
     def reset(self, cars: Sequence[Hashable] | None = None) -> None:

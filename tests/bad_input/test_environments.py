@@ -16,8 +16,10 @@ from lcc_rl.config.nodes import Node
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import DifferentiableRollout, StringCollector, build_env, make_env
 from lcc_rl.errors import ConfigError
-from lcc_rl.pieces import Controller, Feature
+from lcc_rl.interfaces.driver import Driver
+from lcc_rl.pieces import Controller, Feature, Law
 from lcc_rl.pieces.base import REWARD
+from lcc_rl.settings import path_of
 
 PROFILE, START, DRIVER = ("leader", "profile"), ("leader", "start"), ("human", "driver")
 SEED, GAP = ("episode", "seed"), ("vehicles", "gap")
@@ -135,6 +137,38 @@ class Remembering(Controller):
         return torch.zeros_like(speed)
 
 
+LAST: list[torch.Tensor] = []
+COUNT = 0
+
+
+class Store:
+    last: torch.Tensor | None = None
+
+
+def counted(speed):
+    global COUNT
+    COUNT += 1
+    return torch.zeros_like(speed)
+
+
+def listed(speed):
+    LAST[:] = [speed]
+    return torch.zeros_like(speed)
+
+
+def helped(speed):
+    return stored(speed)
+
+
+def stored(speed):
+    Store.last = speed
+    return torch.zeros_like(speed)
+
+
+def still(speed):
+    return torch.zeros_like(speed) * (0.0 if Store is None else len(LAST) + COUNT)
+
+
 class RememberingFeature(Feature):
     """Keeps the last gap in an attribute."""
 
@@ -165,6 +199,18 @@ def test_a_controller_that_remembers_in_an_attribute_is_refused() -> None:
         ),
         [(how, words.format(how)) for how in ("last", "seen", "total")],
     )
+
+
+def test_a_function_that_remembers_in_a_variable_is_refused() -> None:
+    words = rf"{__name__}.{{}} remembers in its variable '{{}}', which all"
+    names = [("counted", "COUNT"), ("listed", "LAST"), ("helped", "Store.last")]
+    cases = [(f"{__name__}.{name}", words.format(name, variable)) for name, variable in names]
+    check_refused(
+        lambda law: driven_by("controllers", "automated", {"_target_": path_of(Law), "law": law}),
+        cases,
+    )
+    check_refused(lambda law: Driver(law, 0.1), cases)
+    driven_by("controllers", "automated", {"_target_": path_of(Law), "law": f"{__name__}.still"})
 
 
 def test_pieces_and_controllers_inside_others_are_held_to_it_too() -> None:
