@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from numbers import Real
@@ -96,10 +96,15 @@ def how_to_install(extra: str) -> str:
 
 def unknown_name(what: str, name: str, valid: Iterable[str]) -> ConfigError:
     """Return the error for an unknown name with the valid names and the nearest one."""
-    options = sorted(valid)
+    known = sorted(valid)
+    hint = nearest(name, known)
+    return ConfigError(f"unknown {what} {name!r}; valid: {', '.join(known) or 'none'}.{hint}")
+
+
+def nearest(name: str, options: Sequence[str]) -> str:
+    """Return the question whether the nearest option is meant, or nothing."""
     near = get_close_matches(name, options, n=1)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
-    return ConfigError(f"unknown {what} {name!r}; valid: {', '.join(options) or 'none'}.{hint}")
+    return f" Did you mean {near[0]!r}?" if near else ""
 
 
 def require_known(what: str, names: str | Iterable[Any], valid: Iterable[str]) -> None:

@@ -44,6 +44,7 @@ from lcc_rl.errors import (
     ConfigError,
     LccError,
     in_short,
+    nearest,
     unknown_name,
 )
 
@@ -267,9 +268,11 @@ def find_target(target: str, where: str) -> Any:
     """
     module, _, name = target.rpartition(".")
     where = f"{where}.{TARGET}"
-    member = getattr(load_module(module, where, target), name, None)
+    holder = load_module(module, where, target)
+    member = getattr(holder, name, None)
     if not callable(member):
-        reason = f"{module} has no {name!r}" if member is None else "it is no class or function"
+        hint = f"{module} has no {name!r}.{nearest(name, dir(holder))}"
+        reason = hint if member is None else "it is no class or function"
         raise ConfigError(f"{where}: cannot find {target!r}: {reason}")
     return member
 

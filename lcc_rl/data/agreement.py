@@ -31,7 +31,8 @@ NEAR_MISTAKE, ALIKE = 1.25, 1.05  # largest factors to a mistake's coefficients;
 STRAY = 0.2  # largest distance left of a relative speed, as a share of the follower's
 LOUD, LOUD_RATE, LOUD_FACTOR = 0.3, 0.3, 1.15  # reported: lag [s], bias of a speed [m/s], factor
 STANDING, LEAST_STANDING = 0.5, 300  # speed [m/s], samples
-FAR_STANDING, BEHIND = 15.0, 0.5  # gap that may be in feet [m]; time gap of speeds in km/h [s]
+# Gap that may be in feet [m]; time gaps of speeds in m/s read as km/h, and of the reverse [s].
+FAR_STANDING, FAR_BEHIND, BEHIND = 15.0, 4.0, 0.5
 OF_LOGS = "relative_speed"  # key of a log's column from which the leader's speed is computed
 RATES = (5, 10, 15, 20, 25, 30, 50, 60)  # frames per second of recordings
 
@@ -162,6 +163,7 @@ def mistakes(units: Units) -> Iterator[tuple[bool, str, str, float, float]]:
     """
     if OF_LOGS in units:
         yield True, "leader", "is relative_speed the own speed minus the leader's?", -1.0, -1.0
+        yield True, "leader", "is it the leader's speed (data.columns.leader_speed)?", 1.0, 2.0
     else:
         yield True, "follower", "are leader and follower exchanged?", -1.0, -1.0
     for signal, subject, quantity, keys, leader, follower in (
@@ -352,8 +354,11 @@ def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Unit
         f"medians: speed {speed.median():.3g} m/s, gap {gap.median():.3g} m, time gap "
         f"{behind:.2g} s above 1 m/s; {', '.join(phrases)}"
     )
-    if OF_LOGS in units and behind < BEHIND:  # gaps agree with relative speeds whatever the own one
-        return Concern(f"{line}; is the own speed in km/h (data.units.follower_speed=km/h)?")
+    key = "speed" if "speed" in units else "follower_speed"
+    short = OF_LOGS in units and behind < BEHIND  # gaps agree with relative speeds whatever the own
+    unit = "km/h" if short else "m/s" if behind > FAR_BEHIND else ""
+    if unit and unit != units.get(key, SI["speed"]):
+        return Concern(f"{line}; is the own speed in {unit} (data.units.{key}={unit})?")
     stand = gap[episodes[["follower_speed_mps", "leader_speed_mps"]].max(axis=1) < STANDING]
     if len(stand) < LEAST_STANDING or stand.median() < FAR_STANDING or "ft" in units.values():
         return line

@@ -24,16 +24,22 @@ UNITS: dict[str, dict[str, float]] = {
 }
 SLOPES = ("%", "m/m")  # units of grades that are slopes, the tangent of the angle
 SI = {quantity: next(iter(units)) for quantity, units in UNITS.items()}
-# Spellings of units other than SI in names of columns; "min" may also mean the minimum.
+QUESTIONS = {  # for numbers outside of their range
+    "time": "; is it in ms, us or ns (units.time)?",
+    "grade": "; is it in % (leader.units.grade=%)?",
+}
+# Spellings of units in names of columns; "min" may also mean the minimum.
 UNIT_WORDS = {
     "time": {"ms": "ms|msecs?|milliseconds?", "us": "us|µs|microseconds?", "ns": "ns|nanoseconds?"},
     "speed": {
+        "m/s": "m ?/?s|mps|(met(re|er)s|m) per s(ec(ond)?)?",
         "km/h": "km ?/?h|kmph|kph|(kilomet(re|er)s|km) per h(ou)?r?",
         "mph": "mph|mi/h|miles? (per|an) hour",
         "ft/s": "ft/s|fps|(feet|ft) per s(ec(ond)?)?",
         "kn": "kn|kts?|knots?",
     },
     "length": {"ft": "ft|feet|foot", "cm": "cm", "km": "km"},
+    "grade": {"rad": "rad", "deg": "deg|degrees?", "%": "%|pct|per ?cent"},
 }
 Names = Mapping[str, str | None]  # names of columns in a file, by key
 Units = Mapping[str, str]  # units of columns, by key
@@ -66,7 +72,6 @@ class Column:
     def expected(self) -> str:
         """Description of valid values for messages."""
         unit = f" {SI[self.quantity]}" if self.quantity in SI else ""
-        unit += "; is it in ms, us or ns (units.time)?" * (self.quantity == "time")
         return f"a {'whole ' * self.whole}number from {self.least:g} to {self.most:g}{unit}"
 
 
@@ -108,8 +113,8 @@ def unit_size(quantity: str, unit: str) -> float | None:
 
 
 def named_unit(name: str, quantity: str) -> str | None:
-    """Return the unit in the name of a column, unless it is SI: ``mph`` for ``v (mph)``."""
-    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|[^\w/]|_", " ", name).lower()
+    """Return the unit in the name of a column: ``mph`` for ``v (mph)``."""
+    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])|[^\w/%]|_", " ", name).lower()
     for unit, spelled in UNIT_WORDS.get(quantity, {}).items():
         if re.search(rf"(?<![^\W\d])({spelled})(?![^\W\d])", spaced):
             return unit

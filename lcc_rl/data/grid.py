@@ -73,7 +73,9 @@ def places(
             name = (vehicles or {}).get(vehicle, vehicle)
             details.append(f"vehicle {name}" + f" ({role})" * (at is None))
         details.append(f"{sample['time_s']:g} s" if at is None else "")
-        details.append(f"column {header!r}" if column else "")
+        if key == "leader_speed" and (relative := named.get("relative_speed")):
+            header = f"{named.get('follower_speed', 'follower_speed_mps')}' + '{relative}"
+        details.append(f"column '{header}'" if column else "")
         file = f"{files[sample['file']]}: " if len(files) > 1 and "file" in sample else ""
         return file + ", ".join(filter(None, details))
 

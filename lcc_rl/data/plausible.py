@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from lcc_rl.arrays import Floats, Mask
-from lcc_rl.data.agreement import OF_PAIRS, check_pairs, numbers_of_pairs
+from lcc_rl.data.agreement import OF_LOGS, OF_PAIRS, check_pairs, numbers_of_pairs
 from lcc_rl.data.columns import Units
 from lcc_rl.data.grid import ORIGIN, Place, Places, divided, steps_of, stretches
 from lcc_rl.data.trajectories import BATCH, FRAME, starts_of
@@ -129,6 +129,8 @@ class Plausible(Settings):
                 continue
             row = int(np.argmax(new))
             limit = f"{setting}.{name}={getattr(self, name):g}"
+            if column == "leader_speed_mps" and OF_LOGS in unit:
+                form = form.replace("ft/s?", "ft/s, or a value for no target?")
             example = f"{place(row, column)} {form.format(values[row])}, {limit}"
             hint = remedy if name == "max_acceleration" else ""
             line = f"left out {int(new.sum()):,} implausible sample(s), the first: {example}"

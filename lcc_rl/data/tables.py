@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pandas.api.types import union_categoricals
 
-from lcc_rl.data.columns import SI, UNITS, Column, Names, Units, named_unit, unit_size
+from lcc_rl.data.columns import QUESTIONS, SI, UNITS, Column, Names, Units, named_unit, unit_size
 from lcc_rl.data.text import (
     NO_TABLE,
     NUMBER,
@@ -370,9 +370,10 @@ def checked_cells(
         wrong &= ~np.isnan(values)
     if wrong.any():
         row = int(np.argmax(wrong))
-        span = f", {column.least / scale:g} to {column.most / scale:g} in its unit"
-        words = f"holds {_shown(cells[row])}; expected {column.expected}"
-        raise fault(row, words + span * (scale != 1.0))
+        hint = f", {column.least / scale:g} to {column.most / scale:g} in its unit"
+        if scale == 1.0:
+            hint = QUESTIONS.get(column.quantity, "")
+        raise fault(row, f"holds {_shown(cells[row])}; expected {column.expected}{hint}")
     return values
 
 

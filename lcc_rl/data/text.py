@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from io import BufferedReader
 from itertools import takewhile
+from operator import add
 from pathlib import Path
 from typing import Any
 
@@ -276,18 +277,18 @@ def is_relative(name: str) -> bool:
 def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: str) -> DataError:
     """Return the error for missing columns of a table."""
     folded = {name.lower(): name for name in header}
-    near = get_close_matches(missing[0].lower(), folded, n=1)
-    hint = f" (is it {folded[near[0]]!r}?)" if near else ""
+    nearest = [get_close_matches(name.lower(), folded, n=1) for name in missing]
+    hints = [f" (is it {folded[near[0]]!r}?)" if near else "" for near in nearest]
     fix = f"; name the columns by {option}={{…}}" if option else "; convert them to SI, rename them"
     if relative := next(filter(is_relative, header), None) if "speed" in missing[0] else None:
-        hint = f" ({relative!r} is relative: add the follower's speed)"
+        hints[0] = f" ({relative!r} is relative: add the follower's speed)"
         if missing[0] == "leader_speed_mps":
-            hint = f" (set data.columns.relative_speed={relative})"
+            hints[0] = f" (set data.columns.relative_speed={relative})"
     if "gap_m" in missing and any("pos" in name.lower() for name in header):
         fix = OF_POSITIONS
     if sum(map(bool, header)) == 1 or header[0].startswith(("#", "%")):
         fix = ": is it a title or a comment? The first line must name the columns"
     if all(re.fullmatch(NUMBER, name) for name in header if name):
         fix = ": is the header missing? The first line must name the columns"
-    shown = ", ".join(header)[:400]
-    return DataError(f"{source}: lacks the column {', '.join(missing)}; it has {shown}{hint}{fix}")
+    lacks = ", ".join(map(add, missing, hints))
+    return DataError(f"{source}: lacks the column {lacks}; it has {', '.join(header)[:400]}{fix}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from argparse import ArgumentTypeError
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.config import load
+from lcc_rl.config.schemas import TimeStep
 from lcc_rl.config.words import FILTERED
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.checks import BATCH, check_forgets, check_step
@@ -37,6 +39,7 @@ from lcc_rl.interfaces.exported import (
 from lcc_rl.pieces import CBFFilter, Controller
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.world import World
+from lcc_rl.runs.arguments import typed
 
 # Motion of the vehicle, of the vehicle ahead and of the vehicle behind.
 MEASURED = (
@@ -54,7 +57,8 @@ class Driver:
         name: a run, a run folder, a policy file, ``pretrained/<name>``, or a controller by name
             (``"idm_acc"``), as object, class, function, file or node, see :func:`lcc_rl.compare`.
             ``_filtered`` at the end of a rule's name, also in ``{name: rule}``, adds the filter.
-        time_step: duration of a step of the simulator [s]; a policy needs that of its training.
+        time_step: duration of a step of the simulator, 0.001 to 0.5 s; a policy needs that of its
+            training.
         trust: modules outside this package that a policy may name.
         safety: the safety filter, or changed settings, such as ``{"margin": 2.0}``, of the default:
             that of the policy's training, or of ``+filter=cbf`` for rules with ``_filtered``.
@@ -91,12 +95,12 @@ class Driver:
         drivers: Population | str | Path | None = None,
         limits: Mapping[str, float] | None = None,
     ) -> None:
-        usable = isinstance(time_step, (int, float)) and 0.0 < time_step < math.inf
-        require(usable, f"time_step must be a positive number of seconds, got {time_step!r}")
+        with raised_as(ConfigError, "time_step", ArgumentTypeError):
+            self.time_step: float = typed(TimeStep)(str(time_step))
         self.name, spec = one_of(name)
         first = checked_seed(seed)
         require(first is not None, "seed must be a whole number, got None")
-        self.time_step, self.seed = time_step, first or 0
+        self.seed = first or 0
         if is_policy(spec):
             require(drivers is None, f"drivers needs a rule; {self.name} is a policy")
             self.program = program(spec, trust, safety=safety, limits=limits)

@@ -197,14 +197,14 @@ def _written(
     normalize: Any = None,
     safety: Safety = None,
     limits: Mapping[str, float] | None = None,
-) -> tuple[Path, list[str]]:
-    """Write the file, see :func:`export`; return its path and the inputs of its program."""
+) -> tuple[Path, DrivingProgram | None]:
+    """Write the file, see :func:`export`; return its path and its program."""
     path = new_file(path, "name")
     require_known("ending", path.suffix, [*EXPORTERS, CODE, PAGE])
     network = None if isinstance(policy, Controller) else network_of(policy, normalize)
     name, spec = one_of(policy) if network is None else (type(policy).__name__, network)
     cfg = None if network is None else load("train", with_variant(variant, overrides))
-    rule, names = cfg is None and not is_policy(spec), list[str]()
+    rule, module = cfg is None and not is_policy(spec), None
     given: dict[str, Any] = {"safety": safety, "limits": limits}
     if path.suffix == PAGE:
         text = f"{name}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
@@ -216,14 +216,14 @@ def _written(
             require(safety is None and limits is None, text)
             given = _changes(overrides, rule, path.suffix)
         module = _rule(policy, trust, **given) if rule else program(spec, trust, cfg, **given)
-        about, names = described(module, name), module.names
+        about = described(module, name)
         if path.suffix == CODE:
             content = c_code(module, about, path.stem).encode()
         else:
             content = EXPORTERS[path.suffix](module, about)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
-    return path, names
+    return path, module
 
 
 def _changes(overrides: Sequence[str], rule: bool, ending: str) -> Any:
@@ -307,11 +307,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     text += "of a rule or a controller of your own (time_step=0.02)"
     parser.add_argument("settings", nargs="*", default=[], help=text)
     options = parser.parse_args(arguments)
-    path, names = _written(options.policy, options.path, options.trust, overrides=options.settings)
-    if path.suffix == PAGE:
+    path, made = _written(options.policy, options.path, options.trust, overrides=options.settings)
+    if made is None:
         print(f"{path}: the ring road in the browser, with {options.policy}")
         return 0
-    for column in map(described_input, names):
+    for column in map(described_input, made.names):
         print(f"  {column.name} [{column.unit}]: {column.meaning}")
-    print(f"{path}: maps these inputs, in this order, to the acceleration [m/s²]")
+    text = "maps these inputs, in this order, to the acceleration [m/s²]"
+    print(f"{path}: {text}, every {made.controller.time_step:g} s")
     return 0

@@ -66,6 +66,7 @@ WRONG = {
     # objects of another kind
     "data._target_=os.getcwd": "data.*",
     "reward.terms.safety._target_=nowhere.X": "cannot find 'nowhere.X'",
+    "data._target_=lcc_rl.data.sources.EpisodeSource": "Did you mean 'EpisodesSource'",
     # what does not fit together
     "scenario.string='automated bus'": "role 'bus', but .* only automated, human",
     "scenario.string='automated (human*2'": "never closed at character 11",

@@ -36,7 +36,8 @@ NAMED = {
     "Time [us]": "us",
 }
 UNNAMED = {
-    "speed": ("speed_mps", "v [m/s]", "v_ms", "kmhspeed", "knee"),
+    "speed": ("kmhspeed", "knee", "maximum_s", "lamps"),
+    "grade": ("slope", "trade"),
     "length": ("gap_m", "left", "min_gap", "shift"),
     "time": ("time_s", "timestamps", "min_time", "status"),
 }
@@ -45,6 +46,8 @@ UNNAMED = {
 def test_the_name_of_a_column_may_say_its_unit(tmp_path) -> None:
     for quantity, names in UNNAMED.items():
         assert [named_unit(name, quantity) for name in names] == [None] * len(names)
+    for name in ("speed_mps", "v_mps", "v_ms", "speed_m_s", "v [m/s]"):
+        assert named_unit(name, "speed") == "m/s"
     keys = {"speed": "speed", "length": "gap", "time": "time"}
     for name, unit in NAMED.items():
         quantity = next(x for x in ("speed", "length", "time") if unit in UNITS[x])

@@ -441,6 +441,10 @@ def test_a_relative_speed_is_no_leaders_speed() -> None:
     table[SPEEDS] = table[SPEEDS].add(2.6 * table["follower_speed_mps"], axis=0)  # own in km/h
     *_, last = judged(table, {"relative_speed": "m/s"})
     assert (type(last), last[-32:]) == (Concern, "data.units.follower_speed=km/h)?")
+    slow = wavy().assign(gap_m=lambda x: x["gap_m"] + 120.0)
+    *_, last = judged(slow, {"relative_speed": "m/s", "follower_speed": "km/h"})
+    assert "; is the own speed in m/s (data.units.follower_speed=m/s)?" in last
+    assert not isinstance(judged(slow, {"relative_speed": "m/s"})[-1], Concern)
     table = irregular()
     relative = table["leader_speed_mps"] - table["follower_speed_mps"]
     cases = [
@@ -451,6 +455,9 @@ def test_a_relative_speed_is_no_leaders_speed() -> None:
         ),
     ]
     check_refused(judged, cases, DataError)
+    table["leader_speed_mps"] += table["follower_speed_mps"]  # relative_speed holds the leader's
+    words = r"the follower does, by -2\.0.* is it the leader's speed \(data\.columns\.leader_speed"
+    check_refused(judged, [(table, {"relative_speed": "m/s"}, words)], DataError)
 
 
 def test_two_names_of_one_car_are_refused() -> None:

@@ -271,18 +271,14 @@ def test_one_vehicle_in_another_unit_is_named(tmp_path) -> None:
 
 
 def test_one_pair_in_another_unit_is_named_as_the_file_calls_it(tmp_path) -> None:
-    table = pairs(episodes=3, rows=120).rename(columns={"follower_speed_mps": "v"})
-    table[["v", "leader_speed_mps"]] *= 3.6
+    names = {"leader_speed": "ahead", "follower_speed": "v"}
+    table = pairs(episodes=3, rows=120).rename(columns={f"{x}_mps": names[x] for x in names})
+    table[["v", "ahead"]] *= 3.6
     table.loc[table["episode"] == 1, "v"] /= 3.6
-    source = EpisodesSource(
-        path=written(tmp_path, table),
-        columns={"follower_speed": "v"},
-        units={"follower_speed": "km/h", "leader_speed": "km/h"},
-    )
-    with pytest.raises(
-        DataError,
-        match=r"data row 121, column 'v': by their .* follower's speed in m/s \(d.*; 1 of 3",
-    ):
+    kmh, path = dict.fromkeys(names, "km/h"), written(tmp_path, table)
+    source = EpisodesSource(path=path, columns=names, units=kmh)
+    words = r"data row 121, column 'v': by their .* follower's speed in m/s \(d.*; 1 of 3"
+    with pytest.raises(DataError, match=words):
         source.load()
 
 
@@ -513,6 +509,11 @@ def test_the_log_of_a_car_has_relative_speeds_targets_and_a_flag(tmp_path) -> No
     np.testing.assert_allclose(fast.episodes[SPEEDS], found[SPEEDS], atol=1e-4)
     with pytest.raises(DataError, match=r"data.units.leader_speed=km/h has no effect: no column"):
         EpisodesSource(path=str(tmp_path / "log.csv"), columns=LOG, units=KMH).load()
+    none = log.assign(range_rate=log["range_rate"].where(log["ok"], 255))
+    none.drop(columns="ok").to_csv(tmp_path / "none.csv", index=False)
+    plain = {key: name for key, name in LOG.items() if name not in ("ok", "id")}
+    report = "".join(EpisodesSource(path=str(tmp_path / "none.csv"), columns=plain).load().report)
+    assert "'v' + 'range_rate' holds 167.108 m/s (is it km/h or ft/s, or a value for no" in report
     bad = other.assign(ok="maybe")
     bad.to_csv(tmp_path / "bad.csv", index=False)
     with pytest.raises(DataError, match="data row 1, column 'ok' is 'maybe'; expected 1 or 0"):

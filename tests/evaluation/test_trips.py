@@ -21,6 +21,7 @@ from lcc_rl.evaluation.metrics import energy_measures
 
 COLUMNS = "leader.columns={drive: trip, time: t, speed: v}"
 GRADED = ["leader.columns={drive: trip, time: t, speed: v, grade: slope}", "leader.units.grade=%"]
+KMH = "leader.units.speed=km/h"
 SECONDS = 60
 
 
@@ -126,7 +127,7 @@ def test_trips_are_sorted_by_their_numbers(path) -> None:
 
 
 def test_refused_trips(path) -> None:
-    trips = made()
+    trips = made().assign(v_mps=1.0, slope_pct=0.0)
     faults = {
         "word": (trips.assign(v=trips["v"].astype(str).where(trips.index != 70, "x")), []),
         "fast": (trips.assign(v=3.6 * trips["v"]), []),
@@ -145,8 +146,14 @@ def test_refused_trips(path) -> None:
             ("fast", r"trips\.csv: .*data row 1\d, column 'v' .*leader\.units\.speed"),
             ("seed=3", "seed=3 has no effect on the energy of given trips"),
             ("energy=mixture", "a mixture has several models"),
-            ("leader.columns.drive=id", "lacks the column id; it has trip, t, v, slope"),
-            (GRADED[0], r"data row 62, column 'slope' holds '3\.0'.*0\.3 rad"),
+            ("leader.columns.drive=id", "lacks the column id; it has trip, t, v, slope, v_mps, "),
+            (GRADED[0], r"holds '3\.0'.*0\.3 rad; is it in % \(leader\.units\.grade=%\)\?"),
+            ("leader.columns.grade=slope_pct", "'slope_pct' contains %, .*leader.units.grade=%"),
+            (
+                "leader.columns.speed=v_mps",
+                KMH,
+                "'v_mps' contains m/s, but it is read in km/h; set",
+            ),
             ("steep", *GRADED, r"column 'slope' holds '45\.0'; .* 0\.3 rad, -30 to 30 in its unit"),
             (*GRADED, "energy=alcc", "PaperMotor has no grade"),
         ],
