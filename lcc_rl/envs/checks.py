@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from difflib import get_close_matches
 from types import FunctionType, ModuleType
 from typing import Any
 
@@ -15,7 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, entries_of, tick, written
-from lcc_rl.errors import ConfigError, LccError, require
+from lcc_rl.errors import ConfigError, LccError, nearest, require
 from lcc_rl.functional.guard import changed, changes
 from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
@@ -219,8 +218,7 @@ def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
             option = ADDED_BY.get(key[0], ADDED_BY.get(name))
             require(option is None, f"{where}; {option} adds one that does")
             near = sorted(".".join(other) for other in keys if other[0] == key[0])
-            close = get_close_matches(name, near, n=1)
-            hint = f" Did you mean {close[0]}?" if close else ""
+            hint = nearest(name, near)
             where += ", only " + ", ".join(near) if near else "; vehicles' are self.x and ahead.x"
             raise ConfigError(
                 f"{where}; was a piece removed, or does it belong to another scenario=…?{hint}"
