@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from types import FunctionType, ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
@@ -102,12 +103,14 @@ def _kept(piece: Piece) -> dict[str, list[Any]]:
 
 
 def _contents(value: Any) -> list[Any]:
-    """Return a value, its items, and counts of changes of its tensors."""
+    """Return a value, its items, and numbers that change with its array or tensors."""
     values = [value]
     if isinstance(value, Mapping):
         values += value.values()
     elif isinstance(value, (list, set, deque)):
         values += value
+    elif isinstance(value, np.ndarray):
+        values.append(hash(value.tobytes()))
     return values + changes([x for x in values if isinstance(x, Tensor)])
 
 

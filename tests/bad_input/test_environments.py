@@ -5,6 +5,7 @@ from __future__ import annotations
 import traceback
 from collections import deque
 
+import numpy as np
 import pytest
 import torch
 from commands import DATA
@@ -138,6 +139,7 @@ class Remembering(Controller):
 
 
 LAST: list[torch.Tensor] = []
+ARRAY = np.zeros(2)
 COUNT = 0
 
 
@@ -153,6 +155,11 @@ def counted(speed):
 
 def listed(speed):
     LAST[:] = [speed]
+    return torch.zeros_like(speed)
+
+
+def arrayed(speed):
+    ARRAY[:] = speed[:, 0, 0].numpy()
     return torch.zeros_like(speed)
 
 
@@ -203,7 +210,12 @@ def test_a_controller_that_remembers_in_an_attribute_is_refused() -> None:
 
 def test_a_function_that_remembers_in_a_variable_is_refused() -> None:
     words = rf"{__name__}.{{}} remembers in its variable '{{}}', which all"
-    names = [("counted", "COUNT"), ("listed", "LAST"), ("helped", "Store.last")]
+    names = [
+        ("counted", "COUNT"),
+        ("listed", "LAST"),
+        ("arrayed", "ARRAY"),
+        ("helped", "Store.last"),
+    ]
     cases = [(f"{__name__}.{name}", words.format(name, variable)) for name, variable in names]
     check_refused(
         lambda law: driven_by("controllers", "automated", {"_target_": path_of(Law), "law": law}),
