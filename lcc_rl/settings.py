@@ -260,6 +260,11 @@ def path_of(kind: Any) -> str:
     return f"{module}.{name}"
 
 
+def is_ours(path: Any) -> bool:
+    """Whether a module, class or function is of this package, by its dotted path."""
+    return f"{path}.".startswith("lcc_rl.")
+
+
 def find_target(target: str, where: str) -> Any:
     """Return the class or function of a ``_target_``.
 
@@ -291,7 +296,7 @@ def load_module(module: str, where: str, target: str = "") -> Any:
         hint = ""
         if not isinstance(error, (ImportError, AttributeError, ValueError)):
             raise ConfigError(f"{where}: {module} cannot be imported: {error}") from error
-        if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("lcc_rl"):
+        if isinstance(error, ModuleNotFoundError) and not is_ours(error.name):
             hint = "; for your own file, export PYTHONPATH=<its folder>"
         text = f"{where}: cannot find {target or module!r}: {error}{hint}"
         raise ConfigError(text) from error

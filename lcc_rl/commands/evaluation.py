@@ -6,7 +6,7 @@ import dataclasses
 import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import pandas as pd
@@ -17,11 +17,10 @@ from lcc_rl.config.compose import identity, with_inputs
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.envs.inputs import build_energy, second_energy
-from lcc_rl.errors import require
 from lcc_rl.evaluation.comparison import IDENTITY, Comparison
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.episodes import plan_of
-from lcc_rl.evaluation.fit import classes, other_drivers, task_of
+from lcc_rl.evaluation.fit import check_table_unit, classes, other_drivers, task_of
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import is_shipped
 from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, read_parquet
@@ -154,20 +153,18 @@ def evaluate_and_write(comparison: Comparison, inputs: Inputs, folder: Path, qui
 
 def reports(rows: Rows, cfg: StudyConfig, against: str | None = None) -> Iterator[Report]:
     """Yield the report of each source of leaders or case of a platoon."""
+    check_table_unit(cfg)
     if isinstance(rows, pd.DataFrame) and cfg.evaluation.rows == "vehicles":
-        require(
-            cfg.unit is None, f"unit={cfg.unit}: tables of platoons have no energy per distance"
-        )
         for source, group in by_source(rows):
             of = f"{source}: " if source else ""
             for case in dict.fromkeys(group["case"]):
                 yield case_report(group, case, f"{of}{case}")
         return
     notes = list(filter(None, [other_drivers(cfg), classes(cfg)]))
-    made = partial(report, task=task_of(cfg), energy=build_energy(cfg), against=against)
+    task, energy, second = task_of(cfg), build_energy(cfg), second_energy(cfg)
     of_sweep = rows.attrs.get("remarks", ()) if isinstance(rows, pd.DataFrame) else ()
     for source, group in by_source(windows_for(rows)):
-        result = made(group, of=source, second=second_energy(cfg), unit=cfg.unit)
+        result = report(group, task, energy, source, against=against, second=second, unit=cfg.unit)
         windows, drivers = group["profile_id"].nunique(), int(group["drivers"].max())
         size = size_in_words(cfg, windows, drivers)
         yield dataclasses.replace(result, remarks=[*result.remarks, *notes, *of_sweep], size=size)

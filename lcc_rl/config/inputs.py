@@ -20,12 +20,11 @@ from lcc_rl.config.words import FILTERED, YAML, module_named
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.paths import matching
 from lcc_rl.io.settings import parse_yaml, read_text
-from lcc_rl.settings import TARGET, load_module
+from lcc_rl.settings import TARGET, is_ours, load_module
 
 FileHashes = dict[str, dict[str, str]]
 NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
 NAMING_SECTIONS = ("compare", "policy")  # sections that name policies, controllers and classes
-OURS = "lcc_rl."
 FRESH = 2.0  # a file may change again within the resolution of its times [s]
 PYTHON = Path(sysconfig.get_path("stdlib"))
 INSTALLED = {"site-packages", "dist-packages"}
@@ -64,8 +63,8 @@ def inputs_of(content: Mapping[str, Any]) -> FileHashes:
 def _files(key: str, named: bool, holder: Any, name: str) -> Iterator[Path]:
     """Yield the files that a setting names."""
     path, last = Path(expanduser(name)), key.rpartition(".")[2]
-    target = holder.get(TARGET, OURS) if isinstance(holder, Mapping) else OURS
-    own = not str(target).startswith(OURS)  # the node of a user's class or function
+    target = holder.get(TARGET) if isinstance(holder, Mapping) else None
+    own = target is not None and not is_ours(target)  # the node of a user's class or function
     if module := module_named(key, name):
         yield from _own_files(module)
     elif named:
@@ -96,7 +95,7 @@ def compared_files(name: str) -> Iterator[Path]:
 def _own_files(module: str) -> Iterator[Path]:
     """Yield the file of a user's module and the files beside it that it imports, or they do."""
     path = Path()  # a notebook has no file
-    if not f"{module}.".startswith(OURS) and "/" not in module:
+    if not is_ours(module) and "/" not in module:
         with suppress(ConfigError):
             path = Path(getattr(load_module(module, TARGET), "__file__", None) or "")
     installed = INSTALLED.intersection(path.parts) or path.is_relative_to(PYTHON)
@@ -122,7 +121,7 @@ def _imports(path: Path, package: str) -> set[str]:
             with suppress(ImportError):
                 base = resolve_name("." * node.level + (node.module or ""), package)
                 names |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
-    return {name for name in names if not f"{name}.".startswith(OURS)}
+    return {name for name in names if not is_ours(name)}
 
 
 _digests: dict[tuple[object, ...], str] = {}  # once per content of a file and process

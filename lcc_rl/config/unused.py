@@ -11,7 +11,7 @@ from lcc_rl.config.schemas import BaseConfig, StudyConfig, TrainConfig
 from lcc_rl.config.words import RECORDED, key_of, typed_keys
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.pattern import AUTOMATED, RING
-from lcc_rl.settings import TARGET
+from lcc_rl.settings import TARGET, is_ours
 
 NO_AGENT = ("agent=none", "agent=null")
 BASELINES = "evaluation.baselines"
@@ -78,7 +78,7 @@ def refuse(overrides: Iterable[str], reasons: Mapping[str, str]) -> None:
 def of_package(part: Any) -> bool:
     """Return whether all nodes in a part of a configuration are of the package's code."""
     settings = (node.settings for node in nodes_in(part))
-    return all(str(x.get("law") or x[TARGET]).startswith("lcc_rl.") for x in settings)
+    return all(is_ours(x.get("law") or x[TARGET]) for x in settings)
 
 
 def _of_road(cfg: StudyConfig) -> Iterator[tuple[str, str]]:

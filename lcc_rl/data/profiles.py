@@ -174,7 +174,9 @@ def from_records(
     if not records:
         raise DataError(NONE_LEFT)
     for name, record in zip(names, records, strict=True):
-        for sample in (~(record.isfinite() & (record >= 0))).nonzero()[:1, 0].tolist():
+        fits = record.isfinite() & (record >= 0)
+        if not fits.all():
+            sample = int(fits.int().argmin())
             wrong = f"sample {sample}, from 0, is {record[sample]:g}"
             raise DataError(f"profile {name}: {wrong}; speeds must be finite and not negative")
     lengths = torch.tensor([len(record) for record in records])

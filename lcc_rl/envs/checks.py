@@ -19,9 +19,9 @@ from lcc_rl.errors import ConfigError, LccError, nearest, require
 from lcc_rl.functional.guard import changed, changes
 from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
+from lcc_rl.settings import is_ours
 
 BATCH = 2
-PACKAGE = "lcc_rl"
 # Options that add pieces, by the entries, or the group of them, that these write.
 ADDED_BY = {
     **{f"{x}.{y}": "+slope=hills" for x in ("vehicles", "leader") for y in ("place", "grade")},
@@ -119,8 +119,8 @@ def _variables(module: nn.Module) -> dict[str, Any]:
     waiting, found = [*vars(module).values(), *vars(type(module)).values()], {}
     while waiting:
         function = waiting.pop()
-        home = getattr(function, "__module__", None) or PACKAGE
-        if not isinstance(function, FunctionType) or home.partition(".")[0] == PACKAGE:
+        home = getattr(function, "__module__", None)
+        if not isinstance(function, FunctionType) or home is None or is_ours(home):
             continue
         known = inspect.getclosurevars(function)
         for name, value in {**known.globals, **known.nonlocals}.items():

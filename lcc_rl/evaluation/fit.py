@@ -21,11 +21,22 @@ from lcc_rl.io.files import parquet_metadata
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.runs import differing, flatten
 from lcc_rl.results.task import OF_FUEL, Task, burns_one_fuel, check_unit
-from lcc_rl.settings import TARGET, parse
+from lcc_rl.settings import TARGET, is_ours, parse
 
 MESSAGES = "communication"  # name of the piece with messages between connected vehicles
 FIRST_LAYER = "module.0.0.weight"  # first layer of a policy's network
 TRAFFIC_NODES = ("data", "split", "drivers")
+
+
+def check_table_unit(cfg: StudyConfig) -> None:
+    """Check that energies of a configuration's tables have its ``unit``, if it gives one."""
+    if (unit := cfg.unit) is None:
+        return
+    episodes, task = cfg.evaluation.rows == "episodes", task_of(cfg)
+    require(episodes, f"unit={unit}: tables of platoons have no energy per distance")
+    per = task is None or task.measure.per
+    require(per, f"unit={unit}: the score of this task is no energy per distance")
+    check_unit(unit, build_energy(cfg))
 
 
 def task_of(cfg: StudyConfig) -> Task | None:
@@ -108,7 +119,7 @@ def of_observation(cfg: StudyConfig) -> set[str]:
     """Return the pieces that belong to an observation: named as an entry, or a user's own."""
     scales = cfg.observation.settings.get("scales", {})
     kinds = {x: node.settings[TARGET] for x, node in cfg.scenario.pieces.items() if node}
-    return {x for x, kind in kinds.items() if x in scales or not kind.startswith("lcc_rl.")}
+    return {x for x, kind in kinds.items() if x in scales or not is_ours(kind)}
 
 
 def _observed(cfg: StudyConfig, names: Iterable[str]) -> dict[str, Any]:

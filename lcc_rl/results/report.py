@@ -280,10 +280,8 @@ def report(
             that of the task, or kJ/km, and g/km for one fuel.
 
     Raises:
-        ConfigError: if the unit is unknown or does not fit the score or the energy models.
+        ConfigError: if the unit is unknown or does not fit the energy models.
     """
-    per = task is None or bool(task.measure.per)
-    require(per or unit is None, f"unit={unit}: the score of this task is no energy per distance")
     against = strategy_named(against, windows["strategy"].unique()) if against else None
     if task:
         task = replace(task, against=against) if against else task.among(windows["strategy"])
