@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lcc_rl.energy.base import BURNT, EnergyModel
 from lcc_rl.energy.electric import PaperMotor
-from lcc_rl.errors import ConfigError, require, require_known
+from lcc_rl.errors import ConfigError, raised_as, require, require_known
 from lcc_rl.functional.guard import unchanged
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.settings import Positive, Settings, values
@@ -21,6 +21,9 @@ from lcc_rl.settings import Positive, Settings, values
 Quantity = Callable[[EnergyModel, Tensor, Tensor], Tensor]
 # Distance of commands from the largest acceleration, which rounded speeds would exceed [m/s²].
 ROUNDING = 1e-3
+# Speed [m/s] at which power and kinetic energy are compared, and their largest factor: the motor of
+# the ALCC paper has 2.6, other shipped models 0.6 to 1.1; km/h for m/s have 3.6.
+PROBE, MOST_OFF = 10.0, 3.0
 
 
 class VehicleClass(Settings):
@@ -42,6 +45,20 @@ class VehicleClass(Settings):
         kind, mass, share = type(self.energy).__name__, self.energy.mass, self.energy.efficiency
         require(mass > 0.0, f"{kind}: an energy model needs its mass [kg], got {mass!r}")
         require(0.0 < share <= 1.0, f"{kind}: efficiency must lie from 0 to 1, got {share!r}")
+        self._check_units(kind)
+
+    def _check_units(self, kind: str) -> None:
+        """Refuse a power that rises otherwise with acceleration than the kinetic energy."""
+        mass, share = self.energy.mass, self.energy.efficiency
+        motion = torch.full((2,), PROBE), torch.tensor([0.0, 0.1])
+        with raised_as(ConfigError, f"{kind}.power", Exception):
+            power = unchanged(self.energy.power, motion, kind, ("speed", "acceleration"))
+            risen, stored = float(power[1] - power[0]) / 0.1, PROBE * self.energy.inertia / share
+        require(
+            stored / MOST_OFF <= risen <= stored * MOST_OFF,
+            f"{kind}.power at {PROBE:g} m/s rises by {risen:.4g} W per m/s², its kinetic energy by "
+            f"{stored:.4g} W (mass {mass:g} kg, efficiency {share:g}): are these in W, m/s and kg?",
+        )
 
     def at(self, grade: Tensor) -> Self:
         """Return the class on a road with a grade at each sample [rad]."""

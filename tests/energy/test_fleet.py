@@ -15,6 +15,7 @@ from lcc_rl.evaluation.fit import classes, task_of
 from lcc_rl.evaluation.rows import traffic
 from lcc_rl.interfaces.exported import program
 from lcc_rl.pieces.features import CLASS
+from lcc_rl.settings import Number, Positive
 
 MODELS = {
     "car": CirclesFuel(),
@@ -97,6 +98,16 @@ class Lossless(Weightless):
     mass, efficiency = 1500.0, 1.3
 
 
+class Rolling(EnergyModel):
+    mass: Positive = 1500.0  # [kg]
+    unit: Number = 1.0
+    summed: bool = False
+
+    def power(self, speed, acceleration):
+        power = (1500.0 * acceleration + 200.0) * speed * self.unit
+        return power.sum() if self.summed else power
+
+
 def test_mistakes_are_named() -> None:
     cases = [
         ({}, "energy.models is empty"),
@@ -105,6 +116,11 @@ def test_mistakes_are_named() -> None:
         (MODELS, None, {"human": {"bus": 1.0}}, r"energy.roles.human.*'bus'"),
         ({"x": Weightless()}, "Weightless: an energy model needs its mass .* nan"),
         ({"x": Lossless()}, "Lossless: efficiency must lie from 0 to 1, got 1.3"),
+        ({"x": Rolling(unit=1e-3)}, "Rolling.power .* 15 W per m/s², .* 1.5e[+]04 W"),
+        ({"x": Rolling(unit=3.6)}, "Rolling.power"),  # speed taken as km/h
+        ({"x": Rolling(unit=-1.0)}, "Rolling.power"),
+        ({"x": Rolling(mass=1.5)}, "Rolling.power .*[(]mass 1.5 kg"),
+        ({"x": Rolling(summed=True)}, "Rolling.power: .*dim"),
     ]
     check_refused(Fleet, cases, ConfigError)
     cases = [
