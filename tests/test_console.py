@@ -66,7 +66,7 @@ def test_help_fits_80_columns(tmp_path, monkeypatch, subtests) -> None:
 QUICK_TO_START = [  # what is done, what is not loaded for it, and what is printed
     (["train", "--help-all"], HEAVY | TABLES, "calibration: both, energy, global, local"),
     (["train", "-h", "agent=td3"], HEAVY | TABLES, "td3             analytic, ddpg"),
-    (["simulate", "-h"], HEAVY, "--string"),
+    *(([x, "-h"], HEAVY, x) for x in ("simulate", "score", "energy", "export", "table")),
     (["status", "."], HEAVY | TABLES, "1 finished"),
     (["from lcc_rl import results; print(results.load('.')['seed'].tolist())"], HEAVY, "[3]"),
     (
@@ -161,7 +161,7 @@ def test_commands_run_on_a_newer_python_in_a_clone_that_is_installed_elsewhere()
         (
             "onnx",
             "interfaces",
-            lambda: import_module("lcc_rl.interfaces.export").main(["pretrained/alcc", "x.onnx"]),
+            lambda: import_module("lcc_rl.cli.export").main(["pretrained/alcc", "x.onnx"]),
         ),
     ],
 )

@@ -22,13 +22,13 @@ TOOLS = {  # name, module, which has a main, and description
     "status": ("lcc_rl.runs.overview", "runs that are running, waiting, finished, failed"),
     "table": ("lcc_rl.cli.table", "the table of an evaluation: text, Markdown, LaTeX, CSV"),
     "repeat": ("lcc_rl.commands.repeat", "a run again, from its folder; are the rows equal?"),
-    "score": ("lcc_rl.commands.score", "a policy on every task and source that it fits"),
+    "score": ("lcc_rl.cli.score", "a policy on every task and source that it fits"),
     "simulate": ("lcc_rl.commands.simulate", "vehicles behind a leader or on a ring: their motion"),
-    "energy": ("lcc_rl.commands.energy", "energy of recorded trips: kJ, kWh, litres, grams"),
+    "energy": ("lcc_rl.cli.energy", "energy of recorded trips: kJ, kWh, litres, grams"),
     "animate": ("lcc_rl.commands.animate", "animations of episodes: page, SVG, GIF, MP4"),
     "reproduce": ("lcc_rl.studies.reproduce", "a paper's study: tables and figures"),
     "clairvoyant": ("lcc_rl.commands.clairvoyant", "upper bound of the saving"),
-    "export": ("lcc_rl.interfaces.export", "a policy or rule as ONNX, PyTorch, C or page"),
+    "export": ("lcc_rl.cli.export", "a policy or rule as ONNX, PyTorch, C or page"),
 }
 COMMANDS = HYDRA_COMMANDS | {name: text for name, (_, text) in TOOLS.items()}
 

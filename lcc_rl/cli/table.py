@@ -14,32 +14,16 @@ lcc-rl table outputs/alcc/tables/<table>.parquet --format latex
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
-from textwrap import fill
 from typing import Annotated
 
-import pandas as pd
 from pydantic import Field
 
-from lcc_rl.commands.evaluation import Run
-from lcc_rl.io.files import Rows, as_rows, read_parquet
-from lcc_rl.results.names import MARKS, rename, worded
-from lcc_rl.results.render import as_csv, as_latex, as_markdown, chosen, for_print
-from lcc_rl.results.report import together
-from lcc_rl.results.runs import EPISODES, FINAL, PARTS, load_config, naming_run
-from lcc_rl.results.sweeps import load_sweep
-from lcc_rl.results.task import ENERGY_UNITS
 from lcc_rl.runs.arguments import Arguments, typed
-from lcc_rl.runs.states import CONFIG, run_folders
+from lcc_rl.runs.interrupts import ending_quietly
 
-TABLE_FORMATS: dict[str, Callable[..., str]] = {
-    "text": as_markdown,
-    "markdown": as_markdown,
-    "latex": as_latex,
-    "csv": as_csv,
-}
+FORMATS = ("text", "markdown", "latex", "csv")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -48,11 +32,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     what = "folder of an evaluation, a training, a job or a sweep; or a parquet file"
     parser.add_argument("run", type=Path, help=what)
     form = "text by default, as the run prints it; markdown for --columns and parquet files"
-    parser.add_argument("--format", choices=TABLE_FORMATS, default="text", help=form)
+    parser.add_argument("--format", choices=FORMATS, default="text", help=form)
     parser.add_argument("--all", action="store_true", help="all measures, as table=all")
     parser.add_argument("--columns", help="names of columns of --format csv, separated by commas")
     parser.add_argument("--against", help="baseline of savings, a name of the table")
-    parser.add_argument("--unit", choices=ENERGY_UNITS, help="energy per distance")
+    unit = "of energy per distance: kJ/km, Wh/km, kWh/100km, and for one fuel g/km, L/100km, mpg"
+    parser.add_argument("--unit", help=unit)
     new = "another name of a row, in all formats; may be repeated"
     parser.add_argument("--rename", nargs=2, action="append", metavar=("ROW", "NAME"), help=new)
     ending = typed(Annotated[str, Field(pattern=r"\.(png|pdf|svg)$")])
@@ -61,68 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     marks = "decimal mark of --format csv; with comma, columns are separated by ;"
     parser.add_argument("--decimal", choices=("point", "comma"), default="point", help=marks)
     options = parser.parse_args(arguments)
-    csv = options.format == "csv"
-    if options.decimal == "comma" and not csv:
+    if options.decimal == "comma" and options.format != "csv":
         parser.error("--decimal comma needs --format csv")
-    names = options.columns.split(",") if options.columns else []
-    note = ""
-    if options.run.suffix == ".parquet":
-        table = chosen(worded(read_parquet(options.run)), names)
-    else:
-        run = read_run(options.run, options.trust)
-        if options.unit:
-            run = replace(run, cfg=run.cfg.with_(unit=options.unit))
-        for row, label in options.rename or ():
-            rename(row, label, names_of(run.rows))
-        if options.figure:
-            draw_table(run, options.against, options.figure)
-        with naming_run(run.folder / EPISODES):
-            if options.format == "text" and not names:
-                print(run.printed(options.all, options.against))
-                return
-            report = together(run.reports(options.against))
-        if options.all:
-            table = chosen(report.table, names)
-        else:
-            note = report.note
-            table = chosen(report.short, names) if csv else for_print(report, names)
-        if csv:  # has no footnotes
-            table = table.replace({"driver": f" [{MARKS}]"}, "", regex=True)
-        note = "" if csv else ". ".join(filter(None, [report.size, note]))
-    print(TABLE_FORMATS[options.format](table, *[options.decimal] * csv))
-    if note:
-        lines = fill(note, 98, initial_indent="% ", subsequent_indent="% ")
-        print(lines if options.format == "latex" else f"\n{note}")
-
-
-def names_of(rows: Rows) -> list[object]:
-    """Return the strategies of rows."""
-    table = rows if isinstance(rows, pd.DataFrame) else rows.to_table(["strategy"]).to_pandas()
-    return list(table["strategy"].unique())
-
-
-def draw_table(run: Run, against: str | None, path: str) -> None:
-    """Draw the table of a run with grey dots for training seeds."""
-    # Here, because tables need no matplotlib.
-    from lcc_rl.figures.drawing import save
-    from lcc_rl.figures.evaluation import measures_of
-
-    rows, alone = run.rows, []
-    with naming_run(run.folder / EPISODES):
-        if isinstance(rows, pd.DataFrame):
-            seeds = rows["training_seed"]
-            parts = (rows[seeds.isna() | (seeds == seed)] for seed in seeds.dropna().unique())
-            alone = [together(replace(run, rows=part).reports(against)) for part in parts]
-        figure = measures_of(together(run.reports(against)), alone)
-    save(figure, path)
-
-
-def read_run(folder: Path, trust: Sequence[str]) -> Run:
-    """Return the run of a folder: the last part of a job, all runs of a sweep as one."""
-    folder = folder / FINAL if (folder / PARTS).is_dir() else folder
-    if not (folder / CONFIG).is_file() and run_folders(folder):
-        rows = load_sweep(folder)
-        return Run(folder, rows, load_config(rows.attrs["first"], trust))
-    cfg = load_config(folder, trust)
-    with naming_run(folder / EPISODES):
-        return Run(folder, as_rows(folder / EPISODES), cfg)
+    with ending_quietly():  # loads torch
+        from lcc_rl.commands.table import print_again
+    print_again(options)

@@ -1,15 +1,7 @@
-"""Energy of recorded trips: in kJ, kWh, litres and grams, per trip and per kilometre.
-
-lcc-rl energy trips.parquet energy=fuel   # columns drive, time_s, speed_mps
-lcc-rl energy folder energy=bolt --out energies.parquet  # a file per trip
-lcc-rl energy a.csv leader.columns.grade=slope leader.units.grade=%
-
-Further words are settings: energy=…, leader.columns and leader.units.
-"""
+"""Energy of recorded trips, per trip and per kilometre."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from os import PathLike, fspath
 from typing import Any
@@ -26,15 +18,11 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import require
 from lcc_rl.evaluation.metrics import KILO
-from lcc_rl.io.atomic import new_file
-from lcc_rl.io.files import write_table
-from lcc_rl.runs.arguments import TABLE, Arguments, files_and_settings
 from lcc_rl.runs.output import log_report
 from lcc_rl.settings import checked
 
 BLOCK = 10  # records whose energies are computed together; more exceed the processor's cache
 KWH = 3600.0  # [kJ]
-MOST_ROWS = 20  # most trips that are printed
 
 
 @checked
@@ -106,21 +94,3 @@ def _energies(records: Profiles, block: slice, model: Any) -> pd.DataFrame:
             "net_energy_kj": drawn - stored,
         }
     )
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the energy of trips, and write it to a file."""
-    parser = Arguments(prog="lcc-rl energy", description=__doc__)
-    parser.add_argument("words", nargs="+", help="tables, folders, patterns; settings key=value")
-    parser.add_argument("--out", type=TABLE, help="also write a row per trip: .csv, .parquet")
-    options = parser.parse_intermixed_args(arguments)
-    files, settings = files_and_settings(options.words)
-    out = options.out and new_file(options.out, "--out")
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    trips = trip_energies(files, settings)
-    print(trips.head(MOST_ROWS).to_string(index=False, float_format="{:,.4g}".format))
-    sums = trips[["distance_km", "energy_kj", "energy_kwh"]].sum()
-    totals = "{distance_km:,.1f} km, {energy_kj:,.0f} kJ, {energy_kwh:,.1f} kWh".format(**sums)
-    print(f"{len(trips):,} trips: {totals}")
-    if out:
-        write_table(trips, out)

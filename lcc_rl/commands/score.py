@@ -1,20 +1,9 @@
-"""Score a policy or controller on all tasks that it fits, for all sources of leaders.
-
-    lcc-rl score policy.onnx      # or a run, pretrained/<name>, idm_acc …
-    lcc-rl score outputs/train/<run> --task i24-follow5 --on everyday
-    lcc-rl score idm --source i24 leader=i24 leader.path=i24_leaders.parquet
-
-Prints a table and writes score.json with scores, intervals over drives, limits, versions, and
-hashes of the leaders' windows, of all settings and of the policy's file. The rows of all episodes
-are in the same folder. Further words are settings of all tasks, except the variant; they change the
-hash of the settings.
-"""
+"""Scores of a policy or controller on all tasks that it fits, for all sources of leaders."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import platform
 import re
 from argparse import Namespace
@@ -26,13 +15,11 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rich.console import Console
-
 from lcc_rl.commands.evaluation import evaluate_and_write
 from lcc_rl.config.compose import choices, identity, load
 from lcc_rl.config.inputs import compared_files
 from lcc_rl.config.schemas import EvaluateConfig
-from lcc_rl.config.words import FILTERED, RECORDED, check_overrides, top_key
+from lcc_rl.config.words import FILTERED, RECORDED, top_key
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.drivers.population import fixed
 from lcc_rl.envs import build_env, load_inputs
@@ -52,14 +39,12 @@ from lcc_rl.evaluation.strategies import Strategy, TrainedPolicy, applies, basel
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.io.atomic import atomic_path, own_folder
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.board import row_of, score_table
+from lcc_rl.results.board import row_of
 from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import load_policy, policy_file
-from lcc_rl.results.render import print_table
 from lcc_rl.results.report import summary, windows_for
 from lcc_rl.results.runs import EPISODES, save_config
-from lcc_rl.runs.arguments import Arguments
-from lcc_rl.runs.output import HEADLINE, show_headline
+from lcc_rl.runs.output import show_headline
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.states import ERROR, LOCK, claim, forget, record
 
@@ -301,30 +286,3 @@ def _source(arguments: Sequence[str]) -> tuple[str, tuple[str, ...]]:
         )
     people = () if any(top_key(word) == "drivers" for word in settings) else ("drivers=highway",)
     return name, (*people, *settings)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Score and print the table."""
-    parser = Arguments(prog="lcc-rl score", description=__doc__)
-    parser.add_argument("policy", help="ONNX file, run, policy file or controller")
-    parser.add_argument("--name", help="name in tables; by default that of the file")
-    parser.add_argument("--task", action="append", help="only this task; repeat for several")
-    parser.add_argument("--on", action="append", default=[], help="only this source")
-    parser.add_argument(
-        "--source",
-        nargs="+",
-        action="append",
-        default=[],
-        metavar=("NAME", "SETTING"),
-        help="a further source of leaders, such as i24 leader=i24 leader.path=…",
-    )
-    parser.add_argument("--out", type=Path, help="folder, by default below outputs/score")
-    parser.add_trust()
-    options, further = parser.parse_known_args(arguments)
-    check_overrides(further, SET_BY_SCORE, "each task has its own; --task and --source choose")
-    logging.basicConfig(level=HEADLINE, format="%(message)s")  # without details
-    document = run(options, further)
-    print_table(score_table(document["name"], document["results"]))
-    for line in document["left_out"]:
-        Console().print(f"left out: {line}", highlight=False, markup=False)
-    return 0

@@ -34,7 +34,6 @@ from lcc_rl.interfaces.ring_page import ring_page
 from lcc_rl.io.atomic import atomic_path, new_file
 from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.runs.arguments import Arguments
 from lcc_rl.version import __version__
 
 HEAD = """\
@@ -185,10 +184,10 @@ def export(
     Examples:
         >>> export("pretrained/alcc_limits", "alcc.pt2")  # doctest: +SKIP
     """
-    return _written(policy, path, trust, variant, overrides, normalize, safety, limits)[0]
+    return written(policy, path, trust, variant, overrides, normalize, safety, limits)[0]
 
 
-def _written(
+def written(
     policy: Any,
     path: str | Path,
     trust: Sequence[str],
@@ -295,24 +294,3 @@ def _as_onnx(module: DrivingProgram, about: str) -> bytes:
 
 CODE, PAGE = ".c", ".html"
 EXPORTERS = {".onnx": _as_onnx, ".pt2": _as_pt2}
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Export the policy of a command line."""
-    parser = Arguments(description="Export a policy for other software.")
-    parser.add_argument("policy", help="run folder, policy.pt, pretrained/<name> or a rule")
-    parser.add_argument("path", help="file: a program (.onnx, .pt2, .c) or a page (.html)")
-    parser.add_trust()
-    text = "of a page's ring (drivers=i80), of a program (safety.margin=2 limits.max_braking=6), "
-    text += "of a rule or a controller of your own (time_step=0.02)"
-    parser.add_argument("settings", nargs="*", default=[], help=text)
-    options = parser.parse_args(arguments)
-    path, made = _written(options.policy, options.path, options.trust, overrides=options.settings)
-    if made is None:
-        print(f"{path}: the ring road in the browser, with {options.policy}")
-        return 0
-    for column in map(described_input, made.names):
-        print(f"  {column.name} [{column.unit}]: {column.meaning}")
-    text = "maps these inputs, in this order, to the acceleration [m/s²]"
-    print(f"{path}: {text}, every {made.controller.time_step:g} s")
-    return 0

@@ -13,7 +13,8 @@ from helpers import check_refused, slow_but
 from page_blocks import ROOT
 
 import lcc_rl
-from lcc_rl.commands.score import about, main, play_source, scored
+from lcc_rl.cli.score import main
+from lcc_rl.commands.score import about, play_source, scored
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.results import board

@@ -13,7 +13,7 @@ from helpers import check_refused
 from page_blocks import blocks
 
 import lcc_rl
-from lcc_rl.commands.energy import main
+from lcc_rl.cli.energy import main
 from lcc_rl.config import load
 from lcc_rl.envs import load_inputs
 from lcc_rl.envs.inputs import build_energy

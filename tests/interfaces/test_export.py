@@ -21,10 +21,10 @@ from page_blocks import ROOT, blocks
 from torch import nn
 
 import lcc_rl
+from lcc_rl.cli.export import main
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.interfaces.driver import Driver
-from lcc_rl.interfaces.export import main
 from lcc_rl.interfaces.exported import DrivingProgram, program
 from lcc_rl.pieces import Controller
 from lcc_rl.results.policies import load_policy

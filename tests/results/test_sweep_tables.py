@@ -15,6 +15,7 @@ from study_frames import episodes
 
 from lcc_rl import results
 from lcc_rl.cli import table
+from lcc_rl.commands.table import read_run
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.figures.evaluation import measures_of
@@ -131,7 +132,7 @@ def test_runs_without_rows_are_listed_wherever_a_sweep_is_read(root, capsys, cap
 
 
 def report_of(root: Path, against: str | None = None):
-    return table.read_run(root, ()).reports(against)[0]
+    return read_run(root, ()).reports(against)[0]
 
 
 def test_rows_are_settings_and_have_their_seeds(root, capsys) -> None:
