@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # npTDMS: a speed of 100 Hz and a radar gap of 10 Hz in one group, as a data frame (1.13.0).
-# Guess before: side by side by number; with `time_index=True` rows of one time that do not meet.
-# Seen: the gap of second 50 stands beside the speed of second 5, without a word: a time gap of 1.5 s
+# Guess before: side by side by number; by `time_index=True` rows of one time that do not meet.
+# Seen: the gap of second 50 is beside the speed of second 5, without a word: a time gap of 1.5 s
 # becomes 0.3 to 2.3 s. With `time_index=True` a sixth of the gaps have a row beside that of their
 # time, as 3 x 0.1 is not 30 x 0.01.
 # Hurt: who computes time gaps or TTC from measurement files of test benches and cars.

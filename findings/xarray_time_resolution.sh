@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# xarray: acceleration and distance from logged speeds by `differentiate` and `integrate` (2026.9.0).
-# Guess before: a factor of 1,000 from one resolution of the stored times to the next, no warning.
+# xarray: acceleration and distance of logged speeds by `differentiate`, `integrate` (2026.9.0).
+# Guess before: a factor of 1,000 from one resolution of stored times to the next, no warning.
 # Seen: with times in s a braking of 2 m/s², in ms 0.002, in µs, as pandas 3 makes them, 2e-6, in ns
 # 2e-9, without a word; 64 m become 64 million.
 # Hurt: who derives accelerations or adds up distances of logs read by different readers.
