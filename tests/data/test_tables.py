@@ -513,7 +513,7 @@ def test_the_log_of_a_car_has_relative_speeds_targets_and_a_flag(tmp_path) -> No
     none.drop(columns="ok").to_csv(tmp_path / "none.csv", index=False)
     plain = {key: name for key, name in LOG.items() if name not in ("ok", "id")}
     report = "".join(EpisodesSource(path=str(tmp_path / "none.csv"), columns=plain).load().report)
-    assert "'v' + 'range_rate' holds 167.108 m/s (is it km/h or ft/s, or a value for no" in report
+    assert "'v' + 'range_rate' holds 167.108 m/s (is it in km/h or ft/s, or a value for" in report
     bad = other.assign(ok="maybe")
     bad.to_csv(tmp_path / "bad.csv", index=False)
     with pytest.raises(DataError, match="data row 1, column 'ok' is 'maybe'; expected 1 or 0"):

@@ -175,16 +175,16 @@ def saving_at(windows, one, other, at: float):
     """Energy saved where both violate the limit for at most this share of the time."""
 
     def measure(*curves):
-        return share_saved(*(energy_at(x[ENERGY], x[LONG_SHARE], at, np.nan, None) for x in curves))
+        return share_saved(*(energy_at(x[ENERGY], x[LONG_SHARE], at, None) for x in curves))
 
     return compare_fronts(windows, one, other, columns=(ENERGY, LONG_SHARE), measure=measure)
 
 
 def test_fronts_are_read_at_the_same_share_not_at_the_same_limit() -> None:
     energy, share = np.array([90.0, 100.0]), np.array([0.02, 0.01])
-    assert energy_at(energy, share, 0.0125, np.nan, None) == pytest.approx(97.5)
-    assert np.isnan(energy_at(energy, share, 0.005, np.nan, None))
-    assert energy_at(energy, share, 0.03, np.nan, None) == 90.0  # a limit that is always kept
+    assert energy_at(energy, share, 0.0125, None) == pytest.approx(97.5)
+    assert np.isnan(energy_at(energy, share, 0.005, None))
+    assert energy_at(energy, share, 0.03, None) == 90.0  # a limit that is always kept
     found = saving_at(fronts(), NETWORK, RULE, 0.012)
     # Every window saves as much: nothing is left to chance.
     assert (found.low, found.value, found.high) == pytest.approx((0.05, 0.05, 0.05))
