@@ -34,7 +34,6 @@ WRONG = {
     "scenario.controllers.human.parameters={a: 1}": "drivers=fixed drivers.acceleration",
     "variant=[alcc,reference]": "variant takes one choice; for a run of each: -m variant=alcc,refe",
     "energy=[fuel,bolt]": "energy takes one choice",
-    "leader=[udds,us06]": "leader takes one choice",
     "+scenario.filters.automated.margin=1": "'automated'.*valid: none; .filter=cbf or a task adds",
     "+scenario.actuators.automated.lag=0.4": "'automated'.* .faults=all actuators and sensors",
     "+scenario.fleet.t={_target_: builtins.dict}": "scenario.fleet.t: expected a .*VehicleClass",
