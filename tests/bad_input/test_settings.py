@@ -21,6 +21,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.functional.ovm import OVMConstants
 from lcc_rl.io import memory
+from lcc_rl.pieces.connected import CACC
 from lcc_rl.pieces.controllers import ConstantAcceleration
 
 HUGE = 10**15
@@ -198,6 +199,16 @@ def test_options_without_effect_are_refused() -> None:
     words = ["variants=[alcc]", "evaluation.baselines=[human]"]  # a job compares
     trainings, final = composed_part(load("pipeline", words), words)
     assert final.evaluation.baselines == ["human"] != trainings["alcc"].evaluation.baselines
+
+
+class Own(CACC):
+    """May draw what its base does not."""
+
+
+def test_a_platoon_with_a_class_of_ones_own_may_depend_on_drivers() -> None:
+    own = f"{AUTO}._target_={__name__}.Own"
+    fixed = [load("evaluate", ["variant=cacc", *words]).is_fixed() for words in ([], [own])]
+    assert fixed == [True, False]
 
 
 def test_programs_are_refused_what_has_no_effect_in_them() -> None:

@@ -114,6 +114,7 @@ def test_several_automated_vehicles_are_a_group_of_agents(subtests) -> None:
     wrappers = {
         "alone": lambda: lcc_rl.make_env("alcc", 2, words),
         "serial": lambda: SerialEnv(2, several),
+        "parallel": lambda: ParallelEnv(2, several, **PROCESSES),
         "parallel without buffers": lambda: ParallelEnv(2, several, use_buffers=False, **PROCESSES),
         "threads": lambda: AsyncEnvPool([several, several], backend="threading"),
     }
