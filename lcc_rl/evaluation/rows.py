@@ -203,7 +203,6 @@ def traffic(
         record["vehicles", "gap"],
         alive,
         mean,
-        time_step,
         None if leader is None else leader[-steps:],
     )
 
