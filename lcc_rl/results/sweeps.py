@@ -20,14 +20,23 @@ from lcc_rl.results.loading import SHARD, listed, load
 from lcc_rl.results.names import ON_FRONT
 from lcc_rl.results.report import baseline_of
 from lcc_rl.results.runs import CONFIG, POLICY, differences, flat_settings, without
-from lcc_rl.results.windows import SOURCE
+from lcc_rl.results.windows import SOURCE, STRATEGY, TRAINED
 from lcc_rl.runs.plans import choices_of
 from lcc_rl.runs.states import run_folders
 
 # Settings in which the parts and the seeds of one study differ.
 SHARED = (*NOT_IDENTITY, "seed", SHARD)
-TRAINING = ["strategy", "training_seed"]
-EPISODE = [*TRAINING, SOURCE, "profile_id", "driver_id", "repeat", "case", "run_id", "follower"]
+EPISODE = [
+    STRATEGY,
+    TRAINED,
+    SOURCE,
+    "profile_id",
+    "driver_id",
+    "repeat",
+    "case",
+    "run_id",
+    "follower",
+]
 Choices = Mapping[str, Any]  # of a run, by dotted key
 
 
@@ -155,5 +164,7 @@ def _check_one_study(root: Path, rows: pd.DataFrame) -> None:
             f"lcc_rl.results.load({str(root)!r}) reads them",
         )
     twice = rows[rows.duplicated([key for key in EPISODE if key in rows])]
-    which = [f"{strategy}, seed {seed}" for strategy, seed in twice[TRAINING].to_numpy()[:1]]
+    which = [
+        f"{strategy}, seed {seed}" for strategy, seed in twice[[STRATEGY, TRAINED]].to_numpy()[:1]
+    ]
     require(not which, f"{root}: it contains a training twice: {''.join(which)}")
