@@ -30,13 +30,13 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 44_220, "code": 29_345},
-    "tests": {"lines": 26_500},
+    "lcc_rl + tools": {"lines": 44_190, "code": 29_316},
+    "tests": {"lines": 26_433},
     "conf": {"yaml": 165},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {
-    "names in several modules": 57,
+    "names in several modules": 55,
     "floors": 10,
     "circles": 0,
     "functions with a configuration": 128,
