@@ -178,7 +178,7 @@ def test_a_filtered_policy_stands_beside_the_baselines_asked_for(
         evaluation.run(cfg, tmp_path / "named")
 
 
-def test_a_training_that_changed_nothing_says_so(trained, tmp_path, caplog) -> None:
+def test_a_training_that_changed_nothing_says_so(tmp_path, caplog) -> None:
     cfg = tiny("train", "variant=alcc", "agent.batch_size=4096")  # more than it ever collects
     training.run(cfg, tmp_path, quiet=True)
     assert "changed nothing" in caplog.text

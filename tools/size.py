@@ -36,7 +36,7 @@ CEILINGS = {
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {
-    "names in several modules": 57,
+    "names in several modules": 55,
     "floors": 10,
     "circles": 0,
     "functions with a configuration": 128,

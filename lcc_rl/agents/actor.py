@@ -22,11 +22,7 @@ Activation = Literal["relu", "tanh", "elu", "silu"]
 
 
 def seeded_mlp(
-    inputs: int,
-    outputs: int,
-    hidden: Sequence[int],
-    seed: int,
-    activation: Activation = "relu",
+    inputs: int, outputs: int, hidden: Sequence[int], seed: int, activation: Activation
 ) -> MLP:
     """Build a network with initial weights that depend on ``seed`` only.
 

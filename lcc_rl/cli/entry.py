@@ -86,7 +86,7 @@ OPTIONS = {
 TOTAL_WIDTH, NAME_WIDTH, DEFAULT_WIDTH = 80, 21, 16
 
 
-def help_text(entry: str, overrides: Sequence[str] = ()) -> str:
+def help_text(entry: str, overrides: Sequence[str]) -> str:
     """Return the help of a command.
 
     Args:

@@ -315,7 +315,7 @@ class StudyConfig(BaseConfig):
             return False
         own = scenario.with_(controllers={HUMAN: None}, start={HUMAN: None})
         nodes = nodes_in([own, self.deployed, *further])
-        return all(getattr(node.kind, "__dict__", {}).get("steady") for node in nodes)
+        return all(getattr(node.kind, "steady", False) for node in nodes)
 
     def for_any_leader(self) -> Self:
         """Return the configuration with a leader that may play any record."""

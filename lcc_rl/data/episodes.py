@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lcc_rl.arrays import Mask
 from lcc_rl.data.columns import Column, Names, Units
-from lcc_rl.data.grid import BRIDGE_S, Places, continuous, cut_by_files, on_grid, places, stretches
+from lcc_rl.data.grid import Places, continuous, cut_by_files, on_grid, places, stretches
 from lcc_rl.data.tables import (
     LARGEST_ID,
     TableFile,
@@ -70,19 +70,17 @@ MOTION_COLUMNS = [name for name in SCHEMA if name.endswith(("_position_m", "_spe
 
 
 def read_episodes(
-    paths: Sequence[str],
-    columns: Names | None = None,
-    units: Units | None = None,
-    bridge: float = BRIDGE_S,
+    paths: Sequence[str], columns: Names, units: Units, bridge: float
 ) -> tuple[pd.DataFrame, list[str]]:
     """Read tables of pairs: a row per pair and time, at any rate, possibly with holes.
 
     Args:
         paths: .csv or .parquet files, see :class:`lcc_rl.data.tables.TableFile`. Columns that
-            ``FIELDS`` does not require may be missing; ``event`` and ``period`` may stand for
+            ``PAIR_FIELDS`` does not require may be missing; ``event`` and ``period`` may stand for
             ``episode`` and ``recording``.
-        columns: names of the columns by the keys of ``FIELDS``; by default those of ``SCHEMA``.
-        units: units by key; by default SI.
+        columns: names of the columns by the keys of ``PAIR_FIELDS``, where they are not those of
+            ``SCHEMA``.
+        units: units by key, where they are not SI.
         bridge: longest hole that does not divide an episode [s].
 
     Returns:
@@ -98,7 +96,7 @@ def read_episodes(
     notes: list[str] = []
     place, seen, count = partial(places, columns=columns), set[str](), 0
     for number, file in enumerate(tables_of(paths)):
-        table, lines = _table(file, columns or {}, units or {}, place, seen, count, bridge)
+        table, lines = _table(file, columns, units, place, seen, count, bridge)
         episode = table["episode"]
         if parts:
             table["episode"] = episode + parts[-1]["episode"].max() + 1 - episode.min()

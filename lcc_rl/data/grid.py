@@ -57,7 +57,11 @@ def places(
         >>> places(table)(0, "gap_m")
         "recording i-80, vehicle 7 (follower), 0.3 s, column 'gap_m'"
     """
-    named = columns or {}
+    named = dict(columns or {})
+    if relative := named.get("relative_speed"):  # the leader's speed is the sum of two columns
+        named["leader_speed"] = (
+            f"{named.get('follower_speed', 'follower_speed_mps')}' + '{relative}"
+        )
 
     def place(row: int, column: str = "") -> str:
         sample = table.iloc[row].to_dict()
@@ -73,8 +77,6 @@ def places(
             name = (vehicles or {}).get(vehicle, vehicle)
             details.append(f"vehicle {name}" + f" ({role})" * (at is None))
         details.append(f"{sample['time_s']:g} s" if at is None else "")
-        if key == "leader_speed" and (relative := named.get("relative_speed")):
-            header = f"{named.get('follower_speed', 'follower_speed_mps')}' + '{relative}"
         details.append(f"column '{header}'" if column else "")
         file = f"{files[sample['file']]}: " if len(files) > 1 and "file" in sample else ""
         return file + ", ".join(filter(None, details))

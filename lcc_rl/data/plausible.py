@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from lcc_rl.arrays import Floats, Mask
-from lcc_rl.data.agreement import OF_LOGS, OF_PAIRS, check_pairs, numbers_of_pairs
+from lcc_rl.data.agreement import OF_PAIRS, check_pairs, numbers_of_pairs
 from lcc_rl.data.columns import Units
 from lcc_rl.data.grid import ORIGIN, Place, Places, divided, steps_of, stretches
 from lcc_rl.data.trajectories import BATCH, FRAME, starts_of
@@ -25,7 +25,7 @@ JUMP_S, HELD_S = 0.5, 1.0  # time in which a gap jumps; longest time without a m
 NOISE = 12.0  # least jump, as a multiple of the median change of a gap beyond that by the speeds
 MOST_JUMPS = 0.5  # largest share of samples that jumps of gaps may cost
 WORDS = {
-    "max_speed": "holds {:g} m/s (is it km/h or ft/s?)",
+    "max_speed": "holds {:g} m/s (is it in km/h or ft/s, or a value for no target?)",
     "min_speed": "holds {:g} m/s (is it relative to another car, or against an axis?)",
     "max_gap": "holds {:g} m (is it in cm, data.units.gap=cm, or a value for no target?)",
 }
@@ -129,8 +129,6 @@ class Plausible(Settings):
                 continue
             row = int(np.argmax(new))
             limit = f"{setting}.{name}={getattr(self, name):g}"
-            if column == "leader_speed_mps" and OF_LOGS in unit:
-                form = form.replace("ft/s?", "ft/s, or a value for no target?")
             example = f"{place(row, column)} {form.format(values[row])}, {limit}"
             hint = remedy if name == "max_acceleration" else ""
             line = f"left out {int(new.sum()):,} implausible sample(s), the first: {example}"

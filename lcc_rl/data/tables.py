@@ -333,9 +333,7 @@ class Block:
 # -- cells -----------------------------------------------------------------------------------------
 
 
-def checked_cells(
-    cells: Cells, column: Column, fault: Fault, scale: float = 1.0, comma: bool = False
-) -> Any:
+def checked_cells(cells: Cells, column: Column, fault: Fault, scale: float, comma: bool) -> Any:
     """Return the checked values of a column, numbers or a categorical.
 
     Args:
@@ -442,7 +440,7 @@ def _seconds(cells: Cells) -> Cells:
     return cells
 
 
-def numbers_of(cells: Cells, fault: Fault, comma: bool = False) -> NDArray[np.float64]:
+def numbers_of(cells: Cells, fault: Fault, comma: bool) -> NDArray[np.float64]:
     """Return cells as numbers, NaN for blank ones; decimal commas or thousands are allowed.
 
     Raises:

@@ -40,7 +40,6 @@ from lcc_rl.functional.driver_models import (
     INDIVIDUAL,
     PARAMETERS,
     DriverConstants,
-    Parameter,
     Reaction,
 )
 from lcc_rl.functional.laws import LAWS
@@ -218,8 +217,7 @@ class _Fit:
             line = f"{falling} of {len(drivers)} records have not converged: more generations?"
             more = f"{self.mode}_genetic.generations={3 * genetic.generations}"
             lines.append(Concern(f"{line} (calibration.{more})"))
-        what = self.names, self.limits, self.table_of, settings.objective
-        return drivers, lines + _findings(drivers, *what)
+        return drivers, [*lines, *self.quality(drivers), *map(Concern, self.concerns(drivers))]
 
     def table(self, best: Tensor) -> pd.DataFrame:
         """Return identities, parameters ``[drivers, names]``, errors and flags, a row per driver.
@@ -272,62 +270,62 @@ class _Fit:
         found = {MEAN_SPEED: speed, MEAN_GAP: gap, EQUILIBRIUM: steady}
         return {name: values.numpy() for name, values in found.items()}
 
+    def quality(self, drivers: pd.DataFrame) -> list[str]:
+        """Return lines on the errors of the fit and on the intervals."""
+        error = 100.0 * drivers["rmspe"]
+        lines = [
+            f"RMSPE of {count_records(drivers)}: mean {error.mean():.2f} %, "
+            f"median {error.median():.2f} %, worst {error.max():.1f} %"
+        ]
+        for end, part in (("", "fitted"), (OUT, "held out")):
+            if f"gap_rmse_m{end}" in drivers:
+                speed, gap, share = (drivers[f"{x}{end}"].mean() for x in ERROR_COLUMNS.values())
+                both = f"RMSPE {100.0 * speed:.2f} %, gap RMSE {gap:.2f} m, {100.0 * share:.1f} %"
+                lines.append(f"{part}: {both} of the gap (means)")
+        v0, headway = (self.table_of[x].column for x in INDIVIDUAL)
+        open_share = 100 * drivers[[f"{v0}_low", f"{v0}_high"]].isna().any(axis=1).mean()
+        width = (drivers[f"{headway}_high"] - drivers[f"{headway}_low"]).median()
+        return [
+            *lines,
+            f"95 % intervals: v0 is not identified for {open_share:.0f} % of the records (an end "
+            f"is not within calibration.bounds); median width of T {width:.2g} s",
+        ]
+
+    def concerns(self, drivers: pd.DataFrame) -> list[str]:
+        """Return lines on gaps that are off and on unidentified parameters."""
+        speed, share = drivers["rmspe"].mean(), drivers["gap_nrmse"].mean()
+        concerns = []
+        apart = self.settings.objective == SPEED_RMSPE
+        if share > (max(GAPS_OFF, 3.0 * speed) if apart else BADLY_OFF):
+            cure = "calibration.objective=both fits gaps, too"
+            hint = cure if apart else "are they to one leader?"
+            concerns.append(
+                f"gaps are off by {100.0 * share:.0f} %, speeds by {100.0 * speed:.1f} %: {hint}"
+            )
+        for name in self.names:
+            bound = drivers[f"{name}_at_bound"]
+            if bound.any():
+                low, high = self.limits[name]
+                column = self.table_of[name].column
+                upper = drivers[column] > (low + high) / 2
+                shares = [100 * (bound & side).mean() for side in (~upper, upper)]
+                concerns.append(
+                    f"{100 * bound.mean():.0f} % of the values of {column} lie on a bound: "
+                    f"{shares[0]:.0f} % on {low:g}, {shares[1]:.0f} % on {high:g} "
+                    f"(calibration.bounds.{name}){CONGESTED if name == 'desired_speed' else ''}"
+                )
+        off = 100.0 * drivers["gap_nrmse"].median()
+        if off > 100.0 * IMPLAUSIBLE:
+            concerns.append(
+                f"IMPLAUSIBLE FIT: the gap of the median driver is off by {off:.0f} %; are speeds "
+                "in km/h or ft/s, or gaps and positions in feet, in columns of m/s and m "
+                "(data.units)?"
+            )
+        return concerns
+
 
 def count_records(drivers: pd.DataFrame) -> str:
     """Return the numbers of fitted records and of drivers as text."""
     people = len(drivers[["recording", "follower_id"]].drop_duplicates())
     counted = f"{people} driver{'s' * (people > 1)}"
     return counted if people == len(drivers) else f"{len(drivers)} records of {counted}"
-
-
-def _findings(
-    drivers: pd.DataFrame,
-    names: Sequence[str],
-    limits: Mapping[str, Any],
-    table: Mapping[str, Parameter],
-    objective: FitMeasure,
-) -> list[str]:
-    """Return lines on the quality of the fit and on unidentified parameters."""
-    error = 100.0 * drivers["rmspe"]
-    lines = [
-        f"RMSPE of {count_records(drivers)}: mean {error.mean():.2f} %, "
-        f"median {error.median():.2f} %, worst {error.max():.1f} %"
-    ]
-    for end, part in (("", "fitted"), (OUT, "held out")):
-        if f"gap_rmse_m{end}" in drivers:
-            speed, gap, share = (drivers[f"{x}{end}"].mean() for x in ERROR_COLUMNS.values())
-            both = f"RMSPE {100.0 * speed:.2f} %, gap RMSE {gap:.2f} m, {100.0 * share:.1f} %"
-            lines.append(f"{part}: {both} of the gap (means)")
-    ends = {x: [drivers[f"{table[x].column}_{end}"] for end in ("low", "high")] for x in INDIVIDUAL}
-    open_share = pd.concat(ends["desired_speed"], axis=1).isna().any(axis=1).mean()
-    low, high = ends["time_gap"]
-    lines.append(
-        f"95 % intervals: v0 is not identified for {100 * open_share:.0f} % of the records (an end "
-        f"is not within calibration.bounds); median width of T {(high - low).median():.2g} s"
-    )
-    speed, share = drivers["rmspe"].mean(), drivers["gap_nrmse"].mean()
-    concerns = []
-    apart = objective == SPEED_RMSPE
-    if share > (max(GAPS_OFF, 3.0 * speed) if apart else BADLY_OFF):
-        hint = "calibration.objective=both fits gaps, too" if apart else "are they to one leader?"
-        concerns.append(
-            f"gaps are off by {100.0 * share:.0f} %, speeds by {100.0 * speed:.1f} %: {hint}"
-        )
-    for name in names:
-        bound = drivers[f"{name}_at_bound"]
-        if bound.any():
-            low, high = limits[name]
-            upper = drivers[table[name].column] > (low + high) / 2
-            shares = [100 * (bound & side).mean() for side in (~upper, upper)]
-            concerns.append(
-                f"{100 * bound.mean():.0f} % of the values of {table[name].column} lie on a bound: "
-                f"{shares[0]:.0f} % on {low:g}, {shares[1]:.0f} % on {high:g} "
-                f"(calibration.bounds.{name}){CONGESTED if name == 'desired_speed' else ''}"
-            )
-    off = 100.0 * drivers["gap_nrmse"].median()
-    if off > 100.0 * IMPLAUSIBLE:
-        concerns.append(
-            f"IMPLAUSIBLE FIT: the gap of the median driver is off by {off:.0f} %; are speeds in "
-            "km/h or ft/s, or gaps and positions in feet, in columns of m/s and m (data.units)?"
-        )
-    return [*lines, *map(Concern, concerns)]

@@ -399,8 +399,8 @@ def compare_twins(
     observed: Observed,
     drivers: pd.DataFrame,
     react: bool,
-    progress: Progress | None = None,
-    perception: bool = False,
+    progress: Progress | None,
+    perception: bool,
 ) -> tuple[Reaction, pd.DataFrame, list[str]]:
     """Compare calibrated drivers with the recorded ones.
 

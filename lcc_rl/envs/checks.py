@@ -116,9 +116,10 @@ def _contents(value: Any) -> list[Any]:
 
 def _variables(module: nn.Module) -> dict[str, Any]:
     """Return the variables outside of a user's functions that these read, by name."""
-    waiting, found = [*vars(module).values(), *vars(type(module)).values()], {}
+    kinds = [kind for kind in type(module).__mro__ if kind not in Piece.__mro__]
+    waiting, found = [x for of in (module, *kinds) for x in vars(of).values()], {}
     while waiting:
-        function = waiting.pop()
+        function = getattr(item := waiting.pop(), "__func__", item)  # of a static method
         home = getattr(function, "__module__", None)
         if not isinstance(function, FunctionType) or home is None or is_ours(home):
             continue

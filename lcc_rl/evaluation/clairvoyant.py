@@ -23,7 +23,7 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.envs import DifferentiableRollout, build_env
 from lcc_rl.envs.inputs import Inputs, build_energy
 from lcc_rl.errors import require
-from lcc_rl.evaluation.episodes import pairs
+from lcc_rl.evaluation.episodes import Plan
 from lcc_rl.evaluation.metrics import KILO, LONG_TIME_GAP, UNSAFE_TTC
 from lcc_rl.evaluation.rollout import reset_options
 from lcc_rl.evaluation.strategies import Strategy
@@ -115,7 +115,8 @@ def _episodes(
     strategy: Strategy, inputs: Inputs, drivers: int | None, seed: int
 ) -> tuple[TransformedEnv, TensorDict]:
     count = len(inputs.population.time_gap)
-    profile, driver = pairs(len(inputs.evaluation), count, drivers)
+    plan = Plan(len(inputs.evaluation), count, drivers, len(inputs.evaluation) * count)
+    profile, driver, _ = plan.episodes(0)
     cfg = strategy.cfg.for_any_leader()
     env = build_env(cfg, inputs.evaluation, inputs.population, len(profile), nominal=True)
     return env, reset_options(env, profile, driver, seed, count)

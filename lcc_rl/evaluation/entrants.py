@@ -34,7 +34,7 @@ from lcc_rl.evaluation.strategies import (
 )
 from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import load_policy, of_task
-from lcc_rl.results.runs import POLICY, flatten
+from lcc_rl.results.runs import POLICY, flatten, without
 from lcc_rl.results.sweeps import labels
 from lcc_rl.runs.states import CONFIG, run_folders
 
@@ -280,9 +280,7 @@ def check_installed(cfg: StudyConfig, compared: Sequence[Any] = ()) -> None:
 # -- names in tables that tell policies of different trainings apart -------------------------------
 
 # Settings that do not distinguish trainings: those of other commands, and those of the seed.
-OF_NO_TRAINING = tuple(
-    f"{key}." for key in (*NOT_IDENTITY, "seed", "evaluation", "policy", "inputs.policy")
-)
+OF_NO_TRAINING = (*NOT_IDENTITY, "seed", "evaluation", "policy", "inputs.policy")
 DATED = re.compile(r"^\d{4}-\d\d-\d\d_(\d\d-\d\d-\d\d)-\d{6}_.*")
 
 
@@ -318,8 +316,7 @@ def _trainings(strategies: Sequence[Strategy]) -> list[tuple[str, int]]:
     of_seed: Counter[Hashable] = Counter()
     for s in strategies:
         settings = dict(flatten(as_plain(s.own or s.cfg))) if s.policy else {}
-        kept = {key: x for key, x in settings.items() if not f"{key}.".startswith(OF_NO_TRAINING)}
-        text = json.dumps(kept, sort_keys=True, default=str)
+        text = json.dumps(without(settings, OF_NO_TRAINING), sort_keys=True, default=str)
         of_seed[s.name, text, s.seed] += 1
         marks.append((text, of_seed[s.name, text, s.seed] if s.policy else 0))
     return marks

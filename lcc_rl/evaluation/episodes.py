@@ -110,17 +110,6 @@ class Plan:
         return pair % self.profiles, self.chosen[driver], pair // self.profiles
 
 
-def pairs(profiles: int, drivers: int, chosen: int | None) -> tuple[Tensor, Tensor]:
-    """Return profile and driver ids, each ``[episodes]``, of every pair, profiles slowest.
-
-    Args:
-        profiles: number of profiles.
-        drivers: number of drivers.
-        chosen: number of drivers used, spread evenly; None: all.
-    """
-    return Plan(profiles, drivers, chosen, profiles * drivers).episodes(0)[:2]
-
-
 def plan_of(cfg: StudyConfig, inputs: Inputs) -> Plan:
     """Return the episodes of a configuration's evaluation."""
     settings, people = cfg.evaluation, len(inputs.population.time_gap)
@@ -218,19 +207,14 @@ class Episodes:
         if self.cfg.scenario.fleet:
             record["vehicles", "length"] = self.energy.lengths(record[CLASS])
         groups = of_rows.grouped(record, self.cfg.scenario.vehicles)
-        described = of_rows.describe(
-            self.strategy,
-            inputs.evaluation,
-            inputs.population,
-            profile,
-            driver,
-            repeat if plan.repeats > 1 else None,
-        )
+        noted = repeat if plan.repeats > 1 else None
+        given = inputs.evaluation, inputs.population, profile, driver, noted
+        described = of_rows.describe(self.strategy, *given)
         desired = of_rows.desired_speeds(self.strategy, described)
         described[FASTER] = of_rows.leader_faster(inputs.evaluation, profile, desired, self.warm_up)
         time_step = self.cfg.scenario.time_step
-        given = inputs.evaluation, profile, self.energy, self.warm_up, self.slope
-        leader = of_rows.leader_measures(*given)
+        led = inputs.evaluation, profile, self.energy, self.warm_up, self.slope
+        leader = of_rows.leader_measures(*led)
         if self.cfg.scenario.road == RING:  # it has no leader
             leader[:] = np.nan
         # The noise of sensors adds energy to the motion of recorded drivers.

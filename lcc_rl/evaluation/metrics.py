@@ -361,12 +361,7 @@ def safety_measures(
 
 
 def string_measures(
-    speed: Tensor,
-    gap: Tensor,
-    alive: Tensor,
-    length: float | Tensor,
-    time_step: float,
-    leader: Tensor | None = None,
+    speed: Tensor, gap: Tensor, alive: Tensor, length: float | Tensor, leader: Tensor | None = None
 ) -> dict[str, Tensor]:
     """Return measures of the traffic of a string.
 
@@ -375,7 +370,6 @@ def string_measures(
         gap: gap to the vehicle ahead, likewise [m].
         alive: whether the episode was still running, ``[time, *batch, 1]``.
         length: length of a vehicle, or its mean by episode, ``[*batch, 1]`` [m].
-        time_step: duration of a step [s].
         leader: speed of the vehicle ahead of the string, ``[time, *batch, 1]`` [m/s].
 
     Returns:
@@ -417,7 +411,8 @@ def damping_time(speed: Tensor, alive: Tensor, time_step: float) -> Tensor:
     """Return the time after which the speeds' deviation over the vehicles stays below 0.5 m/s.
 
     Args:
-        speed, alive, time_step: see :func:`string_measures`.
+        speed, alive: see :func:`string_measures`.
+        time_step: duration of a step [s].
 
     Returns:
         ``[*batch, 1]`` [s]; NaN if it does not stay below.

@@ -139,7 +139,7 @@ class Player:
         first, second = (self._begin(options) for options in (given, other))
         same = all(torch.equal(first[key], second[key]) for key in first if key != SEED)
         seeded = [x for x, _ in self.step.pieces if SEED in [key for _, key in x.needs]]
-        return not same or not all({**vars(type(x)), **vars(x)}.get("steady") for x in seeded)
+        return not same or not all(x.steady for x in seeded)
 
     def _checked(
         self, record: Record, alive: Tensor, named: Callable[[int], str]

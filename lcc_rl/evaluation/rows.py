@@ -16,7 +16,7 @@ from torch import Tensor
 from lcc_rl.arrays import times
 from lcc_rl.config.words import RECORDED
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.energy import AVERAGED, BURNT, SECOND, Fleet, as_fleet
+from lcc_rl.energy import AVERAGED, BURNT, SECOND, Fleet
 from lcc_rl.evaluation import metrics
 from lcc_rl.evaluation.rollout import Record
 from lcc_rl.evaluation.strategies import Strategy
@@ -107,10 +107,10 @@ def measures(
     groups: Groups,
     alive: Tensor,
     time_step: float,
-    energy: Fleet | None = None,
-    averaged: bool = True,
-    second: Fleet | None = None,
-    ahead: Mapping[str, Tensor] | None = None,
+    energy: Fleet,
+    averaged: bool,
+    second: Fleet | None,
+    ahead: Mapping[str, Tensor],
 ) -> dict[str, Tensor]:
     """Return the measures of a batch, each ``[batch, 1]``; energies are sums over vehicles (A20).
 
@@ -118,7 +118,7 @@ def measures(
         groups: the record of each group of vehicles.
         alive: whether each step belongs to a running episode, ``[time, batch, 1]``.
         time_step: duration of a step [s].
-        energy: the energy models; None: that of the ALCC paper.
+        energy: the energy models.
         averaged: include energies of averaged speeds.
         second: a further energy model, for :data:`lcc_rl.energy.SECOND`.
         ahead: see :func:`highest`, may begin before the counted time.
@@ -143,7 +143,7 @@ def measures(
             columns[f"{group}_{name}"] = added
     cav = groups["cav"]
     if "gap" in cav:
-        counted = {name: x[-len(alive) - 1 :] for name, x in (ahead or {}).items()}
+        counted = {name: x[-len(alive) - 1 :] for name, x in ahead.items()}
         columns |= metrics.safety_measures({**cav, **counted}, alive.unsqueeze(-2), time_step)
         for name in SUMMED:
             keys = [f"{group}_{name}" for group in ("cav", "hdv")]
@@ -203,7 +203,6 @@ def traffic(
         record["vehicles", "gap"],
         alive,
         mean,
-        time_step,
         None if leader is None else leader[-steps:],
     )
 
@@ -214,7 +213,7 @@ def describe(
     population: Population,
     profile: Tensor,
     driver: Tensor,
-    repeat: Tensor | None = None,
+    repeat: Tensor | None,
 ) -> pd.DataFrame:
     """Return strategy, profile, driver and repeat of every episode of a batch."""
     columns = {
@@ -259,17 +258,13 @@ def leader_faster(
 
 
 def leader_measures(
-    profiles: Profiles,
-    profile: Tensor,
-    energy: Fleet | None = None,
-    first: int = 0,
-    slope: Slope | None = None,
+    profiles: Profiles, profile: Tensor, fleet: Fleet, first: int, slope: Slope | None
 ) -> pd.DataFrame:
     """Return the path energy [kJ] and the mean speed [m/s] of the leader of each episode.
 
     The leader has the first energy model. The first step that counts is ``first``.
     """
-    fleet, values = as_fleet(energy), {}
+    values = {}
     for index in profile.unique().tolist():
         speed = profiles.record(index)
         grade = None if slope is None else slope.along(speed)[first:]

@@ -77,7 +77,7 @@ def animate(motions: Mapping[str, SampleMotion], path: str | Path) -> Path:
     return path
 
 
-def check_ending(path: Path, episodes: int = 1) -> None:
+def check_ending(path: Path, episodes: int) -> None:
     """Check that an animation can be written in the format of its ending."""
     if path.suffix not in ANIMATION_FORMATS:
         raise unknown_name("ending of an animation", path.suffix, ANIMATION_FORMATS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from argparse import ArgumentTypeError
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
@@ -39,7 +38,7 @@ from lcc_rl.interfaces.exported import (
 from lcc_rl.pieces import CBFFilter, Controller
 from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.world import World
-from lcc_rl.runs.arguments import typed
+from lcc_rl.settings import Settings, parse
 
 # Motion of the vehicle, of the vehicle ahead and of the vehicle behind.
 MEASURED = (
@@ -48,6 +47,12 @@ MEASURED = (
 )
 KNOWN = (*MEASURED, AGE)
 WIDEST = 200  # largest memory in machine code
+
+
+class Simulator(Settings):
+    """The simulator of the vehicles."""
+
+    time_step: TimeStep  # duration of a step [s]
 
 
 class Driver:
@@ -95,8 +100,7 @@ class Driver:
         drivers: Population | str | Path | None = None,
         limits: Mapping[str, float] | None = None,
     ) -> None:
-        with raised_as(ConfigError, "time_step", ArgumentTypeError):
-            self.time_step: float = typed(TimeStep)(str(time_step))
+        self.time_step = parse(Simulator, {"time_step": time_step}, "").time_step
         self.name, spec = one_of(name)
         first = checked_seed(seed)
         require(first is not None, "seed must be a whole number, got None")

@@ -184,7 +184,12 @@ def export(
     Examples:
         >>> export("pretrained/alcc_limits", "alcc.pt2")  # doctest: +SKIP
     """
+<<<<<<< HEAD
     return written(policy, path, trust, variant, overrides, normalize, safety, limits)[0]
+=======
+    changes = {"safety": safety, "limits": limits}
+    return _written(policy, path, trust, variant, overrides, normalize, **changes)[0]
+>>>>>>> st18
 
 
 def written(
@@ -194,8 +199,7 @@ def written(
     variant: str = "alcc",
     overrides: Sequence[str] = (),
     normalize: Any = None,
-    safety: Safety = None,
-    limits: Mapping[str, float] | None = None,
+    **given: Any,
 ) -> tuple[Path, DrivingProgram | None]:
     """Write the file, see :func:`export`; return its path and its program."""
     path = new_file(path, "name")
@@ -204,15 +208,14 @@ def written(
     name, spec = one_of(policy) if network is None else (type(policy).__name__, network)
     cfg = None if network is None else load("train", with_variant(variant, overrides))
     rule, module = cfg is None and not is_policy(spec), None
-    given: dict[str, Any] = {"safety": safety, "limits": limits}
     if path.suffix == PAGE:
         text = f"{name}: a page ({PAGE}) needs a run or a policy file, and has its own filter"
-        require(cfg is None and not (safety or limits or rule), text)
+        require(cfg is None and not (any(given.values()) or rule), text)
         content = ring_page(policy, trust, overrides).encode()
     else:
         if cfg is None and overrides:
             text = "overrides: safety.… and limits.… are given as arguments, too"
-            require(safety is None and limits is None, text)
+            require(all(x is None for x in given.values()), text)
             given = _changes(overrides, rule, path.suffix)
         module = _rule(policy, trust, **given) if rule else program(spec, trust, cfg, **given)
         about = described(module, name)

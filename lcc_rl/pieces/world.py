@@ -150,6 +150,10 @@ class Part(Settings):
     # drivers; of human drivers, whether these have no noise.
     steady = False
 
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        cls.steady = vars(cls).get("steady", False)
+
     def bind(self, world: World | None = None, name: str | None = None) -> Self:
         """Return a copy that is bound to a world.
 

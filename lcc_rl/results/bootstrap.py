@@ -110,14 +110,14 @@ def _over_drives(
     return value - half_width, value + half_width
 
 
-def resampled(table: Floats, stream: int, drives: Sequence[object] | None = None) -> Floats:
+def resampled(table: Floats, stream: int, drives: Sequence[object] | None) -> Floats:
     """Return the resampled means of ``[..., windows, seeds]``; ``stream`` draws the seeds."""
     drawn = drawn_windows(table.shape[-2], tuple(drives or ())) @ table
     return np.asarray((drawn * resample_weights(table.shape[-1], stream)).sum(-1))
 
 
 @lru_cache(maxsize=1)  # all measures of a strategy have the same windows
-def drawn_windows(count: int, drives: tuple[object, ...] = ()) -> Floats:
+def drawn_windows(count: int, drives: tuple[object, ...]) -> Floats:
     """Return the weights of windows in every resample, ``[RESAMPLES, count]``."""
     if len(set(drives)) < LEAST_DRIVES:
         return resample_weights(count, 0)

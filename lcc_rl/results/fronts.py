@@ -79,18 +79,16 @@ def compare_fronts(
     return estimate(statistic, *fronts, drives=drives, paired=paired)
 
 
-def energy_at(
-    energy: Floats, share: Floats, at: Any, least: float | None, most: float | None
-) -> Floats:
+def energy_at(energy: Floats, share: Floats, at: Any, most: float | None = np.nan) -> Floats:
     """Return the energy of a front, ``[..., limits]`` each, at the share ``at``.
 
-    It is interpolated linearly between the limits. If all shares are larger, it is ``least``; if
-    all are smaller, ``most``; None: the energy of the nearest share.
+    It is interpolated linearly between the limits. If all shares are larger, it is NaN; if all are
+    smaller, ``most``; None: the energy of the nearest share.
     """
 
     def read(at: float, share: Floats, energy: Floats) -> float:
         order = np.argsort(share)
-        return float(np.interp(at, share[order], energy[order], left=least, right=most))
+        return float(np.interp(at, share[order], energy[order], left=np.nan, right=most))
 
     return np.asarray(np.vectorize(read, signature="(),(n),(n)->()")(at, share, energy))
 
@@ -123,8 +121,8 @@ def saved_at_flow(own: Curve, other: Curve, reference: Curve | None = None) -> A
         flow = np.maximum(reference[FLOW][..., 0], own[FLOW].min(-1))
         flow = np.maximum(flow, other[FLOW].min(-1))
         most = None if other[FLOW].shape[-1] == 1 else np.nan
-    mine = energy_at(energy_per_distance(own), own[FLOW], flow, np.nan, np.nan)
-    return share_saved(mine, energy_at(energy_per_distance(other), other[FLOW], flow, np.nan, most))
+    mine = energy_at(energy_per_distance(own), own[FLOW], flow)
+    return share_saved(mine, energy_at(energy_per_distance(other), other[FLOW], flow, most))
 
 
 def at_equal_flow(

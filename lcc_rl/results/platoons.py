@@ -91,7 +91,7 @@ PLATOON = [
 BELOW = "sums over followers and frames, means over runs; collisions: cars in all runs"
 
 
-def case_report(rows: pd.DataFrame, case: str, of: str = "") -> Report:
+def case_report(rows: pd.DataFrame, case: str, of: str) -> Report:
     """Return the report of a case of a platoon, from rows of episodes.parquet."""
     table = with_drivers(case_table(rows, case)).astype({"collisions": int})
     shown = [Shown(one.key, one.short) for one in PLATOON if one.short]

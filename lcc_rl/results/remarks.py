@@ -152,16 +152,11 @@ def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
     ]
 
 
-def few_windows(windows: int, seconds: float | None = None) -> str:
-    """Return a warning on few windows; empty for enough or long ones.
-
-    Args:
-        windows: number of windows.
-        seconds: length of each, if it is known.
-    """
-    if windows >= FEW_WINDOWS or windows * (seconds or 0.0) >= SHORT:
+def few_windows(windows: int, seconds: float) -> str:
+    """Return a warning on few windows of a length [s]; empty for enough or long ones."""
+    if windows >= FEW_WINDOWS or windows * seconds >= SHORT:
         return ""
-    count = several(windows, "window") + (f" of {seconds:g} s" if seconds else "")
+    count = f"{several(windows, 'window')} of {seconds:g} s"
     return f"{count} are too few for conclusions: these numbers only show that everything runs"
 
 

@@ -93,10 +93,8 @@ def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:
         return
     with suppress(ResultsError):  # complete a file of an older version by defaults
         stored = as_plain(trusted(stored, str(folder / CONFIG), own_modules(cfg))[0])
-    keys = differing(dict(flatten(stored)), dict(flatten(as_plain(cfg))))
-    free = tuple(f"{name}." for name in (*but, "trust", LOGS))
-    keys = [key for key in keys if not f"{key}.".startswith(free)]
-    if keys:
+    both = (without(dict(flatten(x)), (*but, "trust", LOGS)) for x in (stored, as_plain(cfg)))
+    if keys := differing(*both):
         names = ", ".join(keys[:3]) + (", …" if len(keys) > 3 else "")
         raise ResultsError(
             f"{folder} already holds {files[0]} of other settings ({names}); choose another "
@@ -195,6 +193,12 @@ def naming_run(path: Path) -> Iterator[None]:
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     """Return the sorted keys with different values, or in one of two flat mappings only."""
     return [key for key in sorted(one.keys() | other.keys()) if one.get(key) != other.get(key)]
+
+
+def without(settings: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """Return settings by dotted key, but not those named and those of sections named."""
+    prefixes = tuple(f"{name}." for name in names)
+    return {key: x for key, x in settings.items() if not f"{key}.".startswith(prefixes)}
 
 
 def flatten(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -19,15 +19,24 @@ from lcc_rl.io.tensors import checksums
 from lcc_rl.results.loading import SHARD, listed, load
 from lcc_rl.results.names import ON_FRONT
 from lcc_rl.results.report import baseline_of
-from lcc_rl.results.runs import CONFIG, POLICY, differences, flat_settings
-from lcc_rl.results.windows import SOURCE
+from lcc_rl.results.runs import CONFIG, POLICY, differences, flat_settings, without
+from lcc_rl.results.windows import SOURCE, STRATEGY, TRAINED
 from lcc_rl.runs.plans import choices_of
 from lcc_rl.runs.states import run_folders
 
 # Settings in which the parts and the seeds of one study differ.
-SHARED = tuple(f"{key}." for key in (*NOT_IDENTITY, "seed", SHARD))
-TRAINING = ["strategy", "training_seed"]
-EPISODE = [*TRAINING, SOURCE, "profile_id", "driver_id", "repeat", "case", "run_id", "follower"]
+SHARED = (*NOT_IDENTITY, "seed", SHARD)
+EPISODE = [
+    STRATEGY,
+    TRAINED,
+    SOURCE,
+    "profile_id",
+    "driver_id",
+    "repeat",
+    "case",
+    "run_id",
+    "follower",
+]
 Choices = Mapping[str, Any]  # of a run, by dotted key
 
 
@@ -47,7 +56,7 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
     root = Path(root)
     loaded = load(root, settings=())
     rows = loaded.assign(run=loaded["run"].astype(str), strategy=loaded["strategy"].astype(str))
-    runs = {name: _own(_settings(root / name)) for name in rows["run"].unique()}
+    runs = {x: without(_settings(root / x), SHARED) for x in rows["run"].unique()}
     if of := conditions(rows, runs, root):
         words = rows["run"].map(of)
         rows[SOURCE] = rows[SOURCE].astype(str) + ", " + words if SOURCE in rows else words
@@ -106,7 +115,7 @@ def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str,
     They are on what the commands varied and what only some of them set; or on stored settings, if
     a run has no command or that does not tell them apart. Runs of equal settings share their words.
     """
-    typed = [_own(choices_of(folder)) for folder in folders]
+    typed = [without(choices_of(folder), SHARED) for folder in folders]
     kinds = {(str(one), str(other)) for one, other in zip(typed, stored, strict=True)}
     if len(kinds) > len(set(map(str, typed))) or not all(typed):
         return differences(stored)
@@ -115,10 +124,6 @@ def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str,
     kept = [key for one in each for key in one if not all(key in other for other in each)]
     whole = [{**{k: own[k] for k in kept if k in own}, **first[str(own)]} for own in stored]
     return differences(whole, *kept)
-
-
-def _own(settings: Choices) -> Choices:
-    return {key: x for key, x in settings.items() if not f"{key}.".startswith(SHARED)}
 
 
 def _settings(folder: Path) -> dict[str, Any]:
@@ -132,7 +137,8 @@ def without_effect(root: Path) -> list[str]:
     """Return sentences on settings with which trainings of one seed have the same weights."""
     folders = [folder for folder in run_folders(root) if (folder / POLICY).is_file()]
     stored = [_settings(folder) for folder in folders]
-    named, equal = labels(list(map(_own, stored)), folders), defaultdict(list)
+    named = labels([without(x, SHARED) for x in stored], folders)
+    equal = defaultdict(list)
     for folder, settings, word in zip(folders, stored, named, strict=True):
         weights = checksums(folder / POLICY) or folder  # those of a damaged file equal no others
         equal[settings.get("seed"), weights].append(word)
@@ -158,5 +164,7 @@ def _check_one_study(root: Path, rows: pd.DataFrame) -> None:
             f"lcc_rl.results.load({str(root)!r}) reads them",
         )
     twice = rows[rows.duplicated([key for key in EPISODE if key in rows])]
-    which = [f"{strategy}, seed {seed}" for strategy, seed in twice[TRAINING].to_numpy()[:1]]
+    which = [
+        f"{strategy}, seed {seed}" for strategy, seed in twice[[STRATEGY, TRAINED]].to_numpy()[:1]
+    ]
     require(not which, f"{root}: it contains a training twice: {''.join(which)}")

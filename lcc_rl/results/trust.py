@@ -22,9 +22,7 @@ LOGS = "logger.where"  # the setting that names a path to write to
 RETIRED = ("objective",)  # removed settings that changed no row
 
 
-def trusted(
-    content: dict[str, Any], where: str, trust: Sequence[str] = ()
-) -> tuple[Any, list[str]]:
+def trusted(content: dict[str, Any], where: str, trust: Sequence[str]) -> tuple[Any, list[str]]:
     """Return a stored configuration that can be built safely.
 
     Args:
@@ -53,7 +51,7 @@ def trusted(
         return parse_config(with_defaults(content)), removed
 
 
-def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str] = ()) -> None:
+def check_targets(content: Mapping[str, Any], where: str, trust: Sequence[str]) -> None:
     """Check that a stored configuration names no code outside :data:`REGISTRY`.
 
     Building a node imports and calls its class, ``law`` and ``model``, as does a controller in

@@ -176,6 +176,23 @@ def still(speed):
     return torch.zeros_like(speed) * (0.0 if Store is None else len(LAST) + COUNT)
 
 
+class Base(Controller):
+    """Remembers in a variable, in a static method."""
+
+    reads = ("self.speed",)
+
+    @staticmethod
+    def law(speed):
+        return listed(speed)
+
+    def command(self, speed):
+        return self.law(speed)
+
+
+class Derived(Base):
+    """Remembers by what its base does."""
+
+
 class RememberingFeature(Feature):
     """Keeps the last gap in an attribute."""
 
@@ -223,6 +240,8 @@ def test_a_function_that_remembers_in_a_variable_is_refused() -> None:
     )
     check_refused(lambda law: Driver(law, 0.1), cases)
     driven_by("controllers", "automated", {"_target_": path_of(Law), "law": f"{__name__}.still"})
+    with pytest.raises(ConfigError, match="Derived remembers in its variable 'LAST'"):
+        driven_by("controllers", "automated", {"_target_": f"{__name__}.Derived"})
 
 
 def test_pieces_and_controllers_inside_others_are_held_to_it_too() -> None:

@@ -21,6 +21,7 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.functional.ovm import OVMConstants
 from lcc_rl.io import memory
+from lcc_rl.pieces.connected import CACC
 from lcc_rl.pieces.controllers import ConstantAcceleration
 
 HUGE = 10**15
@@ -34,7 +35,6 @@ WRONG = {
     "scenario.controllers.human.parameters={a: 1}": "drivers=fixed drivers.acceleration",
     "variant=[alcc,reference]": "variant takes one choice; for a run of each: -m variant=alcc,refe",
     "energy=[fuel,bolt]": "energy takes one choice",
-    "leader=[udds,us06]": "leader takes one choice",
     "+scenario.filters.automated.margin=1": "'automated'.*valid: none; .filter=cbf or a task adds",
     "+scenario.actuators.automated.lag=0.4": "'automated'.* .faults=all actuators and sensors",
     "+scenario.fleet.t={_target_: builtins.dict}": "scenario.fleet.t: expected a .*VehicleClass",
@@ -199,6 +199,16 @@ def test_options_without_effect_are_refused() -> None:
     words = ["variants=[alcc]", "evaluation.baselines=[human]"]  # a job compares
     trainings, final = composed_part(load("pipeline", words), words)
     assert final.evaluation.baselines == ["human"] != trainings["alcc"].evaluation.baselines
+
+
+class Own(CACC):
+    """May draw what its base does not."""
+
+
+def test_a_platoon_with_a_class_of_ones_own_may_depend_on_drivers() -> None:
+    own = f"{AUTO}._target_={__name__}.Own"
+    fixed = [load("evaluate", ["variant=cacc", *words]).is_fixed() for words in ([], [own])]
+    assert fixed == [True, False]
 
 
 def test_programs_are_refused_what_has_no_effect_in_them() -> None:

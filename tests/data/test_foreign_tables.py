@@ -216,12 +216,3 @@ def test_a_table_that_sumo_writes_is_read_at_once(tmp_path) -> None:
     assert "slope of gaps over speeds 1.0" in loaded.report[-1]
     with pytest.raises(DataError, match=r"positions jump .* do they begin anew by lane or link"):
         TableSource(path=path, columns=columns | {"position": "vehicle_pos"}).load()
-
-
-def test_sumo_writes_a_blank_row_where_the_road_is_empty(tmp_path) -> None:
-    rows = long_table()
-    empty = pd.DataFrame({"t": [999.0]}).reindex(columns=rows.columns)
-    pd.concat([rows, empty]).to_csv(tmp_path / "fcd.csv", index=False)
-    names = {"vehicle": "id", "time": "t", "speed": "v", "leader": "ahead", "gap": "gap"}
-    loaded = TableSource(path=str(tmp_path / "fcd.csv"), columns=names).load()
-    assert any("dropped 1 rows: blank time, speed or position" in x for x in loaded.report)

@@ -23,7 +23,11 @@ from lcc_rl.io.files import write_parquet
 
 # Column, value in row 95 (episode 3), what is said of it.
 FLAWS = [
-    ("leader_speed_mps", 540.0, r"holds 540 m/s \(is it km/h or ft/s\?\), .*max_speed=70"),
+    (
+        "leader_speed_mps",
+        540.0,
+        r"holds 540 m/s \(is it in km/h .* for no target\?\), .*max_speed=70",
+    ),
     ("follower_speed_mps", 60.0, r"changes by 400 m/s², data\.plausible\.max_acceleration=10"),
     ("leader_length_m", 1.4, r"holds 1\.4 m, data\.plausible\.min_length=2"),
     ("leader_length_m", 60.0, r"holds 60 m, data\.plausible\.max_length=30"),

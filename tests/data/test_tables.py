@@ -203,10 +203,12 @@ def test_a_leader_that_is_not_there_and_duplicates_are_counted(tmp_path) -> None
     frame.loc[frame["id"] == 2, "ahead"] = 77
     frame.loc[frame["id"] == 1, "ahead"] = 1
     frame.loc[20, "v"] = np.nan
-    loaded = TableSource(path=written(tmp_path, frame), columns=BY_GAP).load()
+    empty = pd.DataFrame({"t": [999.0]})  # as SUMO writes where the road is empty
+    path = written(tmp_path, pd.concat([frame, empty]))
+    loaded = TableSource(path=path, columns=BY_GAP).load()
     words = "dropped 2 rows: rows that repeat a time of their vehicle, 0 of them with"
     assert any(line.startswith(words) for line in loaded.report)
-    assert "dropped 1 rows: blank time, speed or position" in loaded.report
+    assert "dropped 2 rows: blank time, speed or position" in loaded.report
     assert loaded.episodes["follower_id"].unique().tolist() == [3]
     unseen = "left out 400 samples: the preceding vehicle is not seen in that frame, the first: "
     assert any(x.startswith(unseen) for x in loaded.report)
@@ -433,7 +435,7 @@ def test_a_real_openacc_file(shared_data) -> None:
     assert 4.0 < loaded.episodes["gap_m"].min() < loaded.episodes["gap_m"].max() < 30.0
 
 
-def test_lengths_in_feet_and_gaps_that_jump_are_named_in_tables(tmp_path) -> None:
+def test_lengths_in_feet_are_named(tmp_path) -> None:
     frame = long_table()
     feet = frame.assign(length=frame["length"] / 0.3048)
     path = written(tmp_path, feet, "feet.csv")
@@ -455,13 +457,6 @@ def test_lengths_in_feet_and_gaps_that_jump_are_named_in_tables(tmp_path) -> Non
         for x in ("ft", "m")
     ]
     assert gaps[0] == pytest.approx(gaps[1] + (1 / 0.3048 - 1) * frame["length"].mean(), rel=1e-3)
-    clean = TableSource(path=written(tmp_path, frame), columns=BY_GAP).load()
-    frame.loc[frame["t"].between(20.0, 24.95) & (frame["gap"] > 0), "gap"] = 100.0
-    jumps = TableSource(path=written(tmp_path, frame), columns=BY_GAP).load()
-    assert len(jumps.episodes) < len(clean.episodes)
-    assert jumps.episodes["gap_m"].max() < 90.0
-    assert any("where the gap jumps or is held" in line for line in jumps.report)
-    assert not any("jumps or is held" in line for line in clean.report)
 
 
 # -- the log of one car ----------------------------------------------------------------------------
@@ -513,7 +508,7 @@ def test_the_log_of_a_car_has_relative_speeds_targets_and_a_flag(tmp_path) -> No
     none.drop(columns="ok").to_csv(tmp_path / "none.csv", index=False)
     plain = {key: name for key, name in LOG.items() if name not in ("ok", "id")}
     report = "".join(EpisodesSource(path=str(tmp_path / "none.csv"), columns=plain).load().report)
-    assert "'v' + 'range_rate' holds 167.108 m/s (is it km/h or ft/s, or a value for no" in report
+    assert "'v' + 'range_rate' holds 167.108 m/s (is it in km/h or ft/s, or a value for" in report
     bad = other.assign(ok="maybe")
     bad.to_csv(tmp_path / "bad.csv", index=False)
     with pytest.raises(DataError, match="data row 1, column 'ok' is 'maybe'; expected 1 or 0"):

@@ -66,14 +66,6 @@ def known_drivers() -> pd.DataFrame:
 
 
 @pytest.fixture(scope="session")
-def known_episodes(known_drivers: pd.DataFrame) -> pd.DataFrame:
-    """Their episodes."""
-    return build_episodes(
-        known_drivers["desired_speed"].tolist(), known_drivers["time_gap"].tolist()
-    )
-
-
-@pytest.fixture(scope="session")
 def make_episodes():
     """Function that makes episodes of given (v0, T); see :func:`build_episodes`."""
     return build_episodes

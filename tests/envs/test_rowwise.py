@@ -26,7 +26,7 @@ FUNCTIONS = {
     ),
     "gathered": lambda x, n: x.gather(-1, n) + x[:, :3].gather(-1, n[:, :1].clamp(max=2)),
     "running": lambda x, n: x.cumsum(-1) + torch.bucketize(x, TABLE[0], right=True),
-    "normal": lambda x, n: torch.special.ndtri(n * 0.2 + 0.1),
+    "normal": lambda x, n: torch.cat([y := torch.special.ndtri(n * 0.2 + 0.1), y + 1e8 - 1e8], -1),
     "powers": lambda x, n: x**2 + x.abs() ** 1.7 + x.square().sqrt(),
     "clamp": lambda x, n: x.clamp(-0.5, 0.5) + x.clamp(min=0.0) + torch.minimum(x, x.flip(-1)),
     "choice": lambda x, n: torch.where((x > 0.0) & ~(n == 2), x, 0.1 * n),

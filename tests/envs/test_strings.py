@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import pytest
 import torch
 from helpers import (
@@ -11,18 +9,16 @@ from helpers import (
     OBSERVATION,
     PLATOON,
     POPULATION,
-    REWARD,
     VARIANTS,
     check_refused,
     composed,
     single_env,
-    slow_but,
     small_env,
     string,
     wavy_profiles,
 )
 from torch import Tensor
-from torchrl.envs import ParallelEnv, SerialEnv, check_env_specs
+from torchrl.envs import check_env_specs
 
 from lcc_rl.envs import Inputs, build_env, make_env
 from lcc_rl.envs.checks import check_pieces
@@ -99,45 +95,6 @@ def test_who_may_ask_for_the_single_agent_view(monkeypatch) -> None:
     assert set(group.full_action_spec.keys(True, True)) == {ACTION}
     with pytest.raises(ConfigError, match="single=True needs one automated vehicle, the string ha"):
         make_env("alcc", 2, [*tiny, string("automated*2")], single=True)
-
-
-# -- TorchRL's vectors of environments -------------------------------------------------------------
-
-
-def vectorised(view: str):
-    if view == "single":
-        return single_env("alcc", 2, seed=1)
-    return small_env("alcc", 2, [string("(automated human)*2")], seed=1)
-
-
-KINDS = [(kind, view) for kind in (SerialEnv, ParallelEnv) for view in ("single", "group")]
-
-
-@pytest.mark.parametrize(("kind", "view"), slow_but([*KINDS[:2], KINDS[3]], KINDS))
-def test_in_torchrls_vectors_of_environments(kind, view) -> None:
-    own = {"mp_start_method": "fork"} if kind is ParallelEnv else {}  # spawning takes 25 s
-    env = kind(2, partial(vectorised, view), **own)
-    try:
-        check_env_specs(env)
-        env.set_seed(0)
-        data = env.rollout(10, break_when_any_done=False)
-    finally:
-        env.close()
-    assert data.shape == (2, 2, 10)
-    assert torch.isfinite(data["next", "vehicles", "gap"]).all()
-    # Each environment has episodes of its own.
-    seeds = data["episode", "seed"][..., 0, 0]
-    assert seeds.unique().numel() == 4
-
-
-def test_the_group_is_what_torchrls_multi_agent_tools_expect() -> None:
-    env = mixture("pattern", 3)
-    td = env.rollout(4)
-    assert td["automated"].keys() >= {"observation", "action", "index"}
-    for key in (OBSERVATION, ACTION, ("next", *REWARD)):
-        assert td[key].shape[:3] == (3, 4, 2), key
-    assert env.action_keys == [ACTION]
-    assert env.reward_keys[0] == REWARD or REWARD in env.reward_keys
 
 
 # -- what is refused when an environment is built --------------------------------------------------

@@ -114,6 +114,7 @@ def test_several_automated_vehicles_are_a_group_of_agents(subtests) -> None:
     wrappers = {
         "alone": lambda: lcc_rl.make_env("alcc", 2, words),
         "serial": lambda: SerialEnv(2, several),
+        "parallel": lambda: ParallelEnv(2, several, **PROCESSES),
         "parallel without buffers": lambda: ParallelEnv(2, several, use_buffers=False, **PROCESSES),
         "threads": lambda: AsyncEnvPool([several, several], backend="threading"),
     }
@@ -188,23 +189,6 @@ def test_the_total_counts_the_terms_that_are_left_or_replaced() -> None:
         after = env.rand_step()["next"]
         assert set(after[terms].keys()) == before - {"safety"} | names
         torch.testing.assert_close(after["automated", "reward"], sum(after[terms].values()))
-
-
-def test_the_chain_of_pieces_equals_torchrls_own() -> None:
-    envs = [lcc_rl.make_env("alcc", 3, WORDS, single=False) for _ in range(2)]
-    envs[1].transform.__class__ = Compose  # without the functions of pieces as one
-    reset = {("episode", "seed"): torch.arange(3).unsqueeze(-1)}
-    start = [env.reset(options=reset) for env in envs]
-    action = torch.linspace(-1.0, 1.0, 3).reshape(3, 1, 1)
-    steps = [
-        env.step(td.set(("automated", "action"), action))
-        for env, td in zip(envs, start, strict=True)
-    ]
-    assert set(steps[0].keys(True, True)) == set(steps[1].keys(True, True))
-    torch.testing.assert_close(*(td.to_dict() for td in steps), rtol=1e-5, atol=1e-5)
-    made, stock = (td["next"] for td in steps)
-    assert made["vehicles"].batch_size == stock["vehicles"].batch_size
-    assert [made.device, made.is_locked, made.names] == [stock.device, stock.is_locked, stock.names]
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the compiler's own

@@ -281,7 +281,7 @@ def env_of(*transforms):
 
 
 @pytest.fixture
-def fork(monkeypatch):
+def fork():
     before = mp.get_start_method(allow_none=True)
     mp.set_start_method("fork", force=True)
     yield

@@ -11,7 +11,7 @@ from helpers import POPULATION, compose, steady, string, wavy_profiles
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent
 from lcc_rl.envs import Inputs, build_env
-from lcc_rl.evaluation.episodes import Episodes, Plan, evaluate, pairs
+from lcc_rl.evaluation.episodes import Episodes, Plan, evaluate
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.strategies import Strategy, baseline
 from lcc_rl.functional.driver_models import simulate_follower
@@ -40,7 +40,7 @@ def test_batch_size_does_not_change_a_row() -> None:
 
 def test_scenario_b_equals_the_plain_simulation() -> None:
     rows, _ = run("direct", "scenario.controllers.human.noise=0")
-    profile, driver = pairs(len(PROFILES), len(POPULATION.time_gap), 5)
+    profile, driver, _ = Plan(len(PROFILES), len(POPULATION.time_gap), 5, 10_000).episodes(0)
     leader = torch.stack([PROFILES.record(i) for i in profile], dim=1)
     v0, gap = POPULATION.desired_speed[driver], POPULATION.time_gap[driver]
     start = POPULATION.constants.equilibrium_gap(leader[0], v0, gap)

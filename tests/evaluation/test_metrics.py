@@ -160,7 +160,7 @@ def test_traffic_of_a_string() -> None:
     alive = torch.tensor([[1, 1], [1, 1], [1, 0], [1, 0]], dtype=torch.bool).unsqueeze(-1)
     leader = torch.tensor([[8.0, 1.0], [12.0, 3.0], [8.0, 0.0], [12.0, 0.0]]).unsqueeze(-1)
     gap = torch.full_like(speed, 15.0)
-    found = string_measures(speed, gap, alive, 5.0, 0.1, leader)
+    found = string_measures(speed, gap, alive, 5.0, leader)
     expected = {
         "mean_speed_mps": [11.5, 6.5],
         "speed_std_mps": [0.5, 0.5],
@@ -172,7 +172,7 @@ def test_traffic_of_a_string() -> None:
     assert set(found) == set(expected)
     for name, values in expected.items():
         torch.testing.assert_close(found[name].flatten(), torch.tensor(values))
-    assert "string_ratio" not in string_measures(speed, gap, alive, 5.0, 0.1)
+    assert "string_ratio" not in string_measures(speed, gap, alive, 5.0)
     # Spreads of 1, 0, 1, 0 m/s, then none above 0.5; the other one still varies when it ends.
     torch.testing.assert_close(
         damping_time(speed, alive, 0.1).flatten(), torch.tensor([0.3, torch.nan]), equal_nan=True

@@ -56,8 +56,8 @@ def states(
     return speed, high + more, ahead
 
 
-@pytest.mark.parametrize(("braking", "time_step"), CASES)
-def test_the_least_room_is_that_of_braking_in_small_steps(braking, time_step) -> None:
+@pytest.mark.parametrize("braking", dict(CASES))
+def test_the_least_room_is_that_of_braking_in_small_steps(braking) -> None:
     chance = torch.Generator().manual_seed(1)
     speed, ahead = draw(200, chance, 40.0).double(), draw(200, chance, 40.0).double()
     gap = draw(200, chance, 150.0).double()

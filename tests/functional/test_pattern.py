@@ -83,15 +83,6 @@ def test_penetration_is_rounded_to_whole_vehicles(subtests) -> None:
             assert string.drawn == (0 < count < size)
 
 
-# A pattern as a tree: a role, or a sequence of trees; each with how often.
-names = st.sampled_from([A, H, "cacc", "x_1"])
-trees = st.recursive(
-    st.tuples(names, st.integers(1, 4)),
-    lambda inner: st.tuples(st.lists(inner, min_size=1, max_size=3), st.integers(1, 3)),
-    max_leaves=8,
-)
-
-
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.text(alphabet="ah()* 12", max_size=12))
 def test_any_text_is_a_string_or_refused_in_one_way(text) -> None:

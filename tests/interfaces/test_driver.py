@@ -255,8 +255,8 @@ def test_bad_input_is_one_clear_error() -> None:
         ("cacc tuned", 0.1, "cacc tuned reads self.gap_error, which is not measured here, only"),
         ("pretrained/hcfs", 0.2, "pretrained/hcfs reads .*, which is not measured here, only"),
         ("idm_ac", 0.1, "Did you mean 'idm_acc'"),
-        *((x, 0, "time_step: must be greater than or equal to 0.001") for x in ("idm_acc", POLICY)),
-        ("idm_acc", None, "time_step: must be a valid number, .*got 'None'"),
+        *((x, 0, "time_step must be greater than or equal to 0.001") for x in ("idm_acc", POLICY)),
+        ("idm_acc", None, "time_step must be a valid number, .*got None"),
         ("idm_acc", 0.1, (), {"margin": 2.0}, "idm_acc has no safety filter whose settings"),
         (POLICY, 0.1, (), {"margins": 2.0}, "Did you mean 'margin'"),
         (POLICY, 0.1, (), None, 0, None, {"max_brake": 6}, "Did you mean 'max_braking'"),
@@ -272,7 +272,6 @@ def test_bad_input_is_one_clear_error() -> None:
         (given | {"self.gap": [[1.0], [2.0]]}, None, "arrays of one length"),
         (given | {"self.gap": [1.0, 2.0], "self.speed": [1.0]}, None, "arrays of one length"),
         ([1.0, 2.0], None, "measured must name measurements, such as self.gap, got list"),
-        (given | {"self.gap": [1.0, 2.0], "ahead.speed": [1.0]}, None, "arrays of one length"),
         *(
             (given | {"self.gap": x}, None, "measured must hold numbers")
             for x in ("near", 1j, [1j], 10**400, None, torch.ones(1, requires_grad=True))

@@ -281,7 +281,7 @@ def test_bad_input_is_one_clear_error() -> None:
             r"\(.c\) takes safety.*no road; .*yaml file",
         ),
         (["pretrained/alcc", "x.c", "time_step=0.02"], "has the time step of its training"),
-        (["idm_acc", "x.c", "time_step=20"], "time_step: must be less than or equal to 0.5, got"),
+        (["idm_acc", "x.c", "time_step=20"], "time_step must be less than or equal to 0.5, got"),
         (["idm_ac", "x.onnx"], "idm_acc"),
         (["idm_acc", "x.html"], r"idm_acc: a page \(.html\) needs a run or a policy file"),
         (["human", "x.c"], "human draws noise from seeds: it cannot be exported"),

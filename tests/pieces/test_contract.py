@@ -395,6 +395,9 @@ def test_torchrls_compose_and_this_packages_give_the_same(road) -> None:
     assert set(other.keys(True, True)) == set(data.keys(True, True))
     for key in data.keys(True, True):
         assert torch.equal(other[key], data[key]), key
+    made, stock = (x.rand_step(x.reset())["next"] for x in (env, full_env(road)))
+    assert made["vehicles"].batch_size == stock["vehicles"].batch_size
+    assert [made.device, made.is_locked, made.names] == [stock.device, stock.is_locked, stock.names]
 
 
 @pytest.mark.parametrize("road", list(STRINGS))

@@ -21,6 +21,14 @@ def test_safety_is_the_literal_term_where_the_bends_are_far() -> None:
     assert torch.allclose(smooth, SafetyReward().reward(gap, relative), atol=2e-3)
 
 
+def test_safety_bends_within_its_widths() -> None:
+    gap, relative = column(11.0, 1.0, 1.0), column(-4.0, -1.0, 0.0)  # contact is at 1 m
+    ratios = 4.0 * torch.tensor([4.0 / 10.0, 1.0 / (0.2 * math.log(2.0)), 0.1 / 0.2])
+    bends = {"width": 0.3, "gap_width": 0.2, "rate_width": 0.1}
+    found = SmoothSafety(threshold=4.0, **bends).reward(gap, relative).squeeze(-1)
+    assert torch.allclose(found, 0.3 - (0.09 + ratios.log().square()).sqrt(), atol=1e-4)
+
+
 def test_safety_always_leads_back() -> None:
     gap, relative = column(8.0, 1.2, 0.5, -3.0), column(-3.0, -1.0, -1.0, -2.0)
     SmoothSafety().reward(gap, relative).sum().backward()

@@ -145,20 +145,6 @@ def test_a_mutated_table_is_read_or_refused_by_name(tmp_path, layout, changes, s
     assert (found[0]["leader_speed_mps"] >= 0).all()
 
 
-values = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers(-(2**53), 2**53)
-    | st.floats(allow_nan=False)
-    | st.text(st.characters(codec="ascii", exclude_characters="${}\\"), max_size=12),
-    lambda inner: (
-        st.lists(inner, max_size=3)
-        | st.dictionaries(st.text("abcxyz_", min_size=1, max_size=6), inner, max_size=3)
-    ),
-    max_leaves=8,
-)
-
-
 @pytest.mark.parametrize("place", [0.2, 0.5, 0.8])
 def test_one_wrong_byte_in_a_table_is_noticed(tmp_path, place) -> None:
     path = tmp_path / "a.parquet"

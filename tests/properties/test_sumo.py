@@ -98,7 +98,7 @@ def test_the_follower_drives_as_sumos_does(tmp_path) -> None:
 
 def test_both_are_as_near_an_exact_solution_as_the_page_says() -> None:
     """The row of docs/elsewhere.md; SUMO's is the same by the test above."""
-    constants, first = IDMConstants(acceleration=1.2, deceleration=1.6, min_gap=2.0), [20.0, 12.0]
+    first = [20.0, 12.0]
     time = np.arange(0.0, SECONDS + STEP / 2, STEP)
 
     def law(now: float, state: np.ndarray) -> list[float]:
@@ -112,9 +112,9 @@ def test_both_are_as_near_an_exact_solution_as_the_page_says() -> None:
         leader_speed().view(-1, 1),
         torch.tensor(first[1:], dtype=torch.float64),
         torch.tensor(first[:1], dtype=torch.float64),
-        torch.tensor(25.0),
-        torch.tensor(1.4),
-        constants,
+        torch.tensor(DESIRED),
+        torch.tensor(TIME_GAP),
+        CONSTANTS,
         STEP,
     )
     assert np.abs(own[:, 0].numpy() - exact[1]).max() == pytest.approx(0.011, abs=5e-4)

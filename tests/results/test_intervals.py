@@ -1,11 +1,13 @@
 """Bootstrap intervals: covered, reproducible, absent where nothing can be resampled; fronts."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
 
-from lcc_rl.results.bootstrap import crossed, mean, saving, share_saved
+from lcc_rl.results.bootstrap import Estimate, crossed, mean, saving, share_saved
 from lcc_rl.results.fronts import (
     DISTANCE,
     ENERGY,
@@ -43,20 +45,25 @@ def test_windows_are_shared_by_both_sides_and_seeds_are_not() -> None:
     assert saving(own, other) == both
 
 
+def check_interval(found: Estimate, value: float, draw: Callable[[], float]) -> float:
+    """Compare with a plain loop of draws; return the width of its interval."""
+    low, high = np.quantile([draw() for _ in range(4000)], [0.025, 0.975])
+    assert found.value == pytest.approx(value)
+    assert (found.low, found.high) == pytest.approx((low, high), abs=0.06 * (high - low))
+    return high - low
+
+
 def test_interval_is_that_of_a_plain_loop() -> None:
     generator = np.random.default_rng(3)
     base = generator.uniform(50, 150, (5, 2, 3))  # windows, seeds, drivers
     own = base[:, :1] * generator.uniform(0.8, 1.0, (5, 4, 3))
-    found = saving(own.mean(2), base.mean(2))
-    draws = []
-    for _ in range(4000):
+
+    def draw() -> float:
         windows = generator.integers(0, 5, 4)
         mine, theirs = generator.integers(0, 4, 3), generator.integers(0, 2, 1)
-        sums = [own[windows][:, mine].mean(), base[windows][:, theirs].mean()]
-        draws.append(1.0 - sums[0] / sums[1])
-    low, high = np.quantile(draws, [0.025, 0.975])
-    assert found.value == pytest.approx(1 - own.mean() / base.mean())
-    assert (found.low, found.high) == pytest.approx((low, high), abs=0.06 * (high - low))
+        return 1.0 - own[windows][:, mine].mean() / base[windows][:, theirs].mean()
+
+    check_interval(saving(own.mean(2), base.mean(2)), 1 - own.mean() / base.mean(), draw)
 
 
 def test_equal_seeds_are_resampled_in_pairs() -> None:
@@ -69,20 +76,18 @@ def test_equal_seeds_are_resampled_in_pairs() -> None:
         pd.DataFrame({"strategy": name, "energy": x.ravel()}, keys).reset_index()
         for name, x in parts.items()
     ).sample(frac=1.0, random_state=0)
-    draws = []
-    for _ in range(4000):
+
+    def draw() -> float:
         windows, seeds = generator.integers(0, 6, 5), generator.integers(0, 4, 3)
-        sums = (x[windows][:, seeds].sum() for x in (own, base))
-        draws.append(1.0 - next(sums) / next(sums))
-    low, high = np.quantile(draws, [0.025, 0.975])
+        return 1.0 - own[windows][:, seeds].sum() / base[windows][:, seeds].sum()
+
     found = savings(rows, "energy", "alcc a", "alcc b")
-    assert found.value == pytest.approx(1.0 - own.sum() / base.sum())
-    assert (found.low, found.high) == pytest.approx((low, high), abs=0.06 * (high - low))
+    width = check_interval(found, 1.0 - own.sum() / base.sum(), draw)
     assert savings(rows, "energy", "alcc b", "alcc b").columns("") == {"": 0, "_low": 0, "_high": 0}
     # Different seeds are independent: the trainings differ more than the saving does.
     shifted = rows.assign(training_seed=rows["training_seed"] + 9 * (rows["strategy"] == "alcc b"))
     apart = savings(shifted, "energy", "alcc a", "alcc b")
-    assert apart.high - apart.low > 3.0 * (high - low)
+    assert apart.high - apart.low > 3.0 * width
 
 
 def test_energy_and_distance_are_resampled_together() -> None:
@@ -93,15 +98,13 @@ def test_energy_and_distance_are_resampled_together() -> None:
     found = saving(0.18 * own, 0.2 * way, ways=(own, way))
     assert (found.low, found.value, found.high) == pytest.approx((0.1, 0.1, 0.1))
     noise = generator.uniform(0.8, 1.0, (12, 3))
-    found = saving(0.2 * own * noise, 0.2 * way, ways=(own, way))
-    draws = []
-    for _ in range(4000):
+
+    def draw() -> float:
         windows, seeds = generator.integers(0, 12, 11), generator.integers(0, 3, 2)
-        mine, driven = (x[windows][:, seeds] for x in (own * noise, own))
-        draws.append(1.0 - mine.sum() / driven.sum())
-    low, high = np.quantile(draws, [0.025, 0.975])
-    assert found.value == pytest.approx(1.0 - (own * noise).sum() / own.sum())
-    assert (found.low, found.high) == pytest.approx((low, high), abs=0.06 * (high - low))
+        return 1.0 - (own * noise)[windows][:, seeds].sum() / own[windows][:, seeds].sum()
+
+    found = saving(0.2 * own * noise, 0.2 * way, ways=(own, way))
+    check_interval(found, 1.0 - (own * noise).sum() / own.sum(), draw)
 
 
 @pytest.mark.parametrize("seeds", [8, 1])
@@ -175,16 +178,16 @@ def saving_at(windows, one, other, at: float):
     """Energy saved where both violate the limit for at most this share of the time."""
 
     def measure(*curves):
-        return share_saved(*(energy_at(x[ENERGY], x[LONG_SHARE], at, np.nan, None) for x in curves))
+        return share_saved(*(energy_at(x[ENERGY], x[LONG_SHARE], at, None) for x in curves))
 
     return compare_fronts(windows, one, other, columns=(ENERGY, LONG_SHARE), measure=measure)
 
 
 def test_fronts_are_read_at_the_same_share_not_at_the_same_limit() -> None:
     energy, share = np.array([90.0, 100.0]), np.array([0.02, 0.01])
-    assert energy_at(energy, share, 0.0125, np.nan, None) == pytest.approx(97.5)
-    assert np.isnan(energy_at(energy, share, 0.005, np.nan, None))
-    assert energy_at(energy, share, 0.03, np.nan, None) == 90.0  # a limit that is always kept
+    assert energy_at(energy, share, 0.0125, None) == pytest.approx(97.5)
+    assert np.isnan(energy_at(energy, share, 0.005, None))
+    assert energy_at(energy, share, 0.03, None) == 90.0  # a limit that is always kept
     found = saving_at(fronts(), NETWORK, RULE, 0.012)
     # Every window saves as much: nothing is left to chance.
     assert (found.low, found.value, found.high) == pytest.approx((0.05, 0.05, 0.05))

@@ -211,7 +211,7 @@ def test_flow_stands_against_the_recorded_drivers_in_table_and_verdict() -> None
     assert found.verdict.splitlines()[0].endswith(" 1,800, the recorded drivers 2,000.")
 
 
-def test_the_table_of_an_evaluation_ends_with_the_verdict(tmp_path, capsys) -> None:
+def test_the_table_of_an_evaluation_ends_with_the_verdict(tmp_path) -> None:
     cfg = load("evaluate", ["variant=alcc"])
     frame = episodes(profiles=12).replace({"strategy": {"idm": "rule", "reference": "human"}})
     run = Run(tmp_path, frame, cfg)

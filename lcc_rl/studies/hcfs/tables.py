@@ -34,9 +34,7 @@ RUN = ["strategy", "training_seed", "case", "profile", "run_id"]
 SUMS = ["speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "reward", "frames"]
 SUMS += ["collided", *PER_RUN]
 LARGEST_COLUMNS = ["max_gap_error_m", "peak_jerk_mps3", "energy_ratio"]
-# Stored columns and strategies of runs behind other sources of leaders.
-COMPARED_BY = ["reward", "jerk_sum", "min_gap_m", "max_gap_error_m", "energy_ratio"]
-COMPARED_BY += ["drawn_energy_kj_per_km"]
+# Strategies of runs behind other sources of leaders.
 STABLE = ("cacc tuned", "deadbeat", LEARNED, "hcfs", "hcfs between", "hcfs first")
 LEADERS = {  # names of sources of leaders in tables
     "traffic": "I-80",
