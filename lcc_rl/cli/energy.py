@@ -17,7 +17,7 @@ from lcc_rl.io.files import write_table
 from lcc_rl.runs.arguments import TABLE, Arguments, files_and_settings
 from lcc_rl.runs.interrupts import ending_quietly
 
-MOST_ROWS = 20  # most trips that are printed
+SHOWN_TRIPS = 20  # most trips that are printed
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with ending_quietly():  # loads torch
         from lcc_rl.commands.energy import trip_energies
     trips = trip_energies(files, settings)
-    print(trips.head(MOST_ROWS).to_string(index=False, float_format="{:,.4g}".format))
+    print(trips.head(SHOWN_TRIPS).to_string(index=False, float_format="{:,.4g}".format))
     sums = trips[["distance_km", "energy_kj", "energy_kwh"]].sum()
     totals = "{distance_km:,.1f} km, {energy_kj:,.0f} kJ, {energy_kwh:,.1f} kWh".format(**sums)
     print(f"{len(trips):,} trips: {totals}")

@@ -23,7 +23,7 @@ from pydantic import Field
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.interrupts import ending_quietly
 
-FORMATS = ("text", "markdown", "latex", "csv")
+SHOWN_AS = ("text", "markdown", "latex", "csv")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     what = "folder of an evaluation, a training, a job or a sweep; or a parquet file"
     parser.add_argument("run", type=Path, help=what)
     form = "text by default, as the run prints it; markdown for --columns and parquet files"
-    parser.add_argument("--format", choices=FORMATS, default="text", help=form)
+    parser.add_argument("--format", choices=SHOWN_AS, default="text", help=form)
     parser.add_argument("--all", action="store_true", help="all measures, as table=all")
     parser.add_argument("--columns", help="names of columns of --format csv, separated by commas")
     parser.add_argument("--against", help="baseline of savings, a name of the table")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from types import FunctionType, ModuleType
 from typing import Any
 
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 
 from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, entries_of, tick, written
 from lcc_rl.errors import ConfigError, LccError, nearest, require
-from lcc_rl.functional.guard import changed, changes
+from lcc_rl.functional.guard import changed, changes, check_alike
 from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
 from lcc_rl.settings import is_ours
@@ -45,7 +46,9 @@ def check_pieces(
     """
     _check_wiring(pieces, [as_key(key) for key in actions])
     episodes = torch.arange(BATCH).unsqueeze(-1)
-    check_forgets(pieces, lambda n: _play(pieces, horizon, actions, episodes + n * BATCH))
+    play = partial(_play, pieces, horizon, actions)
+    check_forgets(pieces, lambda n: play(episodes + n * BATCH))
+    play(episodes, check_alone)
 
 
 def _play(
@@ -53,8 +56,9 @@ def _play(
     horizon: int,
     actions: Mapping[NestedKey, tuple[int, ...]],
     episodes: Tensor,
+    check: Callable[[Piece, State, State], None] | None = None,
 ) -> None:
-    """Reset episodes by their seeds, take a step, and compare written entries with the specs."""
+    """Reset episodes by their seeds, and take a step by a check, by default :func:`check_step`."""
     moment = TensorDict(tick(episodes, torch.zeros_like(episodes), horizon), [BATCH])
     options = TensorDict(batch_size=[BATCH])
     for piece in pieces:
@@ -67,7 +71,7 @@ def _play(
         state[as_key(key)] = torch.zeros(BATCH, *shape)
     reached = tick(state[SEED], state[STEP] + 1, horizon)
     for piece in pieces:
-        check_step(piece, state, reached)
+        (check or check_step)(piece, state, reached)
 
 
 def check_step(piece: Piece, before: State, reached: State) -> None:
@@ -88,6 +92,26 @@ def check_step(piece: Piece, before: State, reached: State) -> None:
         if not torch.equal(read[key].nan_to_num(), value.nan_to_num()):
             raise changed(type(piece).__name__, ".".join(key))
     _compare(piece, {key: reached[key] for key in piece.targets}, "after a step")
+
+
+def check_alone(piece: Piece, before: State, reached: State) -> None:
+    """Refuse a piece that gives an episode other numbers alone than beside another, or again.
+
+    Args:
+        piece: the piece.
+        before: see :func:`check_step`.
+        reached: see :func:`check_step`.
+
+    Raises:
+        ConfigError: naming the piece and the entry.
+    """
+    states = [{key: x[1:] for key, x in state.items()} for state in (before, reached)]
+    piece.derive(before, reached)
+    alone, again = ({**states[1]} for _ in range(2))
+    for other in (alone, again):
+        piece.derive(states[0], other)
+    for key in piece.targets:
+        check_alike(piece.title, ".".join(key), reached[key][1:], alone[key], again[key])
 
 
 def _kept(piece: Piece) -> dict[str, list[Any]]:

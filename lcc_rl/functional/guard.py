@@ -1,13 +1,14 @@
-"""A check that a function does not change its inputs in place."""
+"""Checks that a function changes no inputs in place, and of each episode depends on that alone."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor, compiler
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 
 
 def unchanged(
@@ -40,4 +41,25 @@ def changed(title: str, name: str) -> ConfigError:
     return ConfigError(
         f"{title} changes {name} in place, and so the state of the vehicles; use "
         "gap.clamp(…) instead of gap.clamp_(…), or change a clone"
+    )
+
+
+def check_alike(title: str, entry: str, beside: Tensor, alone: Tensor, again: Tensor) -> None:
+    """Refuse numbers of an episode that depend on others, on earlier calls or on chance.
+
+    Args:
+        title: what computed them.
+        entry: their name.
+        beside: those of the episode beside another.
+        alone: those without another.
+        again: those without another, a second time.
+
+    Raises:
+        ConfigError: naming the title and the entry.
+    """
+    first, second, third = (x.nan_to_num().double() for x in (beside, alone, again))
+    require(
+        torch.equal(second, third) and torch.allclose(first, second, rtol=1e-3, atol=1e-4),
+        f"{title} gives an episode other {entry} alone, or in the same step again: it must not mix "
+        "episodes (mean() of a batch), remember, or draw random numbers but by the episode's seed",
     )

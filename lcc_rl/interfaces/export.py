@@ -184,12 +184,8 @@ def export(
     Examples:
         >>> export("pretrained/alcc_limits", "alcc.pt2")  # doctest: +SKIP
     """
-<<<<<<< HEAD
-    return written(policy, path, trust, variant, overrides, normalize, safety, limits)[0]
-=======
     changes = {"safety": safety, "limits": limits}
-    return _written(policy, path, trust, variant, overrides, normalize, **changes)[0]
->>>>>>> st18
+    return written(policy, path, trust, variant, overrides, normalize, **changes)[0]
 
 
 def written(
