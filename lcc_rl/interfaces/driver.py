@@ -16,7 +16,7 @@ from lcc_rl.config import load
 from lcc_rl.config.schemas import TimeStep
 from lcc_rl.config.words import FILTERED
 from lcc_rl.drivers.population import bootstrap
-from lcc_rl.envs.checks import BATCH, check_forgets, check_step
+from lcc_rl.envs.checks import BATCH, check_alone, check_forgets, check_step
 from lcc_rl.envs.clock import checked_seed
 from lcc_rl.envs.rowwise import Array, Rowwise
 from lcc_rl.errors import ConfigError, Diverged, raised_as, require, unknown_name
@@ -138,11 +138,13 @@ class Driver:
                 raise ConfigError(
                     f"{self.name} reads {name}, which is not measured here, only {measurable}"
                 )
-        step, pieces = partial(self.program.step, apply=check_step), self.program.pieces
-        check_forgets(pieces, lambda n: step(*self._examples(BATCH, 1.0 + n)))
+        step, alone = (partial(self.program.step, apply=x) for x in (check_step, check_alone))
+        check_forgets(self.program.pieces, lambda n: step(*self._examples(BATCH, 1.0 + n)))
+        alone(*self._examples(BATCH))
 
     def _examples(self, count: int, value: float = 1.0) -> list[Tensor]:
         state, seeds = torch.full((count, len(self.names)), value), torch.zeros(count, 1).long()
+        state += torch.arange(count).unsqueeze(-1)  # no two cars alike
         return [state, self.program.begin(state.double(), seeds)] if self.program.width else [state]
 
     def reset(self, cars: Sequence[Hashable] | None = None) -> None:

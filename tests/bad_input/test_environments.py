@@ -176,6 +176,25 @@ def still(speed):
     return torch.zeros_like(speed) * (0.0 if Store is None else len(LAST) + COUNT)
 
 
+def mixing(speed):
+    return speed.mean() - speed
+
+
+def drawing(speed):
+    return torch.randn_like(speed)
+
+
+class Counting(Controller):
+    """Counts its calls in its class, where no check of attributes looks."""
+
+    reads = ("self.speed",)
+    calls = 0
+
+    def command(self, speed):
+        type(self).calls += 1
+        return 0.0 * speed - 0.01 * self.calls
+
+
 class Base(Controller):
     """Remembers in a variable, in a static method."""
 
@@ -242,6 +261,18 @@ def test_a_function_that_remembers_in_a_variable_is_refused() -> None:
     driven_by("controllers", "automated", {"_target_": path_of(Law), "law": f"{__name__}.still"})
     with pytest.raises(ConfigError, match="Derived remembers in its variable 'LAST'"):
         driven_by("controllers", "automated", {"_target_": f"{__name__}.Derived"})
+
+
+def test_a_command_is_of_one_episode_and_one_step_alone() -> None:
+    words = "{} gives an episode other automated.command alone, or in the same step again"
+    for name in ("mixing", "drawing"):
+        law = {"_target_": path_of(Law), "law": f"{__name__}.{name}"}
+        with pytest.raises(ConfigError, match=words.format(f"{__name__}.{name}")):
+            driven_by("controllers", "automated", law)
+        with pytest.raises(ConfigError, match="alone, or in the same step again"):
+            Driver(f"{__name__}.{name}", 0.1)
+    with pytest.raises(ConfigError, match=words.format("Counting")):
+        driven_by("controllers", "automated", {"_target_": f"{__name__}.Counting"})
 
 
 def test_pieces_and_controllers_inside_others_are_held_to_it_too() -> None:

@@ -102,9 +102,12 @@ class Rolling(EnergyModel):
     mass: Positive = 1500.0  # [kg]
     unit: Number = 1.0
     summed: bool = False
+    warming: bool = False
 
     def power(self, speed, acceleration):
         power = (1500.0 * acceleration + 200.0) * speed * self.unit
+        if self.warming:
+            self.unit *= 1.1
         return power.sum() if self.summed else power
 
 
@@ -120,6 +123,7 @@ def test_mistakes_are_named() -> None:
         ({"x": Rolling(unit=3.6)}, "Rolling.power"),  # speed taken as km/h
         ({"x": Rolling(unit=-1.0)}, "Rolling.power"),
         ({"x": Rolling(mass=1.5)}, "Rolling.power .*[(]mass 1.5 kg"),
+        ({"x": Rolling(warming=True)}, "Rolling gives an episode other power .* again"),
         ({"x": Rolling(summed=True)}, "Rolling.power: .*dim"),
     ]
     check_refused(Fleet, cases, ConfigError)
