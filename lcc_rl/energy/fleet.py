@@ -14,7 +14,7 @@ from torch import Tensor
 from lcc_rl.energy.base import BURNT, EnergyModel
 from lcc_rl.energy.electric import PaperMotor
 from lcc_rl.errors import ConfigError, raised_as, require, require_known
-from lcc_rl.functional.guard import check_alike, unchanged
+from lcc_rl.functional.guard import check_independent, unchanged
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.settings import Positive, Settings, values
 
@@ -54,7 +54,7 @@ class VehicleClass(Settings):
         with raised_as(ConfigError, f"{kind}.power", Exception):
             power = unchanged(self.energy.power, motion, kind, ("speed", "acceleration"))
             alone, again = (self.energy.power(*(x[1:] for x in motion)) for _ in range(2))
-            check_alike(kind, "power", power[1:], alone, again)
+            check_independent(kind, "power", power[1:], alone, again)
             risen, stored = float(power[1] - power[0]) / 0.1, PROBE * self.energy.inertia / share
         require(
             stored / MOST_OFF <= risen <= stored * MOST_OFF,

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, entries_of, tick, written
 from lcc_rl.errors import ConfigError, LccError, nearest, require
-from lcc_rl.functional.guard import changed, changes, check_alike
+from lcc_rl.functional.guard import changed, changes, check_independent
 from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
 from lcc_rl.settings import is_ours
@@ -111,7 +111,7 @@ def check_alone(piece: Piece, before: State, reached: State) -> None:
     for other in (alone, again):
         piece.derive(states[0], other)
     for key in piece.targets:
-        check_alike(piece.title, ".".join(key), reached[key][1:], alone[key], again[key])
+        check_independent(piece.title, ".".join(key), reached[key][1:], alone[key], again[key])
 
 
 def _kept(piece: Piece) -> dict[str, list[Any]]:

@@ -44,7 +44,7 @@ def changed(title: str, name: str) -> ConfigError:
     )
 
 
-def check_alike(title: str, entry: str, beside: Tensor, alone: Tensor, again: Tensor) -> None:
+def check_independent(title: str, entry: str, beside: Tensor, alone: Tensor, again: Tensor) -> None:
     """Refuse numbers of an episode that depend on others, on earlier calls or on chance.
 
     Args:
