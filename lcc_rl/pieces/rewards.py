@@ -127,7 +127,7 @@ class CollisionPenalty(RewardTerm):
     ahead.
     """
 
-    weight: NonNegative = 100.0  # must exceed the worst discounted return that remains
+    weight: NonNegative = 100.0  # must exceed the worst discounted objective that remains
     behind: bool = True  # count collisions behind, back to the next automated vehicle, too
 
     graded = False
