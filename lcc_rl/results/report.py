@@ -169,17 +169,17 @@ def summary(
         against: the baseline without a task.
 
     Returns:
-        One row per strategy: :data:`lcc_rl.results.measures.MEASURES`; ``saving``, the share of
-        the score saved ``against`` the baseline, ``second_saving``, that of the second energy
-        model, ``flow_saving`` and ``second_flow_saving``, those against the recorded drivers at
-        their flow, ``more_flow``, see :class:`lcc_rl.results.bootstrap.Estimate`, ``rule_saving``,
-        that against the rule at this flow, and ``drawn_saving``, that of the energy drawn in an episode, and the share of the flow lost, with their intervals;
-        ``end_saving``, the difference of the drawn and the first saving; the share of the distance
-        lost; numbers of windows, drives, drivers behind each window and training seeds;
-        ``left_out``, the seeds that the first saving leaves out, and ``single``, whether it has
-        one training beside others of several; and for a task score, limits and whether they are
-        kept without a collision. Missing values are NaN, as are savings and
-        losses of a strategy with collisions.
+        One row per strategy: :data:`lcc_rl.results.measures.MEASURES`; ``saving``, the share of the
+        score saved ``against`` the baseline, ``second_saving``, that of the second energy model,
+        ``flow_saving`` and ``second_flow_saving``, those against the recorded drivers at their
+        flow, ``more_flow``, see :class:`lcc_rl.results.bootstrap.Estimate`, ``rule_saving``, that
+        against the rule at this flow, and ``drawn_saving``, that of the energy drawn in an episode,
+        and the share of the flow lost, with their intervals; ``end_saving``, the difference of the
+        drawn and the first saving; the share of the distance lost; numbers of windows, drives,
+        drivers behind each window and training seeds; ``left_out``, the seeds that the first saving
+        leaves out, and ``single``, whether it has one training beside others of several; and for a
+        task score, limits and whether they are kept without a collision. Missing values are NaN, as
+        are savings and losses of a strategy with collisions.
 
     Raises:
         ConfigError: if the column of a limit, or the baseline, is missing.
