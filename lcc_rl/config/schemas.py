@@ -163,6 +163,10 @@ class ScenarioConfig(Section):
         """
         return parse_string(self.string, self.road)
 
+    def is_exact(self, role: str) -> bool:
+        """Whether a role has neither actuators nor sensors."""
+        return self.actuators.get(role) is None and self.sensors.get(role) is None
+
     @property
     def replaced(self) -> bool:
         """Whether the leader is replaced during episodes."""

@@ -104,6 +104,7 @@ IGNORED = {
     "variant=hcfs drivers=highway": "no vehicle of this platoon depends on drivers",
     "variant=direct +filter=cbf": "no vehicle of the string is automated",
     "variant=alcc deployed.choice=first": "belongs to variant=hcfs",
+    "+filter=cbf scenario.filters.automated.robust=false": "actuators and sensors are exact",
     "sweep=mine": "names the folder of a sweep, -m",
     "variant=own_energy observation.visible=2": "scales names no vehicle behind",
 }
