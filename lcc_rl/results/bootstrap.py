@@ -36,7 +36,7 @@ class Estimate:
     low: float = np.nan
     high: float = np.nan
     over_drives: tuple[float, float] | None = None
-    more_flow: float = 0.0
+    more_flow: float = np.nan
 
     def columns(self, name: str, factor: float = 1.0) -> dict[str, float]:
         """Return ``name``, ``name_low`` and ``name_high``, scaled."""

@@ -22,7 +22,7 @@ from lcc_rl.results.measures import (
     REACH,
     between,
 )
-from lcc_rl.results.names import HUMAN, NETWORK, RULE_ROWS, in_words, several
+from lcc_rl.results.names import HUMAN, NETWORK, ON_FRONT, RULE_ROWS, in_words, several
 from lcc_rl.results.windows import savings
 
 ONE = " ‡"  # marks a training of one seed beside several
@@ -148,7 +148,8 @@ def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
     shares = measures.means(windows, (FASTER,))[FASTER]
     people = [shares[name] for name in (HUMAN, "direct") if name in shares]
     for name in shares.index if people else ():
-        if not name.endswith(FILTERED) and not np.isclose(shares[name], people).any():
+        filtered = name.partition(ON_FRONT)[0].endswith(FILTERED)
+        if not filtered and not np.isclose(shares[name], people).any():
             driver = "scenario.controllers.automated"
             option = f"variant=idm controller@{driver}={name} {driver}.desired_speed=45"
             option += " 'compare=[<run>]'"
