@@ -107,8 +107,8 @@ def help_text(entry: str, overrides: Sequence[str] = ()) -> str:
         [
             *lines,
             "",
-            f"Settings of conf/: lcc-rl {name} --cfg job. Defaults of all classes: python",
-            "tools/settings.py writes docs/settings.md. All groups: --help-all. Pages: docs/.",
+            f"Settings of conf/: lcc-rl {name} --cfg job. Defaults of all classes:",
+            "docs/settings.md, by python tools/settings.py in a clone. All groups: --help-all.",
             "-m runs a sweep of all combinations: a=1,2 b=3,4.",
         ]
     )
