@@ -30,7 +30,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 44_240, "code": 29_360},
+    "lcc_rl + tools": {"lines": 44_280, "code": 29_400},
     "tests": {"lines": 26_515},
     "conf": {"yaml": 165},
 }

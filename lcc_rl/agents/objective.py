@@ -24,8 +24,8 @@ from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive, Share
 
-ADDED = "<name>={_target_: …} adds one"
-Terms = Annotated[dict[str, Any], AfterValidator(partial(all_of, kind=RewardTerm, added=ADDED))]
+_ALL_TERMS = partial(all_of, kind=RewardTerm, added="<name>={_target_: …} adds one")
+Terms = Annotated[dict[str, Any], AfterValidator(_ALL_TERMS)]
 
 
 class Aiming(Agent):

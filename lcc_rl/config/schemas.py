@@ -67,12 +67,10 @@ def all_of(nodes: dict[str, Any], kind: type, added: str) -> dict[str, Any]:
     return nodes
 
 
-ADDED = (
-    "+filter=cbf or a task adds a filter, +faults=all actuators and sensors, safety.margin=2 "
-    "changes the filter that a policy keeps"
-)
+_ADDED = "+filter=cbf or a task adds a filter, +faults=all actuators and sensors, "
+_ADDED += "safety.margin=2 changes the filter that a policy keeps"
 Described = Annotated[Any, AfterValidator(_described)]  # a node or None
-_ALL_NODES = AfterValidator(partial(all_of, kind=Node, added=ADDED))
+_ALL_NODES = AfterValidator(partial(all_of, kind=Node, added=_ADDED))
 Nodes = Annotated[dict[str, Any], _ALL_NODES, AfterValidator(MappingProxyType)]
 AUTO = "scenario.controllers.automated"
 

@@ -31,7 +31,14 @@ from lcc_rl.data.profiles import (
 from lcc_rl.data.sources import find_files
 from lcc_rl.data.speed_records import DRIVE_COLUMNS, DRIVE_FIELDS, read_drives, read_speed_record
 from lcc_rl.data.trajectories import FRAME, listed
-from lcc_rl.errors import ConfigError, DataError, raised_as, require_known, require_positive
+from lcc_rl.errors import (
+    ConfigError,
+    DataError,
+    raised_as,
+    require,
+    require_known,
+    require_positive,
+)
 from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, parse
 
 LISTED = 8  # most names in a line
@@ -121,19 +128,15 @@ def stretch(
     time, speed = read_speed_record(path, plausible)
     begin = time[0] if from_s is None else float(from_s)
     end = time[-1] if to_s is None else float(to_s)
-    if not begin < end:
-        raise ConfigError(f"leader: the stretch {begin:g}–{end:g} s of {path} is empty")
+    require(begin < end, f"leader: the stretch {begin:g}–{end:g} s of {path} is empty")
     if begin < time[0] or end > time[-1] + 1e-6:
         raise DataError(
             f"{path}: covers {time[0]:g}–{time[-1]:g} s, not the stretch {begin:g}–{end:g} s; "
             "leader=record accepts records of any length"
         )
     limit = (plausible or Plausible()).max_speed
-    if scale * speed.max() > limit:
-        raise ConfigError(
-            f"leader: {path} at scale={scale:g} drives up to {scale * speed.max():.3g} m/s, "
-            f"leader.plausible.max_speed={limit:g}"
-        )
+    fast = f"leader: {path} at scale={scale:g} drives up to {scale * speed.max():.3g} m/s, "
+    require(scale * speed.max() <= limit, f"{fast}leader.plausible.max_speed={limit:g}")
     stem = Path(path).stem
     speeds = resample(time, scale * speed, time_step, begin, end)
     return from_records([speeds], [f"{stem}@{begin:g}s"], [stem], time_step)
@@ -166,8 +169,7 @@ class RecordLeaders(Settings):
         groups: dict[str, list[Profiles]] = {}
         for group in ("training", "held_out"):
             groups[group] = self._stretches(group, getattr(self, group), time_step)
-            if not groups[group]:
-                raise ConfigError(f"leader.{group} names no record")
+            require(groups[group], f"leader.{group} names no record")
         every = joined(groups["held_out"]).windows(horizon)
         windows, left_out, lines = varying(every, self.least_variation)
         report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s", *lines] + [
@@ -204,8 +206,7 @@ class RecordLeaders(Settings):
         """Return settings of a stretch or case; it or ``self`` has a path."""
         settings: Any = parse(kind, node or {}, where)
         settings.path = settings.path or self.path
-        if not settings.path:
-            raise ConfigError(f"{where}.path is required: the name of a cycle or a file")
+        require(settings.path, f"{where}.path is required: the name of a cycle or a file")
         return settings
 
 
@@ -281,10 +282,10 @@ class DriveLeaders(Settings):
     def validate(self) -> None:
         self.columns = {**DRIVE_COLUMNS, **self.columns}
         check_map(DRIVE_FIELDS, self.columns, self.units, "leader")
-        if self.tuning and self.evaluation_share == 1:
-            raise ConfigError("leader.tuning=true leaves nothing to tune on: evaluation_share is 1")
-        if self.together and self.columns["drive"] is None:
-            raise ConfigError("leader.together divides drives by name; the table holds one record")
+        message = "leader.tuning=true leaves nothing to tune on: evaluation_share is 1"
+        require(not self.tuning or self.evaluation_share < 1, message)
+        message = "leader.together divides drives by name; the table holds one record"
+        require(not self.together or self.columns["drive"] is not None, message)
         with raised_as(ConfigError, f"leader.together={self.together}", re.error):
             re.compile(self.together or "")
 
@@ -292,8 +293,7 @@ class DriveLeaders(Settings):
         """Read all records; see :meth:`RecordLeaders.load`."""
         single = self.columns["drive"] is None
         profiles, report = self.profiles(time_step)
-        if profiles.grades is not None:
-            raise ConfigError("leader.columns.grade: only lcc-rl energy uses grades")
+        require(profiles.grades is None, "leader.columns.grade: only lcc-rl energy uses grades")
         drives = {*profiles.recordings}
         per_file = 1 < len(drives) == len(find_files(self.path))  # a file is a drive
         if per_file and self.together and len({*map(self._family, drives)}) == 1:
@@ -438,14 +438,11 @@ class Mixture:
     """
 
     def __init__(self, weights: Mapping[str, float] | None = None, **sources: Any) -> None:
-        if not sources:
-            raise ConfigError("leader: a mixture names no source of leaders")
+        require(sources, "leader: a mixture names no source of leaders")
         for name, source in sources.items():
-            if not callable(getattr(source, "load", None)):
-                raise ConfigError(
-                    f"leader.{name} must be a source of leaders, got {source!r}; "
-                    f"use +leader@leader.{name}=…"
-                )
+            message = f"leader.{name} must be a source of leaders, got {source!r}; "
+            message += f"use +leader@leader.{name}=…"
+            require(callable(getattr(source, "load", None)), message)
         require_known("source in leader.weights", weights or (), sources)
         for name, weight in (weights or {}).items():
             require_positive(f"leader.weights.{name}", weight)
