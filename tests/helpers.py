@@ -183,7 +183,7 @@ def check_resuming(
     whole = make(folder / "whole")
     expected = whole.run()
     first = make(folder / "parts")
-    iterate = first._iterate
+    iterate = first.iterate
 
     def stops(source):
         if first.iteration == 3:
@@ -192,7 +192,7 @@ def check_resuming(
             signal.raise_signal(signal.SIGTERM)
         return iterate(source)
 
-    first._iterate = stops
+    first.iterate = stops
     with pytest.raises(Interrupted if said else MemoryError, match=said):
         first.run()
     second = make(folder / "parts")

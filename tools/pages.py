@@ -40,6 +40,7 @@ from lcc_rl.results import board
 from lcc_rl.results.fronts import ENERGY, FRONT_KINDS, LONG_SHARE, at_equal_flow, points
 from lcc_rl.results.measures import FLOW, SIGNS, Measure, signed
 from lcc_rl.results.names import NETWORK, ON_FRONT, in_words, worded
+from lcc_rl.results.remarks import MORE_NAMED
 from lcc_rl.results.render import as_markdown, markdown_table, saved_text
 from lcc_rl.results.runs import naming_run
 from lcc_rl.results.task import Task
@@ -147,8 +148,9 @@ def averaged(rows: pd.DataFrame) -> str:
             ("tuned IDM against the recorded drivers", rule, [RECORDED]),
             ("network against tuned IDM", own, rule),
         ):
-            found = (at_equal_flow(part, mine, other, x, RECORDED) for x in energies)
-            lines.append([words, label, *map(fleets.percent, found)])
+            found = [at_equal_flow(part, mine, other, x, RECORDED) for x in energies]
+            at = f", at {found[0].more_flow:.0%} more flow" * (found[0].more_flow > MORE_NAMED)
+            lines.append([words, label + at.replace("%", " %"), *map(fleets.percent, found)])
     return markdown_table(head, lines)
 
 

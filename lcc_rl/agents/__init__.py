@@ -1,6 +1,6 @@
 """Agents: learning algorithms and their training loops, one file each."""
 
-from lcc_rl.agents.actor import GaussianExploration, make_actor, seeded_mlp
+from lcc_rl.agents.actor import GaussianExploration, make_actor, seeded_mlp, shared_policy
 from lcc_rl.agents.agent import Agent, Scene, anneal, derived_seed
 from lcc_rl.agents.analytic import Analytic
 from lcc_rl.agents.collecting import CollectingLoop, transitions
@@ -25,5 +25,6 @@ __all__ = [
     "derived_seed",
     "make_actor",
     "seeded_mlp",
+    "shared_policy",
     "transitions",
 ]

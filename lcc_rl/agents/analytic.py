@@ -64,7 +64,7 @@ class GradientLoop(TrainingLoop[Any]):
                 self.horizon,
             )
 
-    def _source(self) -> DifferentiableRollout:
+    def source(self) -> DifferentiableRollout:
         # The iterations are those of the whole training, so that resuming changes nothing.
         long = self.iterations * self.horizon >= COMPILED_GRADIENT_STEPS
         chosen = (self.agent.compiled, self.settings.compiled, long)
@@ -76,7 +76,7 @@ class GradientLoop(TrainingLoop[Any]):
             compiled=next(x for x in chosen if x is not None),
         )
 
-    def _iterate(self, source: DifferentiableRollout) -> dict[str, float]:
+    def iterate(self, source: DifferentiableRollout) -> dict[str, float]:
         """Play one batch of episodes with a gradient step after every segment."""
         rate = self.agent.anneal(self.iteration / self.iterations)
         self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
@@ -110,7 +110,7 @@ class GradientLoop(TrainingLoop[Any]):
         behind = {name: torch.stack([row[name] for row in each]).mean(0) for name in each[0]}
         limits |= self.objective.each.update(behind)
         count = sum(part.numel() for part in played)
-        return self._record(played, losses, spent, count, {"learning_rate": rate}, limits)
+        return self.record(played, losses, spent, count, {"learning_rate": rate}, limits)
 
     def _learn(self, data: TensorDictBase, running: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Take a gradient step on a segment; return which episodes continue, and the results."""

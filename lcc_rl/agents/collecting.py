@@ -83,7 +83,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
         """Set the exploration after this share of the training; return its standard deviation."""
         return 1.0
 
-    def _source(self) -> BaseCollector:
+    def source(self) -> BaseCollector:
         noise = self.agent.noise or TensorDictModule(nn.Identity(), [ACTION], [ACTION])
         self.noise = noise.to(self.env.device or "cpu")
         return self._collector(self.settings.segment, self._compiled())
@@ -108,7 +108,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
             return self.settings.compiled
         return self.iterations * self.horizon >= COMPILED_TRAINING_STEPS
 
-    def _iterate(self, collector: BaseCollector) -> dict[str, float]:
+    def iterate(self, collector: BaseCollector) -> dict[str, float]:
         """Play one batch of episodes and learn after every segment."""
         share, steps = self.iteration / self.iterations, self.settings.segment
         sigma, rate = self.explore(share), self.agent.anneal(share)
@@ -145,7 +145,7 @@ class CollectingLoop(TrainingLoop[AgentT]):
             spent[1] += time.perf_counter() - collected
         begin = {"exploration_sigma": sigma, "learning_rate": rate}
         limits = {} if self.objective is None else self.objective.update(mean_of(missed))
-        return self._record(played, losses, spent, size * len(played), begin, limits)
+        return self.record(played, losses, spent, size * len(played), begin, limits)
 
     def _scored(self, batch: TensorDictBase) -> dict[str, float]:
         """Set the objective as the reward; return the share of the time beyond each limit."""

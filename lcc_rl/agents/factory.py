@@ -90,12 +90,11 @@ def check_lengths(cfg: StudyConfig) -> None:
     settings, horizon = cfg.training, cfg.scenario.horizon
     warm_up_steps(cfg.scenario, cfg.evaluation.warm_up, "evaluation.warm_up")
     warm_up = cfg.agent.settings.get("warm_up") or 0.0
-    counted = horizon - warm_up_steps(cfg.scenario, warm_up, "agent.warm_up")
-    require(
-        counted % settings.segment == 0,
-        f"training.segment ({settings.segment}) must divide scenario.horizon ({horizon})"
-        + f" without the steps of agent.warm_up ({counted})" * (counted < horizon),
-    )
+    skipped = warm_up_steps(cfg.scenario, warm_up, "agent.warm_up")
+    message = f"training.segment ({settings.segment}; its default is of agent={cfg.agent.name}) "
+    message += f"must divide {horizon - skipped}, scenario.horizon ({horizon})"
+    less = f" less {skipped} steps of agent.warm_up (by default evaluation.warm_up)"
+    require((horizon - skipped) % settings.segment == 0, message + less * bool(skipped))
     every = getattr(cfg.agent.made(), "hold", 0.0) / cfg.scenario.time_step
     require(
         settings.segment % max(every, 1.0) < 1e-6,

@@ -112,12 +112,12 @@ class TrainingLoop(ABC, Generic[AgentT]):
         """Build further parts of a subclass; called at the end of the constructor."""
 
     @abstractmethod
-    def _source(self) -> Any:
-        """Return the argument of :meth:`_iterate`; built once per run."""
+    def source(self) -> Any:
+        """Return the argument of :meth:`iterate`, what plays episodes; built once per run."""
 
     @abstractmethod
-    def _iterate(self, source: Any) -> dict[str, float]:
-        """Play and learn from one batch of episodes; append to the record and return the row."""
+    def iterate(self, source: Any) -> dict[str, float]:
+        """Play and learn from one batch of episodes; return the result of :meth:`record`."""
 
     def run(self) -> pd.DataFrame:
         """Train to the end and return the record, one row per iteration.
@@ -130,7 +130,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
         progress = ProgressReporter(
             title, self.iterations, start=self.iteration, folder=self.folder
         )
-        source = self._source()
+        source = self.source()
         with stop_signal() as stop, progress:
             while self.iteration < self.iterations:
                 row = self._numbers(source)
@@ -158,12 +158,12 @@ class TrainingLoop(ABC, Generic[AgentT]):
         try:
             check_learner(self.agent.policy, {}, self.advice)
             with denormals_flushed():
-                return self._iterate(source)
+                return self.iterate(source)
         except Diverged as error:
             state = f"the last good state is in {good}" if good.exists() else "nothing is saved"
             raise Diverged(f"{error.what} {where}; {state}", error.advice) from error
 
-    def _record(
+    def record(
         self,
         played: Sequence[TensorDictBase],
         losses: Sequence[Mapping[str, Any]],

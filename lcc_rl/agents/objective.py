@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field
-from typing import Any, Literal
+from functools import partial
+from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import InstanceOf
+from pydantic import AfterValidator
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from lcc_rl.agents.agent import Agent
 from lcc_rl.agents.limits import Limits, LimitsEach
+from lcc_rl.config.schemas import all_of
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError, Diverged
 from lcc_rl.functional.finite import any_nonfinite
@@ -22,13 +24,16 @@ from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive, Share
 
+_ALL_TERMS = partial(all_of, kind=RewardTerm, added="<name>={_target_: …} adds one")
+Terms = Annotated[dict[str, Any], AfterValidator(_ALL_TERMS)]
+
 
 class Aiming(Agent):
     """Settings of agents with an objective, which may differ from the reward."""
 
     # Reward terms that take the place of those of the same name in the objective; their
     # weights multiply the terms' own. Those of terms that the reward lacks are ignored.
-    surrogates: dict[str, InstanceOf[RewardTerm] | None] = field(default_factory=dict)
+    surrogates: Terms = field(default_factory=dict)
     # Largest share of the time in which a surrogate's limit may be missed, by its name, or that of
     # the recorded drivers; its weight is the price at the start, see lcc_rl.agents.limits.
     limits: dict[str, Share | Literal["recorded"] | None] = field(default_factory=dict)
@@ -36,7 +41,7 @@ class Aiming(Agent):
     # Factor of the latest miss in the logarithm of the price of an average, such as the spacing.
     limit_damping: NonNegative = 2.0
     # Terms of the objective only.
-    regularizers: dict[str, InstanceOf[RewardTerm] | None] = field(default_factory=dict)
+    regularizers: Terms = field(default_factory=dict)
 
     def take(self, profiles: Profiles) -> None:
         """Take the limits that recorded drivers set."""

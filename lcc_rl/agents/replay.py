@@ -43,9 +43,9 @@ class ReplayLoop(CollectingLoop[Any]):
         self.noise.sigma.fill_(sigma)
         return float(sigma)
 
-    def _iterate(self, collector: BaseCollector) -> dict[str, float]:
+    def iterate(self, collector: BaseCollector) -> dict[str, float]:
         self.sampler.manual_seed(derived_seed(self.seed, self.iteration, "replay"))
-        row = super()._iterate(collector)
+        row = super().iterate(collector)
         self._keep_best()
         return row
 

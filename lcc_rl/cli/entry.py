@@ -38,7 +38,7 @@ from lcc_rl.config.compose import (
 )
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.words import top_key
-from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, input_error
+from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, input_error, require
 from lcc_rl.runs.interrupts import ending_quietly, was_interrupted
 from lcc_rl.runs.states import CONFIG, Busy, forget, record, withdraw
 from lcc_rl.runs.sweeps import SweepCallback, conclude, run_job
@@ -107,8 +107,8 @@ def help_text(entry: str, overrides: Sequence[str]) -> str:
         [
             *lines,
             "",
-            f"Settings of conf/: lcc-rl {name} --cfg job. Defaults of all classes: python",
-            "tools/settings.py writes docs/settings.md. All groups: --help-all. Pages: docs/.",
+            f"Settings of conf/: lcc-rl {name} --cfg job. Defaults of all classes:",
+            "docs/settings.md, by python tools/settings.py in a clone. All groups: --help-all.",
             "-m runs a sweep of all combinations: a=1,2 b=3,4.",
         ]
     )
@@ -165,6 +165,11 @@ def entry_point(
             logging.raiseExceptions = False  # a failing log must not end a run
             check_own_files()
             typed = list(HydraConfig.get().overrides.task)
+            if config.get("resume") is not None:  # its settings may have names of its own
+                own = ("resume", "trust", *["logger"] * (config_name == "train"))
+                others = [x.removeprefix("++") for x in typed if top_key(x) not in own]
+                message = "a resumed run keeps the settings it was started with; remove"
+                require(not others, f"{message} {' '.join(others)}")
             with ending_quietly():  # settings load modules, too
                 cfg = parsed(config, config_name, typed, is_sweep())
                 import_module(work)
@@ -328,18 +333,6 @@ def run_folder() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
-def resumed_folder(cfg: StudyConfig, own: Sequence[str]) -> Path:
-    """Return the folder of the run ``resume``, or of the present run, as an absolute path.
-
-    Args:
-        cfg: the configuration, with the key ``resume``.
-        own: settings that may be given besides the folder.
-    """
-    if cfg.resume is None:
-        return run_folder()
-    others = [item for item in HydraConfig.get().overrides.task if top_key(item) not in own]
-    if others:
-        raise ConfigError(
-            f"a resumed run keeps the settings it was started with; remove {' '.join(others)}"
-        )
-    return Path(os.path.abspath(cfg.resume))
+def resumed_folder(cfg: StudyConfig) -> Path:
+    """Return the folder of the run ``resume``, or of the present run, as an absolute path."""
+    return run_folder() if cfg.resume is None else Path(os.path.abspath(cfg.resume))

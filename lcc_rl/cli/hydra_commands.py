@@ -20,7 +20,7 @@ def run(cfg: PipelineConfig) -> None:
     """Run the main job into its folder, or complete that of ``resume``."""
     from lcc_rl.commands import pipeline  # loads torch
 
-    folder = resumed_folder(cfg, ("resume", "trust"))
+    folder = resumed_folder(cfg)
     typed, chosen = HydraConfig.get().overrides.task, HydraConfig.get().runtime.choices
     own = [] if any(top_key(item) == "experiment" for item in typed) else ["experiment"]
     with headlines():  # the parts are composed from the overrides
@@ -32,7 +32,7 @@ def train(cfg: TrainConfig) -> None:
     """Train a variant into the run's folder, and evaluate it on held-out windows."""
     from lcc_rl.commands import training  # loads torch
 
-    folder = resumed_folder(cfg, ("resume", "trust", "logger"))
+    folder = resumed_folder(cfg)
     (training.complete if is_sweep() else training.run)(cfg, folder)
     log.info("results in %s", folder)
 
@@ -42,7 +42,7 @@ def evaluate(cfg: EvaluateConfig) -> None:
     """Evaluate a policy and baselines into the run's folder."""
     from lcc_rl.commands import evaluation  # loads torch
 
-    folder = resumed_folder(cfg, ("resume", "trust"))
+    folder = resumed_folder(cfg)
     work = evaluation.complete if is_sweep() else evaluation.run
     work(cfg, folder, typed=HydraConfig.get().overrides.task)
     log.info("results in %s", folder)

@@ -54,7 +54,8 @@ def inputs_of(content: Mapping[str, Any]) -> FileHashes:
                 for path in filter(Path.is_file, _files(key, named, holder, name)):
                     digest = _digest(path)
                     digests = hashes.setdefault(section, {})
-                    label = path.name if path.suffix == ".py" else str(path)
+                    last = path.parts[-2 if path.name == "__init__.py" else -1 :]
+                    label = "/".join(last) if path.suffix == ".py" else str(path)
                     equal = digests.get(label, digest) == digest
                     digests[label if equal else str(path)] = digest
     return hashes

@@ -55,20 +55,23 @@ def _described(node: Any) -> Any:
     return node
 
 
-def _all_described(nodes: dict[str, Any]) -> Mapping[str, Any]:
+def all_of(nodes: dict[str, Any], kind: type, added: str) -> dict[str, Any]:
+    """Check that named values are of a class or None; ``added``: how they are, if there is none."""
     for name, node in nodes.items():
         if isinstance(node, Mapping):
-            added = "none; +filter=cbf or a task adds a filter, +faults=all actuators and sensors, "
-            added += "safety.margin=2 changes the filter that a policy keeps"
-            known = ", ".join(x for x in nodes if x != name) or added
+            known = ", ".join(x for x in nodes if x != name) or f"none; {added}"
             raise ValueError(f"unknown name {name!r}, which has no {TARGET}; valid: {known}")
-        if node is not None and not isinstance(node, Node):
-            raise ValueError(f"{name}: expected a node with {TARGET} or null, got {node!r}")
-    return MappingProxyType(nodes)
+        if node is not None and not isinstance(node, kind):
+            what = "node" if kind is Node else kind.__name__
+            raise ValueError(f"{name}: expected a {what} with {TARGET} or null, got {node!r}")
+    return nodes
 
 
+_ADDED = "+filter=cbf or a task adds a filter, +faults=all actuators and sensors, "
+_ADDED += "safety.margin=2 changes the filter that a policy keeps"
 Described = Annotated[Any, AfterValidator(_described)]  # a node or None
-Nodes = Annotated[dict[str, Any], AfterValidator(_all_described)]
+_ALL_NODES = AfterValidator(partial(all_of, kind=Node, added=_ADDED))
+Nodes = Annotated[dict[str, Any], _ALL_NODES, AfterValidator(MappingProxyType)]
 AUTO = "scenario.controllers.automated"
 
 
@@ -157,6 +160,10 @@ class ScenarioConfig(Section):
             ConfigError: naming the position in the pattern that cannot be parsed.
         """
         return parse_string(self.string, self.road)
+
+    def is_exact(self, role: str) -> bool:
+        """Whether a role has neither actuators nor sensors."""
+        return self.actuators.get(role) is None and self.sensors.get(role) is None
 
     @property
     def replaced(self) -> bool:

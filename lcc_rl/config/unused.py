@@ -22,6 +22,7 @@ OF_EPISODES = (
     *("humans_first", "second_energy", "terms"),
 )
 OBSERVATION = "lcc_rl.pieces.Observation"
+EXACT = "actuators and sensors are exact; +faults=all adds others"
 FIXED = "no vehicle of this platoon depends on drivers or noise"
 
 
@@ -112,6 +113,8 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
                 yield f"scenario.{group}.{role}", f"no vehicle of the string is {role}"
                 if group == "filters":
                     yield "filter", f"no vehicle of the string is {role}"
+    for role in filter(cfg.scenario.is_exact, cfg.scenario.filters):
+        yield f"scenario.filters.{role}.robust", EXACT
     if AUTOMATED not in cfg.scenario.vehicles.names:
         for name in ("max_braking", "max_acceleration"):
             yield f"scenario.{name}", "no vehicle of the string is automated"

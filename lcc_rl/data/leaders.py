@@ -6,7 +6,7 @@ import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,8 +30,15 @@ from lcc_rl.data.profiles import (
 )
 from lcc_rl.data.sources import find_files
 from lcc_rl.data.speed_records import DRIVE_COLUMNS, DRIVE_FIELDS, read_drives, read_speed_record
-from lcc_rl.data.trajectories import FRAME
-from lcc_rl.errors import ConfigError, DataError, raised_as, require_known, require_positive
+from lcc_rl.data.trajectories import FRAME, listed
+from lcc_rl.errors import (
+    ConfigError,
+    DataError,
+    raised_as,
+    require,
+    require_known,
+    require_positive,
+)
 from lcc_rl.settings import Count, NonNegative, Number, Positive, Settings, parse
 
 LISTED = 8  # most names in a line
@@ -69,6 +76,7 @@ class Leaders:
         cases: named evaluation cases.
         full_length: whole held-out records.
         report: lines on the data.
+        left_out: number of windows that :func:`varying` leaves out, by source.
     """
 
     training: Profiles
@@ -76,6 +84,7 @@ class Leaders:
     cases: tuple[Case, ...] = ()
     full_length: tuple[Case, ...] = ()
     report: tuple[str, ...] = ()
+    left_out: Mapping[str, int] = field(default_factory=dict)
 
 
 class Stretch(Settings):
@@ -119,19 +128,15 @@ def stretch(
     time, speed = read_speed_record(path, plausible)
     begin = time[0] if from_s is None else float(from_s)
     end = time[-1] if to_s is None else float(to_s)
-    if not begin < end:
-        raise ConfigError(f"leader: the stretch {begin:g}–{end:g} s of {path} is empty")
+    require(begin < end, f"leader: the stretch {begin:g}–{end:g} s of {path} is empty")
     if begin < time[0] or end > time[-1] + 1e-6:
         raise DataError(
             f"{path}: covers {time[0]:g}–{time[-1]:g} s, not the stretch {begin:g}–{end:g} s; "
             "leader=record accepts records of any length"
         )
     limit = (plausible or Plausible()).max_speed
-    if scale * speed.max() > limit:
-        raise ConfigError(
-            f"leader: {path} at scale={scale:g} drives up to {scale * speed.max():.3g} m/s, "
-            f"leader.plausible.max_speed={limit:g}"
-        )
+    fast = f"leader: {path} at scale={scale:g} drives up to {scale * speed.max():.3g} m/s, "
+    require(scale * speed.max() <= limit, f"{fast}leader.plausible.max_speed={limit:g}")
     stem = Path(path).stem
     speeds = resample(time, scale * speed, time_step, begin, end)
     return from_records([speeds], [f"{stem}@{begin:g}s"], [stem], time_step)
@@ -164,15 +169,16 @@ class RecordLeaders(Settings):
         groups: dict[str, list[Profiles]] = {}
         for group in ("training", "held_out"):
             groups[group] = self._stretches(group, getattr(self, group), time_step)
-            if not groups[group]:
-                raise ConfigError(f"leader.{group} names no record")
-        windows = varying(joined(groups["held_out"]).windows(horizon), self.least_variation)
-        report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s"] + [
+            require(groups[group], f"leader.{group} names no record")
+        every = joined(groups["held_out"]).windows(horizon)
+        windows, left_out, lines = varying(every, self.least_variation)
+        report = [f"{len(windows)} held-out windows of {horizon * time_step:g} s", *lines] + [
             f"{group}: {line}"
             for group, x in groups.items()
             for line in described_records(joined(x), horizon)
         ]
-        leaders = Leaders(joined(groups["training"]), windows, report=tuple(report))
+        training = joined(groups["training"])
+        leaders = Leaders(training, windows, report=tuple(report), left_out=left_out)
         if followers is None:
             return leaders
         cases = []
@@ -200,8 +206,7 @@ class RecordLeaders(Settings):
         """Return settings of a stretch or case; it or ``self`` has a path."""
         settings: Any = parse(kind, node or {}, where)
         settings.path = settings.path or self.path
-        if not settings.path:
-            raise ConfigError(f"{where}.path is required: the name of a cycle or a file")
+        require(settings.path, f"{where}.path is required: the name of a cycle or a file")
         return settings
 
 
@@ -217,10 +222,10 @@ class TrajectoryLeaders(Settings):
         loaded = self.source.load()
         profiles = at_step(leader_profiles(loaded.episodes, FRAME), time_step)
         training, held_out = self.split(profiles.at_least(horizon))
-        windows = varying(held_out.windows(horizon), self.least_variation)
-        lines = described_records(profiles, horizon), apart(training, held_out, loaded.vehicles)
-        report = (*loaded.report, *lines[0], *lines[1])
-        return Leaders(training, windows, report=report)
+        windows, left_out, lines = varying(held_out.windows(horizon), self.least_variation)
+        lines = [*described_records(profiles, horizon), *lines]
+        report = (*loaded.report, *lines, *apart(training, held_out, loaded.vehicles))
+        return Leaders(training, windows, report=report, left_out=left_out)
 
 
 def apart(
@@ -277,10 +282,10 @@ class DriveLeaders(Settings):
     def validate(self) -> None:
         self.columns = {**DRIVE_COLUMNS, **self.columns}
         check_map(DRIVE_FIELDS, self.columns, self.units, "leader")
-        if self.tuning and self.evaluation_share == 1:
-            raise ConfigError("leader.tuning=true leaves nothing to tune on: evaluation_share is 1")
-        if self.together and self.columns["drive"] is None:
-            raise ConfigError("leader.together divides drives by name; the table holds one record")
+        message = "leader.tuning=true leaves nothing to tune on: evaluation_share is 1"
+        require(not self.tuning or self.evaluation_share < 1, message)
+        message = "leader.together divides drives by name; the table holds one record"
+        require(not self.together or self.columns["drive"] is not None, message)
         with raised_as(ConfigError, f"leader.together={self.together}", re.error):
             re.compile(self.together or "")
 
@@ -288,8 +293,7 @@ class DriveLeaders(Settings):
         """Read all records; see :meth:`RecordLeaders.load`."""
         single = self.columns["drive"] is None
         profiles, report = self.profiles(time_step)
-        if profiles.grades is not None:
-            raise ConfigError("leader.columns.grade: only lcc-rl energy uses grades")
+        require(profiles.grades is None, "leader.columns.grade: only lcc-rl energy uses grades")
         drives = {*profiles.recordings}
         per_file = 1 < len(drives) == len(find_files(self.path))  # a file is a drive
         if per_file and self.together and len({*map(self._family, drives)}) == 1:
@@ -303,14 +307,16 @@ class DriveLeaders(Settings):
             if self.tuning:
                 training, held_out = divide(training, again=True)
             training = training.at_least(horizon)
-        windows = varying(held_out.windows(horizon), self.least_variation, self.fastest)
+        every = held_out.windows(horizon)
+        windows, left_out, lines = varying(every, self.least_variation, self.fastest)
+        used = records_of(windows)
         if not single:  # parts of one drive count as one in intervals, too
             windows = replace(windows, recordings=tuple(map(self._family, windows.recordings)))
         by = "at the end" if single else f"by name (a hash, {self.evaluation_share:.2g} each)"
-        count = f"{len(held_out)} of {len(profiles)} record(s) for evaluation, {by}: "
-        line = f"{self.path}: {count}{', '.join(held_out.names)}"
-        report += [*described_records(profiles, horizon), line]
-        return Leaders(training, windows, report=tuple(report))
+        count = f"{len(used)} of {len(profiles)} record(s) for evaluation, {by}: "
+        line = f"{self.path}: {count}{', '.join(used)}"
+        report += [*described_records(profiles, horizon), *lines, line]
+        return Leaders(training, windows, report=tuple(report), left_out=left_out)
 
     def profiles(self, time_step: float) -> tuple[Profiles, list[str]]:
         """Read all records, see :func:`lcc_rl.data.speed_records.read_drives`."""
@@ -364,18 +370,29 @@ class DriveLeaders(Settings):
         return first, last
 
 
-def varying(profiles: Profiles, least: float, fastest: float | None = None) -> Profiles:
-    """Return the records with a total change of speed of at least ``least``.
+def records_of(windows: Profiles) -> list[str]:
+    """Return the names of the records from which windows are cut."""
+    return list(dict.fromkeys(name.rpartition("+")[0] for name in windows.names))
+
+
+def varying(
+    windows: Profiles, least: float, fastest: float | None = None
+) -> tuple[Profiles, dict[str, int], list[str]]:
+    """Return the windows with a total change of speed of at least ``least``.
 
     Args:
-        profiles: the records.
+        windows: held-out windows.
         least: sum of the changes of speed [m/s].
-        fastest: largest mean speed of a record [m/s]; None: no limit.
+        fastest: largest mean speed of a window [m/s]; None: no limit.
+
+    Returns:
+        The windows, the number of those left out by source, here ``""``, and a line on these and on
+        the records without a window, if any.
 
     Raises:
         DataError: if there is none.
     """
-    records = [profiles.record(index) for index in range(len(profiles))]
+    records = [windows.record(index) for index in range(len(windows))]
     indices = [
         index
         for index, record in enumerate(records)
@@ -388,7 +405,13 @@ def varying(profiles: Profiles, least: float, fastest: float | None = None) -> P
             f"no held-out window in which the leader's speed changes by {least:g} m/s{slow}; "
             "lower leader.least_variation, raise scenario.horizon or give another record"
         )
-    return profiles.select(indices)
+    kept, count = windows.select(indices), len(windows) - len(indices)
+    line = f"left out {count} of {len(windows)} held-out windows, in which the leader's speed "
+    line += f"changes by less than leader.least_variation={least:g} m/s"
+    line += "" if fastest is None else f" or its mean exceeds leader.fastest={fastest:g}"
+    gone = [name for name in records_of(windows) if name not in records_of(kept)]
+    line += f"; no window is left of {len(gone)} record(s): {listed(gone)}" * bool(gone)
+    return kept, {"": count}, [line] * bool(count)
 
 
 def hashed(name: str) -> float:
@@ -415,14 +438,11 @@ class Mixture:
     """
 
     def __init__(self, weights: Mapping[str, float] | None = None, **sources: Any) -> None:
-        if not sources:
-            raise ConfigError("leader: a mixture names no source of leaders")
+        require(sources, "leader: a mixture names no source of leaders")
         for name, source in sources.items():
-            if not callable(getattr(source, "load", None)):
-                raise ConfigError(
-                    f"leader.{name} must be a source of leaders, got {source!r}; "
-                    f"use +leader@leader.{name}=…"
-                )
+            message = f"leader.{name} must be a source of leaders, got {source!r}; "
+            message += f"use +leader@leader.{name}=…"
+            require(callable(getattr(source, "load", None)), message)
         require_known("source in leader.weights", weights or (), sources)
         for name, weight in (weights or {}).items():
             require_positive(f"leader.weights.{name}", weight)
@@ -444,6 +464,7 @@ class Mixture:
             shares.append(self.weights.get(name, 1.0) * even)
         windows = joined([one.windows for one in loaded.values()])
         names = tuple(name for name, one in loaded.items() for _ in range(len(one.windows)))
+        left_out = {name: sum(one.left_out.values()) for name, one in loaded.items()}
         return Leaders(
             replace(training, weights=torch.cat(shares) if shares else None),
             replace(windows, sources=names),
@@ -452,4 +473,5 @@ class Mixture:
             tuple(
                 type(line)(f"{name}: {line}") for name, one in loaded.items() for line in one.report
             ),
+            left_out,
         )

@@ -122,11 +122,12 @@ def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
         f"profiles {source}".strip(): count
         for source, count in (Counter(windows.sources) or {"": len(windows)}).items()
     } | {"drivers": len(population.time_gap)}
+    short = shortfalls(cfg, available, leaders.left_out)
     return Inputs(
         training,
         windows.spread(cfg.evaluation.profiles),
         population,
-        (*leaders.report, described(population, cfg), *shortfalls(cfg, available)),
+        (*leaders.report, described(population, cfg), *short),
         leaders.cases,
         leaders.full_length,
     )
@@ -219,18 +220,23 @@ def load_episodes(node: Node) -> LoadedEpisodes:
     return replace(loaded, report=[SHARED, *loaded.report]) if cached else loaded
 
 
-def shortfalls(cfg: StudyConfig, available: Mapping[str, int]) -> list[str]:
+def shortfalls(
+    cfg: StudyConfig, available: Mapping[str, int], gone: Mapping[str, int]
+) -> list[str]:
     """Return a line for every count of an evaluation that exceeds the available data.
 
     Args:
         cfg: configuration of a study.
         available: available numbers by ``"<setting>"`` or ``"<setting> <source>"``.
+        gone: ``left_out`` of :class:`lcc_rl.data.leaders.Leaders`.
     """
     lines = []
     for label, count in available.items():
         name, _, source = label.partition(" ")
         asked = getattr(cfg.evaluation, name)
         if asked is not None and asked > count:
-            only = f"only {count} {f'of {source} ' if source else ''}are available; taking all"
+            out = gone.get(source, 0) if name == "profiles" else 0
+            only = f"only {count} {f'of {source} ' if source else ''}are available"
+            only += f" and {out} are left out, see above" * bool(out) + "; taking all"
             lines.append(f"evaluation.{name}={asked}: {only}")
     return lines

@@ -14,6 +14,7 @@ from typing import Any
 from lcc_rl.config import load
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config.unused import EXACT
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.errors import ConfigError, ResultsError, raised_as, require
 from lcc_rl.evaluation.fit import check_action, check_scenario, check_width, of_observation
@@ -128,6 +129,8 @@ def with_safety(strategies: Sequence[Strategy], safety: Mapping[str, Any]) -> li
         return [*strategies]
     nodes = [s.cfg.scenario.filters.get(AUTOMATED) for s in strategies]
     require(any(nodes), f"safety.{next(iter(safety))} has no effect: no row has a safety filter")
+    exact = all(s.cfg.scenario.is_exact(AUTOMATED) for s in strategies)
+    require(not exact or "robust" not in safety, f"safety.robust has no effect: {EXACT}")
     others = [{"filters": {AUTOMATED: node and node.changed(**safety)}} for node in nodes]
     pairs = zip(strategies, others, strict=True)
     return [replace(s, cfg=s.cfg.with_(scenario=other)) for s, other in pairs]

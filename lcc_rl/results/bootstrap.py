@@ -28,13 +28,15 @@ Side = Mapping[str, Floats]  # columns of one side of a comparison, each ``[...,
 class Estimate:
     """A value with the bounds of its 95 % interval; NaN bounds if nothing can be resampled.
 
-    Two to four drives also give a t-interval, ``over_drives``.
+    Two to four drives also give a t-interval, ``over_drives``. A comparison at equal flow has
+    ``more_flow``, the share by which this flow exceeds that of its reference.
     """
 
     value: float
     low: float = np.nan
     high: float = np.nan
     over_drives: tuple[float, float] | None = None
+    more_flow: float = np.nan
 
     def columns(self, name: str, factor: float = 1.0) -> dict[str, float]:
         """Return ``name``, ``name_low`` and ``name_high``, scaled."""

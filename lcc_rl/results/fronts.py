@@ -8,6 +8,8 @@ at equal cost.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -108,19 +110,20 @@ def flow_gained(point: Curve, baseline: Curve) -> Any:
     return point[FLOW][..., 0] / baseline[FLOW][..., 0] - 1.0
 
 
-def saved_at_flow(own: Curve, other: Curve, reference: Curve | None = None) -> Any:
+def saved_at_flow(
+    own: Curve, other: Curve, reference: Curve | None = None, most: float | None = np.nan
+) -> Any:
     """Return the share of energy per distance that one front saves against another at equal flow.
 
     A car, a platoon or a fleet is a front of one point. The flow is that of ``own``, or with a
     reference that of the reference, or the least one that both fronts have if that is more. The
-    share is NaN if a front has less flow everywhere.
+    share is NaN if a front has less flow everywhere, but for ``most``: None compares with the point
+    of ``other`` that has most flow.
     """
     flow = own[FLOW][..., 0]
-    most: float | None = np.nan
     if reference is not None:
         flow = np.maximum(reference[FLOW][..., 0], own[FLOW].min(-1))
         flow = np.maximum(flow, other[FLOW].min(-1))
-        most = None if other[FLOW].shape[-1] == 1 else np.nan
     mine = energy_at(energy_per_distance(own), own[FLOW], flow)
     return share_saved(mine, energy_at(energy_per_distance(other), other[FLOW], flow, most))
 
@@ -130,7 +133,9 @@ def at_equal_flow(
 ) -> Estimate:
     """Return the share of energy per distance saved at the flow of a reference.
 
-    See :func:`saved_at_flow`. Trainings are compared by equal seeds.
+    If a front has more flow at all its points, the flow is the least one that both have; then the
+    estimate has ``more_flow``, the share by which it exceeds the reference's. The reference itself
+    as ``other`` counts with its own flow. Trainings are compared by equal seeds.
 
     Args:
         windows: result of :func:`lcc_rl.results.windows.windows_of`.
@@ -141,7 +146,7 @@ def at_equal_flow(
         reference: strategy with the flow.
 
     Returns:
-        The share with its interval; NaN if a front does not reach the flow, or one is missing.
+        The share with its interval; NaN if a front has less flow everywhere, or one is missing.
     """
     columns = (energy, DISTANCE, FLOW)
     sides = {"own": own, "other": other, "reference": [reference]}
@@ -156,8 +161,11 @@ def at_equal_flow(
     both = with_equal_seeds(rows, *list(sides)[:2])
     rows = pd.concat([both, rows[rows[STRATEGY] == "reference"]])
     rows[TRAINED] = rows[TRAINED].astype(object).fillna(-1)
+    measure = partial(saved_at_flow, most=None if [*other] == [reference] else np.nan)
     kinds = ((side, "") for side in sides)
-    return compare_fronts(rows, *kinds, columns=columns, measure=saved_at_flow)
+    found = compare_fronts(rows, *kinds, columns=columns, measure=measure)
+    least = rows.groupby([STRATEGY, "limit"])[FLOW].mean().groupby(level=0).min()
+    return replace(found, more_flow=float(least.max() / least["reference"] - 1.0))
 
 
 def points(windows: pd.DataFrame) -> pd.DataFrame:

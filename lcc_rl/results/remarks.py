@@ -22,13 +22,14 @@ from lcc_rl.results.measures import (
     REACH,
     between,
 )
-from lcc_rl.results.names import HUMAN, NETWORK, RULE_ROWS, in_words, several
+from lcc_rl.results.names import HUMAN, NETWORK, ON_FRONT, RULE_ROWS, in_words, several
 from lcc_rl.results.windows import savings
 
 ONE = " ‡"  # marks a training of one seed beside several
 MUCH = 0.01  # share of time with infeasible accelerations that tables and log mention
 MOSTLY = 0.2  # share of time; I-80's drivers behind its leaders have 0.02, the stream's 0.06
 FLOW_LOST, FLOW_NAMED, MARK = "flow_lost", 0.02, " †"  # loss of flow that tables mark, as a share
+MORE_FLOW, MORE_NAMED = "more_flow", 0.001  # see Estimate; least share that sentences mention
 FEW_DRIVES = ("saving_drives_low", "saving_drives_high")  # t-interval over fewer than five drives
 FEW_WINDOWS, SHORT = 5, 150.0  # least number of windows; length of short ones [s]
 
@@ -67,6 +68,15 @@ def flow_note(table: pd.DataFrame) -> str:
     losses = (f"{in_words(str(name))} {100.0 * share:.0f} %" for name, share in named)
     against = in_words(str(table["against"].iloc[0]))
     return f"{MARK.strip()}: flow lost against {against}: {'; '.join(losses)}." if len(lost) else ""
+
+
+def more_flow_note(table: pd.DataFrame) -> str:
+    """Return a sentence on savings at more flow than the recorded drivers have; empty for none."""
+    rows = table[table[MORE_FLOW] > MORE_NAMED]
+    named = zip(rows["strategy"], rows[MORE_FLOW], strict=True)
+    names = ", ".join(f"{in_words(str(name))} {share:.1%}" for name, share in named)
+    more = "Saved at their flow: not at equal flow, but at the least flow on the strategy's front, "
+    return f"{more}which exceeds that of the recorded drivers by: {names}." if names else ""
 
 
 def seeds_note(table: pd.DataFrame) -> str:
@@ -138,7 +148,8 @@ def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:
     shares = measures.means(windows, (FASTER,))[FASTER]
     people = [shares[name] for name in (HUMAN, "direct") if name in shares]
     for name in shares.index if people else ():
-        if not name.endswith(FILTERED) and not np.isclose(shares[name], people).any():
+        filtered = name.partition(ON_FRONT)[0].endswith(FILTERED)
+        if not filtered and not np.isclose(shares[name], people).any():
             driver = "scenario.controllers.automated"
             option = f"variant=idm controller@{driver}={name} {driver}.desired_speed=45"
             option += " 'compare=[<run>]'"

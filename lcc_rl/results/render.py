@@ -166,6 +166,7 @@ def terminal(report: Report, title: str = "", full: bool = False) -> RenderableT
 def as_rich(table: pd.DataFrame, shown: Sequence[Shown], title: str, caption: str) -> Table:
     """Return columns of a table for the terminal; savings have one decimal, sign and interval."""
     drawn = Table(title=escape(title), caption=escape(caption), **PLAIN)
+    drawn.min_width = min(len(title), WIDTH)  # title and caption are wrapped at its width
     for index, column in enumerate(shown):
         drawn.add_column(escape(column.heading), justify="right" if index else "left")
     texts = [(one.heading, *_short_cells(table, one.key)) for one in shown]

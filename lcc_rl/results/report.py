@@ -35,12 +35,14 @@ from lcc_rl.results.remarks import (
     FLOW_LOST,
     FLOW_NAMED,
     MARK,
+    MORE_FLOW,
     ONE,
     by_ends,
     crashed,
     crashes,
     few_drives,
     flow_note,
+    more_flow_note,
     remarks,
     seeds_note,
     verdict,
@@ -167,17 +169,17 @@ def summary(
         against: the baseline without a task.
 
     Returns:
-        One row per strategy: :data:`lcc_rl.results.measures.MEASURES`; ``saving``, the share of
-        the score saved ``against`` the baseline, ``second_saving``, that of the second energy
-        model, ``flow_saving`` and ``second_flow_saving``, those against the recorded drivers at
-        their flow, ``rule_saving``, that against the rule at this flow, and ``drawn_saving``, that
-        of the energy drawn in an episode, and the share of the flow lost, with their intervals;
-        ``end_saving``, the difference of the drawn and the first saving; the share of the distance
-        lost; numbers of windows, drives, drivers behind each window and training seeds;
-        ``left_out``, the seeds that the first saving leaves out, and ``single``, whether it has
-        one training beside others of several; and for a task score, limits and whether they are
-        kept without a collision. Missing values are NaN, as are savings and
-        losses of a strategy with collisions.
+        One row per strategy: :data:`lcc_rl.results.measures.MEASURES`; ``saving``, the share of the
+        score saved ``against`` the baseline, ``second_saving``, that of the second energy model,
+        ``flow_saving`` and ``second_flow_saving``, those against the recorded drivers at their
+        flow, ``more_flow``, see :class:`lcc_rl.results.bootstrap.Estimate`, ``rule_saving``, that
+        against the rule at this flow, and ``drawn_saving``, that of the energy drawn in an episode,
+        and the share of the flow lost, with their intervals; ``end_saving``, the difference of the
+        drawn and the first saving; the share of the distance lost; numbers of windows, drives,
+        drivers behind each window and training seeds; ``left_out``, the seeds that the first saving
+        leaves out, and ``single``, whether it has one training beside others of several; and for a
+        task score, limits and whether they are kept without a collision. Missing values are NaN, as
+        are savings and losses of a strategy with collisions.
 
     Raises:
         ConfigError: if the column of a limit, or the baseline, is missing.
@@ -252,7 +254,8 @@ def _savings(
         ("rule_saving", fronts.get(rule, []) if name != rule else [], of[0]),
     ):
         front = fronts[name] if len(fronts[name]) > 1 and against is not None else []
-        row |= at_equal_flow(windows, front, other, energy, RECORDED).columns(key)
+        share = at_equal_flow(windows, front, other, energy, RECORDED)
+        row |= share.columns(key) | ({MORE_FLOW: share.more_flow} if key == "flow_saving" else {})
     return row
 
 
@@ -301,7 +304,7 @@ def report(
     text = "\n".join(filter(None, [text, few_drives(table)]))
     seen, shown_windows = (x[x["strategy"].isin(short["strategy"])] for x in (table, windows))
     notes = [*remarks(shown_windows), *crashes(seen)]
-    notes += filter(None, [flow_note(seen), by_ends(seen), seeds_note(seen)])
+    notes += filter(None, [flow_note(seen), more_flow_note(seen), by_ends(seen), seeds_note(seen)])
     fields |= {"full_caption": FULL, "verdict": text, "remarks": notes}
     ends = {"_low": "_high", "_high": "_low"}
     bounds = {f"{FLOW_SHARE.key}{x}": -100.0 * table[f"{FLOW_LOST}{y}"] for x, y in ends.items()}
@@ -327,6 +330,7 @@ def _rows(task: Task | None, against: str | None, score: Shown | None) -> list[M
         Measure("second_saving", "  second energy model", form="{:+.2%}"),
         Measure("flow_saving", "  at the recorded drivers' flow, against them", form="{:+.2%}"),
         Measure("rule_saving", "    against the rule", form="{:+.2%}"),
+        Measure(MORE_FLOW, "    at more flow than theirs, by", form="{:+.2%}"),
         Measure("drawn_saving", "  as drawn, per episode", form="{:+.1%}"),
         Measure("end_saving", "    of it by start and end of episodes", form="{:+.1%}"),
         Measure(WAY.key, "distance against the baseline", form="{:+.2f}%"),

@@ -8,12 +8,13 @@ from typing import Any
 from zlib import crc32
 
 import pytest
+import torch
 from helpers import SMALL, check_refused, check_resuming, slow_but, small_env, small_loop, weights
 from page_blocks import ROOT
 from tensordict import TensorDict
 from torch import nn
 
-from lcc_rl.agents import PPO, TrainingLoop
+from lcc_rl.agents import PPO, TrainingLoop, derived_seed, shared_policy
 from lcc_rl.agents.agent import Scene
 from lcc_rl.errors import ConfigError, ResultsError
 
@@ -42,6 +43,23 @@ def make(folder, agent: str, *overrides: str) -> TrainingLoop:
 @EACH
 def test_resuming_equals_never_having_stopped(tmp_path, agent) -> None:
     check_resuming(lambda place: make(place, agent), tmp_path)
+
+
+def test_a_loop_of_ones_own_plays_by_itself(tmp_path, my_learner) -> None:
+    class Search(TrainingLoop):  # a random search
+        def source(self) -> Any:
+            return shared_policy(self.agent.policy)
+
+        def iterate(self, policy: Any) -> dict[str, float]:
+            drawn = torch.Generator().manual_seed(derived_seed(self.seed, self.iteration))
+            for weight in policy.parameters():
+                weight.data += torch.randn(weight.shape, generator=drawn)
+            self.env.set_seed(derived_seed(self.seed, self.iteration, "episodes"))
+            played = self.env.rollout(self.horizon, policy, break_when_any_done=False)
+            return self.record([played], [{"loss_value": 0.0}], (0.0, 0.0), played.numel(), {})
+
+    my_learner.Reinforce.loop = Search
+    check_resuming(lambda place: make(place, "own"), tmp_path)
 
 
 @pytest.mark.parametrize(("hold", "decisions"), [(0.0, 10), (0.5, 2)])

@@ -127,10 +127,10 @@ def test_drawn_rewards_have_the_present_prices_of_limits(tmp_path, monkeypatch) 
             return dict.fromkeys(("loss_actor", "loss_value"), torch.zeros(()))
 
         monkeypatch.setattr(loop.agent, "update", update)
-        source, now = loop._source(), {"safety": math.log(3.0), "efficiency": math.log(2.0)}
+        source, now = loop.source(), {"safety": math.log(3.0), "efficiency": math.log(2.0)}
         for given in (dict.fromkeys(now, math.log(stored_at)), now):
             prices.update({name: given[name] for name in prices})
-            loop._iterate(source)
+            loop.iterate(source)
         kept = loop.buffer.columns.get(LIMITED)
         assert kept is None or kept[0].any(0).all()  # both limits are missed
         return torch.cat(rewards[-16:])

@@ -52,7 +52,7 @@ def test_the_best_policy_is_that_of_its_iteration(tmp_path, window, episodes, se
     words = f"agent.best_window={window}", f"training.episodes={episodes}", f"seed={seed}"
     trainer = make(tmp_path, *LITERAL, *words)
     seen = {}
-    iterate = trainer._iterate
+    iterate = trainer.iterate
 
     def watched(collector):
         row = iterate(collector)
@@ -61,7 +61,7 @@ def test_the_best_policy_is_that_of_its_iteration(tmp_path, window, episodes, se
         }
         return row
 
-    trainer._iterate = watched
+    trainer.iterate = watched
     rows = trainer.run()
     # Windows of episodes that were played once learning had begun.
     since = rows["updates"].shift(window - 1) > 0
@@ -108,7 +108,7 @@ def test_statistics_leave_out_what_follows_a_collision(tmp_path) -> None:
     with torch.no_grad():
         trainer.agent.policy.module[0][-1].bias.fill_(9.0)  # full throttle into the leader
     batch = torch.cat(
-        [next(segments) for segments in [iter(trainer._source())] for _ in range(10)], 1
+        [next(segments) for segments in [iter(trainer.source())] for _ in range(10)], 1
     )
     row = episode_statistics(batch)
     assert row["collisions"] == 4

@@ -152,7 +152,8 @@ def test_a_refused_command_leaves_a_run_as_it_was(run, tmp_path) -> None:
     for words in (["resume=run", "seed=3"], ["hydra.run.dir=run", *RULE, "evaluation.drivers=0"]):
         refused(["train", *words], tmp_path)
     (run / "episodes.parquet").unlink()
-    refused(["train", "resume=run", "seed=3"], tmp_path)
+    said = refused(["train", "resume=run", "reward.terms.own.weight=1"], tmp_path)
+    assert "a resumed run keeps the settings it was started with; remove reward.terms.own" in said
     assert inspect_run(run).state == "stopped"
 
 

@@ -46,7 +46,7 @@ def test_slow_drivers_behind_faster_leaders_are_said(tmp_path, caplog, v0, said)
 
 def test_every_baseline_with_a_desired_speed_is_warned_of() -> None:
     shares = {"direct": 0.3, "human": 0.3, "idm": 0.1, "recorded": np.nan, "alcc": 0.3}
-    shares |= {"acc_filtered": 1.0, "mine": 0.9}
+    shares |= {"acc_filtered": 1.0, "idm_acc_filtered X=1.2": 1.0, "mine": 0.9}
     rows = pd.DataFrame({"strategy": shares.keys(), FASTER: shares.values()})
     said = [line.split("speed of ")[1].split()[0] for line in leader_too_fast(windows_for(rows))]
     assert said == ["direct", "human", "mine"]

@@ -149,6 +149,20 @@ def test_fast_windows_are_left_out(table) -> None:
     assert list(slow.windows.names) == kept
 
 
+def test_calm_windows_are_counted_and_a_record_without_a_window_is_not_listed(tmp_path) -> None:
+    frame = drives(["a", "b", "c"])
+    frame.loc[frame["drive"] == "c", "speed_mps"] = 0.0
+    frame.to_csv(tmp_path / "x.csv", index=False)
+    words = ["leader=drives", f"leader.path='{tmp_path}/x.csv'", "leader.evaluation_share=1"]
+    lines = load_inputs(load("evaluate", ["variant=rule", "scenario.horizon=100", *words])).report
+    left_out, used = lines[-4:-2]
+    assert left_out.startswith("left out 5 of 15 held-out windows")
+    assert left_out.endswith("leader.least_variation=2 m/s; no window is left of 1 record(s): c")
+    assert "2 of 3 record(s) for evaluation" in used
+    assert used.endswith(": a, b")
+    assert "only 10 are available and 5 are left out" in lines[-1]
+
+
 def test_a_file_of_esmini_is_read(tmp_path) -> None:
     time, speed = "TimeStamp [s]", "#1 Current_Speed [m/s]"
     first = "Version: 2, OpenDRIVE: a.xodr, OpenSCENARIO: b.xosc, vehicles: 1"

@@ -36,7 +36,7 @@ def test_a_training_takes_over_where_humans_are(tmp_path) -> None:
     inputs = load_inputs(cfg)
     env = training_env(cfg, inputs.training, inputs.population)
     trainer = make_trainer(cfg, make_agent(cfg), env, tmp_path)
-    source = trainer._source()
+    source = trainer.source()
     trainer.env.set_seed(3)
     begun = source.skip(source.start(), trainer.agent.burn_in)
     driver = {"automated": cfg.scenario.controllers["human"]}

@@ -72,6 +72,10 @@ def test_safety_changes_the_filter_that_a_policy_keeps() -> None:
     cases = [
         (["idm_acc", "safety.margin=2"], "safety.margin=2 has no effect: nothing drives behind"),
         (["pretrained/alcc", "safety.margin=2"], "safety.margin has no effect: no row has a s"),
+        (
+            ["pretrained/alcc_limits", "safety.robust=false"],
+            "actuators and sensors are exact; .faults",
+        ),
         (["pretrained/alcc_limits", "safety.marge=2"], "unknown setting .* Did you mean 'margin'"),
         (["pretrained/alcc_limits", f"{MARGIN}=2"], "safety.margin=2 changes the filter that a"),
     ]

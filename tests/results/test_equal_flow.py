@@ -13,6 +13,7 @@ from lcc_rl.commands import evaluation
 from lcc_rl.config import load
 from lcc_rl.energy import SECOND
 from lcc_rl.errors import ConfigError
+from lcc_rl.results.bootstrap import Estimate
 from lcc_rl.results.fronts import at_equal_flow
 from lcc_rl.results.report import report, summary, windows_for
 
@@ -69,13 +70,29 @@ def test_a_strategy_is_compared_at_the_flow_of_the_recorded_drivers() -> None:
     assert np.isnan(table.loc["rule", "rule_saving"])
     energy = "total_path_energy_kj"
 
+    def found_for(own: list[str], other: list[str]) -> Estimate:
+        return at_equal_flow(windows, own, other, energy, "recorded")
+
     def saved(own: list[str], other: list[str]) -> float:
-        return at_equal_flow(windows, own, other, energy, "recorded").value
+        return found_for(own, other).value
 
     # A front with more flow everywhere counts with its least flow; the rival must reach the flow.
     assert saved(["rule X=1"], ["recorded"]) == pytest.approx(1.0 - 110.0 / 120.0)
     assert np.isnan(saved(["rule X=2"], ["recorded"]))
     assert np.isnan(saved(["alcc", "alcc X=1"], ["rule X=1"]))
+    assert np.isnan(saved(["rule", "rule X=1"], ["rule X=2"]))  # a point with less flow
+    more = (1100.0 + 3.5) / (1040.0 + 3.5) - 1.0
+    assert found_for(["rule X=1"], ["recorded"]).more_flow == pytest.approx(more)
+    assert found_for(["alcc", "alcc X=1"], list(NAMES[:3])).more_flow == 0.0
+
+
+def test_a_table_marks_savings_at_more_flow_than_the_recorded_drivers_have() -> None:
+    faster = {"alcc": 1200.0, "alcc X=1": 1300.0}
+    one = report(windows_for(rows(flow_vph={**FLOWS, **faster})))
+    assert one.table.set_index("strategy").loc["alcc", "more_flow"] == pytest.approx(0.15, abs=0.01)
+    found = [line for line in one.remarks if "not at equal flow" in line]
+    assert [line.rpartition(": ")[2] for line in found] == ["network 15.4%."]
+    assert not any("not at equal flow" in line for line in report(windows_for(rows())).remarks)
 
 
 def test_fronts_are_compared_by_equal_seeds() -> None:

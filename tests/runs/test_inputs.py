@@ -112,6 +112,11 @@ def test_imports_within_functions_and_packages_are_followed(place) -> None:
     (package / "term.py").write_text("def Term():\n    from .late import X\n")
     found = inputs_of({"compare": ["own_parts.term.Term"]})
     assert [*found["compare"]] == ["term.py", "late.py", "own_helper.py"]
+    (package / "term.py").write_text("import own_parts, other\n\ndef Term(): ...\n")
+    (place / "other").mkdir()
+    (place / "other" / "__init__.py").write_text("other = 1")
+    found = inputs_of({"compare": ["own_parts.term.Term"]})["compare"]
+    assert [*found] == ["term.py", "own_parts/__init__.py", "other/__init__.py"]
 
 
 def test_own_files_of_settings_are_read_anew(place, monkeypatch) -> None:

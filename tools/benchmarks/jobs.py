@@ -80,7 +80,7 @@ def trainer(options: Namespace, batch: int, steps: int, folder: Path, updates: f
     trained = ReplayLoop(agent, env, cfg.training, 0, folder, "benchmark")
     played = alcc(options, 100).rollout(20, break_when_any_done=False)
     trained.buffer.extend(transitions(played))
-    collector = trained._source()
+    collector = trained.source()
     return lambda: trained._numbers(collector)
 
 
@@ -109,7 +109,7 @@ def analytic(options: Namespace) -> list[Row]:
         env = training_env(cfg, profiles, inputs.population)
         trainer = make_trainer(cfg, agent, env, Path(folder))
         assert isinstance(trainer, GradientLoop)
-        own: Run = partial(trainer._numbers, trainer._source())
+        own: Run = partial(trainer._numbers, trainer.source())
         batch = cfg.training.environments
         return rates(options, {OWN: own}, "iterations/s", 1, batch=batch, grad=True)
 
