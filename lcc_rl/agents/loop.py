@@ -7,6 +7,7 @@ training equals an uninterrupted one bit for bit.
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -34,6 +35,9 @@ from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.settings import Settings, Whole
 
 # Entries from which the record of an iteration is computed.
+log = logging.getLogger("lcc_rl")
+
+LATE = 10  # the last episodes are a share of 1 / LATE, of trainings of so many iterations
 REPORTED = tuple(("next", *key) for key in (REWARD, TERMS, ("done",), ("terminated",)))
 
 AgentT = TypeVar("AgentT", bound=Agent)
@@ -149,7 +153,10 @@ class TrainingLoop(ABC, Generic[AgentT]):
                 if self.iteration % self.settings.checkpoint_every == 0:
                     self.save()
         self.save()
-        return pd.DataFrame(self.rows)
+        record = pd.DataFrame(self.rows)
+        if warning := still_colliding(record):
+            log.warning(warning)
+        return record
 
     def _numbers(self, source: Any) -> dict[str, float]:
         """Run an iteration; an error names it and the file of the last valid state."""
@@ -259,6 +266,19 @@ class TrainingLoop(ABC, Generic[AgentT]):
             raise ResultsError(f"{path}: does not fit this training: {error!r}") from error
         self.iteration, self.updates = found.iteration, found.updates
         self.rows, self.times = _rows(found.rows), _rows(found.times)
+
+
+def still_colliding(record: pd.DataFrame) -> str:
+    """Return a warning if more than 1 % of the episodes at the end of a training collided."""
+    if len(record) < LATE:
+        return ""
+    late = record.iloc[-(len(record) // LATE) :]
+    share = 100.0 * late["collisions"].sum() / (late["episodes"] / late["iteration"]).sum()
+    text = (
+        "of the last episodes ended in a collision, which may cost less than the driving that it "
+    )
+    remedy = "ends: raise reward.terms.collision.weight, or train behind a filter"
+    return f"{share:.2g} % {text}{remedy}" if share > 1.0 else ""
 
 
 def episode_statistics(batch: TensorDictBase) -> dict[str, float]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
 from helpers import ACTION, REPLAYED, check_resuming, small_env, small_loop, string
 
 from lcc_rl.agents.collecting import transitions
-from lcc_rl.agents.loop import TrainingLoop, episode_statistics
+from lcc_rl.agents.loop import TrainingLoop, episode_statistics, still_colliding
 from lcc_rl.errors import ResultsError
 
 
@@ -118,6 +119,16 @@ def test_statistics_leave_out_what_follows_a_collision(tmp_path) -> None:
 
 
 @pytest.mark.slow
+def test_collisions_at_the_end_of_a_training_are_said() -> None:
+    number = np.arange(1.0, 21.0)
+    record = pd.DataFrame({"iteration": number, "episodes": 64.0 * number, "collisions": 0.0})
+    record.loc[:16, "collisions"] = 60.0
+    assert still_colliding(record) == ""
+    record.loc[18:, "collisions"] = 3.0, 1.0
+    assert still_colliding(record).startswith("3.1 % of the last episodes ended in a collision")
+    assert still_colliding(record[:9]) == ""
+
+
 def test_learns_to_keep_going(tmp_path) -> None:
     # Behaviour, not numbers: after a few hundred updates the car earns more than at the start.
     trainer = make(
