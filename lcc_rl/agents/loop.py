@@ -37,7 +37,9 @@ from lcc_rl.settings import Settings, Whole
 # Entries from which the record of an iteration is computed.
 log = logging.getLogger("lcc_rl")
 
-LATE = 10  # the last episodes are a share of 1 / LATE, of trainings of so many iterations
+LAST_TENTH = (
+    10  # the last episodes are a share of 1 / LAST_TENTH, of trainings of so many iterations
+)
 REPORTED = tuple(("next", *key) for key in (REWARD, TERMS, ("done",), ("terminated",)))
 
 AgentT = TypeVar("AgentT", bound=Agent)
@@ -270,9 +272,9 @@ class TrainingLoop(ABC, Generic[AgentT]):
 
 def still_colliding(record: pd.DataFrame) -> str:
     """Return a warning if more than 1 % of the episodes at the end of a training collided."""
-    if len(record) < LATE:
+    if len(record) < LAST_TENTH:
         return ""
-    late = record.iloc[-(len(record) // LATE) :]
+    late = record.iloc[-(len(record) // LAST_TENTH) :]
     share = 100.0 * late["collisions"].sum() / (late["episodes"] / late["iteration"]).sum()
     text = (
         "of the last episodes ended in a collision, which may cost less than the driving that it "
