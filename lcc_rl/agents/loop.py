@@ -34,12 +34,10 @@ from lcc_rl.runs.interrupts import stop_signal
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.settings import Settings, Whole
 
-# Entries from which the record of an iteration is computed.
 log = logging.getLogger("lcc_rl")
 
-LAST_TENTH = (
-    10  # the last episodes are a share of 1 / LAST_TENTH, of trainings of so many iterations
-)
+LAST_TENTH = 10  # iterations from which the last episodes of a training, a tenth, are looked at
+# Entries from which the record of an iteration is computed.
 REPORTED = tuple(("next", *key) for key in (REWARD, TERMS, ("done",), ("terminated",)))
 
 AgentT = TypeVar("AgentT", bound=Agent)
