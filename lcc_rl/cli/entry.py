@@ -108,7 +108,7 @@ def help_text(entry: str, overrides: Sequence[str]) -> str:
             *lines,
             "",
             f"Settings of conf/: lcc-rl {name} --cfg job. Defaults of all classes:",
-            "docs/settings.md, by python tools/settings.py in a clone. All groups: --help-all.",
+            "python tools/settings.py writes docs/settings.md in a clone. Groups: --help-all.",
             "-m runs a sweep of all combinations: a=1,2 b=3,4.",
         ]
     )

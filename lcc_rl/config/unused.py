@@ -22,6 +22,8 @@ OF_EPISODES = (
     *("humans_first", "second_energy", "terms"),
 )
 OBSERVATION = "lcc_rl.pieces.Observation"
+# Options that add the pieces of a role; an event also replaces leaders.
+OPTIONS_OF = {"filters": ("filter",), "actuators": ("faults",), "sensors": ("faults", "event")}
 EXACT = "actuators and sensors are exact; +faults=all adds others"
 FIXED = "no vehicle of this platoon depends on drivers or noise"
 
@@ -111,8 +113,9 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
         for role in {*getattr(cfg.scenario, group)} & {*cfg.scenario.controllers}:
             if role not in cfg.scenario.vehicles.names:
                 yield f"scenario.{group}.{role}", f"no vehicle of the string is {role}"
-                if group == "filters":
-                    yield "filter", f"no vehicle of the string is {role}"
+                for option in OPTIONS_OF.get(group, ()):
+                    if option != "event" or not cfg.scenario.replaced:
+                        yield option, f"no vehicle of the string is {role}"
     for role in filter(cfg.scenario.is_exact, cfg.scenario.filters):
         yield f"scenario.filters.{role}.robust", EXACT
     if AUTOMATED not in cfg.scenario.vehicles.names:

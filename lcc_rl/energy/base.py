@@ -22,7 +22,8 @@ SECOND = "second_path_energy_kj"  # path energy by evaluation.second_energy
 BURNT = ("fuel_l", "co2_g")  # fuel of an energy [L] and its carbon dioxide [g]
 
 GRAVITY = 9.81  # [m/s²]
-Grade = Annotated[float, Field(ge=-0.3, le=0.3)]  # grade of the road [rad]
+STEEPEST = 0.3  # grade of a road [rad]
+Grade = Annotated[float, Field(ge=-STEEPEST, le=STEEPEST)]
 
 
 class EnergyModel(Settings, ABC):

@@ -6,14 +6,25 @@ import math
 from typing import Annotated
 
 import torch
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from torch import Tensor
 
 from lcc_rl.energy.base import GRAVITY, EnergyModel, Grade
+from lcc_rl.errors import require
 from lcc_rl.functional.power import acceleration_loss, motor_power, path_power
 from lcc_rl.settings import NonNegative, Positive
 
 AIR = 1.2  # [kg/m³]
+
+
+def _in_watts(least: float) -> AfterValidator:
+    """Return a check of a power that is 0, or at least that of any car: kW for W are refused."""
+
+    def check(power: float) -> float:
+        require(power == 0.0 or power >= least, f"must be 0 or at least {least:g} W, got {power:g}")
+        return power
+
+    return AfterValidator(check)
 
 
 class ElectricCar(EnergyModel):
@@ -34,11 +45,14 @@ class ElectricCar(EnergyModel):
     area: Positive = 2.755  # frontal area [m²]
     rolling: NonNegative = 0.008  # rolling resistance coefficient
     efficiency: Annotated[float, Field(gt=0.0, le=1.0)] = 0.87  # of the drivetrain, either way
-    auxiliary: NonNegative = 250.0  # power of auxiliary consumers [W]
-    regeneration_limit: NonNegative = 50_000.0  # largest braking power of the motor [W]
+    auxiliary: Annotated[NonNegative, _in_watts(1.0)] = 250.0  # power of auxiliary consumers [W]
+    # Largest braking power of the motor [W].
+    regeneration_limit: Annotated[NonNegative, _in_watts(1000.0)] = 50_000.0
     fade_speed: Positive = 5.0  # below this speed recuperation is proportional to speed [m/s]
     grade: Grade = 0.0  # of the road [rad]
-    power_limit: Positive | None = None  # at the wheels; None: no limit [W]
+    power_limit: Annotated[Positive, _in_watts(1000.0)] | None = (
+        None  # at the wheels; None: no limit [W]
+    )
 
     def validate(self) -> None:
         self.resistance = 0.5 * AIR * self.drag * self.area  # of the air [N/(m/s)²]

@@ -11,7 +11,7 @@ import torch
 from pydantic import Field, InstanceOf
 from torch import Tensor
 
-from lcc_rl.energy.base import BURNT, EnergyModel
+from lcc_rl.energy.base import BURNT, STEEPEST, EnergyModel
 from lcc_rl.energy.electric import PaperMotor
 from lcc_rl.errors import ConfigError, raised_as, require, require_known
 from lcc_rl.functional.guard import check_independent, unchanged
@@ -21,6 +21,7 @@ from lcc_rl.settings import Positive, Settings, values
 Quantity = Callable[[EnergyModel, Tensor, Tensor], Tensor]
 # Distance of commands from the largest acceleration, which rounded speeds would exceed [m/s²].
 ROUNDING = 1e-3
+MASSES = (50.0, 200_000.0)  # of vehicles [kg]
 # Speed [m/s] at which power and kinetic energy are compared, and their largest factor: the motor of
 # the ALCC paper has 2.6, other shipped models 0.6 to 1.1; km/h for m/s have 3.6.
 PROBE, MOST_OFF = 10.0, 3.0
@@ -43,7 +44,13 @@ class VehicleClass(Settings):
 
     def validate(self) -> None:
         kind, mass, share = type(self.energy).__name__, self.energy.mass, self.energy.efficiency
-        require(mass > 0.0, f"{kind}: an energy model needs its mass [kg], got {mass!r}")
+        fits = MASSES[0] <= mass <= MASSES[1]
+        text = f"{kind}: an energy model needs its mass, {MASSES[0]:g} to {MASSES[1]:g} kg"
+        require(fits, f"{text}, got {mass!r}")
+        if not isinstance(grade := getattr(self.energy, "grade", 0.0), Tensor):
+            require(
+                abs(grade) <= STEEPEST, f"{kind}: grade must be at most {STEEPEST} rad, got {grade}"
+            )
         require(0.0 < share <= 1.0, f"{kind}: efficiency must lie from 0 to 1, got {share!r}")
         self._check_units(kind)
 

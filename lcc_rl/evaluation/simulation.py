@@ -57,7 +57,8 @@ BLOCK = 2**20  # numbers of each entry that are measured at a time
 LEADER: Key = ("leader", "speed")
 SCENE = {"experiment", *(f"scenario.{name}" for name in ("string", "time_step", "horizon"))}
 OF_FILES = {"leader", "data"}
-OF_ARGUMENTS = SCENE | {"split", "compare", "policy", "seed", "evaluation", "reward"}
+OF_TABLES = {"unit", "table"}
+OF_ARGUMENTS = SCENE | OF_TABLES | {"split", "compare", "policy", "seed", "evaluation", "reward"}
 # Nothing reads the reward; this term fits any scenario.
 UNREAD = RewardConfig(terms={"collision": Node.of({TARGET: path_of(CollisionPenalty)}, "reward")})
 MOTION = {

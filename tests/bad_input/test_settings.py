@@ -103,6 +103,8 @@ IGNORED = {
     "variant=hcfs evaluation.repeats=5": "drives behind every record once",
     "variant=hcfs drivers=highway": "no vehicle of this platoon depends on drivers",
     "variant=direct +filter=cbf": "no vehicle of the string is automated",
+    "variant=direct +event=lost_target": "no vehicle of the string is automated",
+    "variant=direct +faults=sensors": "no vehicle of the string is automated",
     "variant=alcc deployed.choice=first": "belongs to variant=hcfs",
     "+filter=cbf scenario.filters.automated.robust=false": "actuators and sensors are exact",
     "sweep=mine": "names the folder of a sweep, -m",

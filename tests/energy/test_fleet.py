@@ -103,6 +103,7 @@ class Rolling(EnergyModel):
     unit: Number = 1.0
     summed: bool = False
     warming: bool = False
+    grade: Number = 0.0
 
     def power(self, speed, acceleration):
         power = (1500.0 * acceleration + 200.0) * speed * self.unit
@@ -117,12 +118,13 @@ def test_mistakes_are_named() -> None:
         (MODELS, {"cart": 1.0}, r"energy.shares.*'cart'.*car"),
         (MODELS, {"car": 0.0}, "energy.shares: shares"),
         (MODELS, None, {"human": {"bus": 1.0}}, r"energy.roles.human.*'bus'"),
-        ({"x": Weightless()}, "Weightless: an energy model needs its mass .* nan"),
+        ({"x": Weightless()}, "Weightless: an energy model needs its mass, .* nan"),
         ({"x": Lossless()}, "Lossless: efficiency must lie from 0 to 1, got 1.3"),
         ({"x": Rolling(unit=1e-3)}, "Rolling.power .* 15 W per m/s², .* 1.5e[+]04 W"),
         ({"x": Rolling(unit=3.6)}, "Rolling.power"),  # speed taken as km/h
         ({"x": Rolling(unit=-1.0)}, "Rolling.power"),
-        ({"x": Rolling(mass=1.5)}, "Rolling.power .*[(]mass 1.5 kg"),
+        ({"x": Rolling(mass=1.5, unit=1e-3)}, "Rolling: .* its mass, 50 to 200000 kg, got 1.5"),
+        ({"x": Rolling(grade=2.0)}, "Rolling: grade must be at most 0.3 rad, got 2"),
         ({"x": Rolling(warming=True)}, "Rolling gives an episode other power .* again"),
         ({"x": Rolling(summed=True)}, "Rolling.power: .*dim"),
     ]
