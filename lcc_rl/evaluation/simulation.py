@@ -80,9 +80,9 @@ class Simulation:
         steps: a row per episode, time and vehicle; vehicle 0 is the leader, the others are from
             front to back. ``acceleration_mps2`` and ``power_w`` are those of the step that ends at
             ``time_s``. An episode ends with its first collision, a gap of 0 m or less.
-        vehicles: a row per episode and vehicle: ``collided``, ``mean_speed_mps`` (of the speeds
-            after each step, as in evaluations), distance and energies of
-            :func:`lcc_rl.evaluation.metrics.energy_measures`, and the measures of
+        vehicles: a row per episode and vehicle: of a mixture ``energy_class``; ``collided``,
+            ``mean_speed_mps`` (of the speeds after each step, as in evaluations), distance and
+            energies of :func:`lcc_rl.evaluation.metrics.energy_measures`, and the measures of
             :data:`lcc_rl.evaluation.metrics.METRICS` and ``ROAD_METRICS``, those of
             ``measures=[…]`` included, each of one vehicle; NaN where it has none.
     """
@@ -302,6 +302,8 @@ class _Motion:
             **{name: _column(rows, shape) for name, rows in motion.items()},
         }
         measured = self._measures()
+        if len(names := self.energy.names) > 1:
+            summary = summary.assign(energy_class=np.array(names)[self._classes().flatten()])
         summary = summary.assign(collided=measured["min_gap_m"] <= 0.0, **measured)
         return Simulation(pd.DataFrame(columns, copy=False), summary)
 
@@ -328,6 +330,12 @@ class _Motion:
             index = self.record[INDEX][0].squeeze(-1).numpy() + 1
             np.put_along_axis(roles, index, AUTOMATED, axis=1)
         return roles[:, self.vehicles]
+
+    def _classes(self) -> np.ndarray:
+        """Return the number of each vehicle's class, ``[episodes, n]``; a leader has the first."""
+        parts = zip(self.groups, self.kinds, strict=True)
+        none = [group["speed"][0] * 0.0 if kind is None else kind for group, kind in parts]
+        return torch.cat(none, -2).squeeze(-1).long().numpy()
 
     def _measures(self) -> dict[str, np.ndarray]:
         """Return energies and measures of every vehicle, episode by episode; NaN without one."""

@@ -17,6 +17,7 @@ from lcc_rl.data.profiles import from_records, no_profiles
 from lcc_rl.data.sources import ASSETS
 from lcc_rl.drivers.population import SHIPPED_DRIVERS, bootstrap, fixed
 from lcc_rl.envs import Inputs
+from lcc_rl.envs.inputs import build_energy
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.episodes import evaluate
@@ -244,6 +245,21 @@ def test_settings_without_effect_are_said(caplog) -> None:
         lcc_rl.simulate(WAVE, *case, repeats=2, seed=3)
         said = f"without effect on these vehicles: {without}"
         assert caplog.messages == [said] * bool(without), case
+
+
+def test_a_mixture_names_the_class_whose_power_each_vehicle_draws() -> None:
+    settings = ["energy=mixture", "drivers=highway"]
+    found = simulate(20.0 + np.sin(0.1 * np.arange(61)), "human*6", overrides=settings, repeats=2)
+    fleet, keys = build_energy(load("evaluate", settings)), ["episode", "vehicle"]
+    kinds = found.vehicles.set_index(keys)["energy_class"]
+    assert kinds.nunique() > 2
+    for key, rows in found.steps.groupby(keys):
+        speed, acceleration, power = (
+            torch.tensor(rows[name].to_numpy())
+            for name in ("speed_mps", "acceleration_mps2", "power_w")
+        )
+        drawn = fleet.classes[kinds[key]].energy.power(speed[:-1], acceleration[1:])
+        torch.testing.assert_close(drawn, power[1:])
 
 
 def test_a_leader_that_is_replaced_does_not_jump() -> None:
