@@ -249,7 +249,7 @@ def test_settings_without_effect_are_said(caplog) -> None:
 
 def test_a_mixture_names_the_class_whose_power_each_vehicle_draws() -> None:
     settings = ["energy=mixture", "drivers=highway"]
-    found = simulate(20.0 + np.sin(0.1 * np.arange(61)), "human*6", overrides=settings, repeats=2)
+    found = lcc_rl.simulate(10.0 + WAVE, "human*6", overrides=settings, repeats=2)
     fleet, keys = build_energy(load("evaluate", settings)), ["episode", "vehicle"]
     kinds = found.vehicles.set_index(keys)["energy_class"]
     assert kinds.nunique() > 2
