@@ -309,7 +309,8 @@ def register(measure: Measure, metric: Metric, every: bool = False) -> None:
     except LccError:
         raise
     except Exception as error:
-        raise ConfigError(f"measure {key}: {in_short(error)}") from error
+        hint = " (speed has a row more than steps: speed[1:])" * ("speed" in entries)
+        raise ConfigError(f"measure {key}: {in_short(error, 200)}{hint}") from error
     for table in (MEASURES, PLATOON):
         table[:] = [row for row in table if row.key != key] + [measure]
     for metrics in (METRICS, ROAD_METRICS):
