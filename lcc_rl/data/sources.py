@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from glob import has_magic
@@ -11,10 +12,12 @@ from os.path import abspath, expanduser
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import pandas as pd
 from pydantic import Field
 
 import lcc_rl.assets
+from lcc_rl.data.agreement import PAIR_SIGNALS
 from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.columns import SI, Column, Names, Units, check_map
 from lcc_rl.data.episodes import (
@@ -24,12 +27,12 @@ from lcc_rl.data.episodes import (
     derive_positions,
     read_episodes,
 )
-from lcc_rl.data.grid import BRIDGE_S, LongestHole, Places, places
+from lcc_rl.data.grid import BRIDGE_S, LongestHole, Place, Places, places, stretches
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible
 from lcc_rl.data.smoothing import averaged
 from lcc_rl.data.trajectories import Trajectories, listed
-from lcc_rl.errors import DataError, raised_as
+from lcc_rl.errors import Concern, DataError, raised_as
 from lcc_rl.io.paths import matching
 from lcc_rl.settings import Settings
 
@@ -81,6 +84,7 @@ class Source(Settings):
         """Return the averaged plausible episodes; see :meth:`Plausible.select`."""
         thresholds = self.plausible or Plausible()
         rest, notes = thresholds.select(episodes, source, place, remedy=remedy, units=units)
+        notes += _copies(rest, place(rest))
         if self.average_s:
             rest, line = averaged(rest, self.average_s, source)
             notes.append(line)
@@ -179,6 +183,40 @@ class EpisodesSource(Source):
         return replace(
             self.select(episodes, source, lines, place=place, units=units), vehicles=vehicles
         )
+
+
+def copies(names: Sequence[str], motions: Sequence[Hashable]) -> list[Concern]:
+    """Return a concern about a recording or drive that is read twice, under two names.
+
+    Args:
+        names: names or places of the recordings.
+        motions: keys of their motions, such as hashes.
+    """
+    first: dict[Hashable, str] = {}
+    twice = [
+        (first[motion], name)
+        for name, motion in zip(names, motions, strict=True)
+        if first.setdefault(motion, name) != name
+    ]
+    if not twice:
+        return []
+    (one, other), count = twice[0], len(twice)
+    text = f"{count:,} of {len(names):,} recordings have the motion of another, {one} and {other}"
+    return [Concern(f"{text}: is a file read twice? One may be held out while a policy learns it")]
+
+
+def _copies(episodes: pd.DataFrame, place: Place) -> list[Concern]:
+    """Return :func:`copies` of the recordings of an episode table."""
+    motion = np.ascontiguousarray(episodes[[*PAIR_SIGNALS.values()]].to_numpy(np.float32))
+    keys = [x for x in ("recording", "file") if x in episodes]
+    names: dict[Hashable, str] = {}
+    motions: dict[Hashable, list[bytes]] = {}
+    for start, length in zip(*stretches(episodes["episode"].to_numpy()), strict=True):
+        recording = tuple(episodes[key].iat[start] for key in keys)
+        names.setdefault(recording, place(start, ""))
+        digest = hashlib.sha256(motion[start : start + length]).digest()
+        motions.setdefault(recording, []).append(digest)
+    return copies([*names.values()], [tuple(sorted(x)) for x in motions.values()])
 
 
 def read_as(columns: Iterable[Column], names: Names, units: Units) -> str:

@@ -18,7 +18,7 @@ from lcc_rl.data.columns import SLOPES, Column, Names, Units
 from lcc_rl.data.grid import BRIDGE_S, continuous, interpolated, places, stretches
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.profiles import Profiles, from_records, resample
-from lcc_rl.data.sources import SHIPPED_FILES, find_files, units_of
+from lcc_rl.data.sources import SHIPPED_FILES, copies, find_files, units_of
 from lcc_rl.data.tables import TableFile, same_text, tables_of
 from lcc_rl.data.text import alike
 from lcc_rl.data.trajectories import ReadReport
@@ -107,6 +107,8 @@ def read_drives(
             raise DataError(f"{path}: drive {min(twice)!r} is in several files; expected one")
         records |= loaded
         lines += [*report, *interpolated(samples, time_step)]
+    motions = {name: speeds for name, (_, speeds, _) in records.items() if len(speeds.unique()) > 1}
+    lines += copies([*motions], [x.numpy().tobytes() for x in motions.values()])
     names = [*records] if columns["drive"] is None else sorted(records)
     drives, speeds, grades = zip(*(records[name] for name in names), strict=True)
     profiles = from_records(speeds, names, drives, time_step)

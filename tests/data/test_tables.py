@@ -21,9 +21,10 @@ from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.smoothing import SavitzkyGolay
 from lcc_rl.data.sources import EpisodesSource, LoadedEpisodes
+from lcc_rl.data.speed_records import DRIVE_COLUMNS, read_drives
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.data.trajectories import FOOT
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import Concern, ConfigError, DataError
 from lcc_rl.io.files import write_parquet
 
 BASE = {"vehicle": "id", "time": "t", "speed": "v"}
@@ -537,6 +538,22 @@ def test_a_log_with_one_speed_in_another_unit_is_refused(tmp_path) -> None:
     )
     with pytest.raises(DataError, match=r"'range_rate': .* own speed minus the leader's\?"):
         read().load()
+
+
+def test_a_recording_that_is_read_twice_is_reported(tmp_path) -> None:
+    found = EpisodesSource(path="platoons").load().episodes.query("episode < 2")
+    for name in ("a.csv", "b.parquet"):
+        path = tmp_path / name
+        found.to_csv(path) if name == "a.csv" else found.to_parquet(path)
+    pairs = EpisodesSource(path=str(tmp_path), columns={"recording": None}).load().report
+    assert [x for x in pairs if isinstance(x, Concern) and "1 of 2 recordings have the" in x]
+    one = EpisodesSource(path=str(tmp_path / "a.csv"), columns={"recording": None}).load().report
+    assert not [x for x in one if isinstance(x, Concern)]
+    drive = found.rename(columns={"leader_speed_mps": "speed_mps"})[["time_s", "speed_mps"]][:200]
+    for name in ("c.csv", "d.csv"):
+        drive.to_csv(tmp_path / name)
+    _, lines = read_drives([str(tmp_path / x) for x in ("c.csv", "d.csv")], DRIVE_COLUMNS, 0.1)
+    assert [x for x in lines if isinstance(x, Concern) and ", c and d: is a file" in x]
 
 
 def test_episodes_named_by_texts_name_their_drivers(tmp_path) -> None:
