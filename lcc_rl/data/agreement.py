@@ -29,6 +29,8 @@ RIDGE = np.diag([1e-6, 1e-6, 0.1])  # [m²]: for a bias of speeds, unknown in st
 LEAST_WAY = 50.0  # least distance from which the unit of a speed is concluded [m]
 NEAR_MISTAKE, ALIKE = 1.25, 1.05  # largest factors to a mistake's coefficients; between mistakes
 STRAY = 0.2  # largest distance left of a relative speed, as a share of the follower's
+# Range of distance by positions divided by distance by speeds; largest median error of gaps [m].
+AGREE, POSITIONED = (0.8, 1.25), 1.0
 LOUD, LOUD_RATE, LOUD_FACTOR = 0.3, 0.3, 1.15  # reported: lag [s], bias of a speed [m/s], factor
 STANDING, LEAST_STANDING = 0.5, 300  # speed [m/s], samples
 # Gap that may be in feet [m]; time gaps of speeds in m/s read as km/h, and of the reverse [s].
@@ -257,6 +259,41 @@ def check_pairs(
     return [*lines, medians(episodes, pairs[clear], len(pairs), units)], bool(right.any())
 
 
+def check_positions(episodes: pd.DataFrame, place: Place) -> None:
+    """Check that positions agree with speeds, and gaps with positions and known lengths.
+
+    Args:
+        episodes: see :data:`lcc_rl.data.episodes.SCHEMA`.
+        place: returns the description of a sample.
+
+    Raises:
+        DataError: naming a sample and both numbers.
+    """
+    inside = np.diff(episodes["episode"]) == 0
+    step = np.diff(episodes["time_s"])[inside]
+    for car in ("follower", "leader"):
+        speed = episodes[f"{car}_speed_mps"].to_numpy(np.float64)
+        way = float(np.diff(episodes[f"{car}_position_m"].to_numpy(np.float64))[inside].sum())
+        driven = float(((speed[1:] + speed[:-1])[inside] / 2 * step).sum())
+        if driven >= LEAST_WAY and not AGREE[0] * driven <= way <= AGREE[1] * driven:
+            raise DataError(
+                f"{place(0, f'{car}_position_m')}: by their positions {car}s drive {way:.4g} m, by "
+                f"their speeds {driven:.4g} m; check data.units and data.columns of both"
+            )
+    front, rear, length, gap = (
+        episodes[name].to_numpy(np.float64)
+        for name in ("leader_position_m", "follower_position_m", "leader_length_m", "gap_m")
+    )
+    off = (gap - (front - rear - length))[length > 0]
+    if len(off) and abs(middle := float(np.median(off))) > POSITIONED:
+        row = int(np.flatnonzero(length > 0)[np.argmin(np.abs(off - middle))])
+        raise DataError(
+            f"{place(row, 'gap_m')} is {gap[row]:.4g} m, the positions minus the leader's length "
+            f"give {front[row] - rear[row] - length[row]:.4g} m, median difference "
+            f"{middle:+.3g} m; expected gaps from bumper to bumper: name only the right one"
+        )
+
+
 def _mistaken(
     pair: Mapping[Any, Any], units: Units, max_mismatch: float
 ) -> list[tuple[int, str, str]]:
@@ -347,7 +384,9 @@ def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Unit
     behind = (gap / speed)[speed > 1.0].median()
     slope, late = clear["slope"].median(), clear["late"].median()
     fitted = f"slope of gaps over speeds {slope:.2f}, lag {late:.1f} s of {len(clear):,} pair(s)"
-    fitted += " between gap and relative_speed, own speed's clock not checked" * (OF_LOGS in units)
+    fitted += " between gap and relative_speed, own speed's clock and unit not checked" * (
+        OF_LOGS in units
+    )
     few = f"slope and lag unknown for {pairs - len(clear):,}"
     phrases = [fitted] * (len(clear) > 0) + [few] * (len(clear) < pairs)
     line = (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from lcc_rl.arrays import Floats, Mask
-from lcc_rl.data.agreement import OF_PAIRS, check_pairs, numbers_of_pairs
+from lcc_rl.data.agreement import OF_PAIRS, STANDING, check_pairs, numbers_of_pairs
 from lcc_rl.data.columns import Units
 from lcc_rl.data.grid import ORIGIN, Place, Places, divided, steps_of, stretches
 from lcc_rl.data.trajectories import BATCH, FRAME, starts_of
@@ -23,6 +23,10 @@ SHORTEST_PART = 10.0  # least length of parts of a cut record [s]
 HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; least samples of a share
 JUMP_S, HELD_S = 0.5, 1.0  # time in which a gap jumps; longest time without a measurement [s]
 NOISE = 12.0  # least jump, as a multiple of the median change of a gap beyond that by the speeds
+# Step of speeds per sample [m/s²] from which they are coarse; least changes, and share in steps.
+COARSE, LEAST_CHANGES, STEPPED = 0.5, 100, 0.8
+# Top speed that may be in mph [m/s]; range of speeds [m/s] and rate [m/s²] of too slow a clock.
+FASTEST, STOPS, SLOW_RATE = 50.0, 8.0, 0.4
 MOST_JUMPS = 0.5  # largest share of samples that jumps of gaps may cost
 WORDS = {
     "max_speed": "holds {:g} m/s (is it in km/h or ft/s, or a value for no target?)",
@@ -272,6 +276,45 @@ def hard_share(table: pd.DataFrame) -> float | None:
     time = table["time_s"].diff(reach)[inside]
     shares = [(table[x].diff(reach)[inside].abs() > HARD * time).mean() for x in names]
     return float(max(shares, default=0.0))
+
+
+def doubts(table: pd.DataFrame, node: str) -> list[str]:
+    """Return concerns about the resolution of speeds and, without gaps, about their units.
+
+    Args:
+        table: see :meth:`Plausible.select`, as it is used, that is, averaged.
+        node: ``data`` or ``leader``, for messages.
+    """
+    step, inside = usual_step(table), table["episode"].diff()[1:].to_numpy() == 0
+    lines, steps = list[str](), []
+    for name in (str(name) for name in table.columns if str(name).endswith("speed_mps")):
+        speed = table[name].to_numpy(np.float64)
+        rise = np.abs(np.diff(speed))[inside]
+        changes = rise[rise > 1e-4]
+        if len(changes) >= LEAST_CHANGES:
+            least = np.quantile(changes, 0.02)
+            least = np.median(changes[changes <= 1.5 * least])
+            ratio = changes / least
+            stepped = (np.abs(ratio - np.rint(ratio)) < 0.1).mean() > STEPPED
+            steps += [float(least)] * bool(stepped and least >= COARSE * step)
+        if "gap_m" in table or not len(rise):
+            continue
+        if (top := speed.max()) > FASTEST:
+            question = f"are they in mph or kn ({node}.units.speed=mph)?"
+            lines.append(Concern(f"speeds reach {top:.3g} m/s; {question}"))
+        fastest = np.quantile(rise, 0.995) / step if step == 1.0 else np.inf
+        if fastest < SLOW_RATE and speed.min() < STANDING and speed.max() > STOPS:
+            text = f"cars stop, but 99.5 % of speeds change by less than {fastest:.2g} m/s² in 1 s"
+            lines.append(Concern(f"{text}; are times frames ({node}.units.time=frames/10)?"))
+    if steps:
+        lines.append(
+            Concern(
+                f"speeds have a resolution of {max(steps):.2g} m/s, {step:.2g} s apart: "
+                "accelerations, energies and fuel of the recorded motion are too large by its "
+                f"steps of {max(steps) / step:.2g} m/s²; {node}.average_s=1.1 averages them"
+            )
+        )
+    return lines
 
 
 def usual_step(table: pd.DataFrame) -> float:

@@ -17,7 +17,7 @@ import pandas as pd
 from pydantic import Field
 
 import lcc_rl.assets
-from lcc_rl.data.agreement import PAIR_SIGNALS
+from lcc_rl.data.agreement import PAIR_SIGNALS, check_positions
 from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.columns import SI, Column, Names, Units, check_map
 from lcc_rl.data.episodes import (
@@ -29,7 +29,7 @@ from lcc_rl.data.episodes import (
 )
 from lcc_rl.data.grid import BRIDGE_S, LongestHole, Place, Places, places, stretches
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.plausible import SMOOTHING, Plausible
+from lcc_rl.data.plausible import SMOOTHING, Plausible, doubts
 from lcc_rl.data.smoothing import averaged
 from lcc_rl.data.trajectories import Trajectories, listed
 from lcc_rl.errors import Concern, DataError, raised_as
@@ -84,11 +84,14 @@ class Source(Settings):
         """Return the averaged plausible episodes; see :meth:`Plausible.select`."""
         thresholds = self.plausible or Plausible()
         rest, notes = thresholds.select(episodes, source, place, remedy=remedy, units=units)
+        if units:  # of columns that the user maps
+            with raised_as(DataError, source, DataError):
+                check_positions(rest, place(rest))
         notes += _copies(rest, place(rest))
         if self.average_s:
             rest, line = averaged(rest, self.average_s, source)
             notes.append(line)
-        return LoadedEpisodes(rest, [*lines, *notes])
+        return LoadedEpisodes(rest, [*lines, *notes, *doubts(rest, "data")])
 
 
 class TrajectorySource(Source):

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lcc_rl.data.columns import SLOPES, Column, Names, Units
 from lcc_rl.data.grid import BRIDGE_S, continuous, interpolated, places, stretches
-from lcc_rl.data.plausible import Plausible
+from lcc_rl.data.plausible import Plausible, doubts
 from lcc_rl.data.profiles import Profiles, from_records, resample
 from lcc_rl.data.sources import SHIPPED_FILES, copies, find_files, units_of
 from lcc_rl.data.tables import TableFile, same_text, tables_of
@@ -161,7 +161,14 @@ def _read(
     line = f"read {rows['episode'].nunique():,} speed record(s), {len(rows):,} rows, {table.path}"
     if table.preamble:
         line += ": native OpenACC, its first car"
-    return rows, [line, *table.notes, *report.left_out(), *report.notes, *lines]
+    return rows, [
+        line,
+        *table.notes,
+        *report.left_out(),
+        *report.notes,
+        *lines,
+        *doubts(rows, node),
+    ]
 
 
 def _averaged(samples: pd.DataFrame, seconds: float, source: str) -> pd.DataFrame:
