@@ -260,38 +260,20 @@ def check_pairs(
 
 
 def check_positions(episodes: pd.DataFrame, place: Place) -> None:
-    """Check that positions agree with speeds, and gaps with positions and known lengths.
-
-    Args:
-        episodes: see :data:`lcc_rl.data.episodes.SCHEMA`.
-        place: returns the description of a sample.
-
-    Raises:
-        DataError: naming a sample and both numbers.
-    """
-    inside = np.diff(episodes["episode"]) == 0
-    step = np.diff(episodes["time_s"])[inside]
+    """Raise a DataError if positions contradict speeds, or gaps positions and known lengths."""
+    step = episodes["time_s"].diff().where(episodes["episode"].diff() == 0, 0.0)
     for car in ("follower", "leader"):
-        speed = episodes[f"{car}_speed_mps"].to_numpy(np.float64)
-        way = float(np.diff(episodes[f"{car}_position_m"].to_numpy(np.float64))[inside].sum())
-        driven = float(((speed[1:] + speed[:-1])[inside] / 2 * step).sum())
+        way = episodes[f"{car}_position_m"].diff()[step > 0].sum()
+        driven = (episodes[f"{car}_speed_mps"] * step).sum()
         if driven >= LEAST_WAY and not AGREE[0] * driven <= way <= AGREE[1] * driven:
-            raise DataError(
-                f"{place(0, f'{car}_position_m')}: by their positions {car}s drive {way:.4g} m, by "
-                f"their speeds {driven:.4g} m; check data.units and data.columns of both"
-            )
-    front, rear, length, gap = (
-        episodes[name].to_numpy(np.float64)
-        for name in ("leader_position_m", "follower_position_m", "leader_length_m", "gap_m")
-    )
-    off = (gap - (front - rear - length))[length > 0]
-    if len(off) and abs(middle := float(np.median(off))) > POSITIONED:
-        row = int(np.flatnonzero(length > 0)[np.argmin(np.abs(off - middle))])
-        raise DataError(
-            f"{place(row, 'gap_m')} is {gap[row]:.4g} m, the positions minus the leader's length "
-            f"give {front[row] - rear[row] - length[row]:.4g} m, median difference "
-            f"{middle:+.3g} m; expected gaps from bumper to bumper: name only the right one"
-        )
+            at = place(0, f"{car}_position_m")
+            words = f"by their positions {car}s drive {way:.4g} m, by their speeds {driven:.4g} m"
+            raise DataError(f"{at}: {words}; check data.units and data.columns of both")
+    sized = episodes[episodes["leader_length_m"] > 0]
+    other = sized["leader_position_m"] - sized["follower_position_m"] - sized["leader_length_m"]
+    if abs(off := float((sized["gap_m"] - other).median())) > POSITIONED:
+        at = f"{off:+.3g} m from that of positions and lengths, as at {place(0, 'gap_m')}"
+        raise DataError(f"median gap {at}; expected bumper to bumper: name only the right ones")
 
 
 def _mistaken(
@@ -384,9 +366,8 @@ def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Unit
     behind = (gap / speed)[speed > 1.0].median()
     slope, late = clear["slope"].median(), clear["late"].median()
     fitted = f"slope of gaps over speeds {slope:.2f}, lag {late:.1f} s of {len(clear):,} pair(s)"
-    fitted += " between gap and relative_speed, own speed's clock and unit not checked" * (
-        OF_LOGS in units
-    )
+    unchecked = "own speed's clock and unit not checked"
+    fitted += f" between gap and relative_speed, {unchecked}" * (OF_LOGS in units)
     few = f"slope and lag unknown for {pairs - len(clear):,}"
     phrases = [fitted] * (len(clear) > 0) + [few] * (len(clear) < pairs)
     line = (

@@ -53,11 +53,8 @@ class OpenAccSource(TrajectorySource):
         place = partial(places, files=files)
         rows = pd.concat(cars, ignore_index=True)
         if self.driver is not None and not (rows["leader"] > 0).any():
-            followers = [line for line in report.notes if "followers by driver" in line]
-            raise DataError(
-                f"{report.source}: data.driver={self.driver} keeps no follower: "
-                f"{'; '.join(followers)}"
-            )
+            lines = [line for line in report.notes if "followers by driver" in line]
+            raise DataError(f"data.driver={self.driver} keeps no follower: {'; '.join(lines)}")
         trajectories = to_trajectories(rows, place, report, self.bridge_s)
         return self.extracted(trajectories, place=place)
 

@@ -279,42 +279,28 @@ def hard_share(table: pd.DataFrame) -> float | None:
 
 
 def doubts(table: pd.DataFrame, node: str) -> list[str]:
-    """Return concerns about the resolution of speeds and, without gaps, about their units.
-
-    Args:
-        table: see :meth:`Plausible.select`, as it is used, that is, averaged.
-        node: ``data`` or ``leader``, for messages.
-    """
-    step, inside = usual_step(table), table["episode"].diff()[1:].to_numpy() == 0
-    lines, steps = list[str](), []
+    """Return concerns about the resolution of speeds and, of single cars, about their units."""
+    step, inside = usual_step(table), table["episode"].diff() == 0
+    lines, coarse = list[str](), 0.0
     for name in (str(name) for name in table.columns if str(name).endswith("speed_mps")):
-        speed = table[name].to_numpy(np.float64)
-        rise = np.abs(np.diff(speed))[inside]
+        speed = table[name].astype(float)
+        rise = speed.diff().abs()[inside]
         changes = rise[rise > 1e-4]
-        if len(changes) >= LEAST_CHANGES:
-            least = np.quantile(changes, 0.02)
-            least = np.median(changes[changes <= 1.5 * least])
-            ratio = changes / least
-            stepped = (np.abs(ratio - np.rint(ratio)) < 0.1).mean() > STEPPED
-            steps += [float(least)] * bool(stepped and least >= COARSE * step)
-        if "gap_m" in table or not len(rise):
+        least = changes[changes <= 1.5 * changes.quantile(0.02)].median()
+        stepped = ((changes / least + 0.1) % 1 < 0.2).mean() > STEPPED
+        if stepped and len(changes) >= LEAST_CHANGES and least >= COARSE * step:
+            coarse = max(coarse, float(least))
+        if "gap_m" in table:
             continue
         if (top := speed.max()) > FASTEST:
-            question = f"are they in mph or kn ({node}.units.speed=mph)?"
-            lines.append(Concern(f"speeds reach {top:.3g} m/s; {question}"))
-        fastest = np.quantile(rise, 0.995) / step if step == 1.0 else np.inf
-        if fastest < SLOW_RATE and speed.min() < STANDING and speed.max() > STOPS:
+            lines.append(f"speeds reach {top:.3g} m/s; are they in mph ({node}.units.speed=mph)?")
+        fastest = rise.quantile(0.995)
+        if step == 1.0 and fastest < SLOW_RATE and speed.min() < STANDING and top > STOPS:
             text = f"cars stop, but 99.5 % of speeds change by less than {fastest:.2g} m/s² in 1 s"
-            lines.append(Concern(f"{text}; are times frames ({node}.units.time=frames/10)?"))
-    if steps:
-        lines.append(
-            Concern(
-                f"speeds have a resolution of {max(steps):.2g} m/s, {step:.2g} s apart: "
-                "accelerations, energies and fuel of the recorded motion are too large by its "
-                f"steps of {max(steps) / step:.2g} m/s²; {node}.average_s=1.1 averages them"
-            )
-        )
-    return lines
+            lines.append(f"{text}; are times frames ({node}.units.time=frames/10)?")
+    text = f"of {coarse:.2g} m/s, {step:.2g} s apart: recorded energies and fuel are too large"
+    lines += [f"speeds have a resolution {text}; {node}.average_s=1.1 averages"] * (coarse > 0)
+    return [Concern(line) for line in lines]
 
 
 def usual_step(table: pd.DataFrame) -> float:

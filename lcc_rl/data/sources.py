@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from glob import has_magic
 from os.path import abspath, expanduser
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -27,7 +26,7 @@ from lcc_rl.data.episodes import (
     derive_positions,
     read_episodes,
 )
-from lcc_rl.data.grid import BRIDGE_S, LongestHole, Place, Places, places, stretches
+from lcc_rl.data.grid import BRIDGE_S, LongestHole, Places, places
 from lcc_rl.data.ngsim import read_ngsim
 from lcc_rl.data.plausible import SMOOTHING, Plausible, doubts
 from lcc_rl.data.smoothing import averaged
@@ -87,7 +86,7 @@ class Source(Settings):
         if units:  # of columns that the user maps
             with raised_as(DataError, source, DataError):
                 check_positions(rest, place(rest))
-        notes += _copies(rest, place(rest))
+        notes += copies(rest["recording"], rest[[*PAIR_SIGNALS.values()]])
         if self.average_s:
             rest, line = averaged(rest, self.average_s, source)
             notes.append(line)
@@ -188,38 +187,13 @@ class EpisodesSource(Source):
         )
 
 
-def copies(names: Sequence[str], motions: Sequence[Hashable]) -> list[Concern]:
-    """Return a concern about a recording or drive that is read twice, under two names.
-
-    Args:
-        names: names or places of the recordings.
-        motions: keys of their motions, such as hashes.
-    """
-    first: dict[Hashable, str] = {}
-    twice = [
-        (first[motion], name)
-        for name, motion in zip(names, motions, strict=True)
-        if first.setdefault(motion, name) != name
-    ]
-    if not twice:
-        return []
-    (one, other), count = twice[0], len(twice)
-    text = f"{count:,} of {len(names):,} recordings have the motion of another, {one} and {other}"
-    return [Concern(f"{text}: is a file read twice? One may be held out while a policy learns it")]
-
-
-def _copies(episodes: pd.DataFrame, place: Place) -> list[Concern]:
-    """Return :func:`copies` of the recordings of an episode table."""
-    motion = np.ascontiguousarray(episodes[[*PAIR_SIGNALS.values()]].to_numpy(np.float32))
-    keys = [x for x in ("recording", "file") if x in episodes]
-    names: dict[Hashable, str] = {}
-    motions: dict[Hashable, list[bytes]] = {}
-    for start, length in zip(*stretches(episodes["episode"].to_numpy()), strict=True):
-        recording = tuple(episodes[key].iat[start] for key in keys)
-        names.setdefault(recording, place(start, ""))
-        digest = hashlib.sha256(motion[start : start + length]).digest()
-        motions.setdefault(recording, []).append(digest)
-    return copies([*names.values()], [tuple(sorted(x)) for x in motions.values()])
+def copies(names: Any, motion: pd.DataFrame) -> list[Concern]:
+    """Return a concern about recordings, named in each row, with the same speeds and gaps."""
+    rows = pd.util.hash_pandas_object(motion, index=False)
+    sums = rows.groupby(np.asarray(names), sort=False).sum().sort_values(kind="stable")
+    twice = listed(list(sums[sums.duplicated(keep=False)].index))
+    line = f"recordings {twice} hold the same motion; is a file read twice? One may be held out"
+    return [Concern(f"{line} while a policy learns another")] * bool(twice)
 
 
 def read_as(columns: Iterable[Column], names: Names, units: Units) -> str:

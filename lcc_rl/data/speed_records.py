@@ -107,11 +107,10 @@ def read_drives(
             raise DataError(f"{path}: drive {min(twice)!r} is in several files; expected one")
         records |= loaded
         lines += [*report, *interpolated(samples, time_step)]
-    motions = {name: speeds for name, (_, speeds, _) in records.items() if len(speeds.unique()) > 1}
-    lines += copies([*motions], [x.numpy().tobytes() for x in motions.values()])
     names = [*records] if columns["drive"] is None else sorted(records)
     drives, speeds, grades = zip(*(records[name] for name in names), strict=True)
     profiles = from_records(speeds, names, drives, time_step)
+    lines += copies(np.repeat(names, profiles.lengths), pd.DataFrame(profiles.speeds.numpy()))
     joined = torch.cat(grades) if columns.get("grade") else None
     return replace(profiles, grades=joined), alike(lines, files)
 
@@ -161,14 +160,8 @@ def _read(
     line = f"read {rows['episode'].nunique():,} speed record(s), {len(rows):,} rows, {table.path}"
     if table.preamble:
         line += ": native OpenACC, its first car"
-    return rows, [
-        line,
-        *table.notes,
-        *report.left_out(),
-        *report.notes,
-        *lines,
-        *doubts(rows, node),
-    ]
+    lines += doubts(rows, node)
+    return rows, [line, *table.notes, *report.left_out(), *report.notes, *lines]
 
 
 def _averaged(samples: pd.DataFrame, seconds: float, source: str) -> pd.DataFrame:

@@ -546,14 +546,14 @@ def test_a_recording_that_is_read_twice_is_reported(tmp_path) -> None:
         path = tmp_path / name
         found.to_csv(path) if name == "a.csv" else found.to_parquet(path)
     pairs = EpisodesSource(path=str(tmp_path), columns={"recording": None}).load().report
-    assert [x for x in pairs if isinstance(x, Concern) and "1 of 2 recordings have the" in x]
+    assert [x for x in pairs if isinstance(x, Concern) and "recordings a, b hold the same" in x]
     one = EpisodesSource(path=str(tmp_path / "a.csv"), columns={"recording": None}).load().report
     assert not [x for x in one if isinstance(x, Concern)]
     drive = found.rename(columns={"leader_speed_mps": "speed_mps"})[["time_s", "speed_mps"]][:200]
     for name in ("c.csv", "d.csv"):
         drive.to_csv(tmp_path / name)
     _, lines = read_drives([str(tmp_path / x) for x in ("c.csv", "d.csv")], DRIVE_COLUMNS, 0.1)
-    assert [x for x in lines if isinstance(x, Concern) and ", c and d: is a file" in x]
+    assert [x for x in lines if isinstance(x, Concern) and "recordings c, d hold the same" in x]
 
 
 def test_gaps_and_positions_that_contradict_each_other_are_refused(tmp_path) -> None:
@@ -567,7 +567,7 @@ def test_gaps_and_positions_that_contradict_each_other_are_refused(tmp_path) -> 
     read()
     gap, far = found["gap_m"] + 4.5, found["follower_position_m"] / FOOT
     cases = [
-        ({"gap_m": gap}, r"column 'gap_m' is .* m, .* give .* m, median difference \+4\.5 m;"),
+        ({"gap_m": gap}, r"median gap \+4\.5 m from that of positions and .*'gap_m'"),
         ({"follower_position_m": far}, r"by their positions followers drive .* by their speeds"),
     ]
     check_refused(lambda columns: read(**columns), cases, DataError)
