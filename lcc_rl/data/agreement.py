@@ -269,9 +269,9 @@ def check_positions(episodes: pd.DataFrame, place: Place) -> None:
             at = place(0, f"{car}_position_m")
             words = f"by their positions {car}s drive {way:.4g} m, by their speeds {driven:.4g} m"
             raise DataError(f"{at}: {words}; check data.units and data.columns of both")
-    sized = episodes[episodes["leader_length_m"] > 0]
-    other = sized["leader_position_m"] - sized["follower_position_m"] - sized["leader_length_m"]
-    if abs(off := float((sized["gap_m"] - other).median())) > POSITIONED:
+    beyond = episodes["gap_m"] - episodes["leader_position_m"] + episodes["follower_position_m"]
+    length = episodes["leader_length_m"]
+    if abs(off := float((beyond + length)[length > 0].median())) > POSITIONED:
         at = f"{off:+.3g} m from that of positions and lengths, as at {place(0, 'gap_m')}"
         raise DataError(f"median gap {at}; expected bumper to bumper: name only the right ones")
 

@@ -11,7 +11,6 @@ from os.path import abspath, expanduser
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import pandas as pd
 from pydantic import Field
 
@@ -83,7 +82,7 @@ class Source(Settings):
         """Return the averaged plausible episodes; see :meth:`Plausible.select`."""
         thresholds = self.plausible or Plausible()
         rest, notes = thresholds.select(episodes, source, place, remedy=remedy, units=units)
-        if units:  # of columns that the user maps
+        if units and rest["follower_position_m"].any():  # of mapped columns; 0 if unknown
             with raised_as(DataError, source, DataError):
                 check_positions(rest, place(rest))
         notes += copies(rest["recording"], rest[[*PAIR_SIGNALS.values()]])
@@ -189,9 +188,9 @@ class EpisodesSource(Source):
 
 def copies(names: Any, motion: pd.DataFrame) -> list[Concern]:
     """Return a concern about recordings, named in each row, with the same speeds and gaps."""
-    rows = pd.util.hash_pandas_object(motion, index=False)
-    sums = rows.groupby(np.asarray(names), sort=False).sum().sort_values(kind="stable")
-    twice = listed(list(sums[sums.duplicated(keep=False)].index))
+    codes, distinct = pd.factorize(names)
+    sums = pd.util.hash_pandas_object(motion, index=False).groupby(codes).sum().sort_values()
+    twice = listed([str(distinct[x]) for x in sums.index[sums.duplicated(keep=False)]])
     line = f"recordings {twice} hold the same motion; is a file read twice? One may be held out"
     return [Concern(f"{line} while a policy learns another")] * bool(twice)
 

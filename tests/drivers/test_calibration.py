@@ -322,7 +322,7 @@ class Redeclared(Helly):
 
 def test_a_parameter_of_shipped_models_is_not_described_anew(make_episodes):
     with pytest.raises(
-        ConfigError, match=r"Redeclared\.own names 'speed_gain', .*bounds\.speed_gain=\["
+        ConfigError, match=r"Redeclared\.own names 'speed_gain' .*bounds\.speed_gain=\["
     ):
         fit(make_episodes([15.0], [1.0]), model=f"{__name__}.Redeclared")
 
