@@ -29,6 +29,8 @@ RIDGE = np.diag([1e-6, 1e-6, 0.1])  # [m²]: for a bias of speeds, unknown in st
 LEAST_WAY = 50.0  # least distance from which the unit of a speed is concluded [m]
 NEAR_MISTAKE, ALIKE = 1.25, 1.05  # largest factors to a mistake's coefficients; between mistakes
 STRAY = 0.2  # largest distance left of a relative speed, as a share of the follower's
+# Range of distance by positions divided by distance by speeds; largest median error of gaps [m].
+AGREE, POSITIONED = (0.8, 1.25), 1.0
 LOUD, LOUD_RATE, LOUD_FACTOR = 0.3, 0.3, 1.15  # reported: lag [s], bias of a speed [m/s], factor
 STANDING, LEAST_STANDING = 0.5, 300  # speed [m/s], samples
 # Gap that may be in feet [m]; time gaps of speeds in m/s read as km/h, and of the reverse [s].
@@ -257,6 +259,23 @@ def check_pairs(
     return [*lines, medians(episodes, pairs[clear], len(pairs), units)], bool(right.any())
 
 
+def check_positions(episodes: pd.DataFrame, place: Place) -> None:
+    """Raise a DataError if positions contradict speeds, or gaps positions and known lengths."""
+    step = episodes["time_s"].diff().where(episodes["episode"].diff() == 0, 0.0)
+    for car in ("follower", "leader"):
+        way = episodes[f"{car}_position_m"].diff()[step > 0].sum()
+        driven = (episodes[f"{car}_speed_mps"] * step).sum()
+        if driven >= LEAST_WAY and not AGREE[0] * driven <= way <= AGREE[1] * driven:
+            at = place(0, f"{car}_position_m")
+            words = f"by their positions {car}s drive {way:.4g} m, by their speeds {driven:.4g} m"
+            raise DataError(f"{at}: {words}; check data.units and data.columns of both")
+    beyond = episodes["gap_m"] - episodes["leader_position_m"] + episodes["follower_position_m"]
+    length = episodes["leader_length_m"]
+    if abs(off := float((beyond + length)[length > 0].median())) > POSITIONED:
+        at = f"{off:+.3g} m from that of positions and lengths, as at {place(0, 'gap_m')}"
+        raise DataError(f"median gap {at}; expected bumper to bumper: name only the right ones")
+
+
 def _mistaken(
     pair: Mapping[Any, Any], units: Units, max_mismatch: float
 ) -> list[tuple[int, str, str]]:
@@ -347,7 +366,8 @@ def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Unit
     behind = (gap / speed)[speed > 1.0].median()
     slope, late = clear["slope"].median(), clear["late"].median()
     fitted = f"slope of gaps over speeds {slope:.2f}, lag {late:.1f} s of {len(clear):,} pair(s)"
-    fitted += " between gap and relative_speed, own speed's clock not checked" * (OF_LOGS in units)
+    unchecked = "own speed's clock and unit not checked"
+    fitted += f" between gap and relative_speed, {unchecked}" * (OF_LOGS in units)
     few = f"slope and lag unknown for {pairs - len(clear):,}"
     phrases = [fitted] * (len(clear) > 0) + [few] * (len(clear) < pairs)
     line = (

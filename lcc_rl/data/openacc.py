@@ -52,6 +52,9 @@ class OpenAccSource(TrajectorySource):
         ]
         place = partial(places, files=files)
         rows = pd.concat(cars, ignore_index=True)
+        if self.driver is not None and not (rows["leader"] > 0).any():
+            lines = [line for line in report.notes if "followers by driver" in line]
+            raise DataError(f"data.driver={self.driver} keeps no follower: {'; '.join(lines)}")
         trajectories = to_trajectories(rows, place, report, self.bridge_s)
         return self.extracted(trajectories, place=place)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from lcc_rl.arrays import Floats, Mask
-from lcc_rl.data.agreement import OF_PAIRS, check_pairs, numbers_of_pairs
+from lcc_rl.data.agreement import OF_PAIRS, STANDING, check_pairs, numbers_of_pairs
 from lcc_rl.data.columns import Units
 from lcc_rl.data.grid import ORIGIN, Place, Places, divided, steps_of, stretches
 from lcc_rl.data.trajectories import BATCH, FRAME, starts_of
@@ -23,6 +23,10 @@ SHORTEST_PART = 10.0  # least length of parts of a cut record [s]
 HARD, LEAST_SAMPLES = 4.0, 300  # change of speed in a second [m/s]; least samples of a share
 JUMP_S, HELD_S = 0.5, 1.0  # time in which a gap jumps; longest time without a measurement [s]
 NOISE = 12.0  # least jump, as a multiple of the median change of a gap beyond that by the speeds
+# Step of speeds per sample [m/s²] from which they are coarse; least changes, and share in steps.
+COARSE, LEAST_CHANGES, STEPPED = 0.5, 100, 0.8
+# Top speed that may be in mph [m/s]; range of speeds [m/s] and rate [m/s²] of too slow a clock.
+FASTEST, STOPS, SLOW_RATE = 50.0, 8.0, 0.4
 MOST_JUMPS = 0.5  # largest share of samples that jumps of gaps may cost
 WORDS = {
     "max_speed": "holds {:g} m/s (is it in km/h or ft/s, or a value for no target?)",
@@ -272,6 +276,31 @@ def hard_share(table: pd.DataFrame) -> float | None:
     time = table["time_s"].diff(reach)[inside]
     shares = [(table[x].diff(reach)[inside].abs() > HARD * time).mean() for x in names]
     return float(max(shares, default=0.0))
+
+
+def doubts(table: pd.DataFrame, node: str) -> list[str]:
+    """Return concerns about the resolution of speeds and, of single cars, about their units."""
+    step, inside = usual_step(table), table["episode"].diff() == 0
+    lines, coarse = list[str](), 0.0
+    for name in (str(name) for name in table.columns if str(name).endswith("speed_mps")):
+        speed = table[name].astype(float)
+        rise = speed.diff().abs()[inside]
+        changes = rise[rise > 1e-4]
+        least = changes[changes <= 1.5 * changes.quantile(0.02)].median()
+        stepped = ((changes / least + 0.1) % 1 < 0.2).mean() > STEPPED
+        if stepped and len(changes) >= LEAST_CHANGES and least >= COARSE * step:
+            coarse = max(coarse, float(least))
+        if "gap_m" in table:
+            continue
+        if (top := speed.max()) > FASTEST:
+            lines.append(f"speeds reach {top:.3g} m/s; are they in mph ({node}.units.speed=mph)?")
+        fastest = rise.quantile(0.995)
+        if step == 1.0 and fastest < SLOW_RATE and speed.min() < STANDING and top > STOPS:
+            text = f"cars stop, but 99.5 % of speeds change by less than {fastest:.2g} m/s² in 1 s"
+            lines.append(f"{text}; are times frames ({node}.units.time=frames/10)?")
+    text = f"of {coarse:.2g} m/s, {step:.2g} s apart: recorded energies and fuel are too large"
+    lines += [f"speeds have a resolution {text}; {node}.average_s=1.1 averages"] * (coarse > 0)
+    return [Concern(line) for line in lines]
 
 
 def usual_step(table: pd.DataFrame) -> float:

@@ -9,12 +9,13 @@ from functools import partial
 from glob import has_magic
 from os.path import abspath, expanduser
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import pandas as pd
 from pydantic import Field
 
 import lcc_rl.assets
+from lcc_rl.data.agreement import PAIR_SIGNALS, check_positions
 from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.columns import SI, Column, Names, Units, check_map
 from lcc_rl.data.episodes import (
@@ -26,10 +27,10 @@ from lcc_rl.data.episodes import (
 )
 from lcc_rl.data.grid import BRIDGE_S, LongestHole, Places, places
 from lcc_rl.data.ngsim import read_ngsim
-from lcc_rl.data.plausible import SMOOTHING, Plausible
+from lcc_rl.data.plausible import SMOOTHING, Plausible, doubts
 from lcc_rl.data.smoothing import averaged
 from lcc_rl.data.trajectories import Trajectories, listed
-from lcc_rl.errors import DataError, raised_as
+from lcc_rl.errors import Concern, DataError, raised_as
 from lcc_rl.io.paths import matching
 from lcc_rl.settings import Settings
 
@@ -81,10 +82,14 @@ class Source(Settings):
         """Return the averaged plausible episodes; see :meth:`Plausible.select`."""
         thresholds = self.plausible or Plausible()
         rest, notes = thresholds.select(episodes, source, place, remedy=remedy, units=units)
+        if units and rest["follower_position_m"].any():  # of mapped columns; 0 if unknown
+            with raised_as(DataError, source, DataError):
+                check_positions(rest, place(rest))
+        notes += copies(rest["recording"], rest[[*PAIR_SIGNALS.values()]])
         if self.average_s:
             rest, line = averaged(rest, self.average_s, source)
             notes.append(line)
-        return LoadedEpisodes(rest, [*lines, *notes])
+        return LoadedEpisodes(rest, [*lines, *notes, *doubts(rest, "data")])
 
 
 class TrajectorySource(Source):
@@ -179,6 +184,15 @@ class EpisodesSource(Source):
         return replace(
             self.select(episodes, source, lines, place=place, units=units), vehicles=vehicles
         )
+
+
+def copies(names: Any, motion: pd.DataFrame) -> list[Concern]:
+    """Return a concern about recordings, named in each row, with the same speeds and gaps."""
+    codes, distinct = pd.factorize(names)
+    sums = pd.util.hash_pandas_object(motion, index=False).groupby(codes).sum().sort_values()
+    twice = listed([str(distinct[x]) for x in sums.index[sums.duplicated(keep=False)]])
+    line = f"recordings {twice} hold the same motion; is a file read twice? One may be held out"
+    return [Concern(f"{line} while a policy learns another")] * bool(twice)
 
 
 def read_as(columns: Iterable[Column], names: Names, units: Units) -> str:

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from lcc_rl.data.columns import SLOPES, Column, Names, Units
 from lcc_rl.data.grid import BRIDGE_S, continuous, interpolated, places, stretches
-from lcc_rl.data.plausible import Plausible
+from lcc_rl.data.plausible import Plausible, doubts
 from lcc_rl.data.profiles import Profiles, from_records, resample
-from lcc_rl.data.sources import SHIPPED_FILES, find_files, units_of
+from lcc_rl.data.sources import SHIPPED_FILES, copies, find_files, units_of
 from lcc_rl.data.tables import TableFile, same_text, tables_of
 from lcc_rl.data.text import alike
 from lcc_rl.data.trajectories import ReadReport
@@ -110,6 +110,7 @@ def read_drives(
     names = [*records] if columns["drive"] is None else sorted(records)
     drives, speeds, grades = zip(*(records[name] for name in names), strict=True)
     profiles = from_records(speeds, names, drives, time_step)
+    lines += copies(np.repeat(names, profiles.lengths), pd.DataFrame(profiles.speeds.numpy()))
     joined = torch.cat(grades) if columns.get("grade") else None
     return replace(profiles, grades=joined), alike(lines, files)
 
@@ -159,6 +160,7 @@ def _read(
     line = f"read {rows['episode'].nunique():,} speed record(s), {len(rows):,} rows, {table.path}"
     if table.preamble:
         line += ": native OpenACC, its first car"
+    lines += doubts(rows, node)
     return rows, [line, *table.notes, *report.left_out(), *report.notes, *lines]
 
 

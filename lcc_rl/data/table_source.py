@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from lcc_rl.arrays import Integers
-from lcc_rl.data.agreement import LEAST_WAY
+from lcc_rl.data.agreement import AGREE, LEAST_WAY
 from lcc_rl.data.columns import Column, check_map
 from lcc_rl.data.episodes import NO_LEADER
 from lcc_rl.data.grid import (
@@ -56,7 +56,6 @@ TABLE_FIELDS = (
 TABLE_COLUMNS = {column.key: column.name for column in TABLE_FIELDS if column.name}
 TABLE_MEASURED = ("time", "speed", "position")  # rows with a blank cell are left out
 IDENTIFYING = ("vehicle", "lane", "recording")  # must not be blank in the other rows
-AGREE = (0.8, 1.25)  # range of distance by positions divided by distance by speeds
 JUMP = 10.0  # jump of positions between samples beyond the driven distance [m]
 
 

@@ -38,12 +38,15 @@ def find_law(name: str) -> type[DriverConstants]:
             ``my_models.Helly``, which is added to them.
 
     Raises:
-        ConfigError: if there is none, or it is no driver model.
+        ConfigError: if there is none, it is no driver model, or ``own`` names a shipped parameter.
     """
     if name not in LAWS and "." in name:
         found = find_target(name, "model")
         if not (isinstance(found, type) and issubclass(found, DriverConstants)):
             raise ConfigError(f"model: expected a class derived from DriverConstants, got {name!r}")
+        for shipped in found.own.keys() & PARAMETERS.keys():
+            remedy = f"remove it there; calibration.bounds.{shipped}=[…] sets other bounds"
+            raise ConfigError(f"{name}.own names {shipped!r} of shipped models: {remedy}")
         LAWS[name] = found
     require_known("model of drivers", name, LAWS)
     return LAWS[name]

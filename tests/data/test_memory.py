@@ -25,8 +25,9 @@ def written(path, rng: np.random.Generator) -> str:
         columns = {"episode": pair, "recording": "made", "follower_id": 2 * pair + 2}
         columns |= {"leader_id": 2 * pair + 1, "time_s": time.round(1), "leader_length_m": 4.5}
         columns |= {"follower_speed_mps": own, "leader_speed_mps": lead, "gap_m": 25.0 + way}
-        zeros = dict.fromkeys(("follower_position_m", "leader_position_m"), 100.0 + 12.0 * time)
-        parts.append(pd.DataFrame({**columns, **zeros}))
+        front = 100.0 + 0.1 * np.cumsum(lead)
+        places = {"leader_position_m": front, "follower_position_m": front - 29.5 - way}
+        parts.append(pd.DataFrame({**columns, **places}))
     pd.concat(parts).to_parquet(path, row_group_size=10_000)
     return str(path)
 

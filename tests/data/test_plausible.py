@@ -15,7 +15,8 @@ from table_text import pairs
 from lcc_rl.data.agreement import agreement
 from lcc_rl.data.grid import Place
 from lcc_rl.data.ngsim import METRES, read_ngsim
-from lcc_rl.data.plausible import Plausible, hard_share
+from lcc_rl.data.plausible import Plausible, doubts, hard_share
+from lcc_rl.data.smoothing import averaged
 from lcc_rl.data.sources import EpisodesSource, NgsimSource
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.errors import Concern, DataError
@@ -71,6 +72,7 @@ def wavy(seconds: float = 60.0) -> pd.DataFrame:
 
 
 SPEEDS = ["leader_speed_mps", "follower_speed_mps"]
+NOWHERE = {"leader_position_m": 0.0, "follower_position_m": 0.0}
 
 
 def irregular(seconds: float = 60.0) -> pd.DataFrame:
@@ -103,6 +105,25 @@ def judged(table: pd.DataFrame, units: dict[str, str] | None = None, **settings)
         "max_gap": 1e4,
     } | settings
     return Plausible(**settings).select(table, "f.csv", rows_of, units=units)[1]
+
+
+def test_speeds_of_a_coarse_resolution_are_reported_until_they_are_averaged() -> None:
+    for step, said in ((0.1, ["of 0.1 m/s, 0.1"]), (1 / 3.6, ["of 0.28 m/s, 0.1"]), (0.01, [])):
+        table = irregular()
+        table[SPEEDS] = step * (table[SPEEDS] / step).round()
+        lines = doubts(table, "data")
+        assert [line for line, x in zip(lines, said, strict=True) if x in line] == lines
+        assert all(isinstance(x, Concern) and "data.average_s=1.1" in x for x in lines)
+        assert not doubts(averaged(table.assign(**NOWHERE), 1.1, "")[0], "data")
+
+
+def test_drives_in_knots_or_in_frames_are_asked_about() -> None:
+    time = np.arange(0.0, 600.0, 0.1)
+    table = pd.DataFrame({"time_s": time, "speed_mps": 10 - 10 * np.cos(time / 20), "episode": 0})
+    assert not doubts(table, "leader")
+    assert "reach 60 m/s" in doubts(table.assign(speed_mps=3 * table["speed_mps"]), "leader")[0]
+    (line,) = doubts(table.assign(time_s=10 * time), "leader")
+    assert "are times frames (leader.units.time=frames/10)?" in line
 
 
 @pytest.mark.parametrize("bias", [0.0, 0.5])

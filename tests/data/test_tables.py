@@ -21,9 +21,10 @@ from lcc_rl.data.openacc import OpenAccSource
 from lcc_rl.data.plausible import Plausible
 from lcc_rl.data.smoothing import SavitzkyGolay
 from lcc_rl.data.sources import EpisodesSource, LoadedEpisodes
+from lcc_rl.data.speed_records import DRIVE_COLUMNS, read_drives
 from lcc_rl.data.table_source import TableSource
 from lcc_rl.data.trajectories import FOOT
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import Concern, ConfigError, DataError
 from lcc_rl.io.files import write_parquet
 
 BASE = {"vehicle": "id", "time": "t", "speed": "v"}
@@ -526,7 +527,7 @@ def test_a_log_with_one_speed_in_another_unit_is_refused(tmp_path) -> None:
 
     report = read().load().report[-1]
     assert "slope of gaps over speeds 0.96" in report
-    assert report.endswith("between gap and relative_speed, own speed's clock not checked")
+    assert report.endswith("between gap and relative_speed, own speed's clock and unit not checked")
     words = r"where the follower's speed changes by 1 m/s, relative_speed changes by -3\.\d\d m/s; "
     words += r"is the follower's speed in m/s \(data\.units\.follower_speed=m/s\)\?.*max_mismatch"
     other = r"is the relative speed in m/s \(data\.units\.relative_speed=m/s\)\?"
@@ -537,6 +538,39 @@ def test_a_log_with_one_speed_in_another_unit_is_refused(tmp_path) -> None:
     )
     with pytest.raises(DataError, match=r"'range_rate': .* own speed minus the leader's\?"):
         read().load()
+
+
+def test_a_recording_that_is_read_twice_is_reported(tmp_path) -> None:
+    found = EpisodesSource(path="platoons").load().episodes.query("episode < 2")
+    for name in ("a.csv", "b.parquet"):
+        path = tmp_path / name
+        found.to_csv(path) if name == "a.csv" else found.to_parquet(path)
+    pairs = EpisodesSource(path=str(tmp_path), columns={"recording": None}).load().report
+    assert [x for x in pairs if isinstance(x, Concern) and "recordings a, b hold the same" in x]
+    one = EpisodesSource(path=str(tmp_path / "a.csv"), columns={"recording": None}).load().report
+    assert not [x for x in one if isinstance(x, Concern)]
+    drive = found.rename(columns={"leader_speed_mps": "speed_mps"})[["time_s", "speed_mps"]][:200]
+    for name in ("c.csv", "d.csv"):
+        drive.to_csv(tmp_path / name)
+    _, lines = read_drives([str(tmp_path / x) for x in ("c.csv", "d.csv")], DRIVE_COLUMNS, 0.1)
+    assert [x for x in lines if isinstance(x, Concern) and "recordings c, d hold the same" in x]
+
+
+def test_gaps_and_positions_that_contradict_each_other_are_refused(tmp_path) -> None:
+    found = EpisodesSource(path="platoons").load().episodes.assign(leader_length_m=4.5)
+    found["follower_position_m"] -= 4.5
+
+    def read(**columns) -> None:
+        found.assign(**columns).to_parquet(tmp_path / "pairs.parquet")
+        EpisodesSource(path=str(tmp_path / "pairs.parquet")).load()
+
+    read()
+    gap, far = found["gap_m"] + 4.5, found["follower_position_m"] / FOOT
+    cases = [
+        ({"gap_m": gap}, r"median gap \+4\.5 m from that of positions and .*'gap_m'"),
+        ({"follower_position_m": far}, r"by their positions followers drive .* by their speeds"),
+    ]
+    check_refused(lambda columns: read(**columns), cases, DataError)
 
 
 def test_episodes_named_by_texts_name_their_drivers(tmp_path) -> None:

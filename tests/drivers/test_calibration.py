@@ -314,6 +314,19 @@ def test_a_model_of_ones_own_is_calibrated_and_drives(make_episodes):
     torch.testing.assert_close(data["next", "human", "command"], wanted)
 
 
+class Redeclared(Helly):
+    """A law that describes a parameter of the shipped models anew."""
+
+    own: ClassVar = {**Helly.own, "speed_gain": Parameter("gain_hz", "λ", (0.05, 2.0), (0.01, 9.0))}
+
+
+def test_a_parameter_of_shipped_models_is_not_described_anew(make_episodes):
+    with pytest.raises(
+        ConfigError, match=r"Redeclared\.own names 'speed_gain' .*bounds\.speed_gain=\["
+    ):
+        fit(make_episodes([15.0], [1.0]), model=f"{__name__}.Redeclared")
+
+
 def test_a_law_without_machine_code_is_simulated_by_tensors(uneven_lengths):
     observed, candidates = observe(uneven_lengths), torch.tensor([[20.0, 1.0]]).double()
     found = []
