@@ -106,7 +106,7 @@ def _own_files(module: str) -> Iterator[Path]:
     files, root = [path], path.parents[depth]
     for file in files:  # the list grows
         yield file
-        for name in _imports(file, ".".join(file.parent.relative_to(root).parts)):
+        for name in sorted(_imports(file, ".".join(file.parent.relative_to(root).parts))):
             stem = root.joinpath(*name.split("."))
             beside = (stem.with_suffix(".py"), stem / "__init__.py")
             files += [x for x in beside if x.is_file() and x not in files]

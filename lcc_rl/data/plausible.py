@@ -279,7 +279,14 @@ def hard_share(table: pd.DataFrame) -> float | None:
 
 
 def doubts(table: pd.DataFrame, node: str) -> list[str]:
-    """Return concerns about the resolution of speeds and, of single cars, about their units."""
+    """Return concerns about the resolution of speeds and, of single cars, about their units.
+
+    ``node``: section of the settings that help; empty if there is none.
+    """
+
+    def by(setting: str) -> str:
+        return f" ({node}.{setting})" if node else ""
+
     step, inside = usual_step(table), table["episode"].diff() == 0
     lines, coarse = list[str](), 0.0
     for name in (str(name) for name in table.columns if str(name).endswith("speed_mps")):
@@ -293,13 +300,14 @@ def doubts(table: pd.DataFrame, node: str) -> list[str]:
         if "gap_m" in table:
             continue
         if (top := speed.max()) > FASTEST:
-            lines.append(f"speeds reach {top:.3g} m/s; are they in mph ({node}.units.speed=mph)?")
+            lines.append(f"speeds reach {top:.3g} m/s; are they in mph{by('units.speed=mph')}?")
         fastest = rise.quantile(0.995)
         if step == 1.0 and fastest < SLOW_RATE and speed.min() < STANDING and top > STOPS:
             text = f"cars stop, but 99.5 % of speeds change by less than {fastest:.2g} m/s² in 1 s"
-            lines.append(f"{text}; are times frames ({node}.units.time=frames/10)?")
+            lines.append(f"{text}; are times frames{by('units.time=frames/10')}?")
     text = f"of {coarse:.2g} m/s, {step:.2g} s apart: recorded energies and fuel are too large"
-    lines += [f"speeds have a resolution {text}; {node}.average_s=1.1 averages"] * (coarse > 0)
+    if coarse:
+        lines.append(f"speeds have a resolution {text}; average them{by('average_s=1.1')}")
     return [Concern(line) for line in lines]
 
 

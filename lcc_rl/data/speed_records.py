@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -22,7 +23,9 @@ from lcc_rl.data.sources import SHIPPED_FILES, copies, find_files, units_of
 from lcc_rl.data.tables import TableFile, same_text, tables_of
 from lcc_rl.data.text import alike
 from lcc_rl.data.trajectories import ReadReport
-from lcc_rl.errors import DataError
+from lcc_rl.errors import Concern, DataError
+
+log = logging.getLogger("lcc_rl")
 
 TIME_COLUMN, SPEED_COLUMN = "time_s", "speed_mps"
 # Columns of a table of drives, and their default names.
@@ -59,7 +62,9 @@ def read_speed_record(
         known = ", ".join(sorted(cycles))
         raise DataError(f"{path}: no such file, and none of the package ({known})")
     names = {**DRIVE_COLUMNS, "drive": None}
-    samples, _ = _read(TableFile(file), names, plausible, {}, BRIDGE_S)
+    samples, lines = _read(TableFile(file), names, plausible, {}, BRIDGE_S)
+    for line in (line for line in lines if isinstance(line, Concern)):
+        log.warning(line)
     time = samples[TIME_COLUMN].to_numpy()
     if len(holes := np.flatnonzero(np.diff(samples["episode"]))):
         last = holes[0]

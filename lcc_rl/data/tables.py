@@ -140,7 +140,8 @@ class TableFile:
                 raise DataError(f"{self.path}: {at} has no effect: no column is {column.key}")
         for key in (c.key for c in columns if c.key in self.header and c.key not in names):
             if key not in self.names.values():
-                message = f"column {key!r} is not read unless {option}.{key} names it"
+                message = f"column {key!r} is not read"
+                message += f" unless {option}.{key} names it" if option else ""
                 self.notes.append(Concern(f"{self.path}: {message}"))
         scales = {
             column: self._scale(column, units or {}, option)

@@ -11,6 +11,7 @@ from helpers import (
     POPULATION,
     VARIANTS,
     check_refused,
+    compose,
     composed,
     single_env,
     small_env,
@@ -180,5 +181,6 @@ def test_a_configuration_that_does_not_fit_is_refused() -> None:
 
 
 def test_a_role_without_vehicles_has_no_pieces() -> None:
-    plain, further = (small_env("direct", 2, words) for words in ([], ["+faults=all"]))
+    cfg, plain = compose("alcc", "+faults=all").without_automated(), small_env("direct", 2)
+    further = build_env(cfg, wavy_profiles(), POPULATION, 2)
     assert list(map(type, pieces_of(further))) == list(map(type, pieces_of(plain)))

@@ -116,7 +116,7 @@ def test_imports_within_functions_and_packages_are_followed(place) -> None:
     (place / "other").mkdir()
     (place / "other" / "__init__.py").write_text("other = 1")
     found = inputs_of({"compare": ["own_parts.term.Term"]})["compare"]
-    assert [*found] == ["term.py", "own_parts/__init__.py", "other/__init__.py"]
+    assert [*found] == ["term.py", "other/__init__.py", "own_parts/__init__.py"]
 
 
 def test_own_files_of_settings_are_read_anew(place, monkeypatch) -> None:
