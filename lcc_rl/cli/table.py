@@ -20,10 +20,9 @@ from typing import Annotated
 
 from pydantic import Field
 
+from lcc_rl.config.words import SHOWN_AS
 from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.interrupts import ending_quietly
-
-SHOWN_AS = ("text", "markdown", "latex", "csv")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -11,6 +11,7 @@ from textwrap import fill
 import pandas as pd
 
 from lcc_rl.commands.evaluation import Run
+from lcc_rl.config.words import SHOWN_AS
 from lcc_rl.io.files import Rows, as_rows, read_parquet
 from lcc_rl.results.names import MARKS, rename, worded
 from lcc_rl.results.render import as_csv, as_latex, as_markdown, chosen, for_print
@@ -19,12 +20,8 @@ from lcc_rl.results.runs import EPISODES, FINAL, PARTS, load_config, naming_run
 from lcc_rl.results.sweeps import load_sweep
 from lcc_rl.runs.states import CONFIG, run_folders
 
-TABLE_FORMATS: dict[str, Callable[..., str]] = {
-    "text": as_markdown,
-    "markdown": as_markdown,
-    "latex": as_latex,
-    "csv": as_csv,
-}
+PRINTERS = (as_markdown, as_markdown, as_latex, as_csv)
+TABLE_FORMATS: dict[str, Callable[..., str]] = dict(zip(SHOWN_AS, PRINTERS, strict=True))
 
 
 def print_again(options: Namespace) -> None:

@@ -14,6 +14,7 @@ YAML = (".yaml", ".yml")  # endings of files of controllers
 DOTTED = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")  # a class or function: my_pieces.PID
 FILTERED = "_filtered"  # suffix of controllers behind the safety filter
 RECORDED = "recorded"  # the recorded driver as a controller, or its value as a limit
+SHOWN_AS = ("text", "markdown", "latex", "csv")  # formats of printed tables
 
 
 def module_named(key: str, value: str) -> str:
