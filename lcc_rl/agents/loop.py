@@ -274,10 +274,8 @@ def still_colliding(record: pd.DataFrame) -> str:
         return ""
     late = record.iloc[-(len(record) // LAST_TENTH) :]
     share = 100.0 * late["collisions"].sum() / (late["episodes"] / late["iteration"]).sum()
-    text = (
-        "of the last episodes ended in a collision, which may cost less than the driving that it "
-    )
-    remedy = "ends: raise reward.terms.collision.weight, or train behind a filter"
+    text = "of the last episodes ended in a collision, which may cost less than the driving that "
+    remedy = "it ends: raise reward.terms.collision.weight, or train behind a filter"
     return f"{share:.2g} % {text}{remedy}" if share > 1.0 else ""
 
 

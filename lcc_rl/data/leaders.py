@@ -409,7 +409,8 @@ def varying(
     line = f"left out {count} of {len(windows)} held-out windows, in which the leader's speed "
     line += f"changes by less than leader.least_variation={least:g} m/s"
     line += "" if fastest is None else f" or its mean exceeds leader.fastest={fastest:g}"
-    gone = [name for name in records_of(windows) if name not in records_of(kept)]
+    left = set(records_of(kept))
+    gone = [name for name in records_of(windows) if name not in left]
     line += f"; no window is left of {len(gone)} record(s): {listed(gone)}" * bool(gone)
     return kept, {"": count}, [line] * bool(count)
 

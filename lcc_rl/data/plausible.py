@@ -305,8 +305,8 @@ def doubts(table: pd.DataFrame, node: str) -> list[str]:
         if step == 1.0 and fastest < SLOW_RATE and speed.min() < STANDING and top > STOPS:
             text = f"cars stop, but 99.5 % of speeds change by less than {fastest:.2g} m/s² in 1 s"
             lines.append(f"{text}; are times frames{by('units.time=frames/10')}?")
-    text = f"of {coarse:.2g} m/s, {step:.2g} s apart: recorded energies and fuel are too large"
     if coarse:
+        text = f"of {coarse:.2g} m/s, {step:.2g} s apart: recorded energies and fuel are too large"
         lines.append(f"speeds have a resolution {text}; average them{by('average_s=1.1')}")
     return [Concern(line) for line in lines]
 

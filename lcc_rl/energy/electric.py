@@ -50,9 +50,8 @@ class ElectricCar(EnergyModel):
     regeneration_limit: Annotated[NonNegative, _in_watts(1000.0)] = 50_000.0
     fade_speed: Positive = 5.0  # below this speed recuperation is proportional to speed [m/s]
     grade: Grade = 0.0  # of the road [rad]
-    power_limit: Annotated[Positive, _in_watts(1000.0)] | None = (
-        None  # at the wheels; None: no limit [W]
-    )
+    # Largest power at the wheels [W]; None: no limit.
+    power_limit: Annotated[Positive, _in_watts(1000.0)] | None = None
 
     def validate(self) -> None:
         self.resistance = 0.5 * AIR * self.drag * self.area  # of the air [N/(m/s)²]

@@ -52,10 +52,10 @@ class VehicleClass(Settings):
                 abs(grade) <= STEEPEST, f"{kind}: grade must be at most {STEEPEST} rad, got {grade}"
             )
         require(0.0 < share <= 1.0, f"{kind}: efficiency must lie from 0 to 1, got {share!r}")
-        self._check_units(kind)
+        self._check_power(kind)
 
-    def _check_units(self, kind: str) -> None:
-        """Refuse a power that rises otherwise with acceleration than the kinetic energy."""
+    def _check_power(self, kind: str) -> None:
+        """Refuse a power that depends on more than its motion, or is not in W for m/s and kg."""
         mass, share = self.energy.mass, self.energy.efficiency
         motion = torch.full((2,), PROBE), torch.tensor([0.0, 0.1])
         with raised_as(ConfigError, f"{kind}.power", Exception):
