@@ -139,7 +139,7 @@ def stretch(
     require(scale * speed.max() <= limit, f"{fast}leader.plausible.max_speed={limit:g}")
     stem = Path(path).stem
     speeds = resample(time, scale * speed, time_step, begin, end)
-    return from_records([speeds], [f"{stem}@{begin:g}s"], [stem], time_step)
+    return from_records([speeds], [f"{stem}@{begin:g}s"], [stem], time_step, starts=[begin])
 
 
 class RecordLeaders(Settings):
@@ -357,16 +357,21 @@ class DriveLeaders(Settings):
         sides: tuple[list[Any], list[Any]] = [], []
         for index, name in enumerate(profiles.names):
             record, split = profiles.record(index), max(cut, 0)
-            later = f"{name}+{split * profiles.time_step:g}s" if split else name
-            for side, piece, label in zip(
-                sides, (record[:split], record[split:]), (name, later), strict=True
+            since = split * profiles.time_step
+            for side, piece, at in zip(
+                sides, (record[:split], record[split:]), (0.0, since), strict=True
             ):
-                side += [(piece, label, profiles.recordings[index])] if len(piece) > 1 else []
+                label = f"{name}+{at:g}s" if at else name
+                row = (piece, label, profiles.recordings[index], profiles.starts[index] + at)
+                side += [row] if len(piece) > 1 else []
             cut -= len(record)
         if not all(sides):
             raise DataError(f"{self.path}: {total} samples cannot be divided")
-        columns = ([[x[k] for x in side] for k in range(3)] for side in sides)
-        first, last = (from_records(x, y, z, profiles.time_step) for x, y, z in columns)
+        step = profiles.time_step
+        first, last = (
+            from_records(x, y, z, step, starts=starts)
+            for x, y, z, starts in (zip(*side, strict=True) for side in sides)
+        )
         return first, last
 
 

@@ -41,6 +41,7 @@ class Profiles:
         followers: speed [m/s] and gap [m] of the recorded driver behind each leader,
             ``[samples, 2]``, float32; None if there is none.
         grades: grade of the road at each sample, for energies of trips [rad]; None: not read.
+        starts: time in its recording at which each record starts [s]; empty: unknown.
     """
 
     speeds: Tensor
@@ -54,6 +55,7 @@ class Profiles:
     sources: tuple[str, ...] = ()
     followers: Tensor | None = None
     grades: Tensor | None = None
+    starts: tuple[float, ...] = ()
 
     def __len__(self) -> int:
         return len(self.names)
@@ -89,6 +91,7 @@ class Profiles:
             reach=None if self.reach is None else reach[index],
             weights=None if self.weights is None else self.weights[index],
             sources=tuple(self.sources[i] for i in chosen if self.sources),
+            starts=tuple(self.starts[i] for i in chosen if self.starts),
         )
 
     def windows(self, horizon: int, limit: int | None = None) -> Profiles:
@@ -117,6 +120,7 @@ class Profiles:
             [self.recordings[i] for i, _ in cuts],
             self.time_step,
             None if self.followers is None else [self.follower(i)[start:] for i, start in cuts],  # type: ignore[index]
+            [self.starts[i] + start * self.time_step for i, start in cuts if self.starts],
         )
         played = torch.full_like(whole.lengths, horizon + 1)
         return replace(whole, lengths=played, reach=whole.lengths)
@@ -165,6 +169,7 @@ def from_records(
     recordings: Sequence[str],
     time_step: float,
     followers: Sequence[Tensor] | None = None,
+    starts: Sequence[float] = (),
 ) -> Profiles:
     """Build profiles from separate speed records; arguments as for :class:`Profiles`.
 
@@ -188,6 +193,7 @@ def from_records(
         recordings=tuple(recordings),
         time_step=time_step,
         followers=None if followers is None else torch.cat(list(followers)).to(torch.float32),
+        starts=tuple(starts),
     )
 
 
@@ -211,6 +217,7 @@ def joined(parts: Sequence[Profiles]) -> Profiles:
         time_step=parts[0].time_step,
         reach=None if all(part.reach is None for part in parts) else torch.cat(known),
         followers=torch.cat(behind) if len(behind) == len(parts) else None,
+        starts=sum((part.starts for part in parts if all(x.starts for x in parts)), ()),
     )
 
 
@@ -245,7 +252,7 @@ def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
     Raises:
         DataError: if the table has another time step, or no episode.
     """
-    records, names, recordings, followers = [], [], [], []
+    records, names, recordings, followers, starts = [], [], [], [], []
     columns = [episodes[name].to_numpy() for name in ("time_s", "recording", "leader_id")]
     speeds = episodes["leader_speed_mps"].to_numpy(np.float32)
     behind = episodes[["follower_speed_mps", "gap_m"]].to_numpy(np.float32)
@@ -260,8 +267,9 @@ def leader_profiles(episodes: pd.DataFrame, time_step: float) -> Profiles:
         records.append(torch.from_numpy(speeds[rows]))
         names.append(f"{recording[0]}/{int(leader[0])}@{time[0]:.1f}s")
         recordings.append(str(recording[0]))
+        starts.append(float(time[0]))
         followers.append(torch.from_numpy(behind[rows]))
-    return from_records(records, names, recordings, time_step, followers)
+    return from_records(records, names, recordings, time_step, followers, starts)
 
 
 def resample(
@@ -303,7 +311,8 @@ def at_step(profiles: Profiles, time_step: float) -> Profiles:
     if profiles.followers is not None:
         followers = [changed(profiles.follower(index)) for index in numbers]  # type: ignore[arg-type]
     records = [changed(profiles.record(index)) for index in numbers]
-    return from_records(records, profiles.names, profiles.recordings, time_step, followers)
+    same = profiles.names, profiles.recordings, time_step, followers, profiles.starts
+    return from_records(records, *same)
 
 
 class Split(Settings):

@@ -103,7 +103,7 @@ def read_drives(
     files = find_files(path)
     if len(files) > 1 and columns["drive"] is None:
         raise DataError(f"{path}: {len(files)} files; leader=record drives one, see leader=drives")
-    records: dict[str, tuple[str, Tensor, Tensor | None]] = {}
+    records: dict[str, tuple[str, Tensor, Tensor | None, float]] = {}
     lines: list[str] = []
     for table in tables_of(files):
         samples, report = _read(table, columns, plausible, units or {}, bridge, average_s, "leader")
@@ -113,8 +113,8 @@ def read_drives(
         records |= loaded
         lines += [*report, *interpolated(samples, time_step)]
     names = [*records] if columns["drive"] is None else sorted(records)
-    drives, speeds, grades = zip(*(records[name] for name in names), strict=True)
-    profiles = from_records(speeds, names, drives, time_step)
+    drives, speeds, grades, starts = zip(*(records[name] for name in names), strict=True)
+    profiles = from_records(speeds, names, drives, time_step, starts=starts)
     lines += copies(np.repeat(names, profiles.lengths), pd.DataFrame(profiles.speeds.numpy()))
     joined = torch.cat(grades) if columns.get("grade") else None
     return replace(profiles, grades=joined), alike(lines, files)
@@ -122,8 +122,8 @@ def read_drives(
 
 def _records(
     samples: pd.DataFrame, time_step: float
-) -> Iterator[tuple[str, tuple[str, Tensor, Tensor | None]]]:
-    """Yield name, drive, speed and, if it was read, grade of each record of a file."""
+) -> Iterator[tuple[str, tuple[str, Tensor, Tensor | None, float]]]:
+    """Yield name, drive, speed, grade if it was read, and first time of each record of a file."""
     starts, lengths = stretches(samples["episode"].to_numpy())
     drives = samples["recording"].iloc[starts].astype(str).tolist()
     count, time = Counter(drives), samples[TIME_COLUMN].to_numpy()
@@ -135,7 +135,7 @@ def _records(
         if grade is not None:
             at = time[start] + time_step * np.arange(len(speeds))
             slope = torch.tensor(np.interp(at, time[rows], grade[rows]), dtype=torch.float32)
-        yield name, (drive, speeds, slope)
+        yield name, (drive, speeds, slope, float(time[start]))
 
 
 def _read(

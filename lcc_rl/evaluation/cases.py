@@ -24,7 +24,7 @@ from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import REWARD
 from lcc_rl.pieces.hybrid import COUNTERS, WINNER
-from lcc_rl.results.windows import DRIVE, SOURCE
+from lcc_rl.results.windows import DRIVE, SOURCE, START
 
 WINDOW_CASES = "windows"
 TRACKING_ERRORS = ("gap_error", "speed_error", "leader_speed_error")
@@ -85,6 +85,8 @@ class Cases:
             "followers": int(frame["follower"].max()),
         }
         frame = pd.concat([pd.DataFrame(labels), frame], axis=1)
+        if case.profile.starts:
+            frame[START] = [case.profile.starts[i] for i in frame["run_id"]]
         if self.inputs.evaluation.sources:
             sources = case.profile.sources or [""] * len(case.profile)
             frame[SOURCE] = [sources[i] for i in frame["run_id"]]

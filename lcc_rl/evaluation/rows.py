@@ -26,7 +26,7 @@ from lcc_rl.pieces.controllers import Population
 from lcc_rl.pieces.features import CLASS, GRADE
 from lcc_rl.pieces.slope import Slope
 from lcc_rl.pieces.string import COMMAND, WANTED
-from lcc_rl.results.windows import DRIVE, LEADER_COLUMNS, REPEAT, SOURCE
+from lcc_rl.results.windows import DRIVE, LEADER_COLUMNS, REPEAT, SOURCE, START
 
 SUMMED = (
     "energy_kj",
@@ -227,8 +227,8 @@ def describe(
         "desired_speed_mps": population.desired_speed[driver].numpy(),
         "time_gap_s": population.time_gap[driver].numpy(),
     }
-    if profiles.sources:
-        columns[SOURCE] = [profiles.sources[i] for i in profile.tolist()]
+    for name, values in ((SOURCE, profiles.sources), (START, profiles.starts)):
+        columns |= {name: [values[i] for i in profile.tolist()]} if values else {}
     return pd.DataFrame(columns)
 
 

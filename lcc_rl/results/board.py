@@ -127,8 +127,8 @@ def score_table(name: str, rows: Sequence[BoardRow]) -> Table:
             lines[-1] |= {"where": row["task"], "score": str(unit), "saved": against}
         lines.append({"where": f"  {row['source']}", **_cells(row)})
     caption = (
-        "saved, distance, flow: against the baseline; 95 % interval over drives, or over windows "
-        "if there are fewer than five drives (then too narrow); score.json has every limit and "
+        "saved, distance, flow: against the baseline; 95 % interval over drives, or over their "
+        "minutes if these are fewer than five (then too narrow); score.json has every limit and "
         "value."
     )
     return render.as_rich(pd.DataFrame(lines), BOARD_COLUMNS, in_words(name), caption)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from operator import itemgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,13 +15,20 @@ from lcc_rl.arrays import Floats, per_distance
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
-LEAST_DRIVES = 5  # least number of drives that are resampled
+LEAST_DRIVES = 5  # least number of drives, or of their minutes, that are resampled
 STUDENT = (12.706, 4.303, 3.182)  # 97.5 % quantiles of Student's t by degrees of freedom, from 1
 RESAMPLING_SEED = 0  # equal rows give equal intervals
 BOUNDED = ("", "_low", "_high")  # of the names of a value and of the bounds of its interval
 WITHOUT_WINDOWS = -1  # stream for seeds that are resampled without windows
 
 Side = Mapping[str, Floats]  # columns of one side of a comparison, each ``[..., windows, seeds]``
+
+
+class Minute(NamedTuple):
+    """A minute of a drive, in which a window starts; windows at one time are similar."""
+
+    drive: object
+    minute: int
 
 
 @dataclass(frozen=True)
@@ -67,8 +74,9 @@ def estimate(
         statistic: function of one mapping per side with the mean of each column, ``[...]``, or its
             resampled means, ``[..., RESAMPLES]``.
         sides: columns of each side for the same windows; one seed without training.
-        drives: drive of each window. If there are at least five, whole drives are resampled,
-            because windows of one drive are similar.
+        drives: drive of each window, or :class:`Minute` of it. If there are at least five drives,
+            whole drives are resampled, because windows of one drive are similar; else minutes of
+            drives, if these are at least five; else windows.
         paired: whether equal seeds of all sides belong to one training.
         alone: resample seeds only, n of n.
 
@@ -100,6 +108,7 @@ def _over_drives(
     statistic: Callable[..., Any], sides: Sequence[Side], drives: Sequence[object], value: float
 ) -> tuple[float, float] | None:
     """Return the t-interval over two to four drives, by the jackknife's standard error."""
+    drives = whole(drives)
     names = list(dict.fromkeys(drives))
     if not 2 <= len(names) < LEAST_DRIVES:
         return None
@@ -112,6 +121,24 @@ def _over_drives(
     return value - half_width, value + half_width
 
 
+def whole(drives: Sequence[object]) -> list[object]:
+    """Return the drive of each window, without minutes."""
+    return [of.drive if isinstance(of, Minute) else of for of in drives]
+
+
+def clusters(drives: Sequence[object]) -> list[object]:
+    """Return the group of each window that is resampled as a whole; empty: windows are.
+
+    Examples:
+        >>> clusters([Minute("a", 0), Minute("a", 0), *(Minute("a", i) for i in range(1, 5))])[1:3]
+        [Minute(drive='a', minute=0), Minute(drive='a', minute=1)]
+        >>> clusters([Minute(drive, 0) for drive in "aabcde"])
+        ['a', 'a', 'b', 'c', 'd', 'e']
+    """
+    groups = (whole(drives), list(drives))
+    return next((group for group in groups if len(set(group)) >= LEAST_DRIVES), [])
+
+
 def resampled(table: Floats, stream: int, drives: Sequence[object] | None) -> Floats:
     """Return the resampled means of ``[..., windows, seeds]``; ``stream`` draws the seeds."""
     drawn = drawn_windows(table.shape[-2], tuple(drives or ())) @ table
@@ -121,10 +148,10 @@ def resampled(table: Floats, stream: int, drives: Sequence[object] | None) -> Fl
 @lru_cache(maxsize=1)  # all measures of a strategy have the same windows
 def drawn_windows(count: int, drives: tuple[object, ...]) -> Floats:
     """Return the weights of windows in every resample, ``[RESAMPLES, count]``."""
-    if len(set(drives)) < LEAST_DRIVES:
+    if not (groups := clusters(drives)):
         return resample_weights(count, 0)
-    names = {name: code for code, name in enumerate(dict.fromkeys(drives))}
-    drawn = resample_weights(len(names), 0)[:, [names[name] for name in drives]]
+    names = {name: code for code, name in enumerate(dict.fromkeys(groups))}
+    drawn = resample_weights(len(names), 0)[:, [names[name] for name in groups]]
     return np.asarray(drawn / drawn.sum(1, keepdims=True))
 
 

@@ -19,7 +19,7 @@ from lcc_rl.arrays import Floats, per_distance
 from lcc_rl.errors import ResultsError
 from lcc_rl.results.bootstrap import NOTHING, Estimate, Side, equal_seeds, estimate, share_saved
 from lcc_rl.results.measures import DISTANCE, FLOW, LONG_GAPS, PATH
-from lcc_rl.results.windows import DRIVE, STRATEGY, TRAINED, with_equal_seeds
+from lcc_rl.results.windows import STRATEGY, TRAINED, drives_of, with_equal_seeds
 
 FRONT_KINDS = ["variant", "policy"]
 ENERGY, LONG_SHARE = PATH, LONG_GAPS
@@ -73,7 +73,7 @@ def compare_fronts(
     fronts = [front(windows, kind, columns) for kind in kinds]
     seeds = windows.groupby(FRONT_KINDS)["training_seed"].unique()
     paired = equal_seeds(*(seeds[tuple(kind)] for kind in kinds))
-    drives = windows.groupby("profile_id")[DRIVE].first().tolist() if DRIVE in windows else None
+    drives = drives_of(windows.drop_duplicates("profile_id").sort_values("profile_id"))
 
     def statistic(*sides: Curve) -> Any:
         return measure(*({name: x.T for name, x in side.items()} for side in sides))

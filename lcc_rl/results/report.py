@@ -48,7 +48,16 @@ from lcc_rl.results.remarks import (
     verdict,
 )
 from lcc_rl.results.task import ELECTRIC, KJ, Task, burns_one_fuel, in_units
-from lcc_rl.results.windows import DRIVE, TRAINED, savings, seeds_left_out, windows_of, with_bounds
+from lcc_rl.results.windows import (
+    DRIVE,
+    START,
+    TRAINED,
+    drives_of,
+    savings,
+    seeds_left_out,
+    windows_of,
+    with_bounds,
+)
 
 # Baselines of tables and verdicts; the first one that was evaluated is used.
 AGAINST = (RECORDED, HUMAN, "idm", "idm_acc_filtered", "idm_acc", "rule", "reference")
@@ -77,14 +86,14 @@ WAY, FLOW_SHARE = Shown("distance_pct", "dis-\ntance\n[%]"), Shown("flow_pct", "
 # Tables show what is more than the baseline's, in per cent.
 LOST = {"distance_lost": (WAY.key, DISTANCE), FLOW_LOST: (FLOW_SHARE.key, FLOW)}
 COLLISIONS, KEEPS = Shown("collisions", "colli-\nsions"), Shown("kept", "kept")
-COUNTS = {"windows": "windows", "drives": "drives", "drivers": "drivers", "seeds": "training seeds"}
+COUNTS = {x: x for x in ("windows", "drives", "minutes", "drivers")} | {"seeds": "training seeds"}
 ALL = "all measures: table=all or --all."
 CAPTION = f"Path energy per vehicle and km; {{}}{ALL}"
 SHARES = "shares of the time: TTC < 4 s; time gap > 2.5 s above 1 m/s; "
 FULL = (
     "energies: mean per episode; path energy: of the speeds without acceleration, and the loss by "
-    "accelerating; saved: of path energy per km, or of a task's score; intervals: over held-out "
-    "windows, or drives if there are five or more, and training seeds"
+    "accelerating; saved: of path energy per km, or of a task's score; intervals: over drives if "
+    "there are five or more, else their minutes, else windows, and training seeds"
 )
 
 
@@ -197,6 +206,7 @@ def summary(
         row: dict[str, Any] = {"strategy": name, "against": against or ""}
         kinds = {"windows": "profile_id", "drives": DRIVE, "seeds": TRAINED}
         row |= {key: frame.get(of, frame["profile_id"]).nunique() for key, of in kinds.items()}
+        row |= {"minutes": len({*(drives_of(frame) or ())})} if START in frame else {}
         row |= {"drivers": int(frame["drivers"].max())} if "drivers" in frame else {}
         row["left_out"], seeds = seeds_left_out(windows, name, against)
         row["single"] = seeds == 1
@@ -464,8 +474,12 @@ def saved_against(found: pd.DataFrame, against: str, always: bool = False) -> st
 
 def with_interval(found: pd.DataFrame, words: str) -> str:
     """Return the words with the kind of the interval; ``found`` as for :func:`saved_against`."""
-    windows, drives, seeds = (int(found[name].max()) for name in ("windows", "drives", "seeds"))
-    over = "windows" if drives < LEAST_DRIVES else f"{drives} drives"
+    names = ("windows", "drives", "minutes", "seeds")
+    windows, drives, minutes, seeds = (int(found.get(x, pd.Series([0])).max()) for x in names)
+    over = next(
+        (f"{n} {of}" for n, of in ((drives, "drives"), (minutes, "minutes")) if n >= LEAST_DRIVES),
+        "windows",
+    )
     over += " of one training" * (seeds == 1)
     if seeds > 1:
         up_to = "up to " if found.loc[found["seeds"] > 0, "seeds"].nunique() > 1 else ""

@@ -14,7 +14,15 @@ import pyarrow as pa
 from lcc_rl.arrays import per_distance
 from lcc_rl.energy import AVERAGED, BURNT, SECOND
 from lcc_rl.io.files import Rows, read_parquet
-from lcc_rl.results.bootstrap import NOTHING, Estimate, equal_seeds, estimate, saving, share_saved
+from lcc_rl.results.bootstrap import (
+    NOTHING,
+    Estimate,
+    Minute,
+    equal_seeds,
+    estimate,
+    saving,
+    share_saved,
+)
 from lcc_rl.results.measures import DAMPING, DISTANCE, MEASURES, SHARE, WAYS, Measure, aggregates
 from lcc_rl.results.names import in_words, size_of
 from lcc_rl.results.runs import EPISODES
@@ -23,11 +31,12 @@ WINDOWS, DRIVERS = "windows.parquet", "drivers.parquet"
 PAIR_KEYS = ["profile_id", "driver_id"]
 REPEAT = "repeat"  # number of the draw of the noise, if there are several
 DRIVE = "drive"  # drive of a row's window; windows of one drive are similar
+START = "start_s"  # time in its recording at which a row's window starts [s]
 SOURCE = "source"  # source of a row's leader, if a mixture has several
 LEADER_COLUMNS = ("leader_path_energy_kj", "leader_speed_mps")
 STRATEGY, TRAINED = "strategy", "training_seed"
 WINDOW_KEYS = [STRATEGY, TRAINED, "profile_id"]
-PER_WINDOW = ["profile", SOURCE, DRIVE]  # constant within a window
+PER_WINDOW = ["profile", SOURCE, DRIVE, START]  # constant within a window
 ENERGIES = ("energy_kj", "net_energy_kj", "path_energy_kj", *AVERAGED, *BURNT, SECOND)
 FOLDED = 100_000  # most rows of partial sums before they are added
 PER_KM = "vehicle and km"
@@ -112,17 +121,16 @@ def _derived(rows: pd.DataFrame) -> pd.DataFrame:
 def _sums(frame: pd.DataFrame, by: Sequence[str], columns: Sequence[str]) -> pd.DataFrame:
     """Return sums, counts and extremes of columns by keys."""
     numbers = [str(name) for name in frame.select_dtypes(["number", "bool"])]
-    names = [
-        name for name in columns or numbers if name in numbers and name not in (*PAIR_KEYS, TRAINED)
-    ]
+    keys = {*PAIR_KEYS, TRAINED, *by}
+    names = [name for name in columns or numbers if name in numbers and name not in keys]
     if not columns:
         shares = [one.key for one in MEASURES if one.unit == SHARE and one.key in names]
         frame = frame.assign(**{f"{WORST}{name}": frame[name] for name in shares})
         names += [f"{WORST}{name}" for name in shares]
     names = list(dict.fromkeys(["episodes", "drivers", *names]))
-    keys = [frame[name] for name in by if name in frame]
+    of = [frame[name] for name in by if name in frame]
     values = frame[names].astype(np.float64)
-    groups = values.groupby(keys, sort=False, dropna=False, observed=True)
+    groups = values.groupby(of, sort=False, dropna=False, observed=True)
     kinds: dict[str, list[str]] = {kind: [] for kind in ("sum", "count", "min", "max")}
     statistics = aggregates()
     for name in names:
@@ -257,12 +265,22 @@ def seeds_left_out(rows: pd.DataFrame, strategy: str, baseline: str | None) -> t
 
 
 def _by_window(chosen: pd.DataFrame, columns: Iterable[str]) -> dict[str, pd.DataFrame]:
-    """Return columns by window, of each strategy and seed; ``drive`` of a window likewise."""
+    """Return columns by window, of each strategy and seed; ``drive``: a row of each window."""
     names = [name for name in dict.fromkeys(columns) if name in chosen]
-    drives = {DRIVE: chosen.groupby("profile_id")[[DRIVE]].first()} if DRIVE in chosen else {}
+    drives = {DRIVE: chosen.drop_duplicates("profile_id").set_index("profile_id")}
     keyed = chosen.assign(**{TRAINED: chosen[TRAINED].astype(object).fillna(-1)})
     means = keyed.groupby(["profile_id", *WINDOW_KEYS[:2]], observed=True)[names].mean()
     return drives | {x: means[x].unstack(WINDOW_KEYS[:2]).sort_index(axis=1) for x in names}
+
+
+def drives_of(windows: pd.DataFrame) -> list[object] | None:
+    """Return the drive of each row, with the minute if it is known; None without drives."""
+    if DRIVE not in windows:
+        return None
+    drives = windows[DRIVE].tolist()
+    if START not in windows or windows[START].isna().any():
+        return drives
+    return [*map(Minute, drives, (windows[START] // 60.0).astype(int))]
 
 
 def _over(
@@ -272,8 +290,7 @@ def _over(
     energy = tables[column].dropna(axis=1, how="all").dropna()
     ways = [tables[name].reindex_like(energy).fillna(0.0) for name in per if name in tables]
     way = sum(ways, 0.0 * energy) + float(not ways)
-    drives = tables[DRIVE].loc[energy.index, DRIVE].tolist() if DRIVE in tables else None
-    return energy, way, drives
+    return energy, way, drives_of(tables[DRIVE].loc[energy.index])
 
 
 def by_driver(drivers: pd.DataFrame, column: str) -> pd.DataFrame:

@@ -192,6 +192,8 @@ def test_a_single_record_that_is_cut_is_divided_in_time(tmp_path) -> None:
         names = leaders.windows.names
         assert names[0].startswith(first), (tuning, names)
         assert names[-1].startswith(last), (tuning, names)
+        begins = [sum(float(x[:-1]) for x in name.split("+")[1:]) for name in names]
+        assert leaders.windows.starts == pytest.approx(begins)
     begins = 14.0 + 6.0 * np.sin((150.0 + 130.0) / 9.0)
     assert float(leaders.windows.record(0)[0]) == pytest.approx(begins, abs=0.1)
 
@@ -292,6 +294,7 @@ def test_a_mixture_holds_every_source(table) -> None:
     assert [spread.sources.count(name) for name in sources] == [2, 2]
     assert not set(training.names) & names_of(held_out)
     assert (held_out.reach > held_out.lengths).any()
+    assert len(held_out.starts) == len(held_out)
 
 
 def test_impossible_mixtures() -> None:

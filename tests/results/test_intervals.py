@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from lcc_rl.results.bootstrap import Estimate, crossed, mean, saving, share_saved
+from lcc_rl.results.bootstrap import Estimate, Minute, crossed, mean, saving, share_saved
 from lcc_rl.results.fronts import (
     DISTANCE,
     ENERGY,
@@ -253,6 +253,33 @@ def test_windows_of_one_drive_are_resampled_together() -> None:
     assert again.high - again.low == pytest.approx(whole.high - whole.low, rel=0.1)
 
 
+def test_windows_of_one_recording_are_resampled_by_the_minute() -> None:
+    """Thirty windows start in six minutes, whose waves save alike."""
+    generator = np.random.default_rng(0)
+    minute = np.repeat(np.arange(6), 5)
+    saved = np.repeat(generator.normal(0.05, 0.02, 6), 5) + generator.normal(0.0, 0.002, 30)
+    own = pd.DataFrame({"profile_id": range(30), "drive": "one", "start_s": 60.0 * minute + 7.0})
+    rows = pd.concat(
+        own.assign(strategy=name, training_seed=np.nan, energy=energy)
+        for name, energy in (("mine", 100.0 * (1.0 - saved)), ("base", 100.0))
+    )
+    rows = rows.sample(frac=1.0, random_state=0)  # in any order
+
+    def width(rows: pd.DataFrame) -> float:
+        found = savings(rows, "energy", "mine", "base")
+        assert found.value == pytest.approx(saved.mean())
+        return found.high - found.low
+
+    by_minute = width(rows)
+    assert by_minute > 1.5 * width(rows.drop(columns="start_s"))
+    # As of six drives; with five drives these are resampled, with four minutes windows are.
+    assert by_minute == pytest.approx(width(rows.assign(drive=rows["start_s"].astype(str))))
+    five = rows.assign(drive=rows["profile_id"] % 5)
+    assert width(five) == pytest.approx(width(five.drop(columns="start_s")))
+    few = rows.assign(start_s=rows["start_s"] % 240.0)
+    assert width(few) == pytest.approx(width(few.drop(columns="start_s")))
+
+
 def test_few_drives_have_a_t_interval_beside_that_over_windows() -> None:
     # Three drives of four windows each; windows of a drive save alike.
     shares = np.array([0.02, 0.05, 0.11])
@@ -263,5 +290,7 @@ def test_few_drives_have_a_t_interval_beside_that_over_windows() -> None:
     low, high = stats.t.interval(0.95, 2, shares.mean(), shares.std(ddof=1) / 3**0.5)
     assert found.over_drives == pytest.approx((low, high), rel=1e-3)
     assert low < found.low < found.high < high
+    minutes = [Minute(drive, at) for at, drive in enumerate(drives)]
+    assert saving(own, baseline, drives=minutes).over_drives == found.over_drives
     for many in (["a"] * 12, list("abcdef") * 2):  # nothing to tell from; enough to resample
         assert saving(own, baseline, drives=many).over_drives is None

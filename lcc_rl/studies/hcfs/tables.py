@@ -14,7 +14,7 @@ from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.results import bootstrap
 from lcc_rl.results.names import in_words
 from lcc_rl.results.platoons import PER_RUN, case_table
-from lcc_rl.results.windows import DRIVE
+from lcc_rl.results.windows import DRIVE, START, drives_of
 
 LEARNED = "ddpg"  # variant of the hybrid's policy
 # Numbers of Table IV (case 1): Σ|e_v|, its std, Σ|jerk|, Σ reward.
@@ -51,7 +51,7 @@ def per_run(episodes: pd.DataFrame) -> pd.DataFrame:
     """Sum the rows of each run's vehicles; :func:`case_table` also accepts the result."""
     kinds = {**dict.fromkeys(SUMS, "sum"), **dict.fromkeys(LARGEST_COLUMNS, "max")}
     kinds |= {"min_gap_m": "min", "learned_share": "mean", "drawn_energy_kj_per_km": "mean"}
-    kinds |= {DRIVE: "first"} if DRIVE in episodes else {}
+    kinds |= {name: "first" for name in (DRIVE, START) if name in episodes}
     return episodes.groupby(RUN, sort=False, dropna=False, as_index=False).agg(kinds)
 
 
@@ -83,12 +83,14 @@ def reward_per_seed(
 ) -> pd.DataFrame:
     """Return a sum for every run, ``[runs × seeds]``; one column without training.
 
-    The index names the run's window and drive; without drives each window counts as one.
+    The index names the run's window, drive and start, if known; without drives each window counts
+    as one.
     """
     rows = episodes[(episodes["strategy"] == strategy) & (episodes["case"] == case)]
     seeds, drives = rows["training_seed"].fillna(-1), rows.get(DRIVE, rows["profile"])
+    index = ["profile", DRIVE, *[START] * (START in rows)]
     return rows.assign(**{"training_seed": seeds, DRIVE: drives}).pivot_table(
-        index=["profile", DRIVE], columns="training_seed", values=of, aggfunc="sum", observed=True
+        index=index, columns="training_seed", values=of, aggfunc="sum", observed=True
     )
 
 
@@ -97,8 +99,8 @@ def crossed_rewards(runs: pd.DataFrame) -> bootstrap.Estimate:
     return bootstrap.crossed(runs, drives=_drives(runs))
 
 
-def _drives(runs: pd.DataFrame) -> list[object]:
-    return runs.index.get_level_values(DRIVE).tolist()
+def _drives(runs: pd.DataFrame) -> list[object] | None:
+    return drives_of(runs.index.to_frame())
 
 
 def win_rates(
