@@ -109,7 +109,8 @@ def load(
 
     A damaged run is left out with a warning; ``frame.attrs["damaged"]`` holds the reasons by run,
     ``frame.attrs["unfinished"]`` the failed, stopped, running and waiting runs with their states,
-    and ``frame.attrs["missing"]`` the missing shards of an evaluation. The episodes of a finished
+    ``frame.attrs["missing"]`` the missing shards of an evaluation, and ``frame.attrs["repeated"]``
+    the runs of equal settings, whose rows are all included. The episodes of a finished
     job of ``lcc-rl run`` are those of its evaluation, which includes its trainings.
 
     Args:
@@ -118,7 +119,7 @@ def load(
         settings: settings that become columns, by dotted keys (``"seed"``, ``"agent.gamma"``) or
             patterns (``"reward.*"``, ``"*"``); by default ``"variant"``, ``"seed"`` and those in
             which the runs differ, also as typed in their commands (``"reward.without"``).
-        strict: raise for a damaged or unfinished run or a missing shard.
+        strict: raise for a damaged, unfinished or repeated run or a missing shard.
         lazy: return a pyarrow dataset, which reads rows on demand, for tables that do not fit into
             memory.
 
@@ -150,7 +151,8 @@ def load(
     if states:
         log.warning("%s: not finished: %s", root, listed(states))
     missing = missing_shards(list(runs.values())) if table == "episodes" else []
-    for line in missing:
+    twice = repeated(list(runs.values()))
+    for line in (*missing, *twice):
         if strict:
             raise ResultsError(f"{root}: {line}")
         log.warning("%s: %s", root, line)
@@ -160,6 +162,7 @@ def load(
     frame.attrs |= {"damaged": dict(damaged)} if damaged else {}
     frame.attrs |= {"unfinished": states} if states else {}
     frame.attrs |= {"missing": missing} if missing else {}
+    frame.attrs |= {"repeated": twice} if twice else {}
     return frame
 
 
@@ -258,9 +261,7 @@ def missing_shards(runs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return a line for every evaluation with missing shards."""
     shards: dict[str, set[int]] = {}
     for settings in (x for x in runs if (x.get(SHARDS) or 1) > 1):
-        shared = {key: value for key, value in settings.items() if key not in (SHARD, "run")}
-        key = json.dumps(shared, sort_keys=True, default=str)
-        shards.setdefault(key, set()).add(settings[SHARD])
+        shards.setdefault(_key(settings, SHARD), set()).add(settings[SHARD])
     lines = []
     for key, present in shards.items():
         settings = json.loads(key)
@@ -270,6 +271,22 @@ def missing_shards(runs: Sequence[Mapping[str, Any]]) -> list[str]:
             of = f"{len(gaps)} of {settings[SHARDS]} shards of variant {settings['variant']}"
             lines.append(f"{of} are missing: {SHARD}={which}")
     return lines
+
+
+def repeated(runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a line for all runs of equal settings."""
+    groups: dict[str, list[str]] = {}
+    for settings in runs:
+        if settings.keys() - {"run"}:
+            groups.setdefault(_key(settings), []).append(settings["run"])
+    twice = (names for names in groups.values() if len(names) > 1)
+    return [listed(dict.fromkeys(names, "runs of equal settings")) for names in twice]
+
+
+def _key(settings: Mapping[str, Any], *without: str) -> str:
+    """Return the settings of a run as text, without its folder."""
+    kept = {key: value for key, value in settings.items() if key not in ("run", *without)}
+    return json.dumps(kept, sort_keys=True, default=str)
 
 
 def listed(reasons: Mapping[str, str]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -75,6 +76,20 @@ def test_a_job_counts_each_episode_once(tmp_path) -> None:
     assert set(results.load(tmp_path, "training")["run"]) == {"alcc"}
     (tmp_path / "evaluation" / TABLE).unlink()
     assert set(results.load(tmp_path)["run"]) == {"alcc"}  # stopped before its end
+
+
+def test_a_repeated_run_and_one_with_more_text_are_read_and_named(tmp_path, caplog) -> None:
+    made(tmp_path / "first", 5)
+    again, other = made(tmp_path / "again", 5), made(tmp_path / "other", 7)
+    write_parquet(episodes(7).assign(source="highway"), other / TABLE)
+    frame = results.load(tmp_path)
+    assert frame["source"].astype(object).fillna("").tolist() == [""] * 12 + ["highway"] * 6
+    assert frame.attrs["repeated"] == ["again, first (runs of equal settings)"]
+    assert "again, first" in caplog.text
+    with pytest.raises(ResultsError, match=r"again, first \(runs of equal settings\)"):
+        results.load(tmp_path, strict=True)
+    shutil.rmtree(again)
+    assert "repeated" not in results.load(tmp_path, strict=True).attrs
 
 
 def test_what_tells_runs_apart_is_few_settings_by_their_last_words() -> None:
