@@ -129,13 +129,16 @@ class Entrants:
         observing = self.further or cfg.policy is not None or (self.own and cfg.learns)
         learned = self.paths or observing
         if cfg.evaluation.rows == "episodes" and not (cfg.evaluation.terms and learned):
-            unused["reward.terms."] = "only rows of policies have it, with evaluation.terms=true"
+            why = "only rows of policies have it, with evaluation.terms=true"
+            unused |= dict.fromkeys(("reward.terms.", "reward.without"), why)
             if cfg.evaluation.terms:
                 unused["evaluation.terms"] = "no row is a policy"
         # A user's controller or piece may read what is observed.
         if not observing and of_package([cfg.scenario, cfg.observation, *nodes]):
             unused["observation"] = "no row observes; a policy observes as in its training"
-        refuse((word for word in typed if not word.startswith("~")), unused)
+        # A removed piece may need its terms removed.
+        removed = any(word.startswith("~scenario.") for word in typed)
+        refuse((word for word in typed if not (removed and word.startswith("~"))), unused)
         if self.own or self.further or cfg.variant in rows or not cfg.automated:
             return
         check_effective(typed, self.rivals or rows, [*rows, *rivals], bool(self.paths))

@@ -117,6 +117,8 @@ EVALUATED = {
     "alcc agent.hold=5": OF_TRAINING,
     "alcc agent=ppo": f"{OF_TRAINING}, analytic",
     "alcc reward.terms.safety.weight=5": "only rows of policies have it, with evaluation.terms",
+    "alcc reward.without=safety": "only rows of policies have it, with evaluation.terms",
+    "alcc ~reward.terms.safety": "only rows of policies have it, with evaluation.terms",
     "idm": "variant idm has no agent",
     "hcfs +energy@evaluation.second_energy=compact": "drives behind every record once",
     "hcfs evaluation.sample_episodes=0": "drives behind every record once",
