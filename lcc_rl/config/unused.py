@@ -154,10 +154,14 @@ def _of_objective(
     """Yield settings of terms and surrogates that a training ignores, and why."""
     kinds = ("surrogates", "limits", "limits_each")
     surrogates, limits, each = (cfg.agent.settings.get(key, {}) for key in kinds)
-    by_gradient = "bootstrap" in cfg.agent.settings
-    if by_gradient and not cfg.agent.settings["bootstrap"]:
+    without_value = not cfg.agent.settings.get("bootstrap", True)
+    if without_value:
         for key in ("value_lr", "value_every", "td_lambda", "tau"):
             yield f"agent.{key}", "agent.bootstrap=false learns no value"
+        policy = str(cfg.agent.settings["policy"])
+        if policy != "network" and not policy.startswith("residual_"):
+            for key in ("hidden", "activation"):
+                yield f"agent.{key}", f"agent.policy={policy} without a value has no network"
     shares = (*limits.items(), *each.items())
     limited = {name for name, share in shares if share is not None}
     terms = {name: term for name, term in cfg.reward.terms.items() if term.settings.get("weight")}
@@ -165,7 +169,7 @@ def _of_objective(
         for key in kinds:
             yield f"agent.{key}.{name}", f"the reward has no term {name}"
     for name, term in terms.items():
-        if by_gradient and name not in surrogates and not getattr(term.kind, "graded", True):
+        if without_value and name not in surrogates and not getattr(term.kind, "graded", True):
             for key in term.settings:
                 yield f"reward.terms.{name}.{key}", f"{term.kind.__name__} has no gradient"
     if not limited:

@@ -127,8 +127,10 @@ EVALUATED = {
 }
 # Settings of terms and surrogates that a training by the gradient ignores, and why.
 GRADIENT = {
-    "reward.terms.collision.weight=9": "CollisionPenalty has no gradient",
-    "reward.terms.collision.behind=false": "CollisionPenalty has no gradient",
+    "agent.bootstrap=false reward.terms.collision.weight=9": "CollisionPenalty has no gradient",
+    "experiment=limits reward.terms.collision.behind=false": "CollisionPenalty has no gradient",
+    "agent.policy=idm agent.bootstrap=false agent.hidden=[8]": "agent.policy=idm without a value",
+    "agent.policy=acc experiment=limits agent.activation=elu": "agent.policy=acc without a value",
     "reward.terms.safety.floor=0.1": r"surrogates.safety \(SmoothSafety\) takes the term's place",
     "reward.terms.hdv_energy.power=vehicles.power": "surrogates.hdv_energy .* takes the term's",
     "reward.terms.safety={_target_:lcc_rl.pieces.JerkReward}": "takes the term's place",
@@ -179,6 +181,7 @@ def test_options_without_effect_are_refused() -> None:
     check_refused(lambda typed: load("train", typed.split()), cases, ConfigError)
     cases = [(typed, rf"has no effect: .*({why})") for typed, why in EVALUATED.items()]
     check_refused(lambda typed: evaluated(*typed.split()), cases, ConfigError)
+    load("train", ["agent=analytic", "reward.terms.collision.weight=9", "agent.policy=idm"])
     evaluated("alcc", "agent=analytic", "seed=7", "evaluation.seed=${seed}")  # have an effect
     evaluated("alcc", "evaluation.terms=true", "reward.terms.safety.weight=5")
     evaluated("hcfs", "compare=[idm]", "drivers=highway", "evaluation.seed=99")
