@@ -32,6 +32,7 @@ from lcc_rl.evaluation.strategies import (
     trained,
     with_safety,
 )
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import load_policy, of_task
 from lcc_rl.results.runs import POLICY, flatten, without
@@ -90,6 +91,11 @@ class Entrants:
                 f"(of lcc-rl train variant={cfg.variant}) or policy=pretrained, or compare others "
                 "only: compare=[human]"
             )
+        trainings = [x for _, x in filter(None, [self.policy, *self.policies])]
+        safety = [x.scenario.filters.get(AUTOMATED) for x in (cfg, *trainings)]
+        if not any(safety) or not (trainings or self.further):
+            idle = "no policy drives behind the safety filter (+filter=cbf adds one)"
+            refuse(typed, {"evaluation.behind_filter": idle})
 
     def _compared(self) -> tuple[dict[str, Any], list[tuple[str, str]]]:
         """Return the controllers of ``compare`` by name, and its policies with name, if given."""

@@ -119,6 +119,7 @@ EVALUATED = {
     "alcc reward.terms.safety.weight=5": "only rows of policies have it, with evaluation.terms",
     "alcc reward.without=safety": "only rows of policies have it, with evaluation.terms",
     "alcc ~reward.terms.safety": "only rows of policies have it, with evaluation.terms",
+    "alcc evaluation.behind_filter=[acc_filtered]": "no policy drives behind the safety filter",
     "idm": "variant idm has no agent",
     "hcfs +energy@evaluation.second_energy=compact": "drives behind every record once",
     "hcfs evaluation.sample_episodes=0": "drives behind every record once",
@@ -184,6 +185,7 @@ def test_options_without_effect_are_refused() -> None:
     load("train", ["agent=analytic", "reward.terms.collision.weight=9", "agent.policy=idm"])
     evaluated("alcc", "agent=analytic", "seed=7", "evaluation.seed=${seed}")  # have an effect
     evaluated("alcc", "evaluation.terms=true", "reward.terms.safety.weight=5")
+    evaluated("alcc", "+filter=cbf", "evaluation.behind_filter=[acc_filtered]")
     evaluated("hcfs", "compare=[idm]", "drivers=highway", "evaluation.seed=99")
     stronger = f"+{AUTO}.max_acceleration=6"
     words = [stronger, "compare=[idm_acc]"]
