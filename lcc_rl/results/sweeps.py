@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,13 @@ import pandas as pd
 
 from lcc_rl.arrays import Floats
 from lcc_rl.config.compose import NOT_IDENTITY
-from lcc_rl.errors import ResultsError, require
+from lcc_rl.errors import ConfigError, ResultsError, require
+from lcc_rl.io.files import as_rows
 from lcc_rl.io.tensors import checksums
 from lcc_rl.results.loading import SHARD, listed, load
 from lcc_rl.results.names import ON_FRONT
 from lcc_rl.results.report import baseline_of
-from lcc_rl.results.runs import CONFIG, POLICY, differences, flat_settings, without
+from lcc_rl.results.runs import CONFIG, EPISODES, POLICY, differences, flat_settings, without
 from lcc_rl.results.windows import SOURCE, STRATEGY, TRAINED
 from lcc_rl.runs.plans import choices_of
 from lcc_rl.runs.states import run_folders
@@ -56,7 +58,9 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
     root = Path(root)
     loaded = load(root, settings=())
     rows = loaded.assign(run=loaded["run"].astype(str), strategy=loaded["strategy"].astype(str))
-    runs = {x: without(_settings(root / x), SHARED) for x in rows["run"].unique()}
+    every = rows["run"].unique()
+    settings = _settings([root / x for x in every])
+    runs = {name: without(x, SHARED) for name, x in zip(every, settings, strict=True)}
     if of := conditions(rows, runs, root):
         words = rows["run"].map(of)
         rows[SOURCE] = rows[SOURCE].astype(str) + ", " + words if SOURCE in rows else words
@@ -126,33 +130,60 @@ def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str,
     return differences(whole, *kept)
 
 
-def _settings(folder: Path) -> dict[str, Any]:
-    """Return the settings of a run; none if they cannot be read."""
-    with suppress(ResultsError):
-        return flat_settings(folder / CONFIG)
-    return {}
+def _settings(folders: Sequence[Path]) -> list[dict[str, Any]]:
+    """Return the settings of runs, with one path for files of equal content; else nothing."""
+    first: dict[Any, str] = {}
+    found = []
+    for folder in folders:
+        own: dict[str, Any] = {}
+        with suppress(ResultsError):  # they cannot be read
+            own = flat_settings(folder / CONFIG)
+        hashes = {key: x for key, x in own.items() if key.startswith("inputs.")}
+        paths = {
+            (path := key.split(".", 2)[2]): first.setdefault(x, path) for key, x in hashes.items()
+        }
+        own = {key: paths.get(x, x) for key, x in own.items() if key not in hashes}
+        found.append(own | {f"inputs.{first[x]}": x for x in hashes.values()})
+    return found
 
 
 def without_effect(root: Path) -> list[str]:
-    """Return sentences on settings with which trainings of one seed have the same weights."""
-    folders = [folder for folder in run_folders(root) if (folder / POLICY).is_file()]
-    stored = [_settings(folder) for folder in folders]
+    """Return sentences on settings without effect: on networks of a seed, or on evaluations."""
+    folders = run_folders(root)
+    trained = {x: checksums(x / POLICY) for x in folders if (x / POLICY).is_file()}
+    others = (x for x in folders if x not in trained and (x / EPISODES).is_file())
+    lines = _equal(trained, "networks of equal seeds")
+    return [*lines, *_equal({x: _numbers(x) for x in others}, "rows")]
+
+
+def _numbers(folder: Path) -> bytes:
+    """Return a hash of the numbers of a run's rows; empty if they are many or damaged."""
+    with suppress(ResultsError):
+        rows = as_rows(folder / EPISODES)
+        if isinstance(rows, pd.DataFrame):
+            each = pd.util.hash_pandas_object(rows.select_dtypes("number"), index=False)
+            return hashlib.sha256(each.to_numpy().tobytes()).digest()
+    return b""
+
+
+def _equal(results: Mapping[Path, Any], what: str) -> Iterator[str]:
+    """Yield a sentence for each set of settings by which runs of equal results differ."""
+    folders = [*results]
+    stored = _settings(folders)
     named = labels([without(x, SHARED) for x in stored], folders)
     equal = defaultdict(list)
     for folder, settings, word in zip(folders, stored, named, strict=True):
-        weights = checksums(folder / POLICY) or folder  # those of a damaged file equal no others
-        equal[settings.get("seed"), weights].append(word)
+        # A damaged file equals no other one.
+        equal[settings.get("seed"), results[folder] or folder].append(word)
     cases: dict[str, set[str]] = {}
     for first, *rest in equal.values():
         if keys := [key for key in first if any(one.get(key) != first[key] for one in rest)]:
             names = " and ".join(", ".join(one.values()) for one in (first, *rest))
             cases.setdefault(", ".join(keys), set()).add(names)
-    return [
-        f"{keys} had no effect: the networks of equal seeds are the same with {one}"
-        + f" (and in {len(names) - 1} more cases)" * bool(names)
-        + "."
-        for keys, (one, *names) in sorted((keys, sorted(names)) for keys, names in cases.items())
-    ]
+    for which, found in sorted(cases.items()):
+        one, *more = sorted(found)
+        also = f" (and in {len(more)} more case{'s' * (len(more) > 1)})" * bool(more)
+        yield f"{which} had no effect: the {what} are the same with {one}{also}."
 
 
 def _check_one_study(root: Path, rows: pd.DataFrame) -> None:
@@ -163,8 +194,7 @@ def _check_one_study(root: Path, rows: pd.DataFrame) -> None:
             f"{root}: its runs have different leaders (profile_id {leaders.idxmax()}); "
             f"lcc_rl.results.load({str(root)!r}) reads them",
         )
-    twice = rows[rows.duplicated([key for key in EPISODE if key in rows])]
-    which = [
-        f"{strategy}, seed {seed}" for strategy, seed in twice[[STRATEGY, TRAINED]].to_numpy()[:1]
-    ]
-    require(not which, f"{root}: it contains a training twice: {''.join(which)}")
+    twice = rows[rows.duplicated([key for key in EPISODE if key in rows], keep=False)]
+    for (strategy, seed), group in twice.groupby([STRATEGY, TRAINED], dropna=False, observed=True):
+        where = " and ".join(group["run"].unique()[:2])
+        raise ConfigError(f"{root}: it contains a training twice: {strategy}, seed {seed}: {where}")

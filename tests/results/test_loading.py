@@ -138,7 +138,7 @@ def test_the_runs_of_a_sweep_are_read_as_one_evaluation(tmp_path) -> None:
     rounded = [{"seed": seed, "base": 5.0 + 1e-6 * seed} for seed in (0, 1)]
     assert "source" not in sweep_of(tmp_path / "machines", *rounded)
     refusals = [
-        ([{"seed": 0}, {"seed": 0, "table": "all"}], "a training twice: alcc, seed 0"),
+        ([{"seed": 0}, {"seed": 0, "table": "all"}], "training twice: alcc, seed 0: 0 and 1$"),
         ([{"seed": 0}, {"seed": 1, "leader": 8.0}], r"have different leaders .*results\.load"),
     ]
     for place, (runs, words) in enumerate(refusals):

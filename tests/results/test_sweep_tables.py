@@ -168,6 +168,25 @@ def test_rows_are_settings_and_have_their_seeds(root, capsys) -> None:
     assert line.split(",")[3] == ""  # the baseline
 
 
+def test_evaluations_of_equal_rows_name_what_had_no_effect(tmp_path) -> None:
+    for seed, weight in ((0, "1"), (0, "2"), (1, "4"), (1, "8")):
+        (cell(tmp_path, seed, weight, shift=float(seed)) / "policy.pt").unlink()
+    (line,) = without_effect(tmp_path)
+    assert line == (
+        f"{WEIGHT} had no effect: the rows are the same with efficiency.weight=1 and "
+        "efficiency.weight=2 (and in 1 more case)."
+    )
+
+
+def test_files_of_equal_content_are_one_setting(tmp_path) -> None:
+    for seed, place in enumerate(("here", "there")):
+        (path := tmp_path / f"{place}.parquet").write_text("the same")
+        words = ["data=episodes", f"data.path={path}", f"seed={seed}"]
+        folder = cell(tmp_path / "sweep", seed, "1", f"++data.path={path}")
+        save_config(load("train", ["variant=alcc", *words]), folder)
+    assert {*load_sweep(tmp_path / "sweep")["strategy"]} == {"alcc"}
+
+
 def test_a_row_may_have_another_name_everywhere(root, capsys, monkeypatch) -> None:
     monkeypatch.setattr(names, "LABELS", dict(names.LABELS))
     monkeypatch.setattr(names, "FORMER", {})
