@@ -144,7 +144,7 @@ def _train(cfg: TrainConfig, agent: Agent, inputs: Inputs, folder: Path, resume:
     first = deepcopy(agent.policy.state_dict())
     if resume:
         trainer.load()
-    save_config(cfg, folder)
+    save_config(cfg, folder, resume)
     trainer.on_keep = lambda iteration: save_policy(
         agent.policy.state_dict(), cfg, folder / POLICIES / f"{iteration:06d}.pt"
     )

@@ -25,7 +25,7 @@ from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import EPISODES, STEPS
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import check_present
-from lcc_rl.version import __version__
+from lcc_rl.version import code_version
 
 log = logging.getLogger("lcc_rl")
 
@@ -36,8 +36,8 @@ Tables = tuple[pd.DataFrame, pd.DataFrame]  # rows, time series of sample episod
 
 
 def mark_of(strategy: Strategy) -> str:
-    """Return a hash of settings, weights and version, on which a strategy's rows depend."""
-    digest = hashlib.sha256(f"{__version__} {strategy.name} {strategy.seed} ".encode())
+    """Return a hash of settings, weights and code, on which a strategy's rows depend."""
+    digest = hashlib.sha256(f"{code_version()} {strategy.name} {strategy.seed} ".encode())
     digest.update(identity(strategy.cfg).encode())
     weights = getattr(strategy.policy, "state_dict", None)
     for name, value in sorted(weights().items()) if weights else ():

@@ -18,10 +18,10 @@ from pyarrow import fs
 
 from lcc_rl.errors import ResultsError, raised_as
 from lcc_rl.io.atomic import atomic_path
-from lcc_rl.version import __version__
+from lcc_rl.version import code_version
 
 SCHEMA_VERSION = "1"
-PROCESSOR = "lcc_rl.processor"  # key in a table's metadata
+VERSION, PROCESSOR = "lcc_rl.version", "lcc_rl.processor"  # keys in a table's metadata
 # The rows of a table, or, for many rows, a dataset that is read on demand.
 Rows: TypeAlias = pd.DataFrame | ds.Dataset
 NO_FRAME = "damaged, no data frame"
@@ -50,7 +50,7 @@ def write_parquet(
     """
     entries = {
         "lcc_rl.schema": SCHEMA_VERSION,
-        "lcc_rl.version": __version__,
+        VERSION: code_version(),
         "lcc_rl.torch": installed("torch"),
         PROCESSOR: processor(),
     }

@@ -22,7 +22,16 @@ from pyarrow.dataset import Dataset
 
 from lcc_rl.errors import ResultsError, require_known, unknown_name
 from lcc_rl.io.atomic import SUBFOLDERS
-from lcc_rl.io.files import Rows, as_dataset, read_table, schema_of, texts_of, unified
+from lcc_rl.io.files import (
+    VERSION,
+    Rows,
+    as_dataset,
+    parquet_metadata,
+    read_table,
+    schema_of,
+    texts_of,
+    unified,
+)
 from lcc_rl.results.runs import CONFIG, FINAL, PARTS, flat_settings
 from lcc_rl.runs.plans import choices_of, unfinished
 
@@ -110,7 +119,8 @@ def load(
     A damaged run is left out with a warning; ``frame.attrs["damaged"]`` holds the reasons by run,
     ``frame.attrs["unfinished"]`` the failed, stopped, running and waiting runs with their states,
     ``frame.attrs["missing"]`` the missing shards of an evaluation, and ``frame.attrs["repeated"]``
-    the runs of equal settings, whose rows are all included. The episodes of a finished
+    the runs of equal settings, whose rows are all included, and ``frame.attrs["versions"]`` the
+    runs by version of this package and hash of its code, if they differ. The episodes of a finished
     job of ``lcc-rl run`` are those of its evaluation, which includes its trainings.
 
     Args:
@@ -156,6 +166,9 @@ def load(
         if strict:
             raise ResultsError(f"{root}: {line}")
         log.warning("%s: %s", root, line)
+    versions = of_versions(runs)
+    for line in versions:
+        log.warning("%s: %s", root, line)
     if lazy:
         return as_dataset(constants, schema)
     frame = _frame(tables, constants)
@@ -163,6 +176,7 @@ def load(
     frame.attrs |= {"unfinished": states} if states else {}
     frame.attrs |= {"missing": missing} if missing else {}
     frame.attrs |= {"repeated": twice} if twice else {}
+    frame.attrs |= {"versions": versions} if versions else {}
     return frame
 
 
@@ -281,6 +295,13 @@ def repeated(runs: Sequence[Mapping[str, Any]]) -> list[str]:
             groups.setdefault(_key(settings), []).append(settings["run"])
     twice = (names for names in groups.values() if len(names) > 1)
     return [listed(dict.fromkeys(names, "runs of equal settings")) for names in twice]
+
+
+def of_versions(runs: Runs) -> list[str]:
+    """Return a line if tables are of several versions of this package, or of changed code."""
+    written = {x["run"]: parquet_metadata(path).get(VERSION) for path, x in runs.items()}
+    found = {run: f"lcc_rl {version}" for run, version in written.items() if version}
+    return [f"rows of several versions: {listed(found)}"] * (len({*found.values()}) > 1)
 
 
 def _key(settings: Mapping[str, Any], *without: str) -> str:

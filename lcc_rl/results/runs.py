@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.results.trust import LOGS, own_modules, trusted
 from lcc_rl.runs.states import CONFIG, no_run
-from lcc_rl.version import __version__
+from lcc_rl.version import PACKAGE, code_version
 
 log = logging.getLogger("lcc_rl")
 
@@ -37,36 +37,49 @@ SECTION = re.compile(r"^(?=[a-z])", re.MULTILINE)  # before the name of a sectio
 RUN_FILES = (EPISODES, "drivers.parquet", "checkpoint.pt", "command.txt", "blocks")
 
 
-def save_config(cfg: BaseConfig, folder: Path) -> None:
-    """Write the resolved configuration of a run into its folder, and where the run comes from."""
+def save_config(cfg: BaseConfig, folder: Path, resumed: bool = False) -> None:
+    """Write the resolved configuration of a run into its folder, and where the run comes from.
+
+    A resumed run keeps its origin beside that of the new command; other versions are logged.
+    """
     with atomic_path(folder / CONFIG) as temporary:
         temporary.write_text(as_text(cfg), encoding="utf-8")
+    before, now = "", versions()
+    if resumed and (folder / ORIGIN).is_file():
+        before = read_text(folder / ORIGIN)
+        others = {line for line in before.splitlines() if line.startswith("lcc_rl ")} - {now}
+        for line in sorted(others):
+            log.warning("%s: begun with %s, resumed with %s", folder, line, now)
     with atomic_path(folder / ORIGIN) as temporary:
-        temporary.write_text(origin(), encoding="utf-8")
+        temporary.write_text(before + origin(), encoding="utf-8")
+
+
+def versions() -> str:
+    """Return the versions on which a result depends."""
+    return f"lcc_rl {code_version()}, torch {version('torch')}, Python {platform.python_version()}"
 
 
 def origin() -> str:
-    """Return the lines of ``origin.txt``: command, versions, folder and its commit, if it has one.
+    """Return the lines of ``origin.txt``: command, versions, folder, and the commit of a clone.
 
     It is no part of a run's identity; the settings and the hashes of its files are in config.yaml.
     """
     program = [Path(sys.argv[0]).name, *sys.argv[1:]]
-    versions = f"lcc_rl {__version__}, torch {version('torch')}, Python {platform.python_version()}"
-    return "\n".join([shlex.join(program), versions, f"{Path.cwd()}{_commit()}", ""])
+    return "\n".join([shlex.join(program), versions(), str(Path.cwd()), *_commit(), ""])
 
 
-def _commit() -> str:
-    """Return the commit of the working directory, and how many of its files differ from it."""
-    commit, changed = _git("rev-parse", "HEAD"), _git("status", "--porcelain")
-    if not commit:
-        return ""
-    count = len((changed or "").splitlines())
-    return f", commit {commit.strip()}, {f'{count} files changed' if count else 'unchanged'}"
+@cache
+def _commit() -> tuple[str, ...]:
+    """Return the commit of the package and how many files differ from it, if git tracks it."""
+    if not _git("ls-files", "--", "version.py"):
+        return ()
+    commit, count = _git("rev-parse", "HEAD"), len(_git("status", "--porcelain").splitlines())
+    return (f"commit {commit.strip()}, {f'{count} files changed' if count else 'unchanged'}",)
 
 
 def _git(*words: str) -> str:
     # A monitor of file systems is a program that the repository names.
-    command = ["git", "-c", "core.fsmonitor=false", *words]
+    command = ["git", "-C", str(PACKAGE), "-c", "core.fsmonitor=false", *words]
     try:
         found = subprocess.run(command, capture_output=True, text=True, timeout=5.0, check=False)
     except (OSError, subprocess.TimeoutExpired):

@@ -85,6 +85,7 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
     for name, why in loaded.attrs.get("damaged", {}).items():
         missing[name] = f"damaged: {why.removeprefix(f'{root / name}{os.sep}')}"
     remarks = [f"Without rows: {listed(missing)}."] * bool(missing) + without_effect(root)
+    remarks += [f"{x[0].upper()}{x[1:]}." for x in loaded.attrs.get("versions", ())]
     table.attrs |= {"remarks": remarks, "first": str(root / next(iter(runs)))}
     return table
 

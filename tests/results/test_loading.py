@@ -19,6 +19,7 @@ from helpers import check_refused
 from lcc_rl import results
 from lcc_rl.commands import animate
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.io import files
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.runs import differences
 from lcc_rl.results.sweeps import load_sweep
@@ -144,6 +145,15 @@ def test_the_runs_of_a_sweep_are_read_as_one_evaluation(tmp_path) -> None:
     for place, (runs, words) in enumerate(refusals):
         with pytest.raises(ConfigError, match=words):
             sweep_of(tmp_path / f"wrong{place}", *runs)
+
+
+def test_rows_of_changed_code_are_named(tmp_path, monkeypatch, caplog) -> None:
+    for seed, version in enumerate(("1.0+a", "1.0+a", "1.0+b")):
+        monkeypatch.setattr(files, "code_version", lambda version=version: version)
+        made(tmp_path / str(seed), seed=seed)
+        line = "rows of several versions: 0, 1 (lcc_rl 1.0+a); 2 (lcc_rl 1.0+b)"
+        assert results.load(tmp_path).attrs.get("versions") == ([line] if seed == 2 else None)
+    assert line in caplog.text
 
 
 def test_an_unknown_setting_is_refused_with_the_nearest(tmp_path) -> None:

@@ -15,7 +15,8 @@ from helpers import check_refused
 from lcc_rl.commands import repeat, training
 from lcc_rl.errors import LccError
 from lcc_rl.io.files import read_parquet, write_parquet
-from lcc_rl.results.runs import ORIGIN, origin
+from lcc_rl.results import runs
+from lcc_rl.results.runs import ORIGIN
 from lcc_rl.version import __version__
 
 
@@ -73,18 +74,45 @@ def test_every_command_is_repeated(command, words, tmp_path, monkeypatch, capsys
 
 
 def test_a_run_says_where_it_comes_from(evaluated) -> None:
-    command, versions, folder = (evaluated / ORIGIN).read_text().splitlines()
+    command, versions, folder, *_ = (evaluated / ORIGIN).read_text().splitlines()
     assert command
-    assert versions.startswith(f"lcc_rl {__version__}, torch ")
-    assert Path(folder.partition(", commit ")[0]).is_absolute()
+    assert versions.startswith(f"lcc_rl {__version__}+")
+    assert Path(folder).is_absolute()
 
 
-def test_the_state_of_the_users_folder_is_recorded(tmp_path, monkeypatch) -> None:
+def test_the_commit_of_the_package_is_recorded_and_of_no_other_repository(
+    tmp_path, monkeypatch
+) -> None:
+    (package := tmp_path / "package").mkdir()
+    (package / "version.py").touch()
     monkeypatch.chdir(tmp_path)
-    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c"]
-    assert ", commit " not in origin()
-    for words in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "one"]):
-        subprocess.run([*git, *words], check=True)
-    assert origin().rstrip().endswith(", unchanged")
-    (tmp_path / "mine.py").touch()
-    assert origin().rstrip().endswith(", 1 files changed")
+    monkeypatch.setattr(runs, "PACKAGE", package)
+
+    def recorded(*words: str) -> str:
+        if words:
+            git = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c", *words]
+            subprocess.run(git, check=True, capture_output=True)
+        runs._commit.cache_clear()
+        return runs.origin().rstrip()
+
+    try:
+        assert recorded().endswith(str(tmp_path))
+        recorded("init", "-q")
+        assert "\ncommit " not in recorded("commit", "-q", "--allow-empty", "-m", "one")
+        recorded("add", ".")
+        assert recorded("commit", "-q", "-m", "two").endswith(", unchanged")
+        (tmp_path / "mine.py").touch()
+        assert recorded().endswith(", 1 files changed")
+    finally:
+        runs._commit.cache_clear()
+
+
+def test_a_training_that_is_resumed_by_other_code_says_so(tmp_path, caplog, monkeypatch) -> None:
+    cfg, told = tiny("train"), r"begun with lcc_rl \S+\+\w{8}, torch .*, resumed with lcc_rl 9\.9, "
+    for name in (None, None, "9.9"):
+        if name:
+            monkeypatch.setattr(runs, "code_version", lambda: "9.9")
+        assert not caplog.messages
+        runs.save_config(cfg, tmp_path, resumed=True)
+    assert re.search(told, caplog.text)
+    assert (tmp_path / "origin.txt").read_text().count("\nlcc_rl ") == 3
