@@ -113,6 +113,7 @@ def complete(cfg: EvaluateConfig, folder: Path, typed: Sequence[str] = ()) -> No
     table = folder / EPISODES
     if made_by(table) == identity(cfg):
         log.info("%s: finished before", folder.name)
+        forget(folder)
         if (folder / UNDRAWN).exists():
             with claim(folder):
                 draw(as_rows(table), cfg, folder)

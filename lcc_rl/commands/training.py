@@ -32,7 +32,7 @@ from lcc_rl.results.trust import trust_option
 from lcc_rl.runs.loggers import RowLogger, Silent
 from lcc_rl.runs.output import log_report
 from lcc_rl.runs.precision import prepare_torch
-from lcc_rl.runs.states import working
+from lcc_rl.runs.states import forget, working
 
 log = logging.getLogger("lcc_rl")
 
@@ -171,6 +171,7 @@ def complete(cfg: TrainConfig, folder: Path) -> Rows:
     table = folder / EPISODES
     if made_by(table) == identity(cfg):
         log.info("%s: finished before", folder.name)
+        forget(folder)
         return as_rows(table)
     return run(cfg, folder, quiet=True, resume=True)
 

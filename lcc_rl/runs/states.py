@@ -51,7 +51,8 @@ class RunState:
         done: iterations done.
         total: total iterations; 0 if unknown.
         eta_s: estimated remaining time of a running run [s].
-        error: first line of the error of a failed run.
+        error: first line of the error of a failed run, or of a finished one that was refused when
+            it was to be repeated.
     """
 
     name: str
@@ -167,9 +168,10 @@ def _holds_only(folder: Path, names: set[str]) -> bool:
 def record(folder: Path, error: BaseException) -> None:
     """Write ``error.txt``: the error in one line, with a traceback unless it is an input error.
 
-    An error caused by an interrupt is no failure and leaves no file.
+    An error caused by an interrupt is no failure and leaves no file; nor does any in a folder that
+    was removed, which a file would make anew.
     """
-    if was_interrupted(error):
+    if was_interrupted(error) or not folder.is_dir():
         return
     text = described_error(error) + "\n"
     if not isinstance(input_error(error) or error, (LccError, OSError)):
@@ -204,15 +206,15 @@ def _inspected(folder: Path, name: str) -> RunState:
     done, total = int(progress.get("done", 0)), int(progress.get("total", 0))
     if is_claimed(folder):
         return RunState(name, "running", done, total, float(progress.get("eta_s", 0.0)))
-    if (folder / ERROR).exists():
-        with suppress(ResultsError):
-            lines = read_text(folder / ERROR).splitlines()
-            return RunState(name, "failed", done, total, error=one_line(lines[0] if lines else ""))
+    state, why = "stopped", ""
+    with suppress(ResultsError):
+        lines = read_text(folder / ERROR).splitlines()
+        state, why = "failed", one_line(lines[0] if lines else "")
     for table in filter(Path.exists, (folder / table for table in RESULT_TABLES)):
         if not _is_whole(table):
             return RunState(name, "failed", done, total, error=f"{table.name} is cut or damaged")
-        return RunState(name, "finished", done, total)
-    return RunState(name, "stopped", done, total)
+        state = "finished"  # also if it could not be repeated
+    return RunState(name, state, done, total, error=why)
 
 
 def read_progress(folder: Path) -> dict[str, float] | None:

@@ -291,15 +291,17 @@ def conclude(folder: Path) -> None:
     states = survey(folder)
     if not states:
         raise LccError(f"nothing was swept, in {folder}: is a list of values empty?")
-    finished = sum(state.state == "finished" for state in states)
-    failed = [state for state in states if state.state == "failed"]
+    failed = [state for state in states if state.error]
+    finished = sum(state.state == "finished" and not state.error for state in states)
     log.info("%d of %d runs finished, in %s", finished, len(states), folder)
     if finished > 1 and next(folder.glob("*/episodes.parquet"), None):
         log.info("side by side: lcc-rl table %s --figure sweep.png", shlex.quote(str(folder)))
     for state in failed:
         log.error("failed: %s: %s", state.name, state.error)
     if failed:
+        begun = any(x.state == "failed" and (folder / x.name / CONFIG).is_file() for x in failed)
+        again = "; the same command repeats those that had begun" * begun
         raise LccError(
-            f"{len(failed)} of {len(states)} runs failed; the same command repeats them "
+            f"{len(failed)} of {len(states)} runs failed{again} "
             f"(reasons: error.txt in the folder of each run, {folder})"
         )

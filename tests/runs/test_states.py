@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 from io import StringIO
 from pathlib import Path
@@ -12,9 +13,11 @@ import pytest
 from commands import run_command
 from rich.console import Console
 
-from lcc_rl.errors import ConfigError, Interrupted, ResultsError
+from lcc_rl.commands import training
+from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.results.runs import load_config
 from lcc_rl.runs.overview import main, states_table
+from lcc_rl.runs.plans import unfinished
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import (
     Busy,
@@ -23,9 +26,11 @@ from lcc_rl.runs.states import (
     inspect_run,
     is_claimed,
     no_run,
+    record,
     survey,
     working,
 )
+from lcc_rl.runs.sweeps import conclude
 
 
 def status(folder: Path) -> list[str]:
@@ -80,6 +85,20 @@ def test_a_failure_is_recorded_and_forgotten_when_tried_again(tmp_path) -> None:
         fails(tmp_path, Interrupted("stopped"))
     assert not list(tmp_path.iterdir())
     assert inspect_run(tmp_path).state == "stopped"
+
+
+def test_a_finished_run_stays_finished_and_a_removed_one_removed(tmp_path, trained) -> None:
+    folder = shutil.copytree(trained, tmp_path / "run")
+    record(folder, ConfigError("its data have changed"))
+    assert str(inspect_run(folder)) == "finished: its data have changed"
+    assert not unfinished(tmp_path)
+    with pytest.raises(LccError, match=r"^1 of 1 runs failed \(reasons"):  # nothing to repeat
+        conclude(tmp_path)
+    training.complete(load_config(folder), folder)
+    assert str(inspect_run(folder)) == "finished"
+    shutil.rmtree(folder)
+    record(folder, ConfigError("the folder was removed during the run"))
+    assert not folder.exists()
 
 
 def test_survey_and_status_of_a_sweep(tmp_path) -> None:
