@@ -119,15 +119,16 @@ def resumed_config(folder: str | Path, trust: Sequence[str] = ()) -> Any:
     """Read the configuration of a run to resume; arguments as for :func:`load_config`.
 
     Raises:
-        ResultsError: naming an input file that has changed since the run began.
+        ResultsError: naming an input file that has changed since the run began, or is missing.
     """
     cfg = load_config(folder, trust)
     now = inputs_of(as_plain(cfg))
     for section, hashes in cfg.inputs.items():
-        for file in differing(hashes, now.get(section, {})):
+        present = now.get(section, {})
+        for file in differing(hashes, present):
+            how = "has changed since the run began" if file in present else "is missing"
             raise ResultsError(
-                f"{folder}: {file} ({section}) has changed since the run began; restore it, or "
-                "begin a new run"
+                f"{folder}: {file} ({section}) {how}; restore it, or begin a new run"
             )
     return cfg
 
