@@ -74,6 +74,8 @@ Increasing = AfterValidator(_increasing)  # checks the two ends of a range
 # Range of a factor that training episodes draw by their seed; 1 in an evaluation.
 Factors = Annotated[tuple[Positive, Positive], Increasing]
 
+# What pydantic adds to a place for the one of several types that it tried.
+ONE_TYPE = re.compile(r"constrained-\w+|[\w-]+\[.*|int|float|str|bool|callable")
 TARGET = "_target_"  # the key that names the class of a node
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -185,7 +187,8 @@ def _reason(error: Any, kind: Any, where: str) -> str:
         name = str(first["loc"][-1])
         plain = f" A setting has a type: {name}: float = …" if hasattr(kind, name) else ""
         return f"{unknown_name(what, name, names)}{plain}"
-    path = "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in first["loc"])
+    place = [x for x in first["loc"] if x == first["loc"][0] or not ONE_TYPE.fullmatch(str(x))]
+    path = "".join(f"[{x}]" if isinstance(x, int) else f".{x}" for x in place)
     key = (where + path).removeprefix(".")
     if first["type"] == "missing" and len(first["loc"]) == 1:
         return f"{key} is required: use {key}=…"

@@ -61,6 +61,7 @@ WRONG = {
     f"scenario.horizon={HUGE}": "scenario.horizon must be less than",
     f"seed={10**19}": "seed must be a number of 63 bits",
     "agent.batch_size=50000": "buffer_size",
+    "agent=analytic +agent.limits.spacing=30": r"agent\.limits\.spacing must be less than 1, got",
     "evaluation.baselines=[human,human]": "baselines names human 2 times",
     "agent=analytic evaluation.warm_up=0.5 training.segment=4": r"divide 15, .*\(20\) less 5 steps",
     "agent.limits.efficiency=0.2": "no agent.surrogates.efficiency; surrogates@agent=limits adds",

@@ -143,6 +143,7 @@ CELLS = {
         "will fail: training.episodes=none: training.episodes"
     ],
     ("seed=0,1",): [],
+    ("seed=0,1", "data=episodes", "data.path=${hydra:runtime.cwd}/pairs.csv"): [],
 }
 
 
