@@ -172,7 +172,7 @@ def _read(
 def _averaged(samples: pd.DataFrame, seconds: float, source: str) -> pd.DataFrame:
     """Return centred moving averages of the speeds, of the samples that have a whole window."""
     step = float(samples[TIME_COLUMN].diff()[samples["episode"].diff() == 0].median())
-    window = samples.groupby("episode")[SPEED_COLUMN].rolling(
+    window = samples.groupby("episode", sort=False)[SPEED_COLUMN].rolling(  # keeps their order
         round(seconds / step) | 1, center=True
     )
     rows = samples.assign(**{SPEED_COLUMN: window.mean().to_numpy()}).dropna(subset=SPEED_COLUMN)
