@@ -74,6 +74,16 @@ def test_units(tmp_path) -> None:
     truth(TableSource(path=written(tmp_path, frame), columns=columns, units=units).load())
 
 
+def test_smoothed_positions_far_from_zero_keep_their_precision(tmp_path) -> None:
+    near, found = long_table(), []
+    for frame in (near, near.assign(x=near["x"] + 4_200_000.0)):  # as northings
+        settings = {"columns": BY_LANE, "smoothing": SavitzkyGolay()}
+        found.append(TableSource(path=written(tmp_path, frame), **settings).load())
+    for name in ("follower_speed_mps", "gap_m"):
+        np.testing.assert_allclose(*(x.episodes[name] for x in found), atol=1e-3)
+    assert any("positions are counted from the least" in line for line in found[1].report)
+
+
 def test_times_of_a_clock(tmp_path) -> None:
     # As programs and as spreadsheets write them.
     for form, mark in (("{:02d}:{:02d}:{:04.1f}", "."), (" {:d}:{:02d}:{:04.1f}", ",")):
