@@ -56,7 +56,7 @@ TABLE_FIELDS = (
 TABLE_COLUMNS = {column.key: column.name for column in TABLE_FIELDS if column.name}
 TABLE_MEASURED = ("time", "speed", "position")  # rows with a blank cell are left out
 IDENTIFYING = ("vehicle", "lane", "recording")  # must not be blank in the other rows
-FAR = 1e5  # positions beyond this are counted from the least: they are in single precision [m]
+REMOTE = 1e5  # positions beyond this are counted from the least: they are in single precision [m]
 JUMP = 10.0  # jump of positions between samples beyond the driven distance [m]
 
 
@@ -220,7 +220,7 @@ def to_trajectories(
     if "leader" in rows:
         _bridge_dropouts(rows, bridge, report)
     _check_way(rows, place, report)
-    if "position" in rows and rows["position"].abs().max() > FAR:
+    if "position" in rows and rows["position"].abs().max() > REMOTE:
         least = float(rows["position"].min())
         rows["position"] -= least
         report.notes.append(f"positions are counted from the least, {least:,.10g} m")
