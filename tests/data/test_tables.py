@@ -594,14 +594,17 @@ def test_episodes_named_by_texts_name_their_drivers(tmp_path) -> None:
         assert [name for name in found if name] == expected
 
 
-def test_averaged_speeds_stay_with_their_drive_where_a_hole_divides_another(tmp_path) -> None:
+def test_speeds_are_averaged_within_their_drive_by_its_own_step(tmp_path) -> None:
     time = np.delete(0.1 * np.arange(400), slice(150, 200))
     drives = [pd.DataFrame({"drive": x, "time_s": time, "speed_mps": x}) for x in (10.0, 20.0)]
     drives[1] = drives[1].iloc[:150]  # a part of the first drive has a number beyond this one's
-    pd.concat(drives).to_csv(tmp_path / "two.csv", index=False)
-    found, _ = read_drives(str(tmp_path / "two.csv"), DRIVE_COLUMNS, 0.1, average_s=0.5)
-    for index, drive in enumerate(found.recordings):
-        np.testing.assert_allclose(found.record(index), float(drive))
+    slow = 15.0 + np.sin(np.arange(60.0) / 2.0)  # 1 Hz: no other sample is within 0.5 s
+    drives.append(pd.DataFrame({"drive": 30.0, "time_s": np.arange(60.0), "speed_mps": slow}))
+    pd.concat(drives).to_csv(tmp_path / "some.csv", index=False)
+    found, _ = read_drives(str(tmp_path / "some.csv"), DRIVE_COLUMNS, 0.1, average_s=0.5)
+    for index, drive in enumerate(map(float, found.recordings)):
+        seconds = found.record(index)[::10] if drive == 30.0 else found.record(index)
+        np.testing.assert_allclose(seconds, slow if drive == 30.0 else drive, rtol=1e-6)
 
 
 def test_noisy_speeds_of_a_fast_raster_are_smoothed_by_the_option_of_the_message(tmp_path) -> None:
