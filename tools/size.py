@@ -30,7 +30,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 44_520, "code": 29_550},
+    "lcc_rl + tools": {"lines": 44_525, "code": 29_550},
     "tests": {"lines": 26_690},
     "conf": {"yaml": 165},
 }
