@@ -16,12 +16,12 @@ from lcc_rl.energy import AVERAGED, BURNT, SECOND
 from lcc_rl.io.files import Rows, read_parquet
 from lcc_rl.results.bootstrap import NOTHING, Estimate, equal_seeds, estimate, saving, share_saved
 from lcc_rl.results.measures import (
-    WITH_VALUE,
     DAMPING,
     DISTANCE,
     MEASURES,
     SHARE,
     WAYS,
+    WITH_VALUE,
     Measure,
     aggregates,
 )
