@@ -68,7 +68,9 @@ def estimate(
     with ``paired`` the seeds. From n windows or seeds n − 1 are drawn, which makes the
     variance of a mean unbiased (Rao and Wu 1988). In synthetic data with 20 windows, 95 % intervals
     contain the true value in 90 to 97 % of cases with eight seeds, 80 to 91 % with four and 61 to
-    84 % with two: with few seeds that differ much, the interval is too narrow.
+    84 % with two: with few seeds that differ much, the interval is too narrow. So it is over few
+    drives: it contains the true saving in 84, 88, 91 and 92 % of cases with 5, 6, 9 and 18 drives
+    with normal savings, in 71 to 81 % with a skewed distribution.
 
     Args:
         statistic: function of one mapping per side with the mean of each column, ``[...]``, or its
