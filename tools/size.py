@@ -30,7 +30,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 44_640, "code": 29_630},
+    "lcc_rl + tools": {"lines": 44_640, "code": 29_640},
     "tests": {"lines": 26_760},
     "conf": {"yaml": 165},
 }

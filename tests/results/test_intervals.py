@@ -26,12 +26,15 @@ from lcc_rl.results.windows import savings, windows_of, with_bounds
 NETWORK, RULE = ("alcc", "network"), ("alcc", "idm")
 
 
-def test_one_seed_has_no_interval_and_two_span_theirs() -> None:
+def test_one_seed_has_no_interval_and_several_have_students() -> None:
     found = mean([3.0])
     assert found.value == 3.0
     assert np.isnan([found.low, found.high, saving([[1.0]], [[2.0]]).low]).all()
-    columns = mean([1.0, 3.0]).columns("x_pct", 100.0)
-    assert columns == {"x_pct": 200.0, "x_pct_low": 100.0, "x_pct_high": 300.0}
+    for values in ([1.0, 3.0], [0.2, 0.3, 0.7, 0.9]):
+        found = mean(values).columns("x_pct", 100.0)
+        ends = stats.t.interval(0.95, len(values) - 1, np.mean(values), stats.sem(values))
+        assert [*found] == ["x_pct", "x_pct_low", "x_pct_high"]
+        assert [*found.values()] == pytest.approx([100 * x for x in (np.mean(values), *ends)])
 
 
 def test_episodes_without_a_value_have_no_weight() -> None:
