@@ -171,11 +171,14 @@ def _read(
 
 def _averaged(samples: pd.DataFrame, seconds: float, source: str) -> pd.DataFrame:
     """Return centred moving averages of the speeds, of the samples that have a whole window."""
-    step = float(samples[TIME_COLUMN].diff()[samples["episode"].diff() == 0].median())
-    window = samples.groupby("episode")[SPEED_COLUMN].rolling(
-        round(seconds / step) | 1, center=True
-    )
-    rows = samples.assign(**{SPEED_COLUMN: window.mean().to_numpy()}).dropna(subset=SPEED_COLUMN)
+    record = samples["episode"]
+    steps = samples[TIME_COLUMN].diff().where(record.diff() == 0).groupby(record)
+    width = (seconds / steps.transform("median")).round() // 2 * 2 + 1  # of a record [samples]
+    means = [
+        rows.groupby("episode")[SPEED_COLUMN].rolling(int(count), center=True).mean().droplevel(0)
+        for count, rows in samples.groupby(width)
+    ]
+    rows = samples.assign(**{SPEED_COLUMN: pd.concat(means)}).dropna(subset=SPEED_COLUMN)
     if len(rows) < 2:
         raise DataError(f"{source}: no record is as long as leader.average_s={seconds:g}")
     return rows.reset_index(drop=True)

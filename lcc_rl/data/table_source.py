@@ -56,6 +56,7 @@ TABLE_FIELDS = (
 TABLE_COLUMNS = {column.key: column.name for column in TABLE_FIELDS if column.name}
 TABLE_MEASURED = ("time", "speed", "position")  # rows with a blank cell are left out
 IDENTIFYING = ("vehicle", "lane", "recording")  # must not be blank in the other rows
+REMOTE = 1e5  # positions beyond this are counted from the least: they are in single precision [m]
 JUMP = 10.0  # jump of positions between samples beyond the driven distance [m]
 
 
@@ -219,6 +220,10 @@ def to_trajectories(
     if "leader" in rows:
         _bridge_dropouts(rows, bridge, report)
     _check_way(rows, place, report)
+    if "position" in rows and rows["position"].abs().max() > REMOTE:
+        least = float(rows["position"].min())
+        rows["position"] -= least
+        report.notes.append(f"positions are counted from the least, {least:,.10g} m")
     origin = rows.groupby("recording", observed=True)["time_s"].transform("min").to_numpy()
     motion = [name for name in ("speed", "position") if name in rows]
     rows, frame = on_grid(rows, origin, motion, place, report)

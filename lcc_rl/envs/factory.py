@@ -76,6 +76,8 @@ def build_env(
         ConfigError: naming the option at fault, or the memory that the batch needs.
     """
     scenario, device = cfg.scenario, device and torch_device(device)
+    if scenario.road != RING:  # numbers of records are the same for all pieces
+        profiles = profiles.at_least(scenario.horizon)
     world = world_of(cfg, profiles, population, nominal)
     pieces = build_pieces(cfg, world)
     if (dtype := torch.get_default_dtype()) != torch.float32:  # in which inputs are stored

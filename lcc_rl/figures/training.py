@@ -98,7 +98,7 @@ def learning_curve(training: pd.DataFrame) -> Figure:
 def draw_curves(axis: Axes, training: pd.DataFrame, column: str) -> tuple[float, float]:
     """Draw the rolling mean of every variant's column with a band.
 
-    With several seeds the line is the mean and the band its 95 % bootstrap interval, up to the
+    With several seeds the line is the mean and the band its 95 % t-interval, up to the
     shortest training. With one seed the band spans the 5th to 95th percentile of the window.
 
     Returns:

@@ -9,6 +9,7 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy  # loads special where it is used
 from numpy.typing import ArrayLike
 
 from lcc_rl.arrays import Floats, per_distance
@@ -16,10 +17,8 @@ from lcc_rl.arrays import Floats, per_distance
 CONFIDENCE = 0.95
 RESAMPLES = 9999
 LEAST_DRIVES = 5  # least number of drives, or of their minutes, that are resampled
-STUDENT = (12.706, 4.303, 3.182)  # 97.5 % quantiles of Student's t by degrees of freedom, from 1
 RESAMPLING_SEED = 0  # equal rows give equal intervals
 BOUNDED = ("", "_low", "_high")  # of the names of a value and of the bounds of its interval
-WITHOUT_WINDOWS = -1  # stream for seeds that are resampled without windows
 
 Side = Mapping[str, Floats]  # columns of one side of a comparison, each ``[..., windows, seeds]``
 
@@ -59,7 +58,6 @@ def estimate(
     *sides: Side,
     drives: Sequence[object] | None = None,
     paired: bool = False,
-    alone: bool = False,
 ) -> Estimate:
     """Return a statistic of means with its interval.
 
@@ -68,7 +66,9 @@ def estimate(
     with ``paired`` the seeds. From n windows or seeds n − 1 are drawn, which makes the
     variance of a mean unbiased (Rao and Wu 1988). In synthetic data with 20 windows, 95 % intervals
     contain the true value in 90 to 97 % of cases with eight seeds, 80 to 91 % with four and 61 to
-    84 % with two: with few seeds that differ much, the interval is too narrow.
+    84 % with two: with few seeds that differ much, the interval is too narrow. So it is over few
+    drives: it contains the true saving in 84, 88, 91 and 92 % of cases with 5, 6, 9 and 18 drives
+    with normal savings, in 71 to 81 % with a skewed distribution.
 
     Args:
         statistic: function of one mapping per side with the mean of each column, ``[...]``, or its
@@ -78,7 +78,6 @@ def estimate(
             whole drives are resampled, because windows of one drive are similar; else minutes of
             drives, if these are at least five; else windows.
         paired: whether equal seeds of all sides belong to one training.
-        alone: resample seeds only, n of n.
 
     Returns:
         The statistic. It has no interval if it is NaN, if each side has one window and one seed, or
@@ -87,9 +86,7 @@ def estimate(
     value = float(statistic(*({key: x.mean((-2, -1)) for key, x in one.items()} for one in sides)))
     if not np.isfinite(value) or max(max(x.shape[-2:]) for one in sides for x in one.values()) < 2:
         return Estimate(value)
-    streams = [
-        WITHOUT_WINDOWS if alone else 1 if paired else side for side in range(1, len(sides) + 1)
-    ]
+    streams = [1 if paired else side for side in range(1, len(sides) + 1)]
     drawn = (
         {key: resampled(x, stream, drives) for key, x in one.items()}
         for one, stream in zip(sides, streams, strict=True)
@@ -117,7 +114,7 @@ def _over_drives(
         mask = np.array([drive != name for drive in drives])
         means = ({key: x[..., mask, :].mean((-2, -1)) for key, x in one.items()} for one in sides)
         jackknife.append(float(statistic(*means)))
-    half_width = STUDENT[len(names) - 2] * float(np.std(jackknife)) * (len(names) - 1) ** 0.5
+    half_width = student(len(names)) * float(np.std(jackknife)) * (len(names) - 1) ** 0.5
     return value - half_width, value + half_width
 
 
@@ -158,11 +155,6 @@ def drawn_windows(count: int, drives: tuple[object, ...]) -> Floats:
 @lru_cache(maxsize=8)  # tables repeat the same calls
 def resample_weights(count: int, stream: int) -> Floats:
     """Return the weights of ``count`` units in every resample, ``[RESAMPLES, count]``."""
-    if stream == WITHOUT_WINDOWS:
-        drawn = np.random.default_rng(RESAMPLING_SEED).integers(0, count, (RESAMPLES, count))
-        drawn += count * np.arange(RESAMPLES)[:, None]
-        times = np.bincount(drawn.ravel(), minlength=RESAMPLES * count)
-        return times.reshape(RESAMPLES, count) / count
     draws, generator = max(count - 1, 1), np.random.default_rng([RESAMPLING_SEED, stream])
     return generator.multinomial(draws, np.full(count, 1.0 / count), RESAMPLES) / draws
 
@@ -174,9 +166,12 @@ def bounds(values: Floats) -> Floats:
 
 
 def mean(values: ArrayLike) -> Estimate:
-    """Return the mean of one number per seed with its interval over seeds."""
+    """Return the mean of one number per seed with its t-interval over seeds."""
     numbers = np.asarray(values, dtype=np.float64).reshape(1, -1)
-    return estimate(itemgetter(""), {"": numbers}, alone=True) if numbers.size else NOTHING
+    if not numbers.size:
+        return NOTHING
+    ends = band(numbers)[:, 0].tolist() if numbers.size > 1 else ()
+    return Estimate(float(numbers.mean()), *ends)
 
 
 def crossed(values: ArrayLike, drives: Sequence[object] | None = None) -> Estimate:
@@ -185,12 +180,19 @@ def crossed(values: ArrayLike, drives: Sequence[object] | None = None) -> Estima
 
 
 def band(curves: Floats) -> Floats:
-    """Return the bounds of the mean over seeds at every point of a curve, ``[2, points]``.
+    """Return the t-interval of the mean over seeds at every point of a curve, ``[2, points]``.
 
     Args:
         curves: ``[points, seeds]``, at least two seeds.
     """
-    return bounds(curves @ resample_weights(curves.shape[1], WITHOUT_WINDOWS)[: RESAMPLES // 9].T)
+    count = curves.shape[1]
+    half = student(count) * curves.std(1, ddof=1) / count**0.5
+    return curves.mean(1) + np.stack([-half, half])
+
+
+def student(count: int) -> float:
+    """Return the factor of the standard error of a mean of some values, of Student's t."""
+    return float(scipy.special.stdtrit(count - 1, 0.5 + 0.5 * CONFIDENCE))
 
 
 def share_saved(value: Any, baseline: Any) -> Any:

@@ -29,6 +29,7 @@ BARE, TURNED = "share_ttc_unpromised", "share_turned_unsafe"
 FILTER_ACTS = "share_filter_acts"  # NaN without a safety filter
 SPEED_STD, FINAL_SPREAD = "speed_std_mps", "final_speed_spread_mps"
 CALM = 0.5  # spread of speeds below which a wave counts as damped [m/s]
+WITH_VALUE = "counted_"  # prefix of a window's number of episodes with a value, if some lack one
 AGGREGATES = ("mean", "sum", "min", "max")
 SIGNS = {"at least": "≥", "at most": "≤"}
 SHARE, COUNT = "%", "{:.0f}"
@@ -293,8 +294,8 @@ def means(windows: pd.DataFrame, keys: tuple[str, ...]) -> pd.DataFrame:
 
 
 def episode_mean(part: pd.DataFrame, column: str) -> float:
-    """Return a column's mean over episodes, from windows; NaN without any."""
-    episodes = part["episodes"][part[column].notna()]
+    """Return a column's mean over episodes that have it, from windows; NaN without any."""
+    episodes = part.get(f"{WITH_VALUE}{column}", part["episodes"])[part[column].notna()]
     return float((part[column] * episodes).sum() / episodes.sum()) if len(episodes) else np.nan
 
 

@@ -227,7 +227,8 @@ def summary(
     table["single"] &= table["seeds"].max() > 1
     base = table[table["strategy"] == against]
     for key, (_, lost) in LOST.items():
-        table[key] = 1.0 - table[lost] / (base[lost].iloc[0] if len(base) else np.nan)
+        share = 1.0 - table[lost] / (base[lost].iloc[0] if len(base) else np.nan)
+        table[key] = table[key].fillna(share) if key in table else share  # of equal seeds if known
     table.loc[crashed(table), [*LOST, *(f"{FLOW}{end}" for end in BOUNDED)]] = np.nan
     if task:
         table["kept"] = table["collisions"] == 0

@@ -23,7 +23,16 @@ from lcc_rl.results.bootstrap import (
     saving,
     share_saved,
 )
-from lcc_rl.results.measures import DAMPING, DISTANCE, MEASURES, SHARE, WAYS, Measure, aggregates
+from lcc_rl.results.measures import (
+    DAMPING,
+    DISTANCE,
+    MEASURES,
+    SHARE,
+    WAYS,
+    WITH_VALUE,
+    Measure,
+    aggregates,
+)
 from lcc_rl.results.names import in_words, size_of
 from lcc_rl.results.runs import EPISODES
 
@@ -56,7 +65,7 @@ def windows_of(rows: Rows, columns: Sequence[str] = ()) -> pd.DataFrame:
         A row per strategy, training seed and window. Measures have their ``aggregate``; other
         columns are means, ``episodes`` is the number of rows, ``drivers`` that of drivers,
         ``collisions`` that of rows with a collision, ``worst_share_…`` the largest share of an
-        episode.
+        episode, ``counted_…`` the number of episodes with a value, if some of a window lack one.
     """
     return fold(rows, [*WINDOW_KEYS, *PER_WINDOW], columns)
 
@@ -78,6 +87,8 @@ def fold(rows: Rows, by: Sequence[str], columns: Sequence[str] = ()) -> pd.DataF
             count = total.get(("count", name))
             values = total[kind, name]
             means[name] = values if count is None else values / count.replace(0, np.nan)
+            if count is not None and ((count > 0) & (count < total["sum", "episodes"])).any():
+                means[f"{WITH_VALUE}{name}"] = count
     return pd.DataFrame(means).reset_index()
 
 
@@ -223,7 +234,8 @@ def savings(
     if energy.empty or not {strategy, baseline} <= set(energy.columns.get_level_values(0)):
         return NOTHING
     ours, theirs = ((energy[x].to_numpy(), distance[x].to_numpy()) for x in (strategy, baseline))
-    if theirs[0].mean() < next((x.least for x in MEASURES if x.key == column), -np.inf):
+    least = next((x.least for x in MEASURES if x.key == column), -np.inf)
+    if theirs[0].mean() < least * float(theirs[1].mean()):
         return NOTHING
     paired = equal_seeds(energy[strategy].columns, energy[baseline].columns)
     return saving(ours[0], theirs[0], paired, drives, ways=(ours[1], theirs[1]))
@@ -266,7 +278,8 @@ def seeds_left_out(rows: pd.DataFrame, strategy: str, baseline: str | None) -> t
 
 def _by_window(chosen: pd.DataFrame, columns: Iterable[str]) -> dict[str, pd.DataFrame]:
     """Return columns by window, of each strategy and seed; ``drive``: a row of each window."""
-    names = [name for name in dict.fromkeys(columns) if name in chosen]
+    both = [each for name in dict.fromkeys(columns) for each in (name, f"{WITH_VALUE}{name}")]
+    names = [name for name in both if name in chosen]
     drives = {DRIVE: chosen.drop_duplicates("profile_id").set_index("profile_id")}
     keyed = chosen.assign(**{TRAINED: chosen[TRAINED].astype(object).fillna(-1)})
     means = keyed.groupby(["profile_id", *WINDOW_KEYS[:2]], observed=True)[names].mean()
@@ -290,6 +303,9 @@ def _over(
     energy = tables[column].dropna(axis=1, how="all").dropna()
     ways = [tables[name].reindex_like(energy).fillna(0.0) for name in per if name in tables]
     way = sum(ways, 0.0 * energy) + float(not ways)
+    if not ways and (counts := tables.get(f"{WITH_VALUE}{column}")) is not None:
+        way = counts.reindex_like(energy)  # not all episodes of a window have a value
+        energy = energy * way
     return energy, way, drives_of(tables[DRIVE].loc[energy.index])
 
 

@@ -74,6 +74,16 @@ def test_units(tmp_path) -> None:
     truth(TableSource(path=written(tmp_path, frame), columns=columns, units=units).load())
 
 
+def test_smoothed_positions_far_from_zero_keep_their_precision(tmp_path) -> None:
+    near, found = long_table(), []
+    for frame in (near, near.assign(x=near["x"] + 4_200_000.0)):  # as northings
+        settings = {"columns": BY_LANE, "smoothing": SavitzkyGolay()}
+        found.append(TableSource(path=written(tmp_path, frame), **settings).load())
+    for name in ("follower_speed_mps", "gap_m"):
+        np.testing.assert_allclose(*(x.episodes[name] for x in found), atol=1e-3)
+    assert any("positions are counted from the least" in line for line in found[1].report)
+
+
 def test_times_of_a_clock(tmp_path) -> None:
     # As programs and as spreadsheets write them.
     for form, mark in (("{:02d}:{:02d}:{:04.1f}", "."), (" {:d}:{:02d}:{:04.1f}", ",")):
@@ -582,6 +592,19 @@ def test_episodes_named_by_texts_name_their_drivers(tmp_path) -> None:
         loaded = EpisodesSource(path=str(tmp_path / "pairs.csv")).load()
         found = map(loaded.vehicles.get, loaded.episodes["follower_id"].unique())
         assert [name for name in found if name] == expected
+
+
+def test_speeds_are_averaged_within_their_drive_by_its_own_step(tmp_path) -> None:
+    time = np.delete(0.1 * np.arange(400), slice(150, 200))
+    drives = [pd.DataFrame({"drive": x, "time_s": time, "speed_mps": x}) for x in (10.0, 20.0)]
+    drives[1] = drives[1].iloc[:150]  # a part of the first drive has a number beyond this one's
+    slow = 15.0 + np.sin(np.arange(60.0) / 2.0)  # 1 Hz: no other sample is within 0.5 s
+    drives.append(pd.DataFrame({"drive": 30.0, "time_s": np.arange(60.0), "speed_mps": slow}))
+    pd.concat(drives).to_csv(tmp_path / "some.csv", index=False)
+    found, _ = read_drives(str(tmp_path / "some.csv"), DRIVE_COLUMNS, 0.1, average_s=0.5)
+    for index, drive in enumerate(map(float, found.recordings)):
+        seconds = found.record(index)[::10] if drive == 30.0 else found.record(index)
+        np.testing.assert_allclose(seconds, slow if drive == 30.0 else drive, rtol=1e-6)
 
 
 def test_noisy_speeds_of_a_fast_raster_are_smoothed_by_the_option_of_the_message(tmp_path) -> None:

@@ -38,6 +38,19 @@ def drive(profiles, steps: int):
     return env.rollout(steps, break_when_any_done=False)
 
 
+def test_a_record_shorter_than_the_horizon_shifts_no_other() -> None:
+    speeds = [torch.full((n,), v) for n, v in ((20, 5.0), (80, 10.0), (80, 20.0))]
+    behind = [torch.stack([speed, speed + 7.0], -1) for speed in speeds]
+    short = from_records(speeds, [*"abc"], [*"abc"], 0.1, behind)
+    cfg = compose("alcc", "scenario.horizon=50", "+knowledge=preview")
+    first = build_env(cfg, short, POPULATION, 8, 0, nominal=True).reset()
+    leader = first["leader", "speed"]
+    assert {*leader.flatten().tolist()} == {10.0, 20.0}
+    assert torch.equal(first["preview", "speed"], leader.unsqueeze(-1).expand(-1, 1, 5))
+    assert torch.equal(first["vehicles", "speed"][:, 0], leader)
+    assert torch.equal(first["vehicles", "gap"][:, 0], leader + 7.0)
+
+
 def test_vehicles_start_as_recorded_and_reach_every_recorded_speed() -> None:
     profiles = followed_profiles()
     data = drive(profiles, 20)

@@ -20,17 +20,38 @@ from lcc_rl.results.fronts import (
     points,
     saved_at_flow,
 )
-from lcc_rl.results.windows import savings, windows_of
+from lcc_rl.results.measures import MEASURES
+from lcc_rl.results.windows import savings, windows_of, with_bounds
 
 NETWORK, RULE = ("alcc", "network"), ("alcc", "idm")
 
 
-def test_one_seed_has_no_interval_and_two_span_theirs() -> None:
+def test_one_seed_has_no_interval_and_several_have_students() -> None:
     found = mean([3.0])
     assert found.value == 3.0
     assert np.isnan([found.low, found.high, saving([[1.0]], [[2.0]]).low]).all()
-    columns = mean([1.0, 3.0]).columns("x_pct", 100.0)
-    assert columns == {"x_pct": 200.0, "x_pct_low": 100.0, "x_pct_high": 300.0}
+    for values in ([1.0, 3.0], [0.2, 0.3, 0.7, 0.9]):
+        found = mean(values).columns("x_pct", 100.0)
+        ends = stats.t.interval(0.95, len(values) - 1, np.mean(values), stats.sem(values))
+        assert [*found] == ["x_pct", "x_pct_low", "x_pct_high"]
+        assert [*found.values()] == pytest.approx([100 * x for x in (np.mean(values), *ends)])
+
+
+def test_episodes_without_a_value_have_no_weight() -> None:
+    keys = {
+        "training_seed": np.nan,
+        "profile_id": [0] * 10 + [1] * 10,
+        "driver_id": [*range(10)] * 2,
+    }
+    value = np.array([2.0, *[np.nan] * 9, *[10.0] * 10])  # one of ten stops in the first window
+    names = {"human": value, "alcc": 0.5 * value}
+    rows = [pd.DataFrame(keys | {"strategy": x, "standstill_s": y}) for x, y in names.items()]
+    windows = windows_of(pd.concat(rows))
+    (measure,) = (one for one in MEASURES if one.key == "standstill_s")
+    human = windows[windows["strategy"] == "human"]
+    assert measure.value(human) == pytest.approx(np.nanmean(value))
+    assert with_bounds(human, [measure])["standstill_s"].value == pytest.approx(np.nanmean(value))
+    assert savings(windows, "standstill_s", "alcc", "human").value == pytest.approx(0.5)
 
 
 def test_windows_are_shared_by_both_sides_and_seeds_are_not() -> None:

@@ -90,6 +90,18 @@ def test_a_saving_per_km_is_of_the_sums_over_windows() -> None:
     assert row["saving"] == pytest.approx(1.0 / 11.0)
 
 
+def test_saving_and_flow_are_of_the_same_seeds() -> None:
+    flows = {("reference", 0): 1000.0, ("alcc", 0): 950.0, ("alcc", 1): 500.0}
+    rows = pd.DataFrame(
+        {"strategy": name, "training_seed": seed, "profile_id": profile, "flow_vph": flow * factor}
+        for (name, seed), flow in flows.items()
+        for profile, factor in enumerate((1.0, 1.1, 0.9))
+    ).assign(driver_id=0, total_path_energy_kj=1.0, cav_distance_m=1.0, collided=False)
+    row = summary(windows_for(rows), against="reference").set_index("strategy").loc["alcc"]
+    lost = [row[f"flow_lost{end}"] for end in ("_low", "", "_high")]
+    assert lost == pytest.approx([0.05] * 3)  # of seed 0, as the saving
+
+
 def series() -> dict[str, torch.Tensor]:
     """Two followers, one run, three frames."""
     error = [[1.0, 0.5], [-1.0, 0.5], [2.0, -0.5]]
