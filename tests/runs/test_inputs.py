@@ -163,6 +163,11 @@ def test_a_changed_file_is_said_on_resume_and_seen_by_a_sweep(place, entry, anew
     assert (made_by(run / "episodes.parquet") != first) == anew == (done.returncode == 0)
     if not anew:
         assert "of other settings (inputs.drivers.d.parquet)" in done.stderr + done.stdout
+        drivers(place, 1.0)
+        assert run_command(*sweep, cwd=place).returncode == 0  # the refusal is forgotten
+    (place / "d.parquet").unlink()
+    done = run_command(entry, f"resume='{run}'", cwd=place)
+    assert "d.parquet (drivers) is missing; restore it" in done.stderr
 
 
 def test_what_a_run_reads_is_no_setting() -> None:
@@ -219,8 +224,3 @@ def test_a_setting_that_an_older_version_did_not_have_is_no_other_setting(place)
     check_folder(cfg, place)
     with pytest.raises(ResultsError, match=r"episodes.parquet of other settings \(seed\)"):
         check_folder(load("evaluate", ["variant=idm", "seed=1"]), place)
-        drivers(place, 1.0)
-        assert run_command(*sweep, cwd=place).returncode == 0  # the refusal is forgotten
-    (place / "d.parquet").unlink()
-    done = run_command(entry, f"resume='{run}'", cwd=place)
-    assert "d.parquet (drivers) is missing; restore it" in done.stderr
