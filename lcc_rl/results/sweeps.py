@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -151,10 +151,10 @@ def _settings(folders: Sequence[Path]) -> list[dict[str, Any]]:
 def without_effect(root: Path) -> list[str]:
     """Return sentences on settings without effect: on networks of a seed, or on evaluations."""
     folders = run_folders(root)
-    trained = {x: checksums(x / POLICY) for x in folders if (x / POLICY).is_file()}
-    others = (x for x in folders if x not in trained and (x / EPISODES).is_file())
-    lines = _equal(trained, "networks of equal seeds")
-    return [*lines, *_equal({x: _numbers(x) for x in others}, "rows")]
+    trained = [x for x in folders if (x / POLICY).is_file()]
+    others = [x for x in folders if (x / EPISODES).is_file() and not (x / POLICY).is_file()]
+    lines = _equal(trained, "networks of equal seeds", lambda x: checksums(x / POLICY))
+    return [*lines, *_equal(others, "rows", _numbers)]
 
 
 def _numbers(folder: Path) -> bytes:
@@ -167,15 +167,16 @@ def _numbers(folder: Path) -> bytes:
     return b""
 
 
-def _equal(results: Mapping[Path, Any], what: str) -> Iterator[str]:
+def _equal(folders: Sequence[Path], what: str, digest: Callable[[Path], Any]) -> Iterator[str]:
     """Yield a sentence for each set of settings by which runs of equal results differ."""
-    folders = [*results]
     stored = _settings(folders)
     named = labels([without(x, SHARED) for x in stored], folders)
+    if not any(word != named[0] for word in named):  # seeds or shards, which may be many
+        return
     equal = defaultdict(list)
     for folder, settings, word in zip(folders, stored, named, strict=True):
         # A damaged file equals no other one.
-        equal[settings.get("seed"), results[folder] or folder].append(word)
+        equal[settings.get("seed"), digest(folder) or folder].append(word)
     cases: dict[str, set[str]] = {}
     for first, *rest in equal.values():
         if keys := [key for key in first if any(one.get(key) != first[key] for one in rest)]:
