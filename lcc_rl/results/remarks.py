@@ -104,8 +104,10 @@ def by_ends(table: pd.DataFrame) -> str:
 
 
 def crashed(table: pd.DataFrame) -> pd.Series:
-    """Return which strategies collide, so that they have neither saving nor flow."""
-    return (table["collisions"] > 0) & (table["strategy"] != table["against"])
+    """Return which rows have neither saving nor flow: they, or their baseline, collide."""
+    hit = table["strategy"][table["collisions"] > 0]
+    own = table["strategy"].isin(hit) & (table["strategy"] != table["against"])
+    return own | table["against"].isin(hit)
 
 
 def crashes(table: pd.DataFrame) -> list[str]:
@@ -113,10 +115,12 @@ def crashes(table: pd.DataFrame) -> list[str]:
     collided = table[table["collisions"] > 0]
     rows = zip(collided["strategy"], collided["collisions"], collided["episodes"], strict=True)
     names = ", ".join(f"{in_words(str(x))} {some} of {of:,}" for x, some, of in rows)
+    base = collided["strategy"][collided["strategy"] == collided["against"]]
+    names += "".join(f" (so none has a saving against {in_words(str(x))})" for x in base)
     ahead, own = (collided[f"max_{x}braking_mps2"].max() for x in ("leader_", ""))
     return [
         f"Episodes end in a collision, so that rows have no saving and no flow: {names}; leaders "
-        f"brake by up to {ahead:.1f} m/s², automated vehicles by up to {own:.1f} m/s²."
+        f"brake by up to {ahead:.1f} m/s², whoever drives automated cars by up to {own:.1f} m/s²."
     ] * bool(len(collided))
 
 

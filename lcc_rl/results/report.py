@@ -67,6 +67,7 @@ UNTRAINED = (
     *("idm_acc_filtered", "acc_filtered", "idm_acc", "acc"),
 )
 SCORE = "score"
+NONE = pd.Series(dtype=float)
 SAVED = Shown("saved_pct", "saved\n[%]")
 SECOND_SAVED = Shown("second_pct", "saved,\n{}\n[%]")
 # Savings at the flow of the recorded drivers.
@@ -188,7 +189,7 @@ def summary(
         drivers behind each window and training seeds; ``left_out``, the seeds that the first saving
         leaves out, and ``single``, whether it has one training beside others of several; and for a
         task score, limits and whether they are kept without a collision. Missing values are NaN, as
-        are savings and losses of a strategy with collisions.
+        are savings and losses of a strategy with collisions, and of all if the baseline has some.
 
     Raises:
         ConfigError: if the column of a limit, or the baseline, is missing.
@@ -201,7 +202,7 @@ def summary(
     for column in task.limits if task and WAYS[0] in windows else ():
         require(column in windows, f"task.limits.{column}: episodes.parquet has no such column")
     column, *per = task.measure.columns if task else (PATH, DISTANCE)
-    rows = []
+    rows, hit = [], {name for name, frame in frames.items() if frame.get("collisions", NONE).sum()}
     for name, frame in frames.items():
         row: dict[str, Any] = {"strategy": name, "against": against or ""}
         kinds = {"windows": "profile_id", "drives": DRIVE, "seeds": TRAINED}
@@ -219,8 +220,7 @@ def summary(
         if task:
             unit = task.unit if task.measure.per and energy is not None else KJ
             row |= in_units(values, task.measure.key, SCORE, unit, energy)
-        hit = bool(frame.get("collisions", pd.Series(dtype=float)).sum())
-        row |= _savings(windows, name, (column, per), None if hit else against)
+        row |= _savings(windows, name, (column, per), None if hit & {name, against} else against)
         rows.append(row | values)
     table = pd.DataFrame(rows)
     table = table.astype({"collisions": int, "episodes": int}).copy()  # has few blocks

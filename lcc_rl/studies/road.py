@@ -170,7 +170,9 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
         table,
     )
     for share, rows in table.groupby("automated_pct"):
-        study.blocks += [f"{share:g} % automated: {remark}" for remark in crashes(rows)]
+        study.blocks += [
+            f"{share:g} % automated: {remark}" for remark in crashes(rows.assign(against=HUMAN))
+        ]
     shown = [Shown(x.shown.key, fill(x.title, 18)) for x in MEASURES if x.key in DRAWN]
     of = [f"{x:g} %" for x in table["automated_pct"]]
     report = Report("", table, with_drivers(table.assign(of=of)), tuple(shown), (), "", "")
@@ -187,7 +189,8 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
 def rows_of(share: str, windows: pd.DataFrame) -> Iterator[dict[str, Any]]:
     """Yield a row per strategy: measures, with intervals from those of the ratio to humans'.
 
-    Without automated cars nothing is compared; a controller with collisions has no values.
+    Without automated cars nothing is compared; a controller with collisions has no values. If human
+    drivers collide, nothing is compared with them.
 
     Args:
         share: share of automated cars [%].
@@ -197,10 +200,10 @@ def rows_of(share: str, windows: pd.DataFrame) -> Iterator[dict[str, Any]]:
     for name, group in groups.items():
         row: dict[str, Any] = {"automated_pct": float(share), "strategy": name}
         crashed = name != HUMAN and bool(group["collisions"].sum())
+        alone = crashed or name == HUMAN or bool(groups[HUMAN]["collisions"].sum())
         for one in (one for one in MEASURES if one.key in COMPARED):
             column, *per = one.columns
-            nothing = crashed or name == HUMAN
-            saved = NOTHING if nothing else savings(windows, column, name, HUMAN, per)
+            saved = NOTHING if alone else savings(windows, column, name, HUMAN, per)
             low, high = saved.over_drives or (saved.low, saved.high)
             humans = one.value(groups[HUMAN])
             value = math.nan if crashed else one.value(group)

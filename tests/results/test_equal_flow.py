@@ -123,7 +123,7 @@ def test_a_strategy_that_collides_has_no_saving_and_no_flow() -> None:
     assert one.short.set_index("strategy").loc["alcc", ["saved_pct", "flow_pct"]].isna().all()
     sentence = (
         "Episodes end in a collision, so that rows have no saving and no flow: network 8 of 8; "
-        "leaders brake by up to 6.0 m/s², automated vehicles by up to 3.0 m/s²."
+        "leaders brake by up to 6.0 m/s², whoever drives automated cars by up to 3.0 m/s²."
     )
     assert sentence in one.remarks
     several = report(windows_for(rows(collided={"alcc": True, "rule": True}))).remarks
@@ -131,6 +131,14 @@ def test_a_strategy_that_collides_has_no_saving_and_no_flow() -> None:
     assert len(named) == 1
     assert "network 8 of 8" in named[0]
     assert "data 8 of 8" in named[0]
+
+
+def test_nothing_is_saved_against_a_baseline_that_collides() -> None:
+    one = report(windows_for(rows(collided={"recorded": True})))
+    table = one.table.set_index("strategy")
+    assert (table["against"] == "recorded").all()
+    assert table[["saving", "second_saving", "drawn_saving", "flow_pct"]].isna().all(axis=None)
+    assert any("(so none has a saving against the recorded drivers)" in x for x in one.remarks)
 
 
 def test_what_episodes_end_with_is_told_from_steady_driving() -> None:

@@ -43,6 +43,7 @@ def test_one_command_writes_table_figure_and_reports(tmp_path) -> None:
     assert "RMSPE of 6 " in page
     rows = read_parquet(tmp_path / "road" / "evaluation" / "25" / "episodes.parquet")
     rows["collided"] |= rows["strategy"] == "idm_acc"
+    half = read_parquet(tmp_path / "road" / "evaluation" / "50" / "episodes.parquet")
     write_parquet(rows, tmp_path / "road" / "evaluation" / "25" / "episodes.parquet")
     found = road.study_results(tmp_path / "road")
     crashed, whole = (found.tables["road"].iloc[row] for row in (1, 3))
@@ -51,6 +52,11 @@ def test_one_command_writes_table_figure_and_reports(tmp_path) -> None:
         assert np.isfinite(whole[key]), key
     words = r"25 % automated: Episodes end in a collision.*: tuned IDM 2 of 2;"
     assert len([block for block in found.blocks if re.match(words, block)]) == 1
+    half["collided"] |= half["strategy"] == "human"
+    write_parquet(half, tmp_path / "road" / "evaluation" / "50" / "episodes.parquet")
+    humans, whole = road.study_results(tmp_path / "road").tables["road"].iloc[2:].iloc
+    assert np.isnan([whole["fuel_saved_pct"], whole["flow_vph_low"]]).all()
+    assert np.isfinite([whole["fuel_l_per_100km"], humans["fuel_l_per_100km"]]).all()
     again = read_parquet(tmp_path / "road" / "leaders.parquet")
     assert again.groupby("drive").size().max() == 4209  # seven minutes
     with pytest.raises(ResultsError, match="of other data; choose another folder"):
