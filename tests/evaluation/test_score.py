@@ -160,6 +160,16 @@ def test_a_table_of_scores_refuses_what_is_not_alike_or_contradicts_itself() -> 
     board.check_alike({"a.json": {"name": "a", "results": [ROW]}, "b.json": rounded})
 
 
+def test_limits_of_comfort_and_of_standing_belong_to_the_tasks_that_they_decide() -> None:
+    for task in ("i24-follow5", "i24-mixed", "i24-fleet"):
+        assert load("evaluate", [f"task={task}"]).task["limits"]["rms_jerk_mps3"] == 2.0
+    dithered = {"rms_jerk_mps3": {"bound": 2.0, "value": 5.57}}  # fuel cut in every other step
+    crept = {"mean_speed_mps": {"bound": 4.8, "value": 0.99}}
+    assert load("evaluate", ["task=i80-follow"]).task["limits"]["mean_speed_mps"] == "95 %"
+    for limits, word in ((dithered, "RMS jerk"), (crept, "mean speed")):
+        assert board.broken({**ROW, "limits": limits}) == [word]
+
+
 def test_a_killed_score_is_played_again_and_a_finished_or_running_one_is_left_alone(
     tmp_path,
 ) -> None:
