@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -13,8 +14,10 @@ from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
-from lcc_rl.pieces.base import SEED, STEP, Entry, Feature, StepTransform
-from lcc_rl.pieces.leader import PROFILE, PROFILE_START
+from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP, Entry, Feature, Piece, StepTransform
+from lcc_rl.pieces.cbf import CBFFilter
+from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.leader import NEXT_SPEED, PROFILE, PROFILE_START, NGSIMLeader
 from lcc_rl.pieces.views import EPISODE, NEXT, Views
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative
@@ -66,6 +69,27 @@ class LeaderPreview(Feature):
             error = normal(seed, step, self.stream + self.columns)
             speed = (speed + self.noise * error).clamp(min=0.0)
         return speed.unsqueeze(-2)
+
+
+def foreseen(pieces: Sequence[Piece]) -> list[str]:
+    """Return the entries of the leader's future that drive the automated vehicles, by name.
+
+    Its next speed, the record that it plays, and entries that other pieces compute from these. A
+    policy reads what is observed.
+
+    Args:
+        pieces: the pieces of an environment in the order in which they act.
+    """
+    future, reads = {PROFILE, PROFILE_START, NEXT_SPEED}, set()
+    for piece in pieces:
+        keys = {key for _, key in piece.needs}
+        if isinstance(piece, Controller | CBFFilter):
+            reads |= keys if piece.role == AUTOMATED else set()
+        elif OBSERVATION in piece.targets:
+            reads |= keys if ACTION in reads else set()
+        elif not isinstance(piece, NGSIMLeader) and keys & future:
+            future |= {*piece.targets}
+    return sorted(".".join(key) for key in reads & future)
 
 
 class ObservationMemory(StepTransform):
