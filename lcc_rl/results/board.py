@@ -144,9 +144,9 @@ def _cells(row: BoardRow) -> dict[str, str]:
     return {
         "score": _text(row["score"], "{:.2f}".format),
         "saved": saved_text(*share),
-        "distance": _text(row["distance_lost"], _gained),
+        "distance": _text(row["distance_lost"], lambda lost: signed(-100.0 * lost)),
         "flow": _text(row[FLOW], "{:,.0f}".format),
-        "flow_pct": _text(row[FLOW_LOST], _gained),
+        "flow_pct": _text(row[FLOW_LOST], lambda lost: signed(-100.0 * lost)),
         "ratio": _text(row["string_ratio"], "{:.2f}".format),
         "drives": str(row["drives"]),
         "kept": "yes" if row["kept"] else ",\n".join(broken(row)),
@@ -156,11 +156,6 @@ def _cells(row: BoardRow) -> dict[str, str]:
 def _text(value: float | None, form: Callable[[float], str]) -> str:
     """Return a number as text; a dash for a missing one, as of a row with a collision."""
     return DASH if value is None else form(value)
-
-
-def _gained(lost: float) -> str:
-    """Return a lost share with its sign, in per cent."""
-    return signed(-100.0 * lost)
 
 
 def future_note(rows: Sequence[BoardRow]) -> str:
