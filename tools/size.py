@@ -30,8 +30,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 44_600, "code": 29_600},
-    "tests": {"lines": 26_700},
+    "lcc_rl + tools": {"lines": 44_716, "code": 29_680},
+    "tests": {"lines": 26_800},
     "conf": {"yaml": 165},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py

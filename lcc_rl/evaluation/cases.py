@@ -34,6 +34,7 @@ CASE_KEYS += [INDEX, WINNER, *COUNTERS]
 # Columns of a time series besides the speed.
 TRACED = {"gap": "gap_m", "acceleration": "acceleration_mps2", "jerk": "jerk_mps3"}
 TRACED["winner"] = "winner"
+OF_CAV = ("speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "max_gap_error_m")
 CaseSeries = dict[str, Tensor]  # ``[time, runs, vehicles]``
 
 
@@ -147,24 +148,21 @@ def measured_series(series: CaseSeries, time_step: float = 0.1) -> pd.DataFrame:
     ratio[..., 1:] = torch.where(ahead > 1e-3, energy[..., 1:] / ahead.clamp(min=1e-3), torch.nan)
     keeps = series["reward"].isfinite().all(0)
     driven = 0.5 * (series["speed"][1:] + series["speed"][:-1]).sum(0)  # in units of a step
-
-    def own(value: Tensor) -> Tensor:
-        return torch.where(keeps, value, torch.nan)
-
     columns = {
-        "speed_error_sum": own(error.sum(0)),
-        "speed_error_squares": own(error.square().sum(0)),
-        "jerk_sum": own(jerk.sum(0)),
-        "jerk_squares": own(jerk.square().sum(0)),
+        "speed_error_sum": error.sum(0),
+        "speed_error_squares": error.square().sum(0),
+        "jerk_sum": jerk.sum(0),
+        "jerk_squares": jerk.square().sum(0),
         "reward": series["reward"].sum(0),
         "min_gap_m": series["gap"].amin(0),
-        "max_gap_error_m": own(series["gap_error"].abs().amax(0)),
+        "max_gap_error_m": series["gap_error"].abs().amax(0),
         "peak_jerk_mps3": jerk.amax(0),
         "energy_ratio": ratio,
         "drawn_energy_kj_per_km": torch.where(
             driven > 0.0, series["power"].sum(0) / driven, torch.nan
         ),
     }
+    columns |= {key: torch.where(keeps, columns[key], torch.nan) for key in OF_CAV}
     if "winner" in series:
         columns["learned_share"] = series["winner"].double().mean(0)
         columns |= {name: series[name][-1] for _, name in COUNTERS}

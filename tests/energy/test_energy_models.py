@@ -72,7 +72,7 @@ def test_a_truck_pays_for_the_speed_that_it_cannot_hold() -> None:
 
 
 def test_alternating_around_a_speed_takes_less_fuel_than_holding_it() -> None:
-    """docs/energy.md: the jump of the fuel cut rewards it, which the tasks' limit of jerk bounds."""
+    """docs/energy.md: the jump of the fuel cut rewards it, see the limit of jerk."""
     car, speed = CirclesFuel(), torch.tensor([10.0, 20.0, 30.0], dtype=torch.float64)
     cut = car._cut(speed)
     share = 0.5 * (car.fuel(speed, cut) + car.fuel(speed, -cut)) / car.fuel(speed, 0.0 * cut)

@@ -194,11 +194,15 @@ def test_what_a_controller_reads_of_the_future_is_named(tmp_path, monkeypatch) -
     for text in (str(table.caption), page):
         assert "§: reads the leader's future (leader.next_speed)." in text
     assert "| `a` § |" in page
-    code = "from lcc_rl.pieces import Controller\nclass Seer(Controller):\n    reads = ('self.speed',)\n"
-    code += "    def setup(self, world):\n        super().setup(world)\n"
-    code += (
-        "        assert world.profiles is None\n    command = staticmethod(lambda speed: -speed)\n"
-    )
+    code = """from lcc_rl.pieces import Controller
+class Seer(Controller):
+    reads = ("self.speed",)
+    def setup(self, world):
+        super().setup(world)
+        assert world.profiles is None
+    def command(self, speed):
+        return -speed
+"""
     (tmp_path / "foreign_seer.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     assert scored("foreign_seer.Seer").strategy(load("evaluate", ["task=i80-follow"]))[1] == []
