@@ -100,6 +100,12 @@ def check_lengths(cfg: StudyConfig) -> None:
         settings.segment % max(every, 1.0) < 1e-6,
         f"agent.hold ({every:g} steps) must divide training.segment ({settings.segment})",
     )
+    steps = getattr(cfg.agent.made(), "n_step", 1) * max(every, 1.0)
+    require(
+        steps < settings.segment + 0.5,
+        f"agent.n_step ({steps:g} steps with agent.hold) must not exceed training.segment "
+        f"({settings.segment}), in which returns end",
+    )
     window = getattr(cfg.agent.made(), "best_window", None) or 0
     count = settings.environments
     require(

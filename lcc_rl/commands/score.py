@@ -24,6 +24,7 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.drivers.population import fixed
 from lcc_rl.envs import build_env, load_inputs
 from lcc_rl.envs.inputs import build_drivers, build_energy, constant_profiles
+from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, require
 from lcc_rl.evaluation.comparison import Comparison
 from lcc_rl.evaluation.entrants import check_effective, check_installed
@@ -39,6 +40,7 @@ from lcc_rl.evaluation.strategies import Strategy, TrainedPolicy, applies, basel
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.io.atomic import atomic_path, own_folder
 from lcc_rl.io.files import read_parquet
+from lcc_rl.pieces.knowledge import foreseen
 from lcc_rl.results.board import row_of
 from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import load_policy, policy_file
@@ -79,8 +81,8 @@ class Scored(NamedTuple):
     spec: str
     policy: TrainedPolicy | None
 
-    def strategy(self, cfg: EvaluateConfig) -> Strategy:
-        """Return it as a strategy of a task.
+    def strategy(self, cfg: EvaluateConfig) -> tuple[Strategy, list[str]]:
+        """Return it as a strategy of a task, and the entries of the leader's future that it reads.
 
         Raises:
             LccError: if it does not fit the vehicles, observation or action of the task.
@@ -97,8 +99,8 @@ class Scored(NamedTuple):
             )
             entry = baseline(cfg, self.label, self.spec)
         road = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["trial"])
-        build_env(entry.cfg.for_any_leader(), road, population, 1, nominal=True)
-        return entry
+        env = build_env(entry.cfg.for_any_leader(), road, population, 1, nominal=True)
+        return entry, foreseen(pieces_of(env))
 
 
 def scored(spec: str, trust: Sequence[str] = ()) -> Scored:
@@ -147,7 +149,7 @@ def play_source(entrant: Scored, source: str, cfg: EvaluateConfig, folder: Path)
         LccError: if it does not fit the task, or the source has no suitable leaders.
     """
     prepare_torch(cfg)
-    task, strategy = task_of(cfg), entrant.strategy(cfg)
+    task, (strategy, future) = task_of(cfg), entrant.strategy(cfg)
     assert task is not None
     check_installed(cfg)
     inputs = load_inputs(cfg)
@@ -164,7 +166,7 @@ def play_source(entrant: Scored, source: str, cfg: EvaluateConfig, folder: Path)
     task = task.resolved(windows)
     table = summary(windows, task, build_energy(cfg))
     drivers = rows["driver_id"].nunique()
-    return row_of(table, task, source, strategy.name, drivers) | hashes
+    return row_of(table, task, source, strategy.name, drivers, future) | hashes
 
 
 def hash_of(windows: Profiles) -> str:

@@ -41,7 +41,7 @@ from lcc_rl.pieces import (
 )
 from lcc_rl.pieces.base import ACTION
 from lcc_rl.pieces.controllers import Population
-from lcc_rl.pieces.hybrid import check_spacing
+from lcc_rl.pieces.hybrid import check_rewards, check_spacing
 from lcc_rl.pieces.views import LEADER, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import TARGET, parse, path_of
@@ -213,6 +213,7 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
     pieces.append(cfg.observation.made(Piece).bind(world))
     terms = cfg.reward.terms
     pieces += [node.made(Piece).bind(world, name) for name, node in terms.items()]
+    check_rewards(pieces)
     # The sum is last, before collisions of the next step.
     return [*pieces, TotalReward(terms=list(terms)).bind(world)]
 

@@ -34,6 +34,7 @@ CASE_KEYS += [INDEX, WINNER, *COUNTERS]
 # Columns of a time series besides the speed.
 TRACED = {"gap": "gap_m", "acceleration": "acceleration_mps2", "jerk": "jerk_mps3"}
 TRACED["winner"] = "winner"
+OF_CAV = ("speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "max_gap_error_m")
 CaseSeries = dict[str, Tensor]  # ``[time, runs, vehicles]``
 
 
@@ -47,6 +48,7 @@ class Cases:
         cases = (*inputs.cases, windows, *full)
         self.drives = [CaseRuns(strategy, case, inputs, cfg.device) for case in cases]
         self.idle = [drive.player.idle for drive in self.drives]
+        self.player = self.drives[0].player
         self.largest = max((drive.size for drive in self.drives), key=math.prod)
         # Size of the time series of the cases in a file, which hardly compress [bytes].
         steps = sum(case.horizon * (case.followers + 1) for case in inputs.cases)
@@ -133,10 +135,11 @@ class CaseRuns:
 def measured_series(series: CaseSeries, time_step: float = 0.1) -> pd.DataFrame:
     """Return one row per run and vehicle; ``time_step`` [s].
 
-    Speed errors are e_v(i,0), as in the paper's tables. ``energy_ratio`` is Σ e_v(i,i−1)² divided
-    by that of the vehicle ahead (string stability: at most 1); it is missing for the first vehicle
-    and without motion. ``drawn_energy_kj_per_km`` is the scenario's power over the distance,
-    missing at standstill. ``max_gap_error_m`` is the largest |e_x(i,i−1)| of an automated vehicle.
+    Speed errors are e_v(i,0), as in the paper's tables; sums and squares of them and of jerks, and
+    ``max_gap_error_m``, the largest |e_x(i,i−1)|, are NaN for vehicles that are not automated.
+    ``energy_ratio`` is Σ e_v(i,i−1)² divided by that of the vehicle ahead (string stability: at
+    most 1); it is missing for the first vehicle and without motion. ``drawn_energy_kj_per_km`` is
+    the scenario's power over the distance, missing at standstill.
     """
     error, jerk = series["leader_speed_error"].abs(), series["jerk"].abs()
     energy = series["speed_error"].square().sum(0)
@@ -144,7 +147,6 @@ def measured_series(series: CaseSeries, time_step: float = 0.1) -> pd.DataFrame:
     ahead = energy[..., :-1]
     ratio[..., 1:] = torch.where(ahead > 1e-3, energy[..., 1:] / ahead.clamp(min=1e-3), torch.nan)
     keeps = series["reward"].isfinite().all(0)
-    gap_error = series["gap_error"].abs().amax(0)
     driven = 0.5 * (series["speed"][1:] + series["speed"][:-1]).sum(0)  # in units of a step
     columns = {
         "speed_error_sum": error.sum(0),
@@ -153,13 +155,14 @@ def measured_series(series: CaseSeries, time_step: float = 0.1) -> pd.DataFrame:
         "jerk_squares": jerk.square().sum(0),
         "reward": series["reward"].sum(0),
         "min_gap_m": series["gap"].amin(0),
-        "max_gap_error_m": torch.where(keeps, gap_error, torch.nan),
+        "max_gap_error_m": series["gap_error"].abs().amax(0),
         "peak_jerk_mps3": jerk.amax(0),
         "energy_ratio": ratio,
         "drawn_energy_kj_per_km": torch.where(
             driven > 0.0, series["power"].sum(0) / driven, torch.nan
         ),
     }
+    columns |= {key: torch.where(keeps, columns[key], torch.nan) for key in OF_CAV}
     if "winner" in series:
         columns["learned_share"] = series["winner"].double().mean(0)
         columns |= {name: series[name][-1] for _, name in COUNTERS}

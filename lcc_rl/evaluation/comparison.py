@@ -14,6 +14,7 @@ import pandas as pd
 from lcc_rl.config.compose import identity
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.envs.inputs import Inputs
+from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ResultsError
 from lcc_rl.evaluation.cases import Cases
 from lcc_rl.evaluation.episodes import Episodes, plan_of
@@ -21,6 +22,7 @@ from lcc_rl.evaluation.rollout import warn_of_idle
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import Rows, as_rows, parquet_metadata, read_parquet, write_parquet
 from lcc_rl.io.memory import require_memory
+from lcc_rl.pieces.knowledge import hears
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import EPISODES, STEPS
 from lcc_rl.runs.progress import ProgressReporter
@@ -138,6 +140,10 @@ class Comparison:
             self.blocks = plan.own
             args = (settings.seed, settings.sample_episodes, cfg.device, settings.compiled)
             self.players = [Episodes(strategy, inputs, plan, *args) for strategy in strategies]
+        rows = zip(strategies, self.players, strict=True)
+        heard = [in_words(x.name) for x, one in rows if hears(pieces_of(one.player.env))]
+        if heard:
+            log.warning("sensors change no messages, which are read by %s", "; ".join(heard))
         count, steps, moment = max((x.largest for x in self.players), key=math.prod)
         size = f"an evaluation of {count} episodes of {steps} steps side by side"
         require_memory({size: count * steps * moment}, cfg.device)

@@ -194,7 +194,10 @@ def _described(spec: Any) -> Any:
     if spec.endswith(ONNX):
         return {TARGET: ONNX_POLICY, "path": spec}
     if spec.endswith(YAML):
-        return parse_yaml(read_text(Path(spec)), spec)
+        settings = parse_yaml(read_text(Path(spec)), spec)
+        for key in settings:
+            require(isinstance(key, str), f"{spec}: the key {key} is no name: quote it, as in 'on'")
+        return settings
     if spec.endswith(MODULE):
         inside = Path(spec).stem
         raise ConfigError(f"{spec} is a module: name a class or function in it, {inside}.<Class>")

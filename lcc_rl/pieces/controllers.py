@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, Protocol, Self
 
 import torch
@@ -29,7 +30,7 @@ from lcc_rl.pieces.base import ACTION, ROLE, Entry, RoleTransform, as_key, retur
 from lcc_rl.pieces.string import COMMANDED, WISHED
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF
 from lcc_rl.pieces.world import World
-from lcc_rl.settings import NonNegative, Number, Positive, find_target
+from lcc_rl.settings import NonNegative, Number, Positive, find_target, is_ours
 
 # Names of the random streams; a seed gives the same episode under either name.
 STREAMS = {AUTOMATED: "cav", HUMAN: "hdv"}
@@ -77,9 +78,14 @@ class Controller(RoleTransform):
     orders = (COMMANDED, WISHED)
 
     def bind(self, world: World | None = None, name: str | None = None) -> Self:
-        """Return the controller of a role; without a world, of one vehicle of that role."""
+        """Return the controller of a role; without a world, of one vehicle of that role.
+
+        A class of another package gets a world without the records of the leaders.
+        """
         role = name or self.name
-        return super().bind(world or World(VehicleString((role,))), role)
+        world = world or World(VehicleString((role,)))
+        known = world if is_ours(type(self).__module__) else replace(world, profiles=None)
+        return super().bind(known, role)
 
     def declare(
         self,

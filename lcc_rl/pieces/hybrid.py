@@ -12,7 +12,7 @@ from pydantic import InstanceOf
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.braking import Braking, safe_acceleration
 from lcc_rl.functional.cacc import next_leader_speed
 from lcc_rl.functional.hcfs import (
@@ -33,6 +33,7 @@ from lcc_rl.pieces.connected import (
     leader_names,
 )
 from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.rewards import JerkReward, RewardTerm, SpacingReward, VelocityReward
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative, Positive
 
@@ -42,6 +43,7 @@ COUNTERS = SWITCHES, CLAMPS, CAPS = tuple(
 )
 DRIVEN = ("speed", "acceleration", "received_gap", "speed_error", "leader_gap_error")
 HYBRID_READS = (".".join(WINNER), *(f"self.{name}" for name in DRIVEN))
+COMPARED = (VelocityReward, JerkReward, SpacingReward)  # terms of PlatoonReward
 SPARE = 2.0  # headway beyond the gap that the cap needs, for deviations [m]
 
 
@@ -162,6 +164,21 @@ class HCFS(Hybrid):
             PlatoonPlace(leader_gap, leader[0]),
             self.choice,
         )
+
+
+def check_rewards(pieces: Sequence[Piece]) -> None:
+    """Check that HCFS, which compares its candidates by three terms, has no reward with others.
+
+    Raises:
+        ConfigError: naming the terms.
+    """
+    terms = [x for x in pieces if isinstance(x, RewardTerm) and not isinstance(x, COMPARED)]
+    named = ", ".join(f"reward.terms.{x.name}" for x in terms if x.weight)
+    require(
+        not named or not any(isinstance(piece, HCFS) for piece in pieces),
+        f"HCFS compares its candidates by velocity, jerk and spacing only, not by {named}: train "
+        "variant=ddpg with it, and evaluate variant=hcfs policy=<run>",
+    )
 
 
 def check_spacing(pieces: Sequence[Piece], profiles: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -13,9 +14,13 @@ from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
-from lcc_rl.pieces.base import SEED, STEP, Entry, Feature, StepTransform
-from lcc_rl.pieces.leader import PROFILE, PROFILE_START
-from lcc_rl.pieces.views import EPISODE, NEXT, Views
+from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP, Entry, Feature, Piece, StepTransform
+from lcc_rl.pieces.cbf import CBFFilter
+from lcc_rl.pieces.connected import Communication
+from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.leader import NEXT_SPEED, PROFILE, PROFILE_START, NGSIMLeader
+from lcc_rl.pieces.sensors import Sensors
+from lcc_rl.pieces.views import EPISODE, NEXT, Key, Views
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative
 
@@ -66,6 +71,42 @@ class LeaderPreview(Feature):
             error = normal(seed, step, self.stream + self.columns)
             speed = (speed + self.noise * error).clamp(min=0.0)
         return speed.unsqueeze(-2)
+
+
+def driving_reads(pieces: Sequence[Piece]) -> set[Key]:
+    """Return the entries that controllers and filters of the automated vehicles read.
+
+    A policy reads what is observed.
+
+    Args:
+        pieces: the pieces of an environment in the order in which they act.
+    """
+    reads: set[Key] = set()
+    for piece in pieces:
+        drives = isinstance(piece, Controller | CBFFilter) and piece.role == AUTOMATED
+        if drives or (OBSERVATION in piece.targets and ACTION in reads):
+            reads |= {key for _, key in piece.needs}
+    return reads
+
+
+def foreseen(pieces: Sequence[Piece]) -> list[str]:
+    """Return the entries of the leader's future that drive the automated vehicles, by name.
+
+    These are its next speed, the record that it plays, and what other pieces compute from them.
+    """
+    future: set[Key] = {PROFILE, PROFILE_START, NEXT_SPEED}
+    for piece in pieces:
+        own = isinstance(piece, Controller | CBFFilter | NGSIMLeader)
+        if not own and any(key in future for _, key in piece.needs):
+            future |= {*piece.targets}
+    return sorted(".".join(key) for key in driving_reads(pieces) & future)
+
+
+def hears(pieces: Sequence[Piece]) -> bool:
+    """Whether automated vehicles with sensors are driven by messages, which have no faults."""
+    sensed = any(isinstance(piece, Sensors) and piece.role == AUTOMATED for piece in pieces)
+    heard = {x for piece in pieces if isinstance(piece, Communication) for x in piece.targets}
+    return sensed and not heard.isdisjoint(driving_reads(pieces))
 
 
 class ObservationMemory(StepTransform):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from itertools import product
 from math import isclose
@@ -39,6 +39,7 @@ HEAD = ["leaders", "driven by", "saved [%]", "flow [1/h]", "flow [%]", "limits n
 SAVED_SHARE = ("saving", "saving_low", "saving_high")
 OF_HEADING, OF_PLACE = ("measure", "unit", "against"), ("data", "settings", "baseline")
 COPIED = ("score", *SAVED_SHARE, "distance_lost", FLOW, FLOW_LOST, "string_ratio", FINAL_SPREAD)
+FUTURE = " §"  # marks rows that read the leader's future
 CELL = r"[^\r\n|`]{1,200}"  # a text in a cell of a table
 Name = Annotated[str, Field(pattern=f"^{CELL}$")]
 Missing = Number | None
@@ -60,11 +61,11 @@ class ScoreRow(Settings):
     unit: Name | None
     against: Name
     baseline: Missing
-    score: Number
+    score: Missing
     saving: Missing
     saving_low: Missing
     saving_high: Missing
-    distance_lost: Number
+    distance_lost: Missing
     flow_vph: Missing
     flow_lost: Missing
     string_ratio: Missing
@@ -74,6 +75,7 @@ class ScoreRow(Settings):
     data: Name
     settings: Name
     kept: bool
+    future: list[Name]
     limits: dict[str, Limit]
 
 
@@ -81,7 +83,7 @@ SHAPE = [field.name for field in fields(ScoreRow)]
 
 
 def row_of(
-    table: pd.DataFrame, task: Task, source: str, strategy: str, drivers: int
+    table: pd.DataFrame, task: Task, source: str, strategy: str, drivers: int, future: Sequence[str]
 ) -> dict[str, Any]:
     """Return the row of a strategy on a task behind the leaders of a source.
 
@@ -91,6 +93,7 @@ def row_of(
         source: name of the leaders.
         strategy: the strategy.
         drivers: number of drivers of the evaluation.
+        future: entries of the leader's future that it reads.
 
     Returns:
         Plain values, None for missing numbers. ``limits`` holds bound and value of each limit,
@@ -108,7 +111,7 @@ def row_of(
         for limit, bound in task.bounds.items()
     }
     row |= {name: int(str(values[name])) for name in ("collisions", "windows", "drives")}
-    return row | {"kept": bool(values["kept"]), "drivers": drivers}
+    return row | {"kept": bool(values["kept"]), "drivers": drivers, "future": [*future]}
 
 
 def _number(value: Any) -> float | None:
@@ -125,29 +128,40 @@ def score_table(name: str, rows: Sequence[BoardRow]) -> Table:
             against = in_words(row["against"])
             unit = row["unit"] or ("m/s" if row["measure"].endswith("_mps") else "–")
             lines[-1] |= {"where": row["task"], "score": str(unit), "saved": against}
-        lines.append({"where": f"  {row['source']}", **_cells(row)})
+        mark = FUTURE * bool(row["future"])
+        lines.append({"where": f"  {row['source']}{mark}", **_cells(row)})
     caption = (
         "saved, distance, flow: against the baseline; 95 % interval over drives, or over their "
         "minutes if these are fewer than five (then too narrow); score.json has every limit and "
-        "value."
+        f"value. {future_note(rows)}"
     )
-    return render.as_rich(pd.DataFrame(lines), BOARD_COLUMNS, in_words(name), caption)
+    return render.as_rich(pd.DataFrame(lines), BOARD_COLUMNS, in_words(name), caption.strip())
 
 
 def _cells(row: BoardRow) -> dict[str, str]:
     """Return the cells of a row as text."""
     share = [np.nan if row[key] is None else 100.0 * row[key] for key in SAVED_SHARE]
-    ratio, flow, lost = row["string_ratio"], row[FLOW], row[FLOW_LOST]
     return {
-        "score": f"{row['score']:.2f}",
+        "score": _text(row["score"], "{:.2f}".format),
         "saved": saved_text(*share),
-        "distance": signed(-100.0 * row["distance_lost"]),
-        "flow": DASH if flow is None else f"{flow:,.0f}",
-        "flow_pct": DASH if lost is None else signed(-100.0 * lost),
-        "ratio": DASH if ratio is None else f"{ratio:.2f}",
+        "distance": _text(row["distance_lost"], lambda lost: signed(-100.0 * lost)),
+        "flow": _text(row[FLOW], "{:,.0f}".format),
+        "flow_pct": _text(row[FLOW_LOST], lambda lost: signed(-100.0 * lost)),
+        "ratio": _text(row["string_ratio"], "{:.2f}".format),
         "drives": str(row["drives"]),
         "kept": "yes" if row["kept"] else ",\n".join(broken(row)),
     }
+
+
+def _text(value: float | None, form: Callable[[float], str]) -> str:
+    """Return a number as text; a dash for a missing one, as of a row with a collision."""
+    return DASH if value is None else form(value)
+
+
+def future_note(rows: Sequence[BoardRow]) -> str:
+    """Return a sentence on the rows that read the leader's future; empty without any."""
+    names = ", ".join(dict.fromkeys(name for row in rows for name in row["future"]))
+    return f"{FUTURE.strip()}: reads the leader's future ({names})." if names else ""
 
 
 def leaderboard(documents: Mapping[str, Mapping[str, Any]]) -> str:
@@ -169,9 +183,10 @@ def leaderboard(documents: Mapping[str, Mapping[str, Any]]) -> str:
         for row in sorted(rows, key=lambda x: sources.index(x["source"])):
             sample = "drives" if row["drives"] >= LEAST_DRIVES else "windows"
             place = f"{row['source']}, {row[sample]} {sample}"
-            lines.append([place, f"`{row['by']}`", *_markdown(row)])
-        text = markdown_table(HEAD, lines)
-        sections.append(f"### {task}\n\nAgainst {in_words(rows[0]['against'])}.\n\n{text}\n")
+            mark = FUTURE * bool(row["future"])
+            lines.append([place, f"`{row['by']}`{mark}", *_markdown(row)])
+        text = f"Against {in_words(rows[0]['against'])}. {future_note(rows)}".strip()
+        sections.append(f"### {task}\n\n{text}\n\n{markdown_table(HEAD, lines)}\n")
     return "\n".join(sections)
 
 
@@ -228,7 +243,8 @@ def check_row(row: BoardRow, where: str) -> None:
     inside = low is high is None or (None not in (low, value, high) and low <= value <= high)
     require(inside, f"{where}: the saving {value} is not within its interval {low} … {high}")
     score, baseline = row["score"], row["baseline"]
-    agree = value is None or (baseline and isclose(value, 1.0 - score / baseline, abs_tol=1e-4))
+    known = baseline and score is not None
+    agree = value is None or (known and isclose(value, 1.0 - score / baseline, abs_tol=1e-4))
     require(agree, f"{where}: the saving {value} is not that of {score} against {baseline}")
     wrong = broken(row)
     require(

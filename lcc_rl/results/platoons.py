@@ -22,11 +22,11 @@ def case_table(episodes: pd.DataFrame, case: str) -> pd.DataFrame:
         case: name of the case; for ``"windows"`` sums are means over the windows.
 
     Returns:
-        One row per strategy. Means over seeds of sums over followers and steps: Σ|e_v(i,0)| and its
-        standard deviation [m/s], Σ|jerk| and its standard deviation [m/s³], Σ reward with its 95 %
-        interval over seeds, switches and interventions. Over all seeds: smallest gap and largest
-        gap error [m], collided vehicles, peak jerk [m/s³], worst string ratio and the share of
-        steps of the learned policy.
+        One row per strategy. Means over seeds of sums over automated followers and steps:
+        Σ|e_v(i,0)| and its standard deviation [m/s], Σ|jerk| and its standard deviation [m/s³],
+        Σ reward with its 95 % interval over seeds, switches and interventions. Over all seeds:
+        smallest gap and largest gap error [m], collided vehicles, peak jerk [m/s³], worst error
+        ratio and the share of steps of the learned policy.
 
     Raises:
         ConfigError: if there is no such case.
@@ -45,7 +45,7 @@ def _row(strategy: str, rows: pd.DataFrame) -> dict[str, object]:
     def per_run(column: str) -> pd.Series:
         return rows.groupby(seeds)[column].sum() / runs
 
-    frames = rows["frames"].sum()
+    frames = rows["frames"][rows["jerk_sum"].notna()].sum()
     row: dict[str, object] = {"strategy": strategy, "seeds": rows["training_seed"].nunique()}
     for name, label in (("speed_error", "mps"), ("jerk", "mps3")):
         mean = rows[f"{name}_sum"].sum() / frames
@@ -68,11 +68,11 @@ PLATOON = [
     Measure("min_gap_m", "smallest gap", unit="m", aggregate="min", short="least\ngap [m]"),
     Measure("max_gap_error_m", "largest gap error", unit="m", aggregate="max"),
     Measure(
-        "string_ratio",
-        "string ratio, worst",
+        "error_ratio",
+        "error ratio, worst",
         of="energy_ratio",
         aggregate="max",
-        short="string\nratio",
+        short="error\nratio",
     ),
     Measure(
         "collisions",
@@ -88,7 +88,7 @@ PLATOON = [
     Measure("clamps", "jerk clamps", form="{:.1f}"),
     Measure("cap_interventions", "safe-cap interventions", form="{:.1f}"),
 ]
-BELOW = "sums over followers and frames, means over runs; collisions: cars in all runs"
+BELOW = "sums over automated followers and frames, means over runs; collisions: cars in all runs"
 
 
 def case_report(rows: pd.DataFrame, case: str, of: str) -> Report:

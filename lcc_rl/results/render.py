@@ -174,6 +174,9 @@ def as_rich(table: pd.DataFrame, shown: Sequence[Shown], title: str, caption: st
     drawn.columns[0].overflow = "fold"
     if first > WIDTH // 4:  # names are wrapped at spaces, if all columns have room
         drawn.columns[0].width = max(min(first, WIDTH - sum(rest) - len(rest)), 1)
+    widest, *others = (max(map(len, "\n".join(text).split("\n"))) for text in texts)
+    if widest > (room := WIDTH - sum(others) - len(others)) and first <= WIDTH // 4:
+        drawn.columns[0].width = max(first, room)  # before the cells of others are wrapped
     for row in zip(*(cells for _, *cells in texts), strict=True):
         drawn.add_row(*map(escape, row))
     return drawn

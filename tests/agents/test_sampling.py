@@ -21,6 +21,7 @@ from lcc_rl.agents.collecting import LIMITED, decisions, n_step_returns, of_deci
 from lcc_rl.agents.factory import check_lengths, make_trainer, training_env
 from lcc_rl.agents.sampling import Returns
 from lcc_rl.envs import make_env
+from lcc_rl.errors import ConfigError
 from lcc_rl.pieces.base import ACTION, OBSERVATION, REWARD, SEED, STEP
 
 LEARNERS = ("ppo", "sac", "td3", "ddpg")
@@ -194,3 +195,6 @@ def test_what_does_not_fit_is_refused() -> None:
         ("agent.limits.jerk=0.1", "agent.limits.jerk=0.1 has no effect: the reward has no term"),
     )
     check_refused(built, cases)
+    words = ("training.segment=10", "agent.n_step=4", "agent.hold=0.5")
+    with pytest.raises(ConfigError, match=r"agent.n_step \(20 steps with agent.hold\) must not"):
+        check_lengths(compose("alcc", "agent=td3", *words))

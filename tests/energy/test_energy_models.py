@@ -71,6 +71,14 @@ def test_a_truck_pays_for_the_speed_that_it_cannot_hold() -> None:
     assert per_km.tolist() == pytest.approx([14776.0, 18421.0, 27529.0], rel=1e-4)
 
 
+def test_alternating_around_a_speed_takes_less_fuel_than_holding_it() -> None:
+    """docs/energy.md: the jump of the fuel cut rewards it, see the limit of jerk."""
+    car, speed = CirclesFuel(), torch.tensor([10.0, 20.0, 30.0], dtype=torch.float64)
+    cut = car._cut(speed)
+    share = 0.5 * (car.fuel(speed, cut) + car.fuel(speed, -cut)) / car.fuel(speed, 0.0 * cut)
+    assert share.tolist() == pytest.approx([0.65, 0.77, 0.92], abs=0.005)
+
+
 def test_a_trucks_steady_fuel_grows_with_speed_as_published() -> None:
     def litres(kmh: float) -> float:
         speed = torch.tensor(kmh / 3.6)

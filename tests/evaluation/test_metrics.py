@@ -89,6 +89,7 @@ def test_safety() -> None:
     named = {name for name in expected if name.startswith(("max_", "min_", "share_"))}
     filtered = {"share_ttc_unpromised", "share_turned_unsafe"}
     others = {"share_leader_faster", "share_time_gap_short", "flow_vph", "mean_speed_mps"}
+    others |= {"rms_jerk_mps3"}
     braking = {"max_deceleration_mps2", "max_jerk_1s_mps3"}  # of accelerations
     named |= {"standstill_gap_m"}
     assert named | others | filtered | braking == set(limit_measures())

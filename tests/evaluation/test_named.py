@@ -150,13 +150,15 @@ scenario: {{controllers: {{automated: {node}}}}}
         (tmp_path / "run" / "config.yaml").unlink()
 
 
-def test_who_cannot_drive_is_told_how() -> None:
+def test_who_cannot_drive_is_told_how(tmp_path) -> None:
+    (tmp_path / "on.yaml").write_text("{_target_: lcc_rl.pieces.IDMACC, on: 3}")
     cases = [
         ("nowhere.X", "export PYTHONPATH"),
         (f"{__name__}.Nobody", "Nobody"),
         ("idm_ac", "'idm_ac'.*'idm_acc'.*--config-dir"),
         ("rule", "learned: .* lcc-rl train variant=rule"),
         ("nowhere.yaml", "nowhere.yaml: no such file"),
+        (str(tmp_path / "on.yaml"), r"on\.yaml: the key True is no name: quote it"),
         ("my_pid.py", r"my_pid.py is a module: name a class or function in it, my_pid.<Class>"),
         ({"gain": 3}, "expected _target_"),
         ({TARGET: PATH, "gian": 3}, "'gian'.*'gain'"),

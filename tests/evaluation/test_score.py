@@ -16,7 +16,11 @@ import lcc_rl
 from lcc_rl.cli.score import main
 from lcc_rl.commands.score import about, play_source, scored
 from lcc_rl.config import load
+from lcc_rl.envs import build_env
+from lcc_rl.envs.inputs import build_drivers, constant_profiles
+from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.pieces.knowledge import foreseen
 from lcc_rl.results import board
 from lcc_rl.runs.states import Busy, claim
 
@@ -109,7 +113,7 @@ ROW = {"task": "t", "source": "s", "data": "1", "settings": "2", "kept": True, "
 ROW |= {"saving": 0.02, "saving_low": 0.01, "saving_high": 0.03, "limits": LIMITS}
 ROW |= {"score": 98.0, "baseline": 100.0, "measure": "path_energy", "unit": "kJ/km"}
 ROW |= {"against": "human", "distance_lost": 0.0, "flow_vph": None, "flow_lost": None}
-ROW |= {"windows": 20, "drives": 1, "string_ratio": None}
+ROW |= {"windows": 20, "drives": 1, "string_ratio": None, "future": []}
 BROKEN = {"share_ttc_unsafe": {"bound": 0.01, "value": 0.02}}
 HEADINGS = [({"unit": "g/km"}, "unit"), ({"measure": "net_energy"}, "measure")]
 HEADINGS += [({"against": "idm"}, "against")]
@@ -132,6 +136,7 @@ def test_a_table_of_scores_refuses_what_is_not_alike_or_contradicts_itself() -> 
         ({"string_ratio": "x"}, r"b\.json, row 1.string_ratio must be .*, got 'x'"),
         ({"saving_high": None}, "the saving .* is not within its interval .* None"),
         ({"baseline": None}, "the saving .* is not that of .* against None"),
+        ({"score": None}, "the saving .* is not that of None against"),
         ({"collisions": "no"}, r"b\.json, row 1.collisions must be .*, got 'no'"),
         ({"collisions": -3}, r"b\.json, row 1.collisions must be .*, got -3"),
         ({"source": "s\nt"}, r"b\.json, row 1.source must"),
@@ -158,6 +163,59 @@ def test_a_table_of_scores_refuses_what_is_not_alike_or_contradicts_itself() -> 
     check_refused(lambda document: board.check_alike({"b.json": document}), whole, ConfigError)
     rounded = {"name": "b", "results": [{**ROW, "baseline": 100.001}]}  # of another processor
     board.check_alike({"a.json": {"name": "a", "results": [ROW]}, "b.json": rounded})
+
+
+UNSAVED = dict.fromkeys(("saving", "saving_low", "saving_high", "distance_lost"))
+UNSAVED |= {"kept": False, "collisions": 1}
+
+
+@pytest.mark.parametrize("some", [UNSAVED, {**UNSAVED, "score": None, "collisions": 20}])
+def test_rows_with_collisions_have_dashes_and_their_number(some: dict[str, object]) -> None:
+    row = {**ROW, **some}
+    table = board.score_table("mine", [row])
+    cells = {column.header: list(column.cells)[-1] for column in table.columns}
+    assert cells["dis-\ntance\n[%]"] == cells["saved [%]\nagainst"] == "–"
+    assert cells["score"] == ("98.00" if row["score"] else "–")
+    assert cells["limits\nkept"] == f"{row['collisions']} coll."
+    page = board.leaderboard({"a.json": {"name": "a", "results": [row]}})
+    assert f"| – | – | – | {row['collisions']} coll. |" in page
+
+
+def test_what_a_controller_reads_of_the_future_is_named(tmp_path, monkeypatch) -> None:
+    knowing = scored("deadbeat oracle").strategy(load("evaluate", ["task=platoon-us06"]))[1]
+    assert knowing == ["leader.next_speed"]
+    cfg = load("train", ["variant=alcc", "+knowledge=preview"])
+    env = build_env(cfg, constant_profiles(10.0, 600, 0.1, ["a"]), build_drivers(cfg), 1)
+    assert foreseen(pieces_of(env)) == ["preview.speed"]
+    row = {**ROW, "future": knowing}
+    table = board.score_table("mine", [row])
+    assert list(table.columns[0].cells)[-1] == "  s §"
+    page = board.leaderboard({"a.json": {"name": "a", "results": [row]}})
+    for text in (str(table.caption), page):
+        assert "§: reads the leader's future (leader.next_speed)." in text
+    assert "| `a` § |" in page
+    code = """from lcc_rl.pieces import Controller
+class Seer(Controller):
+    reads = ("self.speed",)
+    def setup(self, world):
+        super().setup(world)
+        assert world.profiles is None
+    def command(self, speed):
+        return -speed
+"""
+    (tmp_path / "foreign_seer.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert scored("foreign_seer.Seer").strategy(load("evaluate", ["task=i80-follow"]))[1] == []
+
+
+def test_limits_of_comfort_and_of_standing_belong_to_the_tasks_that_they_decide() -> None:
+    for task in ("i24-follow5", "i24-mixed", "i24-fleet"):
+        assert load("evaluate", [f"task={task}"]).task["limits"]["rms_jerk_mps3"] == 2.0
+    dithered = {"rms_jerk_mps3": {"bound": 2.0, "value": 5.57}}  # fuel cut in every other step
+    crept = {"mean_speed_mps": {"bound": 4.8, "value": 0.99}}
+    assert load("evaluate", ["task=i80-follow"]).task["limits"]["mean_speed_mps"] == "95 %"
+    for limits, word in ((dithered, "RMS jerk"), (crept, "mean speed")):
+        assert board.broken({**ROW, "limits": limits}) == [word]
 
 
 def test_a_killed_score_is_played_again_and_a_finished_or_running_one_is_left_alone(

@@ -28,10 +28,13 @@ from platoons import (
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
+from lcc_rl.config import load
 from lcc_rl.data.profiles import Profiles
-from lcc_rl.envs import build_env
+from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.comparison import Comparison
 from lcc_rl.evaluation.rollout import reset_options
+from lcc_rl.evaluation.strategies import Strategy, baseline
 from lcc_rl.functional.cacc import Gains
 from lcc_rl.pieces import CACC, HCFS, Communication, parse_string
 from lcc_rl.pieces.world import World
@@ -358,6 +361,25 @@ def test_the_first_decides_for_one_platoon_only() -> None:
     words = "choice=first needs a string that is one platoon, but the string has automated, human"
     with pytest.raises(ConfigError, match=words):
         HCFS(rule=CACC(), choice="first").bind(World(MIXED, T))
+
+
+def test_a_reward_by_which_hcfs_does_not_compare_is_refused() -> None:
+    own = "+reward.terms.mine={_target_: lcc_rl.pieces.SafetyReward}"
+    env_of(ramps(), Driver(("variant=ddpg", own)))
+    with pytest.raises(ConfigError, match=r"jerk and spacing only, not by reward\.terms\.mine:"):
+        env_of(ramps(), Driver((*hcfs().overrides, own)))
+
+
+def test_an_evaluation_with_sensors_names_who_reads_messages(caplog) -> None:
+    cfg = load("evaluate", ["variant=cacc", "+faults=sensors", "scenario.horizon=20"])
+    inputs = Inputs(ramps(), ramps(), POPULATION)
+    both = [Strategy("cacc tuned", cfg), baseline(cfg, "idm_acc")]
+    Comparison(cfg, inputs, both)
+    text = "sensors change no messages, which are read by CACC, tuned"
+    assert [x for x in caplog.messages if "messages" in x] == [text]
+    caplog.clear()
+    Comparison(load("evaluate", ["variant=cacc", "scenario.horizon=20"]), inputs, [both[1]])
+    assert not caplog.messages
 
 
 # -- the headway and the safe cap ------------------------------------------------------------------

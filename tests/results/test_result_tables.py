@@ -148,10 +148,16 @@ def test_case_table_by_hand() -> None:
     assert row["speed_error_std_mps"] == pytest.approx(errors.std(ddof=0))
     assert row["reward"] == pytest.approx(-5.5)
     assert (row["collisions"], row["switches"]) == (1, 1)
-    assert (row["max_gap_error_m"], row["string_ratio"]) == (pytest.approx(5.1), pytest.approx(2.0))
+    assert (row["max_gap_error_m"], row["error_ratio"]) == (pytest.approx(5.1), pytest.approx(2.0))
     assert row["learned_share"] == pytest.approx(5 / 6)
     with pytest.raises(ConfigError, match="case 9"):
         case_table(rows, "case 9")
+    mixed = series()  # the second follower is a human driver, who earns nothing
+    mixed["reward"][..., 1] = torch.nan
+    rows = measured_series(mixed).assign(strategy="x", training_seed=pd.NA, case="a", profile="a")
+    (row,) = case_table(rows, "a").to_dict("records")
+    assert (row["speed_error_sum_mps"], row["jerk_sum_mps3"], row["reward"]) == (4.0, 10.0, -4.0)
+    assert row["speed_error_std_mps"] == pytest.approx(errors[:3].std(ddof=0))
 
 
 def rewards(strategy: str, seed: int | None, *values: float) -> pd.DataFrame:

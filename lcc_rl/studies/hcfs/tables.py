@@ -222,8 +222,8 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
 
     Returns:
         A row per source and strategy: Σ reward and the energy saved against CACC, with intervals
-        over windows and seeds; the largest gap error, the worst string ratio and the number of
-        runs with a string ratio above 1.
+        over windows and seeds; the largest gap error, the worst error ratio and the number of
+        runs with an error ratio above 1.
     """
     rows = []
     named = runs["source"].map(LEADERS).fillna(runs["source"])
@@ -240,7 +240,7 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
             row: dict[str, object] = {"leaders": source, "strategy": in_words(name)}
             row |= crossed_rewards(reward_per_seed(group, name, WINDOW_CASES)).columns("Σ reward")
             row |= {"gap error_m": driven["max_gap_error_m"].max()}
-            row |= {"string ratio, above 1": f"{driven['energy_ratio'].max():.2f}, {above}"}
+            row |= {"error ratio, above 1": f"{driven['energy_ratio'].max():.2f}, {above}"}
             rows.append(row | saved.columns("drawn energy saved_pct", 100.0))
     return pd.DataFrame(rows)
 
@@ -262,7 +262,7 @@ def whole_records(episodes: pd.DataFrame, strategies: Sequence[str]) -> pd.DataF
                         "Σ reward_high": runs["reward"].max() if many else np.nan,
                         "smallest gap_m": runs["min_gap_m"].min(),
                         "runs that collide": f"{(runs['collided'] > 0).sum()} of {len(runs)}",
-                        "string ratio": runs["energy_ratio"].max(),
+                        "error ratio": runs["energy_ratio"].max(),
                     }
                 )
     return pd.DataFrame(rows)
