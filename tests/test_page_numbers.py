@@ -77,10 +77,18 @@ def findings() -> list[str]:
     )
     at_its_flow = np.interp(own[FLOW], rule[FLOW], rule["e"])
     regard = pd.read_parquet(REFERENCE / "limits_true_drivers.parquet")
-    regard = regard[regard["policy"] == "i80_energy"]
+    regard["way"] = regard["cav_distance_m"] + regard["hdv_distance_m"]
     gaps = "share_time_gap_long_moving"
-    ends = [regard[regard["variant"] == x].groupby("limit")[[gaps, PATH]].mean() for x in VARIANTS]
-    energies = [float(np.interp(0.0115, x[gaps], x[PATH])) for x in ends]
+    means = regard.groupby(["policy", "variant", "limit"])[[gaps, PATH, "way"]].mean()
+    means["e"] = means[PATH] / means["way"]
+    both, either = (
+        [
+            float(np.interp(0.0115, *means.loc[drivers, kind][[gaps, "e"]].to_numpy().T))
+            for drivers in ("i80", "i80_energy")
+        ]
+        for kind in VARIANTS
+    )
+    least, most = (1.0 - x / y for x, y in zip(both, either, strict=True))
     rings = pd.read_parquet(REFERENCE / "tasks" / "ring_reactions.parquet")
     late = rings[(rings["delay_s"] == 0.5) & (rings["strategy"] == "pretrained")]["damping_time_s"]
     return [
@@ -88,7 +96,7 @@ def findings() -> list[str]:
         f"4% learned cars save {1.0 - own['e'] / humans['e']:.1%} (",
         f"at {1.0 - own[FLOW] / humans[FLOW]:.1%} less flow",
         f"They need {1.0 - own['e'] / at_its_flow:.1%} (",
-        f"driver behind saves {1.0 - energies[0] / energies[1]:.1%} (",
+        f"driver behind saves {100.0 * least:.1f} to {most:.1%} in windows",
         f"ends {late.count()} of {len(late)} waves",
     ]
 
