@@ -17,8 +17,8 @@ import torch
 from helpers import check_refused, slow_but
 
 import lcc_rl
-from lcc_rl.cli import table
-from lcc_rl.commands import evaluation, score
+from lcc_rl.cli import score, table
+from lcc_rl.commands import evaluation
 from lcc_rl.config import load
 from lcc_rl.errors import ResultsError
 from lcc_rl.evaluation.metrics import METRICS, ROAD_METRICS, register, safety_measures
