@@ -95,18 +95,19 @@ def check_lengths(cfg: StudyConfig) -> None:
     message += f"must divide {horizon - skipped}, scenario.horizon ({horizon})"
     less = f" less {skipped} steps of agent.warm_up (by default evaluation.warm_up)"
     require((horizon - skipped) % settings.segment == 0, message + less * bool(skipped))
-    every = getattr(cfg.agent.made(), "hold", 0.0) / cfg.scenario.time_step
+    agent = cfg.agent.made()
+    every = getattr(agent, "hold", 0.0) / cfg.scenario.time_step
     require(
         settings.segment % max(every, 1.0) < 1e-6,
         f"agent.hold ({every:g} steps) must divide training.segment ({settings.segment})",
     )
-    steps = getattr(cfg.agent.made(), "n_step", 1) * max(every, 1.0)
+    steps = getattr(agent, "n_step", 1) * max(every, 1.0)
     require(
         steps < settings.segment + 0.5,
         f"agent.n_step ({steps:g} steps with agent.hold) must not exceed training.segment "
         f"({settings.segment}), in which returns end",
     )
-    window = getattr(cfg.agent.made(), "best_window", None) or 0
+    window = getattr(agent, "best_window", None) or 0
     count = settings.environments
     require(
         window % count == 0 and window <= settings.episodes,

@@ -111,16 +111,14 @@ def read_parquet(path: str | Path) -> pd.DataFrame:
 
 
 def read_table(path: str | Path, encoded: Sequence[str] = ()) -> pa.Table:
-    """Read a table with dictionary encoding of some columns of text, of those that it has.
+    """Read a table with dictionary encoding of some columns of text.
 
     Raises:
         ResultsError: if it is missing or damaged.
     """
 
     def read(place: Path) -> pa.Table:  # pq.read_table takes a third longer for small files
-        own = {*pq.read_schema(place).names} if encoded else {}
-        texts = [name for name in encoded if name in own]
-        options = {"page_checksum_verification": True, "read_dictionary": texts}
+        options = {"page_checksum_verification": True, "read_dictionary": list(encoded)}
         with pq.ParquetFile(place, **options) as file:
             return file.read()
 

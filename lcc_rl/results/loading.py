@@ -147,13 +147,13 @@ def load(
     states = unfinished(root) if root.is_dir() else {}
     if strict and states:
         raise ResultsError(f"{root}: not finished: {listed(states)}")
-    runs, schema = _surveyed(root, table, damaged, states)
+    runs, schema, own = _surveyed(root, table, damaged, states)
     constants = _chosen(runs, settings, schema.names)
     tables = {}
     if not lazy:
         for path in runs:
             with damaged.noting(path.parent):
-                tables[path] = read_table(path, texts_of(schema))
+                tables[path] = read_table(path, texts_of(own[path]))
         runs = {path: runs[path] for path in tables}
         if not runs:
             raise _nothing(root, table, damaged)
@@ -172,11 +172,9 @@ def load(
     if lazy:
         return as_dataset(constants, schema)
     frame = _frame(tables, constants)
-    frame.attrs |= {"damaged": dict(damaged)} if damaged else {}
-    frame.attrs |= {"unfinished": states} if states else {}
-    frame.attrs |= {"missing": missing} if missing else {}
-    frame.attrs |= {"repeated": twice} if twice else {}
-    frame.attrs |= {"versions": versions} if versions else {}
+    noted = {"damaged": dict(damaged), "unfinished": states, "missing": missing}
+    noted |= {"repeated": twice, "versions": versions}
+    frame.attrs |= {name: value for name, value in noted.items() if value}
     return frame
 
 
@@ -195,8 +193,8 @@ def _files(root: Path, name: str, damaged: Damaged) -> list[Path]:
 
 def _surveyed(
     root: Path, table: str, damaged: Damaged, states: Mapping[str, str]
-) -> tuple[Runs, pa.Schema]:
-    """Return the settings of all runs with readable tables, and their common columns."""
+) -> tuple[Runs, pa.Schema, dict[Path, pa.Schema]]:
+    """Return the settings of all runs with readable tables, their common and own columns."""
     runs, schemas = {}, {}
     for path in _files(root, f"{table}.parquet", damaged):
         with damaged.noting(path.parent):
@@ -212,7 +210,7 @@ def _surveyed(
             paths.append(path)
     if not paths:
         raise _nothing(root, table, {**states, **damaged})
-    return {path: runs[path] for path in sorted(paths)}, columns
+    return {path: runs[path] for path in sorted(paths)}, columns, schemas
 
 
 def _chosen(runs: Runs, names: Sequence[str] | None, columns: Sequence[str]) -> Runs:

@@ -106,8 +106,7 @@ def by_ends(table: pd.DataFrame) -> str:
 def crashed(table: pd.DataFrame) -> pd.Series:
     """Return which rows have neither saving nor flow: they, or their baseline, collide."""
     hit = table["strategy"][table["collisions"] > 0]
-    own = table["strategy"].isin(hit) & (table["strategy"] != table["against"])
-    return own | table["against"].isin(hit)
+    return table["strategy"].isin(hit) | table["against"].isin(hit)
 
 
 def crashes(table: pd.DataFrame) -> list[str]:
