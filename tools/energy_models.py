@@ -26,7 +26,7 @@ from lcc_rl.energy import CirclesFuel, ElectricCar, EnergyModel, PaperMotor
 from lcc_rl.energy.fuel import coefficients
 from lcc_rl.errors import DataError, require
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.bootstrap import Estimate, saving
+from lcc_rl.results.intervals import Estimate, saving
 from lcc_rl.results.render import markdown_table, saved_text
 from lcc_rl.runs.arguments import Arguments
 

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from lcc_rl.config.words import FILTERED
 from lcc_rl.figures import drawing
-from lcc_rl.results.bootstrap import Estimate
 from lcc_rl.results.fronts import (
     DISTANCE,
     FLEET,
@@ -22,6 +21,7 @@ from lcc_rl.results.fronts import (
     flow_gained,
     saved_at_flow,
 )
+from lcc_rl.results.intervals import Estimate
 from lcc_rl.results.measures import between, signed
 from lcc_rl.results.names import NETWORK, in_words
 from lcc_rl.results.render import markdown_table

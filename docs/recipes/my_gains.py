@@ -5,7 +5,7 @@ import optuna
 from my_car import Follow
 
 import lcc_rl
-from lcc_rl.results.bootstrap import saving
+from lcc_rl.results.intervals import saving
 
 CAR = ["energy._target_=my_car.MyCar"]  # of all runs; harder brakes: "scenario.max_braking=6"
 # Windows of the training recordings; the evaluation's are set aside.

@@ -34,14 +34,14 @@ from lcc_rl.figures.drawing import (
 from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
-from lcc_rl.results.bootstrap import Estimate, share_saved
+from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.measures import between, signed
 from lcc_rl.results.motion import most_varied
 from lcc_rl.results.names import ON_FRONT, RULE, in_words, several, size_of
 from lcc_rl.results.render import column_cells
 from lcc_rl.results.report import AGAINST, ALL, COUNTS, Report
 from lcc_rl.results.runs import CONFIG, read_settings
-from lcc_rl.results.windows import Means, by_driver
+from lcc_rl.results.windows import Means, by_driver, varied
 
 LINES = "{}; lines: 95 % intervals"  # of a figure, after its numbers of windows and drivers
 VEHICLE_STYLES = {
@@ -284,7 +284,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], owner: str) -> 
     legend_above(left, 1)
     saving = share_saved(energy[strategy], energy[baseline])
     ordered = 100 * np.sort(saving.to_numpy())  # a bar per driver; negative values are losses
-    right.bar(np.arange(1, len(ordered) + 1), ordered, width=1.0, color=colour(strategy), alpha=0.8)
+    right.bar(np.arange(1, len(ordered) + 1), ordered, width=1.0, color=colour(strategy), zorder=2)
     right.axhline(0.0, color=INK, lw=0.6)
     right.xaxis.set_major_locator(MaxNLocator(5, integer=True, min_n_ticks=1))
     found = means.saving(column, strategy, baseline)
@@ -300,10 +300,12 @@ def _mean_line(axis: Axes, found: Estimate, rows: pd.DataFrame) -> None:
     text = f"mean {signed(value)} %"
     if np.isfinite(low):
         seeds = min(rows["training_seed"].nunique(), 2)
-        over = ("windows", "windows, 1 seed", "windows and seeds")[seeds]
+        over = f"{varied(rows)}{('', ', 1 seed', ' and seeds')[seeds]}"
+        limits = axis.get_ylim()  # of few drives the band may be far wider than all bars
         axis.axhspan(low, high, color=SOFT, alpha=0.3, lw=0)
+        axis.set_ylim(limits)
         text += f" ({between(low, high, '{:+.1f}')})\nband: 95 % interval over {over}"
     else:
         text += " (1 window, 1 training seed: no interval)"
-    axis.axhline(value, color=INK, lw=0.8, ls="--")
+    axis.axhline(value, color=INK, lw=0.8, ls="--", zorder=3)
     axis.set_title(text, fontsize=7)

@@ -17,7 +17,7 @@ from lcc_rl.figures.drawing import (
     new_figure,
     paper,
 )
-from lcc_rl.results.bootstrap import band
+from lcc_rl.results.intervals import band
 from lcc_rl.results.names import in_words, several
 
 ROLLING = 10  # iterations of the rolling mean

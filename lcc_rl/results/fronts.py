@@ -17,7 +17,7 @@ import pandas as pd
 
 from lcc_rl.arrays import Floats, per_distance
 from lcc_rl.errors import ResultsError
-from lcc_rl.results.bootstrap import NOTHING, Estimate, Side, equal_seeds, estimate, share_saved
+from lcc_rl.results.intervals import NOTHING, Estimate, Side, equal_seeds, estimate, share_saved
 from lcc_rl.results.measures import DISTANCE, FLOW, LONG_GAPS, PATH
 from lcc_rl.results.windows import STRATEGY, TRAINED, drives_of, with_equal_seeds
 
@@ -26,7 +26,7 @@ ENERGY, LONG_SHARE = PATH, LONG_GAPS
 # Columns of a fleet.
 NET = "total_net_energy_kj"
 FLEET = NET, DISTANCE, FLOW
-# Means of columns of one kind of controller, each ``[limits]``, or ``[RESAMPLES, limits]``.
+# Means of columns of one kind of controller, each ``[limits]``, or ``[groups, limits]``.
 Curve = Mapping[str, Floats]
 Statistic = Callable[[Curve, Curve], Any]
 
@@ -63,7 +63,7 @@ def compare_fronts(
 ) -> Estimate:
     """Return a measure of kinds of controllers with its interval.
 
-    It is resampled as in :func:`lcc_rl.results.bootstrap.estimate`, equal seeds in pairs.
+    See :func:`lcc_rl.results.intervals.estimate`; equal seeds are left out in pairs.
 
     Args:
         windows, columns: see :func:`front`.

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from lcc_rl.errors import require_known
-from lcc_rl.results import bootstrap
+from lcc_rl.results import intervals
 from lcc_rl.results.measures import COUNT, Measure, Shown
 from lcc_rl.results.names import with_drivers
 from lcc_rl.results.report import ALL, Report, shortened
@@ -52,7 +52,7 @@ def _row(strategy: str, rows: pd.DataFrame) -> dict[str, object]:
         spread = rows[f"{name}_squares"].sum() / frames - mean**2
         row[f"{name}_sum_{label}"] = per_run(f"{name}_sum").mean()
         row[f"{name}_std_{label}"] = float(np.sqrt(max(spread, 0.0)))
-    row |= bootstrap.mean(per_run("reward")).columns("reward")
+    row |= intervals.mean(per_run("reward")).columns("reward")
     rows = rows.assign(episodes=1.0)
     row |= {one.key: one.value(rows) for one in PLATOON if one.key not in row}
     hybrid = "learned_share" in rows and rows["learned_share"].notna().any()

@@ -30,7 +30,6 @@ MUCH = 0.01  # share of time with infeasible accelerations that tables and log m
 MOSTLY = 0.2  # share of time; I-80's drivers behind its leaders have 0.02, the stream's 0.06
 FLOW_LOST, FLOW_NAMED, MARK = "flow_lost", 0.02, " †"  # loss of flow that tables mark, as a share
 MORE_FLOW, MORE_NAMED = "more_flow", 0.001  # see Estimate; least share that sentences mention
-FEW_DRIVES = ("saving_drives_low", "saving_drives_high")  # t-interval over fewer than five drives
 FEW_WINDOWS, SHORT = 5, 150.0  # least number of windows; length of short ones [s]
 
 
@@ -121,14 +120,6 @@ def crashes(table: pd.DataFrame) -> list[str]:
         f"Episodes end in a collision, so that rows have no saving and no flow: {names}; leaders "
         f"brake by up to {ahead:.1f} m/s², whoever drives automated cars by up to {own:.1f} m/s²."
     ] * bool(len(collided))
-
-
-def few_drives(table: pd.DataFrame) -> str:
-    """Return a sentence with the intervals over fewer than five drives; empty without any."""
-    few = table[table[FEW_DRIVES[0]].notna()]
-    rows = zip(few["strategy"], *(100.0 * few[name] for name in FEW_DRIVES), strict=True)
-    text = "; ".join(f"{in_words(str(name))} {between(*bounds)}" for name, *bounds in rows)
-    return f"Saved [%], t-interval over {few['drives'].max()} drives: {text}." if text else ""
 
 
 def leader_too_fast(windows: pd.DataFrame, of_task: bool = False) -> list[str]:

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lcc_rl.errors import require_known
-from lcc_rl.results.bootstrap import BOUNDED
+from lcc_rl.results.intervals import BOUNDED
 from lcc_rl.results.measures import Shown, between, heading, signed
 from lcc_rl.results.names import in_words
 from lcc_rl.results.report import Report

@@ -15,8 +15,8 @@ from lcc_rl.errors import require, require_known
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import Rows
 from lcc_rl.results import measures
-from lcc_rl.results.bootstrap import BOUNDED, LEAST_DRIVES, NOTHING
 from lcc_rl.results.fronts import at_equal_flow
+from lcc_rl.results.intervals import BOUNDED, NOTHING
 from lcc_rl.results.measures import (
     DISTANCE,
     FILTER_ACTS,
@@ -31,7 +31,6 @@ from lcc_rl.results.measures import (
 )
 from lcc_rl.results.names import ON_FRONT, RULE, RULE_ROWS, in_words, strategy_named, with_drivers
 from lcc_rl.results.remarks import (
-    FEW_DRIVES,
     FLOW_LOST,
     FLOW_NAMED,
     MARK,
@@ -40,7 +39,6 @@ from lcc_rl.results.remarks import (
     by_ends,
     crashed,
     crashes,
-    few_drives,
     flow_note,
     more_flow_note,
     remarks,
@@ -182,7 +180,7 @@ def summary(
         One row per strategy: :data:`lcc_rl.results.measures.MEASURES`; ``saving``, the share of the
         score saved ``against`` the baseline, ``second_saving``, that of the second energy model,
         ``flow_saving`` and ``second_flow_saving``, those against the recorded drivers at their
-        flow, ``more_flow``, see :class:`lcc_rl.results.bootstrap.Estimate`, ``rule_saving``, that
+        flow, ``more_flow``, see :class:`lcc_rl.results.intervals.Estimate`, ``rule_saving``, that
         against the rule at this flow, and ``drawn_saving``, that of the energy drawn in an episode,
         and the share of the flow lost, with their intervals; ``end_saving``, the difference of the
         drawn and the first saving; the share of the distance lost; numbers of windows, drives,
@@ -253,8 +251,6 @@ def _savings(
         comparable = against not in (None, name) and energy in windows
         share = savings(windows, energy, name, str(against), per) if comparable else NOTHING
         row |= share.columns(key)
-        if key == "saving":
-            row |= dict(zip(FEW_DRIVES, share.over_drives or (np.nan, np.nan), strict=True))
     row["end_saving"] = row["drawn_saving"] - row["saving"]
     names = windows["strategy"].unique()
     fronts = {x: [y for y in names if y.partition(ON_FRONT)[0] == x] for x in (*RULE_ROWS, name)}
@@ -312,7 +308,6 @@ def report(
     short, shown = fields.pop("short")
     rows = _rows(task, table["against"].iloc[0], shown[1] if task or unit else None)
     text = "" if task else verdict(windows, table, few)
-    text = "\n".join(filter(None, [text, few_drives(table)]))
     seen, shown_windows = (x[x["strategy"].isin(short["strategy"])] for x in (table, windows))
     notes = [*remarks(shown_windows), *crashes(seen)]
     notes += filter(None, [flow_note(seen), more_flow_note(seen), by_ends(seen), seeds_note(seen)])
@@ -336,8 +331,6 @@ def _rows(task: Task | None, against: str | None, score: Shown | None) -> list[M
     return [
         *([Measure(score.key, score.words)] if score else ()),
         Measure("saving", f"saved against {in_words(str(against))}", form="{:+.2%}"),
-        Measure(FEW_DRIVES[0], "  over its few drives (t), low", form="{:+.2%}"),
-        Measure(FEW_DRIVES[1], "    high", form="{:+.2%}"),
         Measure("second_saving", "  second energy model", form="{:+.2%}"),
         Measure("flow_saving", "  at the recorded drivers' flow, against them", form="{:+.2%}"),
         Measure("rule_saving", "    against the rule", form="{:+.2%}"),
@@ -477,15 +470,12 @@ def with_interval(found: pd.DataFrame, words: str) -> str:
     """Return the words with the kind of the interval; ``found`` as for :func:`saved_against`."""
     names = ("windows", "drives", "minutes", "seeds")
     windows, drives, minutes, seeds = (int(found.get(x, pd.Series([0])).max()) for x in names)
-    over = next(
-        (f"{n} {of}" for n, of in ((drives, "drives"), (minutes, "minutes")) if n >= LEAST_DRIVES),
-        "windows",
-    )
+    counted = ((drives, "drives"), (minutes, "minutes"))
+    over = next((f"{n} {of}" for n, of in counted if n > 1), "windows")
     over += " of one training" * (seeds == 1)
     if seeds > 1:
         up_to = "up to " if found.loc[found["seeds"] > 0, "seeds"].nunique() > 1 else ""
         over += f" and {up_to}{seeds} training seeds"
-    if drives < min(LEAST_DRIVES, windows):
-        of = "one drive" if drives == 1 else f"only {drives} drives"
-        over += f" (too narrow: all windows are of {of})"
+    if drives == 1 < windows:
+        over += " (too narrow: all windows are of one drive)"
     return f"{words}, with the 95 % interval over {over}"

@@ -15,7 +15,7 @@ from lcc_rl.config.words import RECORDED
 from lcc_rl.energy import Fleet
 from lcc_rl.errors import ConfigError, require, require_known
 from lcc_rl.results import measures
-from lcc_rl.results.bootstrap import BOUNDED
+from lcc_rl.results.intervals import BOUNDED
 from lcc_rl.results.measures import Measure, heading
 from lcc_rl.results.names import HUMAN
 from lcc_rl.settings import Settings

@@ -14,10 +14,11 @@ import pyarrow as pa
 from lcc_rl.arrays import per_distance
 from lcc_rl.energy import AVERAGED, BURNT, SECOND
 from lcc_rl.io.files import Rows, read_parquet
-from lcc_rl.results.bootstrap import (
+from lcc_rl.results.intervals import (
     NOTHING,
     Estimate,
     Minute,
+    clusters,
     equal_seeds,
     estimate,
     saving,
@@ -214,7 +215,7 @@ def savings(
     """Return the share of the baseline's mean energy that a strategy saves.
 
     Tables show ``savings(rows, "total_path_energy_kj", "alcc", "human", per=WAYS)``. Trainings are
-    compared by equal seeds (:func:`with_equal_seeds`), which are resampled in pairs.
+    compared by equal seeds (:func:`with_equal_seeds`), which are left out in pairs.
 
     Args:
         rows: rows of an evaluation, or result of :func:`windows_of`.
@@ -226,7 +227,7 @@ def savings(
 
     Returns:
         The share with its interval over windows or drives, and seeds
-        (:func:`lcc_rl.results.bootstrap.estimate`), for the windows of both; NaN if one of them is
+        (:func:`lcc_rl.results.intervals.estimate`), for the windows of both; NaN if one of them is
         missing, or the baseline is below the measure's ``least``.
     """
     chosen = with_equal_seeds(rows, strategy, baseline)
@@ -294,6 +295,12 @@ def drives_of(windows: pd.DataFrame) -> list[object] | None:
     if START not in windows or windows[START].isna().any():
         return drives
     return [*map(Minute, drives, (windows[START] // 60.0).astype(int))]
+
+
+def varied(windows: pd.DataFrame) -> str:
+    """Return what intervals of these windows are over: drives, minutes or windows."""
+    groups = clusters(drives_of(windows) or ())
+    return ("minutes" if isinstance(groups[0], Minute) else "drives") if groups else "windows"
 
 
 def _over(

@@ -23,7 +23,7 @@ from lcc_rl.errors import ConfigError, require
 from lcc_rl.figures.evaluation import measures_of
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import parquet_metadata, read_parquet, write_parquet
-from lcc_rl.results.bootstrap import LEAST_DRIVES, NOTHING, Estimate
+from lcc_rl.results.intervals import NOTHING, Estimate
 from lcc_rl.results.measures import MEASURES, Shown
 from lcc_rl.results.names import several, with_drivers
 from lcc_rl.results.remarks import crashes
@@ -159,14 +159,14 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     table = table.astype(dict.fromkeys(COUNTED[:2], int))
     windows, cfg = by_share[places[0].name], read_settings(places[0] / CONFIG)
     drives, scenario, settings = windows[DRIVE].nunique(), cfg["scenario"], cfg["evaluation"]
-    few = ", by t since these are few (of one recording over its windows)" * (drives < LEAST_DRIVES)
+    over = several(drives, "recording") + " (of a single one over its minutes)" * (drives == 1)
     study.table(
         "road",
         f"{scenario['string']['size']} vehicles, {settings['drivers']} times behind each of "
         f"{several(len(windows['profile_id'].unique()), 'window')} of "
         f"{scenario['horizon'] * scenario['time_step']:g} s, the first {settings['warm_up']:g} s "
         "not counted. Brackets: the value of human drivers times the 95 % interval of the ratio to "
-        f"it, over {several(drives, 'recording')}{few}",
+        f"it, over {over}",
         table,
     )
     for share, rows in table.groupby("automated_pct"):
@@ -204,11 +204,10 @@ def rows_of(share: str, windows: pd.DataFrame) -> Iterator[dict[str, Any]]:
         for one in (one for one in MEASURES if one.key in COMPARED):
             column, *per = one.columns
             saved = NOTHING if alone else savings(windows, column, name, HUMAN, per)
-            low, high = saved.over_drives or (saved.low, saved.high)
             humans = one.value(groups[HUMAN])
             value = math.nan if crashed else one.value(group)
-            interval = Estimate(value, humans * (1.0 - high), humans * (1.0 - low))
+            interval = Estimate(value, humans * (1.0 - saved.high), humans * (1.0 - saved.low))
             row |= interval.columns(one.shown.key, one.scale)
             if one.key == FUEL:
-                row |= Estimate(saved.value, low, high).columns("fuel_saved_pct", 100.0)
+                row |= saved.columns("fuel_saved_pct", 100.0)
         yield row | {one.key: one.value(group) for one in MEASURES if one.key in COUNTED}

@@ -13,8 +13,8 @@ from lcc_rl.commands import evaluation
 from lcc_rl.config import load
 from lcc_rl.energy import SECOND
 from lcc_rl.errors import ConfigError
-from lcc_rl.results.bootstrap import Estimate
 from lcc_rl.results.fronts import at_equal_flow
+from lcc_rl.results.intervals import Estimate
 from lcc_rl.results.report import report, summary, windows_for
 
 WINDOWS = 8

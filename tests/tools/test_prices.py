@@ -10,7 +10,7 @@ from helpers import check_refused
 
 import lcc_rl
 from lcc_rl.energy import CirclesFuel
-from lcc_rl.results.bootstrap import Estimate
+from lcc_rl.results.intervals import Estimate
 
 WORDS = ["evaluation.profiles=3", "evaluation.drivers=1", "evaluation.sample_episodes=3"]
 

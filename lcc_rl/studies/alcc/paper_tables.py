@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lcc_rl.results.bootstrap import share_saved
+from lcc_rl.results.intervals import share_saved
 from lcc_rl.results.windows import Means, by_driver, driver_savings, per_seed, savings
 from lcc_rl.studies.alcc.tables import ENERGY_KINDS
 

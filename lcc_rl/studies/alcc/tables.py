@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
-from lcc_rl.results.bootstrap import NOTHING, mean, share_saved
+from lcc_rl.results.intervals import NOTHING, mean, share_saved
 from lcc_rl.results.measures import PATH, heading
 from lcc_rl.results.render import DASH
 from lcc_rl.results.report import UNTRAINED

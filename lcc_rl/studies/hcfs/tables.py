@@ -11,7 +11,7 @@ import torch
 from lcc_rl.data.leaders import WHOLE_RECORD
 from lcc_rl.evaluation.cases import WINDOW_CASES
 from lcc_rl.functional.hcfs import PlatoonReward
-from lcc_rl.results import bootstrap
+from lcc_rl.results import intervals
 from lcc_rl.results.names import in_words
 from lcc_rl.results.platoons import PER_RUN, case_table
 from lcc_rl.results.windows import DRIVE, START, drives_of
@@ -28,7 +28,7 @@ CASE_3 = {"CACC": -4.78, "DDPG": -5.81, "HCFS": -1.90}  # Σ reward in Table VI
 GAINED = {
     f"{old}{end}": f"{new}{end}"
     for old, new in {"wins_pct": "HCFS wins_pct", "gain_pct": "HCFS gains_pct"}.items()
-    for end in bootstrap.BOUNDED
+    for end in intervals.BOUNDED
 }
 RUN = ["strategy", "training_seed", "case", "profile", "run_id"]
 SUMS = ["speed_error_sum", "speed_error_squares", "jerk_sum", "jerk_squares", "reward", "frames"]
@@ -94,9 +94,9 @@ def reward_per_seed(
     )
 
 
-def crossed_rewards(runs: pd.DataFrame) -> bootstrap.Estimate:
+def crossed_rewards(runs: pd.DataFrame) -> intervals.Estimate:
     """Return the mean of :func:`reward_per_seed` with its interval over drives and seeds."""
-    return bootstrap.crossed(runs, drives=_drives(runs))
+    return intervals.crossed(runs, drives=_drives(runs))
 
 
 def _drives(runs: pd.DataFrame) -> list[object] | None:
@@ -133,7 +133,7 @@ def win_rates(
         row |= crossed_rewards(difference).columns("reward_gain")
         # Rewards are negative: the share of the cost that is saved.
         both = -reward[shared], -other[shared]
-        gain = bootstrap.saving(*both, paired=True, drives=_drives(reward))
+        gain = intervals.saving(*both, paired=True, drives=_drives(reward))
         row |= gain.columns("gain_pct", 100.0)
         rows.append(row | {"seeds_ahead": int((difference.mean() > 0).sum())})
     return pd.DataFrame(rows)
@@ -185,7 +185,7 @@ def over_cases(episodes: pd.DataFrame, cases: Sequence[str], like: Sequence[str]
     for name in like:
         row: dict[str, object] = {"strategy": in_words(name)}
         for case, table in tables.items():
-            row |= {f"{case}{end}": table.at[name, f"reward{end}"] for end in bootstrap.BOUNDED}
+            row |= {f"{case}{end}": table.at[name, f"reward{end}"] for end in intervals.BOUNDED}
         rows.append(row)
     for name, (*_, reward) in TABLE_IV.items():
         rows.append({"strategy": f"{name}, paper", "case 1": reward, "case 3": CASE_3[name]})
@@ -235,7 +235,7 @@ def sources(runs: pd.DataFrame, strategies: Sequence[str] = STABLE) -> pd.DataFr
         }
         for name, energy in spent.items():
             driven = group[group["strategy"] == name]
-            saved = bootstrap.saving(energy, spent[strategies[0]], drives=_drives(energy))
+            saved = intervals.saving(energy, spent[strategies[0]], drives=_drives(energy))
             above = f"{(driven['energy_ratio'] > 1.0).sum()} of {len(driven)}"
             row: dict[str, object] = {"leaders": source, "strategy": in_words(name)}
             row |= crossed_rewards(reward_per_seed(group, name, WINDOW_CASES)).columns("Σ reward")
