@@ -379,8 +379,8 @@ def _of_energy(table: pd.DataFrame, units: Sequence[str], second: Fleet | None) 
 
 def _energy_in(unit: str) -> Shown:
     """Return the column of energies or fuel per distance in a unit."""
-    name = "energy" if unit in ELECTRIC else "fuel"
-    return Shown(f"{name}_{unit.replace('/', '_per_').lower()}", f"{name}\n[{unit}]")
+    key, name = ("energy", "energy") if unit in ELECTRIC else ("path_fuel", "fuel")
+    return Shown(f"{key}_{unit.replace('/', '_per_').lower()}", f"{name}\n[{unit}]")
 
 
 def behind_filter(found: pd.DataFrame) -> str:

@@ -151,6 +151,11 @@ def test_energies_come_in_the_unit_asked_for(tmp_path, capsys) -> None:
         pd.testing.assert_frame_equal(every, asked.set_index("strategy"), check_dtype=False)
         table.main([str(tmp_path / name), "--all", "--unit", "kWh/100km"])
         assert "[kWh/100km]" in capsys.readouterr().out
+    petrol = noisy().assign(all_fuel_l=lambda rows: rows["total_path_energy_kj"] / 3e4)
+    for unit in ("g/km", "L/100km", "mpg"):  # each beside the litres drawn
+        words = [*SETTINGS["episodes"], "energy=fuel", f"unit={unit}"]
+        (made,) = reports(petrol, load("evaluate", words))
+        assert made.table.columns.is_unique and made.short[made.score].notna().all()
     (made,) = reports(noisy(), load("evaluate", [*SETTINGS["episodes"], "unit=Wh/km"]))
     assert made.score in {*made.short} & {"energy_wh_per_km"}
     cases = [
