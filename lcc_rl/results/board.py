@@ -130,8 +130,8 @@ def score_table(name: str, rows: Sequence[BoardRow]) -> Table:
         mark = FUTURE * bool(row["future"])
         lines.append({"where": f"  {row['source']}{mark}", **_cells(row)})
     caption = (
-        "saved, distance, flow: against the baseline; 95 % interval over drives, or over their "
-        "minutes if these are fewer than five (then too narrow); score.json has every limit and "
+        "saved, distance, flow: against the baseline; 95 % interval over drives, or over the "
+        "minutes of a single one (then too narrow); score.json has every limit and "
         f"value. {future_note(rows)}"
     )
     return render.as_rich(pd.DataFrame(lines), BOARD_COLUMNS, in_words(name), caption.strip())
