@@ -85,12 +85,20 @@ def energy_at(energy: Floats, share: Floats, at: Any, most: float | None = np.na
     """Return the energy of a front, ``[..., limits]`` each, at the share ``at``.
 
     It is interpolated linearly between the limits. If all shares are larger, it is NaN; if all are
-    smaller, ``most``; None: the energy of the nearest share.
+    smaller, ``most``; None: the energy of the nearest share. Several fronts are those without one
+    group of windows or seeds after the other, which just miss a share that all reach: in place of
+    NaN they are continued by the slope from end to end.
     """
+    several = share.ndim > 1
 
     def read(at: float, share: Floats, energy: Floats) -> float:
         order = np.argsort(share)
-        return float(np.interp(at, share[order], energy[order], left=np.nan, right=most))
+        (least, *_, x), (first, *_, y) = share[order][[0, -1]], energy[order][[0, -1]]
+        found = float(np.interp(at, share[order], energy[order], left=np.nan, right=most))
+        if not (several and np.isnan(found)):
+            return found
+        slope = (y - first) / (x - least) if x > least else 0.0
+        return float(first + slope * (at - least) if at < least else y + slope * (at - x))
 
     return np.asarray(np.vectorize(read, signature="(),(n),(n)->()")(at, share, energy))
 

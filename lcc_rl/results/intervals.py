@@ -93,25 +93,23 @@ def _left_out(
     """Yield the means of all sides without each of the windows' groups, and without each seed."""
     if (windows := next(iter(sides[0].values())).shape[-2]) > 1:
         groups = clusters(drives or ()) or range(windows)
-        yield [{key: without(x.mean(-1), groups) for key, x in one.items()} for one in sides]
+        yield [{key: means_without(x.mean(-1), groups) for key, x in one.items()} for one in sides]
     seeds = [next(iter(one.values())).shape[-1] for one in sides]
     varied = [place for place, count in enumerate(seeds) if count > 1]
+    means = [{key: x.mean((-2, -1))[..., None] for key, x in one.items()} for one in sides]
     for places in filter(None, [varied] if paired else [[place] for place in varied]):
-        each = range(seeds[places[0]])
-        yield [
-            {
-                key: without(x.mean(-2), each) if place in places else x.mean((-2, -1))[..., None]
-                for key, x in one.items()
-            }
-            for place, one in enumerate(sides)
-        ]
+        found = means.copy()
+        for place in places:
+            each = range(seeds[place])
+            found[place] = {x: means_without(y.mean(-2), each) for x, y in sides[place].items()}
+        yield found
 
 
-def without(values: Floats, groups: Sequence[object]) -> Floats:
+def means_without(values: Floats, groups: Sequence[object]) -> Floats:
     """Return the means of ``[..., values]`` without each of their groups, ``[..., groups]``.
 
     Examples:
-        >>> without(np.array([1.0, 2.0, 3.0]), ["a", "a", "b"])
+        >>> means_without(np.array([1.0, 2.0, 3.0]), ["a", "a", "b"])
         array([3. , 1.5])
     """
     names = {name: code for code, name in enumerate(dict.fromkeys(groups))}

@@ -225,6 +225,13 @@ def test_fronts_are_read_at_the_same_share_not_at_the_same_limit() -> None:
     assert (found.low, found.value, found.high) == pytest.approx((0.05, 0.05, 0.05))
     table = points(fronts()).set_index(["policy", "limit"])
     assert table.loc[("idm", 0.02), LONG_SHARE] == pytest.approx(0.01)
+    # Without some windows a front just misses a share that it reaches with all of them.
+    table = fronts(0.05, 2.0)
+    table[LONG_SHARE] += 1e-4 * (table["profile_id"] - 5.5)
+    least = table.groupby(["policy", "limit"])[LONG_SHARE].mean().groupby("policy").min().max()
+    found = saving_at(table, NETWORK, RULE, least)
+    assert found.low < found.value < found.high
+    assert np.isnan(saving_at(table, NETWORK, RULE, least - 1e-6).value)
     nothing = saving_at(fronts(0.0, 2.0), NETWORK, RULE, 0.012)
     assert -0.03 < nothing.low < 0.0 < nothing.high < 0.03
 
