@@ -162,8 +162,8 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     over = several(drives, "recording") + " (of a single one over its minutes)" * (drives == 1)
     study.table(
         "road",
-        f"{scenario['string']['size']} vehicles, {several(settings['drivers'], 'time')} behind each of "
-        f"{several(len(windows['profile_id'].unique()), 'window')} of "
+        f"{scenario['string']['size']} vehicles, {several(settings['drivers'], 'time')} behind "
+        f"each of {several(len(windows['profile_id'].unique()), 'window')} of "
         f"{scenario['horizon'] * scenario['time_step']:g} s, the first {settings['warm_up']:g} s "
         "not counted. Brackets: the value of human drivers times the 95 % interval of the ratio to "
         f"it, over {over}",
