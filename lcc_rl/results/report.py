@@ -91,8 +91,8 @@ CAPTION = f"Path energy per vehicle and km; {{}}{ALL}"
 SHARES = "shares of the time: TTC < 4 s; time gap > 2.5 s above 1 m/s; "
 FULL = (
     "energies: mean per episode; path energy: of the speeds without acceleration, and the loss by "
-    "accelerating; saved: of path energy per km, or of a task's score; intervals: over drives if "
-    "there are five or more, else their minutes, else windows, and training seeds"
+    "accelerating; saved: of path energy per km, or of a task's score; intervals: over drives, "
+    "else minutes of the only one, else windows, and training seeds"
 )
 
 
