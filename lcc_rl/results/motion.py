@@ -76,10 +76,10 @@ class SampleMotion:
 
 def of_first_seed(steps: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of steps.parquet of each strategy's first training seed."""
-    if "training_seed" not in steps:
+    if "case" in steps and "training_seed" not in steps:  # of earlier versions
         return steps
-    first = steps.groupby("strategy")["training_seed"].transform("min")
-    return steps[first.isna() | (steps["training_seed"] == first)]
+    seeds = steps["training_seed"]
+    return steps[seeds.isna() | (seeds == seeds.groupby(steps["strategy"]).transform("min"))]
 
 
 def sample_episodes(steps: pd.DataFrame, strategy: str) -> dict[str, pd.DataFrame]:
