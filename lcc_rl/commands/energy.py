@@ -23,11 +23,8 @@ from lcc_rl.settings import checked
 
 BLOCK = 10  # records whose energies are computed together; more exceed the processor's cache
 KWH = 3600.0  # [kJ]
-# Settings that are used, besides the energy model.
-OF_TRIPS = (
-    *("scenario.time_step.", "leader.columns.", "leader.units.", "leader.plausible."),
-    *("leader.average_s.", "leader.bridge_s."),
-)
+OF_DRIVES = ("columns", "units", "plausible", "average_s", "bridge_s")  # of leader, that are used
+OF_TRIPS = ("scenario.time_step.", *(f"leader.{name}." for name in OF_DRIVES))
 
 
 @checked

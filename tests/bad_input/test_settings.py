@@ -44,7 +44,6 @@ WRONG = {
     "agent=dddpg": "agent 'dddpg'.*'ddpg'.* agent/dddpg.yaml, needs --config-dir",
     "reward.terms.safety.wieght=1": "reward.terms.safety .*'weight'",
     "learning=follow": "choice of learning 'follow'; valid: follow_samples.*, needs --config-dir",
-    "surrogates@agent=limit": "choice of surrogates 'limit'.*'limits'",
     "agent._partial_=true": "agent._partial_ has no effect",
     "agent.gamma=???": r"^agent\.gamma=\?\?\?: expected a value",
     # types
@@ -119,8 +118,6 @@ EVALUATED = {
     "alcc training.gap_range=[0.2,0.3]": OF_TRAINING,
     "alcc agent.hold=5": OF_TRAINING,
     "alcc scenario.controllers.human.time_gap_range=[1,2]": "only episodes of a training draw it",
-    "hcfs scenario.pieces.leader.perturbation=0": "only episodes of a training draw it",
-    "hcfs scenario.start.automated.gap_spread=0": "only episodes of a training draw it",
     "alcc agent=ppo": f"{OF_TRAINING}, analytic",
     "alcc reward.terms.safety.weight=5": "only rows of policies have it, with evaluation.terms",
     "alcc reward.without=safety": "only rows of policies have it, with evaluation.terms",

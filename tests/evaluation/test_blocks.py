@@ -120,7 +120,6 @@ def test_resuming_equals_never_having_stopped(whole, tmp_path, monkeypatch, coun
 
 
 def test_blocks_of_a_policy_whose_file_changed_are_played_again(tmp_path) -> None:
-    """The settings of a task name no file of the policy that ``lcc-rl score`` plays."""
     settings = {"_target_": "lcc_rl.data.sources.EpisodesSource", "path": str(tmp_path / "a.csv")}
     strategy, marks = Strategy("own", compose("idm").with_(data=Node.of(settings, "data"))), set()
     for text in ("one", "two", "two"):
