@@ -83,6 +83,8 @@ def compare(
     require(valid, f"compare: expected strategies, or a mapping of them by name: {strategies!r}")
     resolved = [(name, x, as_given(x, name)) for name, x in pairs]
     policies = {name: policy for name, _, policy in resolved if policy is not None}
+    several = len(policies) < sum(policy is not None for *_, policy in resolved)
+    require(not several, "compare: two policies of one class; name them: {'a': …, 'b': …}")
     rules = [(name, x) for name, x, policy in resolved if policy is None]
     if named:
         spec: Any = {name: setting_of(x, f"compare.{name}") for name, x in rules}

@@ -40,6 +40,7 @@ from lcc_rl.evaluation.strategies import Strategy, baseline, trained
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.atomic import own_folder
 from lcc_rl.io.files import write_parquet
+from lcc_rl.results.names import in_words
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.runs import EPISODES
 from lcc_rl.results.windows import savings
@@ -47,20 +48,13 @@ from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import PROGRESS, claim
-from lcc_rl.settings import Million
+from lcc_rl.settings import Million, Positive
 
 DRIVER_COUNT = 12
 BLOCK = 1_000_000  # vehicles × steps of parallel plans: some GiB
 SET_BY_BOUND = (
-    "variant",
-    "policy",
-    "compare",
-    "safety",
-    "seed",
-    "knowledge",
-    "agent",
-    "observation",
-    "reward",
+    *("variant", "policy", "compare", "safety", "seed", "knowledge"),
+    *("agent", "observation", "reward"),
 )
 PATH_ENERGY = {BOUND_BOTH: "total_path_energy_kj", BOUND_OWN: "cav_path_energy_kj"}
 KEYS = ["profile_id", "driver_id"]
@@ -133,21 +127,23 @@ def block_rows(
 
 
 def best(plans: list[pd.DataFrame]) -> pd.DataFrame:
-    """Return the plan with the lowest objective of every episode."""
+    """Return the plan with the lowest objective of every episode, without a collision if any is."""
     together = pd.concat(plans, ignore_index=True)
     energy = PATH_ENERGY[str(together["strategy"].iloc[0])]
-    return together.loc[together.groupby(KEYS)[energy].idxmin()].reset_index(drop=True)
+    ranked = together.sort_values([*KEYS, "collided", energy], kind="stable")
+    return ranked.drop_duplicates(KEYS, ignore_index=True)
 
 
 def regard(episodes: pd.DataFrame) -> str:
     """Return a sentence on the largest saving by regard for the drivers behind."""
     saved = savings(episodes, PATH_ENERGY[BOUND_BOTH], BOUND_BOTH, BOUND_OWN)
     energy = episodes.groupby("strategy")[PATH_ENERGY[BOUND_BOTH]].mean()
-    share = (energy[BOUND_OWN] - energy[BOUND_BOTH]) / energy["idm"]
+    rival = str(episodes["strategy"].iloc[0])
+    share = (energy[BOUND_OWN] - energy[BOUND_BOTH]) / energy[rival]
     return (
         f"With plans for all vehicles, their path energy is {100 * saved.value:.2f} % lower than "
         f"with plans for the car only (95 % interval over windows: {100 * saved.low:.2f} … "
-        f"{100 * saved.high:.2f}); {share:.2%} of idm's."
+        f"{100 * saved.high:.2f}); {share:.2%} of that with {in_words(rival)}."
     )
 
 
@@ -157,7 +153,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--policy", action="append", help="initial policy (pretrained)")
     parser.add_argument("--regard", action="store_true", help="also plan for the car only")
     parser.add_argument("--iterations", type=typed(Million), default=400)
-    parser.add_argument("--hold", type=float, default=0.1, help="duration of a shift [s]")
+    parser.add_argument("--hold", type=typed(Positive), default=0.1, help="duration of a shift [s]")
     parser.add_argument("--no-compile", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("outputs/clairvoyant"))
     options, overrides = parser.parse_known_args(arguments)
@@ -167,6 +163,8 @@ def main(arguments: list[str]) -> int:
     cfg = cfg.with_(evaluation={"drivers": cfg.evaluation.drivers or DRIVER_COUNT})
     require(cfg.device == "cpu", "lcc-rl clairvoyant runs on device=cpu")
     require(cfg.scenario.slope is None, "lcc-rl clairvoyant: plans know no slopes")
+    least = cfg.scenario.time_step
+    require(options.hold >= least, f"--hold={options.hold:g} is shorter than a step, {least:g} s")
     folder = own_folder(options.out, {PROGRESS}.issuperset)
     prepare_torch(cfg)
     with claim(folder):

@@ -12,7 +12,7 @@ import torch
 
 from lcc_rl.arrays import times
 from lcc_rl.config import load
-from lcc_rl.config.words import quoted, top_key
+from lcc_rl.config.words import key_of, quoted, top_key
 from lcc_rl.data.leaders import DriveLeaders
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.inputs import build_energy
@@ -23,6 +23,8 @@ from lcc_rl.settings import checked
 
 BLOCK = 10  # records whose energies are computed together; more exceed the processor's cache
 KWH = 3600.0  # [kJ]
+OF_DRIVES = ("columns", "units", "plausible", "average_s", "bridge_s")  # of leader, that are used
+OF_TRIPS = ("scenario.time_step.", *(f"leader.{name}." for name in OF_DRIVES))
 
 
 @checked
@@ -43,7 +45,7 @@ def trip_energies(
         and carbon dioxide.
     """
     for word in overrides:
-        valid = top_key(word) in ("energy", "leader", "scenario", "trust")
+        valid = top_key(word) in ("energy", "trust") or f"{key_of(word)}.".startswith(OF_TRIPS)
         require(valid, f"{word} has no effect on the energy of given trips")
     names = [path] if isinstance(path, (str, PathLike)) else path
     listed = ",".join(quoted(fspath(name)) for name in names)

@@ -42,7 +42,8 @@ def repeat(folder: Path, target: Path, trust: Sequence[str] = ()) -> None:
     """
     cfg = resumed_config(folder, trust)
     require(any(folder.rglob("*.parquet")), f"{folder}: no rows to compare; resume the run")
-    require(not target.exists(), f"{target} exists already; choose another with --out")
+    message = f"{target} exists already, or lies in the run; choose another with --out"
+    require(not target.exists() and folder.resolve() not in target.resolve().parents, message)
     target.mkdir(parents=True)
     for name in (CONFIG, pipeline.COMMAND_FILE):
         if (folder / name).is_file():

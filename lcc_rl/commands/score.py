@@ -19,6 +19,7 @@ from lcc_rl.commands.evaluation import evaluate_and_write
 from lcc_rl.config.compose import choices, identity, load
 from lcc_rl.config.inputs import compared_files
 from lcc_rl.config.schemas import EvaluateConfig
+from lcc_rl.config.unused import drawn_in_training, refuse
 from lcc_rl.config.words import FILTERED, RECORDED, top_key
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.drivers.population import fixed
@@ -60,15 +61,8 @@ LEADER_SOURCES: dict[str, tuple[str, ...]] = {
 }
 OF_A_SOURCE = ("data", "split", "leader", "drivers")
 SET_BY_SCORE = (
-    *OF_A_SOURCE,
-    "task",
-    "variant",
-    "policy",
-    "compare",
-    "safety",
-    "agent",
-    "observation",
-    "reward",
+    *(*OF_A_SOURCE, "task", "variant", "policy", "compare", "safety"),
+    *("agent", "observation", "reward"),
 )
 SCORED_WITH = ("torch", "torchrl", "tensordict", "numpy", "onnxruntime")
 FILE = "score.json"
@@ -128,6 +122,7 @@ def roads(
     """
     overrides = (f"task={task}", *further)
     base: EvaluateConfig = load("evaluate", overrides)
+    refuse(further, drawn_in_training(base.scenario))
     entrant.strategy(base)
     if base.scenario.road == RING:
         return {"ring": base}

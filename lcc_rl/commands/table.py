@@ -12,6 +12,7 @@ import pandas as pd
 
 from lcc_rl.commands.evaluation import Run
 from lcc_rl.config.words import SHOWN_AS
+from lcc_rl.errors import require
 from lcc_rl.io.files import Rows, as_rows, read_parquet
 from lcc_rl.results.names import MARKS, rename, worded
 from lcc_rl.results.render import as_csv, as_latex, as_markdown, chosen, for_print
@@ -21,6 +22,7 @@ from lcc_rl.results.sweeps import load_sweep
 from lcc_rl.runs.states import CONFIG, run_folders
 
 PRINTERS = (as_markdown, as_markdown, as_latex, as_csv)
+OF_RUNS = ("all", "against", "unit", "rename", "figure")  # options of a run's table
 TABLE_FORMATS: dict[str, Callable[..., str]] = dict(zip(SHOWN_AS, PRINTERS, strict=True))
 
 
@@ -30,6 +32,8 @@ def print_again(options: Namespace) -> None:
     names = options.columns.split(",") if options.columns else []
     note = ""
     if options.run.suffix == ".parquet":
+        unused = [name for name in OF_RUNS if getattr(options, name)]
+        require(not unused, f"--{', --'.join(unused)} need a run's folder, not a parquet file")
         table = chosen(worded(read_parquet(options.run)), names)
     else:
         run = read_run(options.run, options.trust)

@@ -63,6 +63,7 @@ NAMES_HINT = (
     "and have no quotes; lcc_rl.compare accepts any name"
 )
 # Groups that no file of the package chooses.
+OPTIONAL = ("learning", "surrogates")  # groups that Hydra lets choose a missing file
 ADDED = ("event", "faults", "filter", "fleet", "knowledge", "slope")
 OF_NODE = re.compile(r"([\w.: ]+): expected a node with .*, got (?:'(\w+)'|{.*)$")
 OWN_FILES = re.compile(r"path=(?!pkg://|structured://)")  # in Hydra's search path
@@ -183,6 +184,21 @@ def check_recipes(word: str, names: Sequence[str]) -> None:
         require(other not in _built_on(name), message)
 
 
+def check_optional(word: str) -> None:
+    """Refuse an unknown choice of a group whose file may be missing, which Hydra passes over."""
+    group, names = key_of(word).partition("@")[0], word.partition("=")[2].strip("[]")
+    for name in names.split(",") if group in OPTIONAL and "${" not in names else ():
+        if name.strip() not in (known := choices(group)):
+            raise unknown_choice(group, name.strip(), known)
+
+
+def unknown_choice(group: str, name: str, options: Sequence[str]) -> ConfigError:
+    """Return the error for a choice that no file of a group has."""
+    return ConfigError(
+        f"{unknown_name(f'choice of {group}', name, options)} {own_file(group, name)}"
+    )
+
+
 def _built_on(recipe: str) -> set[str]:
     """Return the shipped recipes that a shipped recipe is built on."""
     path = Path(str(files(CONF))) / "experiment" / f"{recipe}.yaml"
@@ -222,6 +238,7 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     """
     for item in overrides:
         require(not item.endswith(f"={MISSING}"), f"{item.removeprefix('++')}: expected a value")
+        check_optional(item)
     try:
         # Settings may refer to defaults of classes.
         written = OmegaConf.to_container(cfg, resolve=False)
@@ -340,8 +357,7 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         options = error.options or ()
         if not group:
             return unknown_name("option", name, options)
-        error = unknown_name(f"choice of {group}", name, options)
-        return ConfigError(f"{error} {own_file(group, name)}")
+        return unknown_choice(group, name, options)
     if isinstance(error, OverrideParseException):
         key, equals, value = str(error.override).lstrip("+").partition("=")
         if not equals or key.startswith("-"):

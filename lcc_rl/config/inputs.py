@@ -115,7 +115,10 @@ def _own_files(module: str) -> Iterator[Path]:
 def _imports(path: Path, package: str) -> set[str]:
     """Return the names of all modules that a file of a package may import; not this package's."""
     names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_bytes())):
+    tree: Any = ()
+    with suppress(SyntaxError):  # an optional module that cannot be imported
+        tree = ast.walk(ast.parse(path.read_bytes()))
+    for node in tree:
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

@@ -78,6 +78,14 @@ def refuse(overrides: Iterable[str], reasons: Mapping[str, str]) -> None:
                     raise ConfigError(f"{option.removeprefix('++')} has no effect: {reason}")
 
 
+def drawn_in_training(scenario: Any) -> dict[str, str]:
+    """Return the settings of a scenario that an evaluation does not use, and why."""
+    keys = ["scenario.circumference_range"]
+    for node in nodes_in(scenario):
+        keys += [f"{node.where}.{name}" for name in getattr(node.kind, "of_training", ())]
+    return dict.fromkeys(keys, "only episodes of a training draw it")
+
+
 def of_package(part: Any) -> bool:
     """Return whether all nodes in a part of a configuration are of the package's code."""
     settings = (node.settings for node in nodes_in(part))

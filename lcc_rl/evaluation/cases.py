@@ -70,9 +70,9 @@ class Cases:
             rows.append(self._described(case, measured_series(series, time_step)))
             if case in self.inputs.cases:
                 drawn = trace(series, time_step)
-                drawn.insert(0, "strategy", self.strategy.name)
-                drawn.insert(1, "case", case.name)
-                steps.append(drawn)
+                seed = pd.Series(self.strategy.seed, drawn.index, "Int64")
+                labels = {"strategy": self.strategy.name, "training_seed": seed, "case": case.name}
+                steps.append(pd.concat([pd.DataFrame(labels), drawn], axis=1))
         trails = pd.concat(steps, ignore_index=True) if steps else pd.DataFrame()
         return pd.concat(rows, ignore_index=True), trails
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from lcc_rl.config.compose import identity
+from lcc_rl.config.compose import identity, with_inputs
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.envs.inputs import Inputs
 from lcc_rl.envs.step import pieces_of
@@ -38,9 +38,9 @@ Tables = tuple[pd.DataFrame, pd.DataFrame]  # rows, time series of sample episod
 
 
 def mark_of(strategy: Strategy) -> str:
-    """Return a hash of settings, weights and code, on which a strategy's rows depend."""
+    """Return a hash of settings, files, weights and code, on which a strategy's rows depend."""
     digest = hashlib.sha256(f"{code_version()} {strategy.name} {strategy.seed} ".encode())
-    digest.update(identity(strategy.cfg).encode())
+    digest.update(identity(with_inputs(strategy.cfg)).encode())
     weights = getattr(strategy.policy, "state_dict", None)
     for name, value in sorted(weights().items()) if weights else ():
         digest.update(name.encode())

@@ -14,7 +14,7 @@ from typing import Any
 from lcc_rl.config.compose import NOT_IDENTITY
 from lcc_rl.config.nodes import Node, as_plain, nodes_in
 from lcc_rl.config.schemas import AUTO, EvaluateConfig, StudyConfig
-from lcc_rl.config.unused import FIXED, of_package, refuse
+from lcc_rl.config.unused import FIXED, drawn_in_training, of_package, refuse
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError, require
@@ -125,6 +125,7 @@ class Entrants:
         cfg, rivals, named = self.cfg, [*self.rivals.values()], self.cfg.evaluation.baselines
         rows, specs = [*self.rivals, *named], [*rivals, *named]
         unused = {"seed": "it is that of trainings; evaluation.seed draws other noise"}
+        unused |= drawn_in_training(cfg.scenario)
         nodes = [controller_of(spec) for spec in specs if spec not in (DIRECT, PEOPLE)]
         others = self.paths or self.further or {DIRECT, PEOPLE} & {*map(str, specs)}
         if not others and cfg.is_fixed(nodes):

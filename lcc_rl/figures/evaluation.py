@@ -36,7 +36,7 @@ from lcc_rl.figures.space_time import space_time
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.intervals import Estimate, share_saved
 from lcc_rl.results.measures import between, signed
-from lcc_rl.results.motion import most_varied
+from lcc_rl.results.motion import most_varied, of_first_seed
 from lcc_rl.results.names import ON_FRONT, RULE, in_words, several, size_of
 from lcc_rl.results.render import column_cells
 from lcc_rl.results.report import AGAINST, ALL, COUNTS, Report
@@ -238,9 +238,7 @@ def _over_time(axis: Axes, rows: pd.DataFrame, entry: str) -> None:
 def _one_episode(steps: pd.DataFrame, strategy: str) -> pd.DataFrame:
     """Return the episode of :func:`most_varied`, with columns for one car and one human driver."""
     rows = most_varied(steps)
-    rows = rows[rows["strategy"] == strategy]
-    if "training_seed" in rows and rows["training_seed"].notna().any():
-        rows = rows[rows["training_seed"] == rows["training_seed"].min()]
+    rows = of_first_seed(rows[rows["strategy"] == strategy])
     # Of several vehicles, the first automated one and the human driver behind it.
     rows = rows.rename(columns=lambda name: re.sub(r"^cav1_", "cav_", name))
     behind = 1 + int(rows["cav_place"].iloc[0] if "cav_place" in rows else 0)

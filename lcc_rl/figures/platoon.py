@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from lcc_rl.data.leaders import Case
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.figures.drawing import INK, PAGE_WIDTH, footnote, legend_above, new_figure, paper
+from lcc_rl.results.motion import of_first_seed
 from lcc_rl.results.names import in_words
 
 # Strategies with a panel, beside those of the user.
@@ -25,12 +26,13 @@ WHO_DRIVES = ListedColormap(list(WINNER_COLOURS.values()))
 
 
 def platoon_figures(steps: pd.DataFrame, bound: float) -> Iterator[tuple[str, Figure]]:
-    """Yield name and figure of every case.
+    """Yield name and figure of every case, of trained strategies with their first seed.
 
     Args:
         steps: rows of steps.parquet.
         bound: bound of the jerk [m/s³].
     """
+    steps = of_first_seed(steps)
     for case in dict.fromkeys(steps["case"]) if len(steps) else ():
         yield f"{case} velocities", velocities(steps, case)
         yield f"{case} jerk", jerks(steps, case, bound)

@@ -19,6 +19,7 @@ from torch import nn
 
 from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
+from lcc_rl.config.unused import drawn_in_training, refuse
 from lcc_rl.config.words import key_of, top_key
 from lcc_rl.energy.fuel import STANDSTILL, STILL, CirclesFuel
 from lcc_rl.envs.factory import build_env
@@ -82,6 +83,7 @@ def page_data(policy: Any, trust: Sequence[str], overrides: Sequence[str]) -> di
         strange.append("drivers (only IDM drivers that share a, b and s0, without gap_noise)")
     if strange or car is None:
         raise ConfigError(f"{policy}: a page of the ring does not support {', '.join(strange)}")
+    refuse(overrides, drawn_in_training(scenario))
     for override in overrides:
         key = key_of(override).removeprefix("controller@")
         require(key.startswith(SHOWN), f"{override} has no effect: a page shows {', '.join(SHOWN)}")

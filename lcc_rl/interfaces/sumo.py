@@ -99,7 +99,7 @@ class Bridge:
         present = cars.getIDList()
         rows = {car: self._measured(car) for car in present if self.chosen(car)}
         measured = {car: row for car, row in rows.items() if row is not None}
-        for car in [car for car in self.modes if car not in measured]:
+        for car in [car for car in self.modes if not execute or car not in measured]:
             self._release(car, car in present)
         columns = zip(*measured.values(), strict=True) if measured else [()] * len(MEASURED)
         try:

@@ -65,6 +65,7 @@ class Drivers(Controller):
     # Standard deviation of a smooth noise of ln(perceived gap); None: that of the population.
     gap_noise: NonNegative | None = None
 
+    of_training = ("wiener_range", "time_gap_range", "delay_range", "acceleration_noise_range")
     reads_drivers = True
     name = HUMAN
     known = (

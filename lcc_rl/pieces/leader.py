@@ -37,6 +37,7 @@ class NGSIMLeader(StepTransform):
     perturbation: NonNegative = 0.0  # p; 0 in evaluation
     foresight: bool = False  # write the next speed, too
 
+    of_training = ("start", "perturbation")
     steady = True
     role = EPISODE
     keeps = (

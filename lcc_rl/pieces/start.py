@@ -42,6 +42,7 @@ class TimeGapStart(Part):
     # thus includes gaps that good driving never reaches.
     gap_range: Factors = (0.1, 1.5)
 
+    of_training = ("gap_range",)
     name = AUTOMATED
 
     def setup(self, world: World) -> None:
@@ -104,6 +105,7 @@ class HeadwayStart(Part):
     gap_spread: NonNegative = 2.0  # largest deviation of a gap; 0 in evaluation [m]
     speed_spread: NonNegative = 1.0  # largest deviation of a speed; 0 in evaluation [m/s]
 
+    of_training = ("gap_spread", "speed_spread")
     steady = True
 
     def validate(self) -> None:

@@ -145,6 +145,7 @@ def _sensed(role: str, name: str) -> str:
 class Part(Settings):
     """Settings of a part of an environment, bound to a world."""
 
+    of_training: ClassVar[Sequence[str]] = ()  # settings without effect in an evaluation
     name: ClassVar[str] = ""  # default; a part in an environment has its own name
     # Whether this class, not those derived from it, draws nothing in an evaluation and reads no
     # drivers; of human drivers, whether these have no noise.

@@ -74,6 +74,14 @@ class SampleMotion:
         )
 
 
+def of_first_seed(steps: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of steps.parquet of each strategy's first training seed."""
+    if "case" in steps and "training_seed" not in steps:  # of earlier versions
+        return steps
+    seeds = steps["training_seed"]
+    return steps[seeds.isna() | (seeds == seeds.groupby(steps["strategy"]).transform("min"))]
+
+
 def sample_episodes(steps: pd.DataFrame, strategy: str) -> dict[str, pd.DataFrame]:
     """Return the sample episodes of a strategy by a readable name.
 
@@ -86,12 +94,10 @@ def sample_episodes(steps: pd.DataFrame, strategy: str) -> dict[str, pd.DataFram
     """
     if "strategy" not in steps:
         raise ResultsError("no sample episode is stored")
-    rows = steps[steps["strategy"] == strategy]
+    rows = of_first_seed(steps[steps["strategy"] == strategy])
     if "case" in rows:
         episodes = {str(case): group for case, group in rows.groupby("case", sort=False)}
     else:
-        if rows["training_seed"].notna().any():
-            rows = rows[rows["training_seed"] == rows["training_seed"].min()]
         keys = [name for name in SAMPLE_KEYS if name in rows]
         groups = rows.groupby(keys, sort=False)
         episodes = {f"profile {key[0]}, driver {key[1]}": group for key, group in groups}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from os.path import exists  # false, too, for what is too long for a path
 from textwrap import fill
 from typing import Annotated, Any, NoReturn
 
@@ -62,5 +62,5 @@ TABLE = typed(Annotated[str, Field(pattern=r"\.(csv|parquet)$")])  # a file to w
 
 def files_and_settings(words: Sequence[str]) -> tuple[list[str], list[str]]:
     """Divide the words of a command into names, such as files, and settings ``key=value``."""
-    files = [word for word in words if "=" not in word or Path(word).exists()]
+    files = [word for word in words if "=" not in word or exists(word)]
     return files, [word for word in words if word not in files]

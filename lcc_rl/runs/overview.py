@@ -140,10 +140,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--clean", action="store_true", help="first remove failed runs without results"
     )
     options = parser.parse_args(arguments)
+    require(options.folder, "the name of the folder is empty; use, e.g., outputs")
     if options.clean:
         for path in clean(Path(options.folder)):
             print(f"removed {path}")
-    require(options.folder, "the name of the folder is empty; use, e.g., outputs")
     console = Console(highlight=False)
     show = watch_folder if options.watch and console.is_terminal else show_states
     show(Path(options.folder), console)

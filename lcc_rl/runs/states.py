@@ -66,6 +66,15 @@ class RunState:
         return f"{self.state}: {self.error}".removesuffix(": ")
 
 
+_locks: dict[Path, int | None] = {}  # locks of the folders that this process claims
+
+
+def _inode(folder: Path) -> int | None:
+    with suppress(OSError):
+        return (folder / LOCK).stat().st_ino
+    return None
+
+
 @contextmanager
 def claim(folder: Path) -> Iterator[None]:
     """Lock a run's folder and remove temporary files of killed processes.
@@ -83,12 +92,14 @@ def claim(folder: Path) -> Iterator[None]:
         raise busy(folder) from None
     except (OSError, NotImplementedError, ValueError) as error:  # ValueError: invalid name
         raise ResultsError(f"{folder}: cannot be written: {error}") from error
+    _locks[folder.absolute()] = _inode(folder)
     try:
         remove_leftovers(folder)
         yield
     finally:
         with suppress(OSError):
-            (folder / LOCK).unlink()
+            if _inode(folder) == _locks.pop(folder.absolute(), None):
+                (folder / LOCK).unlink()
         lock.release()
         with suppress(OSError):  # not empty
             for path in made:
@@ -115,7 +126,7 @@ def working(folder: Path) -> Iterator[None]:
         forget(folder)
         try:
             yield
-        except Interrupted:
+        except (Interrupted, Busy):
             raise
         except Exception as error:
             # A finished run remains finished if it could not be repeated.
@@ -125,9 +136,11 @@ def working(folder: Path) -> Iterator[None]:
 
 
 def check_present(folder: Path) -> None:
-    """Check that the folder of a run was not removed; writing a file would create it again."""
+    """Check that the folder was not removed; writing would create it again, or harm a new run."""
     if not folder.is_dir():
         raise ResultsError(f"{folder}: cannot be written: the folder was removed during the run")
+    if (lock := _inode(folder)) and lock != _locks.get(folder.absolute(), lock):
+        raise busy(folder)
 
 
 def forget(folder: Path) -> None:
@@ -148,11 +161,8 @@ def withdraw(folders: Sequence[Path]) -> None:
 def clean(root: Path) -> list[Path]:
     """Remove the folders of failed runs without rows and states; return them."""
     failed = [root / run.name for run in survey(root) if run.state == "failed"]
-    empty = [
-        run
-        for run in failed
-        if _holds_only(run, {HYDRA_FOLDER, ERROR, LOCK, CONFIG, PROGRESS, UNDRAWN})
-    ]
+    names = {HYDRA_FOLDER, ERROR, LOCK, CONFIG, PROGRESS, UNDRAWN}
+    empty = [run for run in failed if _holds_only(run, names)]
     for folder in empty:
         shutil.rmtree(folder)
     return empty

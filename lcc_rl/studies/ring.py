@@ -60,9 +60,10 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     source = folder / RING_EVALUATION
     rows, steps = (read_parquet(source / name) for name in (EPISODES, STEPS))
     cfg, study = read_settings(source / CONFIG), StudyResults(folder, formats)
-    first = cfg["evaluation"]["humans_first"]
+    first, skipped = (cfg["evaluation"][name] for name in ("humans_first", "warm_up"))
     lasting = cfg["scenario"]["horizon"] * cfg["scenario"]["time_step"]
-    caption = f"{lasting:g} s after {first:g} s in which humans drive all cars: means over episodes"
+    caption = f"{lasting:g} s after {first:g} s in which humans drive all cars, the first "
+    caption += f"{skipped:g} s not counted: means over episodes"
     study.table("ring", caption, table(rows))
     for name in dict.fromkeys(rows["strategy"]):
         figure = space_time(steps, [name], cfg)

@@ -17,9 +17,9 @@ import pandas as pd
 
 from lcc_rl.commands.evaluation import complete
 from lcc_rl.commands.pipeline import TRAJECTORIES, calibrate_once, read_once
-from lcc_rl.config.compose import load, with_inputs
+from lcc_rl.config.compose import NOT_IDENTITY, load, with_inputs
 from lcc_rl.config.words import key_of, quoted, top_key
-from lcc_rl.errors import ConfigError, require
+from lcc_rl.errors import ConfigError, ResultsError, require
 from lcc_rl.figures.evaluation import measures_of
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import parquet_metadata, read_parquet, write_parquet
@@ -28,7 +28,7 @@ from lcc_rl.results.measures import MEASURES, Shown
 from lcc_rl.results.names import several, with_drivers
 from lcc_rl.results.remarks import crashes
 from lcc_rl.results.report import Report, windows_for
-from lcc_rl.results.runs import CONFIG, EPISODES, read_settings
+from lcc_rl.results.runs import CONFIG, EPISODES, differing, flatten, read_settings, without
 from lcc_rl.results.windows import DRIVE, savings
 from lcc_rl.studies.alcc.study import DRIVERS_FILE
 from lcc_rl.studies.study import StudyResults
@@ -52,6 +52,7 @@ DRIVEN = (
     "ACC: {_target_: lcc_rl.pieces.LinearACC, desired_speed: 45}}",
 )
 LEADERS_FILE, SHARES_FOLDER = "leaders.parquet", "evaluation"
+OF_SHARE = ("scenario.string.penetration", *NOT_IDENTITY)  # settings in which shares may differ
 OF_DRIVE = " leader "  # separates recording and leader in the name of a drive
 LONGEST = 4000  # most steps of a window
 FUEL = "fuel_l_per_100km"
@@ -81,8 +82,9 @@ def run(folder: Path, overrides: Sequence[str], shares: Sequence[str] = ROAD_SHA
     if "leader" not in keys:
         drives = leader_drives(read_parquet(folder / TRAJECTORIES), cfg.scenario.time_step)
         write_parquet(drives, folder / LEADERS_FILE)
-        skipped = round(first.evaluation.warm_up / cfg.scenario.time_step)
-        steps = window_steps(drives.groupby("drive").size().to_numpy(), skipped)
+        step = first.scenario.time_step
+        samples = samples_of(drives, cfg.scenario.time_step, step)
+        steps = window_steps(samples, round(first.evaluation.warm_up / step))
         extra += ["leader=drives", f"leader.path={quoted(folder / LEADERS_FILE)}"]
         extra += ["leader.evaluation_share=1", "leader.least_variation=0"]
         extra += [f"leader.together='.*(?={OF_DRIVE})'", f"scenario.horizon={steps}"]
@@ -134,6 +136,12 @@ def leader_drives(episodes: pd.DataFrame, time_step: float) -> pd.DataFrame:
     return rows[["drive", "time_s", "speed_mps"]]
 
 
+def samples_of(drives: pd.DataFrame, recorded: float, step: float) -> np.ndarray:
+    """Return the samples of each drive at a step [s], of a table with another step [s]."""
+    lasting = (drives.groupby("drive").size().to_numpy() - 1) * recorded
+    return (lasting / step + 1e-6).astype(int) + 1
+
+
 def window_steps(samples: np.ndarray, begun: int) -> int:
     """Return the length of windows [steps] that covers the most time of all drives.
 
@@ -154,6 +162,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     """
     study = StudyResults(folder, formats)
     places = sorted((folder / SHARES_FOLDER).iterdir(), key=lambda path: float(path.name))
+    check_one_study(places)
     by_share = {path.name: windows_for(read_parquet(path / EPISODES)) for path in places}
     table = pd.DataFrame(row for share, group in by_share.items() for row in rows_of(share, group))
     table = table.astype(dict.fromkeys(COUNTED[:2], int))
@@ -184,6 +193,17 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
             study.blocks.append("\n".join([f"## {name}\n", *new]))
     study.write("Automated cars on this road")
     return study
+
+
+def check_one_study(places: Sequence[Path]) -> None:
+    """Refuse evaluations that differ in more than the share of automated cars."""
+    settings = [without(dict(flatten(read_settings(path / CONFIG))), OF_SHARE) for path in places]
+    for place, own in zip(places, settings, strict=True):
+        if keys := differing(settings[0], own):
+            raise ResultsError(
+                f"{place} differs from {places[0]} in {', '.join(keys[:3])}; remove the shares of "
+                "other settings, or choose another --out"
+            )
 
 
 def rows_of(share: str, windows: pd.DataFrame) -> Iterator[dict[str, Any]]:

@@ -43,6 +43,7 @@ WRONG = {
     "scenario.string='automated human*٢٥'": "expected .* at character 16",
     "agent=dddpg": "agent 'dddpg'.*'ddpg'.* agent/dddpg.yaml, needs --config-dir",
     "reward.terms.safety.wieght=1": "reward.terms.safety .*'weight'",
+    "learning=follow": "choice of learning 'follow'; valid: follow_samples.*, needs --config-dir",
     "agent._partial_=true": "agent._partial_ has no effect",
     "agent.gamma=???": r"^agent\.gamma=\?\?\?: expected a value",
     # types
@@ -116,6 +117,7 @@ OF_TRAINING = "has the (settings|agent) of its training"
 EVALUATED = {
     "alcc training.gap_range=[0.2,0.3]": OF_TRAINING,
     "alcc agent.hold=5": OF_TRAINING,
+    "alcc scenario.controllers.human.time_gap_range=[1,2]": "only episodes of a training draw it",
     "alcc agent=ppo": f"{OF_TRAINING}, analytic",
     "alcc reward.terms.safety.weight=5": "only rows of policies have it, with evaluation.terms",
     "alcc reward.without=safety": "only rows of policies have it, with evaluation.terms",

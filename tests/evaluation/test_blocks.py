@@ -15,10 +15,11 @@ from helpers import POPULATION, compose, network, slow_but, wavy_profiles
 from lcc_rl import results
 from lcc_rl.commands import evaluation
 from lcc_rl.config import load
+from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import EvaluateConfig
 from lcc_rl.envs import Inputs
 from lcc_rl.errors import ResultsError
-from lcc_rl.evaluation.comparison import BLOCKS, Store
+from lcc_rl.evaluation.comparison import BLOCKS, Store, mark_of
 from lcc_rl.evaluation.episodes import Episodes, Plan, evaluate
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.figures import evaluation as figures
@@ -116,6 +117,15 @@ def test_resuming_equals_never_having_stopped(whole, tmp_path, monkeypatch, coun
     assert len(played) == 12 - count
     same(folder, whole)
     assert not (folder / BLOCKS).exists()
+
+
+def test_blocks_of_a_policy_whose_file_changed_are_played_again(tmp_path) -> None:
+    settings = {"_target_": "lcc_rl.data.sources.EpisodesSource", "path": str(tmp_path / "a.csv")}
+    strategy, marks = Strategy("own", compose("idm").with_(data=Node.of(settings, "data"))), set()
+    for text in ("one", "two", "two"):
+        (tmp_path / "a.csv").write_text(text)
+        marks.add(mark_of(strategy))
+    assert len(marks) == 2
 
 
 def test_an_interrupted_command_names_the_one_that_goes_on(tmp_path, monkeypatch) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 import pytest
-from helpers import POPULATION, compose, wavy_profiles
+from helpers import POPULATION, check_refused, compose, wavy_profiles
 
+from lcc_rl.commands.clairvoyant import best, main, regard
 from lcc_rl.config import load
 from lcc_rl.envs import Inputs
-from lcc_rl.evaluation.clairvoyant import clairvoyant
+from lcc_rl.errors import ConfigError
+from lcc_rl.evaluation.clairvoyant import BOUND_BOTH, BOUND_OWN, clairvoyant
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.strategies import Strategy, trained
 from lcc_rl.results.policies import load_policy
@@ -50,6 +53,19 @@ def test_who_knows_the_profile_saves() -> None:
     assert [number for number, *_ in told] == list(range(1, 11))
     assert told[0][1] == pytest.approx(before[BOTH].sum(axis=1).mean(), rel=1e-4)
     assert told[-1][1] == pytest.approx(after[BOTH].sum(axis=1).mean(), rel=0.01)
+
+
+def test_the_best_plan_has_no_collision_and_regard_is_a_share_of_the_baseline() -> None:
+    rows = pd.DataFrame({"strategy": BOUND_BOTH, "profile_id": [0, 1, 2], "driver_id": 0})
+    whole = rows.assign(total_path_energy_kj=90.0, collided=False)
+    short = rows.assign(total_path_energy_kj=[20.0, 95.0, 95.0], collided=[True, False, False])
+    plan = best([short, whole])
+    assert plan["total_path_energy_kj"].tolist() == [90.0] * 3
+    parts = [whole.assign(strategy=name) for name in ("human", BOUND_OWN)]
+    played = pd.concat([*parts, plan]).assign(training_seed=np.nan)
+    assert regard(played).endswith("; 0.00% of that with simulated drivers.")
+    cases = [("0", "greater than 0"), ("nan", "finite"), ("0.04", "shorter than a step")]
+    check_refused(lambda hold: main(["--hold", hold]), cases, ConfigError)
 
 
 @pytest.mark.slow

@@ -170,6 +170,7 @@ def test_what_is_no_policy_of_these_keys_is_refused_in_a_line() -> None:
         ({"x": TensorDictModule(network, ["observation"], ["act"])}, r"writes \['act'\]: expected"),
         ({"alcc": network}, "a policy alcc, which stands for 'network': choose another"),
     ]
+    cases += [([network, networks()[0]], "two policies of one class; name them")]
     check_refused(lambda who: lcc_rl.compare(who, overrides=SMALL), cases, ConfigError)
     with pytest.raises(ConfigError, match="x is a policy, and variant idm has no agent"):
         lcc_rl.compare({"x": network}, "idm", [*NO_AGENT])

@@ -71,6 +71,8 @@ def test_a_task_compares_rivals_by_name_and_prints_its_scores(name, tmp_path, ca
     assert heads.split(" & ") == ["driven by", r"saved [\%] \\"]
     with pytest.raises(ConfigError, match="Did you mean 'saved_pct'"):
         table_again([str(tmp_path), "--columns", "saved"])
+    with pytest.raises(ConfigError, match="--against, --unit need a run's folder"):
+        table_again(["a.parquet", "--against", "idm", "--unit", "mpg"])
 
 
 @pytest.mark.usefixtures("blank_figures")

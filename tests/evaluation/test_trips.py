@@ -18,6 +18,7 @@ from lcc_rl.config import load
 from lcc_rl.envs import load_inputs
 from lcc_rl.envs.inputs import build_energy
 from lcc_rl.evaluation.metrics import energy_measures
+from lcc_rl.runs.arguments import files_and_settings
 
 COLUMNS = "leader.columns={drive: trip, time: t, speed: v}"
 GRADED = ["leader.columns={drive: trip, time: t, speed: v, grade: slope}", "leader.units.grade=%"]
@@ -124,6 +125,7 @@ def test_trips_are_sorted_by_their_numbers(path) -> None:
     pd.concat([made()[:61].assign(trip=name) for name in names]).to_csv(path, index=False)
     found = lcc_rl.trip_energies(path, ["energy=fuel", COLUMNS])
     assert found["trip"].tolist() == ["1", "a", "trip 2", "trip 2b", "trip 10"]
+    assert files_and_settings(["a" * 300 + "=1", path]) == ([path], ["a" * 300 + "=1"])
 
 
 def test_refused_trips(path) -> None:
@@ -145,6 +147,7 @@ def test_refused_trips(path) -> None:
             ("word", r"trips\.csv: data row 71, column 'v' holds 'x'"),
             ("fast", r"trips\.csv: .*data row 1\d, column 'v' .*leader\.units\.speed"),
             ("seed=3", "seed=3 has no effect on the energy of given trips"),
+            ("leader.fastest=9", "leader.fastest=9 has no effect on the energy of given trips"),
             ("energy=mixture", "a mixture has several models"),
             ("leader.columns.drive=id", "lacks the column id; it has trip, t, v, slope, v_mps, "),
             (GRADED[0], r"holds '3\.0'.*0\.3 rad; is it in % \(leader\.units\.grade=%\)\?"),

@@ -222,6 +222,7 @@ def test_what_the_page_cannot_compute_is_one_clear_error(tmp_path) -> None:
             export(RING, tmp_path / "ring.html", overrides=ring)
     unseen = ("seed=3", "agent=td3", "scenario.horizon=200", "filter=cbf", "training.episodes=3")
     cases = [(words, "has no effect: a page shows drivers, energy, .*") for words in unseen]
+    cases += [("scenario.circumference_range=[0.5,2]", "only episodes of a training draw it")]
     check_refused(lambda words: ring_page(RING, overrides=[words]), cases, ConfigError)
     with pytest.raises(ConfigError, match="no road"):
         export(RING, tmp_path / "ring.onnx", overrides=["scenario.circumference=300"])

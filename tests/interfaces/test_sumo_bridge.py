@@ -120,8 +120,9 @@ def test_it_moves_as_in_the_own_environment(driver, share, tmp_path) -> None:
 def test_with_nobody_ahead_in_sight_sumo_drives(tmp_path) -> None:
     start(tmp_path, {"lead": (500.0, 10.0), "own": (400.0, 10.0)})
     bridge = Bridge(POLICY, lambda car: car == "own", sight=100.0)
-    assert set(bridge.command()) == {"own"}
-    assert libsumo.vehicle.getSpeedMode("own") == 0
+    for executed, mode in ((True, 0), (False, 31), (True, 0)):
+        assert set(bridge.command(executed)) == {"own"}
+        assert libsumo.vehicle.getSpeedMode("own") == mode
     libsumo.vehicle.setSpeedMode("lead", 0)
     libsumo.vehicle.setSpeed("lead", 30.0)
     for _ in range(100):

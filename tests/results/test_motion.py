@@ -17,6 +17,7 @@ from PIL import Image, ImageSequence
 from lcc_rl.commands import animate as command
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.figures.animation import LARGEST_PAGE, ROLE_COLOURS, animate, frames, page
+from lcc_rl.figures.platoon import platoon_figures
 from lcc_rl.io.files import write_parquet
 from lcc_rl.results.motion import SampleMotion, motion_of, sample_episodes
 
@@ -56,6 +57,10 @@ def test_a_platoon_has_a_row_per_vehicle() -> None:
     table |= {"follower": np.tile([0, 1, 2], 4), "speed_mps": np.tile([4.0, 3.0, 2.0], 4)}
     table |= {"gap_m": np.tile([np.nan, 5.0, 6.0], 4)}
     found = sample_episodes(pd.DataFrame(table), "hcfs")["case 1"]
+    steps = pd.concat([pd.DataFrame(table).assign(training_seed=s, speed_mps=s) for s in (1, 0)])
+    assert set(sample_episodes(steps, "hcfs")["case 1"]["speed_mps"]) == {0}  # no mean of both
+    for _, figure in platoon_figures(steps.assign(jerk_mps3=0.0), 30.0):
+        assert all(np.diff(x.get_xdata()).min() > 0 for x in figure.axes[0].lines if x.get_label())
     motion = motion_of(found, {**OPEN, "string": "automated*6"})
     assert motion.roles == ("automated", "automated")
     assert motion.position[0].tolist() == [-10.0, -21.0]

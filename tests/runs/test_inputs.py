@@ -107,11 +107,12 @@ def test_imports_within_functions_and_packages_are_followed(place) -> None:
     package = place / "own_parts"
     package.mkdir()
     (package / "__init__.py").write_text("")
-    (package / "late.py").write_text("import own_helper, torch, lcc_rl, missing\n")
+    (package / "late.py").write_text("import own_helper, torch, lcc_rl, missing, old\n")
+    (place / "old.py").write_text("print 'of Python 2'\n")  # may be imported optionally
     (package / "beside.py").write_text("")
     (package / "term.py").write_text("def Term():\n    from .late import X\n")
     found = inputs_of({"compare": ["own_parts.term.Term"]})
-    assert [*found["compare"]] == ["term.py", "late.py", "own_helper.py"]
+    assert [*found["compare"]] == ["term.py", "late.py", "old.py", "own_helper.py"]
     (package / "term.py").write_text("import own_parts, other\n\ndef Term(): ...\n")
     (place / "other").mkdir()
     (place / "other" / "__init__.py").write_text("other = 1")

@@ -52,7 +52,7 @@ def test_settings_alone_are_a_run_to_begin(trained, tmp_path) -> None:
     again = tiny("train", f"resume={folder}")
     cases = [
         (lambda: training.run(again, tmp_path), "parquet without checkpoint.pt .* lcc-rl repeat"),
-        (lambda: repeat.repeat(folder, trained), "exists already; choose another with --out"),
+        *((lambda to=x: repeat.repeat(folder, to), "or lies in") for x in (trained, folder / "a")),
         (lambda: repeat.repeat(tmp_path, folder), "not a run folder"),
     ]
     check_refused(lambda call: call(), cases, LccError)

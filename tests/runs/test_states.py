@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from commands import run_command
+from helpers import check_refused
 from rich.console import Console
 
 from lcc_rl.commands import training
@@ -22,6 +23,7 @@ from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import (
     Busy,
     RunState,
+    check_present,
     claim,
     inspect_run,
     is_claimed,
@@ -101,6 +103,15 @@ def test_a_finished_run_stays_finished_and_a_removed_one_removed(tmp_path, train
     assert not folder.exists()
 
 
+def test_a_folder_that_was_removed_and_made_anew_belongs_to_its_new_run(tmp_path) -> None:
+    lock = tmp_path / "run" / ".lock"
+    with claim(lock.parent):
+        lock.unlink()
+        lock.write_text("of another process")
+        check_refused(check_present, [(lock.parent, "another process is working")], Busy)
+    assert lock.exists()
+
+
 def test_survey_and_status_of_a_sweep(tmp_path) -> None:
     for name in ("finished", "failed", "stopped", "running", "running/part"):
         (tmp_path / name).mkdir()
@@ -132,7 +143,7 @@ def test_survey_and_status_of_a_sweep(tmp_path) -> None:
     )
 
 
-def test_clean_removes_failed_runs_without_work(tmp_path, capsys) -> None:
+def test_clean_removes_failed_runs_without_work(tmp_path, capsys, monkeypatch) -> None:
     for name in ("failed", "failed_late", "stopped"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.yaml").write_text("")
@@ -140,6 +151,8 @@ def test_clean_removes_failed_runs_without_work(tmp_path, capsys) -> None:
         (tmp_path / name / "error.txt").write_text("full")
         (tmp_path / name / "train.log").write_text("")
     (tmp_path / "failed_late" / "checkpoint.pt").write_text("")
+    monkeypatch.chdir(tmp_path)
+    check_refused(main, [(["", "--clean"], "the name of the folder is empty")])
     main([str(tmp_path), "--clean"])
     assert f"removed {tmp_path / 'failed'}\n" in capsys.readouterr().out
     assert {path.name for path in tmp_path.iterdir()} == {"failed_late", "stopped"}

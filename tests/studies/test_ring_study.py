@@ -14,7 +14,7 @@ SMALL = (
     "scenario.circumference=72",
     "evaluation.humans_first=2",
     "scenario.horizon=40",
-    "evaluation.warm_up=0",
+    "evaluation.warm_up=1",
     "evaluation.profiles=2",
 )
 
@@ -26,7 +26,7 @@ def test_one_command_writes_the_table(tmp_path) -> None:
     assert {"FollowerStopper", "PI with saturation", "field experiment"} < set(table.index)
     assert table.loc["simulated drivers", "speeds against humans"] == "0.0 %"
     text = (tmp_path / "ring" / "results.md").read_text()
-    assert "2 s in which humans drive all cars" in text
+    assert "4 s after 2 s in which humans drive all cars, the first 1 s not counted" in text
 
 
 def test_changes_are_against_the_humans() -> None:

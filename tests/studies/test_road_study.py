@@ -57,6 +57,10 @@ def test_one_command_writes_table_figure_and_reports(tmp_path) -> None:
     humans, whole = road.study_results(tmp_path / "road").tables["road"].iloc[2:].iloc
     assert np.isnan([whole["fuel_saved_pct"], whole["flow_vph_low"]]).all()
     assert np.isfinite([whole["fuel_l_per_100km"], humans["fuel_l_per_100km"]]).all()
+    file = tmp_path / "road" / "evaluation" / "50" / "config.yaml"
+    file.write_text(file.read_text().replace("horizon: 60", "horizon: 80"))
+    with pytest.raises(ResultsError, match=r"50 differs from .*25 in scenario.horizon; remove"):
+        road.study_results(tmp_path / "road")
     again = read_parquet(tmp_path / "road" / "leaders.parquet")
     assert again.groupby("drive").size().max() == 4209  # seven minutes
     with pytest.raises(ResultsError, match="of other data; choose another folder"):
@@ -79,6 +83,7 @@ def test_a_leader_is_one_drive_whoever_follows() -> None:
     }
     found = road.leader_drives(pd.DataFrame(rows), 0.1)
     drives = {str(name): part["speed_mps"].tolist() for name, part in found.groupby("drive")}
+    assert road.samples_of(found, 0.1, 0.2).tolist() == [2, 1, 1]
     assert drives == {
         "a leader 1 from 0.0 s": [5.0, 6.0, 7.0],
         "a leader 1 from 9.0 s": [1.0, 4.0],
