@@ -155,7 +155,8 @@ def test_energies_come_in_the_unit_asked_for(tmp_path, capsys) -> None:
     for unit in ("g/km", "L/100km", "mpg"):  # each beside the litres drawn
         words = [*SETTINGS["episodes"], "energy=fuel", f"unit={unit}"]
         (made,) = reports(petrol, load("evaluate", words))
-        assert made.table.columns.is_unique and made.short[made.score].notna().all()
+        assert made.table.columns.is_unique
+        assert made.short[made.score].notna().all()
     (made,) = reports(noisy(), load("evaluate", [*SETTINGS["episodes"], "unit=Wh/km"]))
     assert made.score in {*made.short} & {"energy_wh_per_km"}
     cases = [
