@@ -52,5 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     found = simulate(leaders or None, overrides=settings, **given)
     shown = found.vehicles.loc[: MOST_ROWS - 1, :LAST_SHOWN]
     print(shown.to_string(index=False, float_format="{:,.4g}".format))
+    if (more := len(found.vehicles) - len(shown)) > 0:
+        print(f"and {more} more: --vehicles FILE has all")
     for name, path in written.items():
         write_table(getattr(found, name), path)

@@ -277,8 +277,8 @@ def ring_picture(motions: Mapping[str, SampleMotion]) -> str:
 
 def _panel(name: str, motion: SampleMotion, place: int, top: float) -> str:
     """Return one ring with its cars."""
-    step = float(motion.time[1] - motion.time[0])
-    shown = motion.at(slice(None, None, max(round(KEY_STEP / step), 1)))
+    last, pieces = len(motion.time) - 1, (motion.time[-1] - motion.time[0]) / KEY_STEP
+    shown = motion.at(np.linspace(0, last, max(math.ceil(pieces), 1) + 1).round().astype(int))
     turn = 360.0 / float(motion.circumference or 1.0)  # of a metre [degrees]
     angles = -turn * (shown.position - 0.5 * motion.lengths[1:])
     long = math.radians(turn) * RADIUS * motion.lengths[1:]

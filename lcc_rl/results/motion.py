@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from lcc_rl.arrays import Integers
 from lcc_rl.errors import ResultsError
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING, parse_string
 from lcc_rl.settings import TARGET
@@ -62,7 +63,7 @@ class SampleMotion:
         first = self.speed[:, -1] if self.leader is None else self.leader
         return np.column_stack([first, self.speed[:, :-1]])
 
-    def at(self, moments: slice) -> SampleMotion:
+    def at(self, moments: slice | Integers) -> SampleMotion:
         """Return the motion at selected times."""
         return replace(
             self,

@@ -299,7 +299,11 @@ def test_the_command_drives_as_the_function_does(tmp_path, capsys) -> None:
     words = f"{leader} --string automated+human --controller idm_acc --seed 2 energy=bolt"
     words = [word.replace("+", " ") for word in words.split()]
     main([*words, "--steps", f"{steps}", "--vehicles", f"{vehicles}"])
-    assert "path_energy_kj" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "path_energy_kj" in printed
+    assert "more:" not in printed
+    main([f"{leader}", "--string", "human*42"])
+    assert capsys.readouterr().out.endswith("and 3 more: --vehicles FILE has all\n")
     pd.testing.assert_frame_equal(pd.read_parquet(steps), found.steps, check_dtype=False)
     pd.testing.assert_frame_equal(pd.read_csv(vehicles), found.vehicles, check_dtype=False)
     cases = [

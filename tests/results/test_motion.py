@@ -160,12 +160,13 @@ def test_every_colour_and_axis_of_a_film_is_named() -> None:
 
 
 def test_an_svg_turns_each_car_by_its_way_and_shows_rings_side_by_side(tmp_path) -> None:
-    moved = drifting(3, ring=True, seconds=6.0)
+    moved = drifting(3, ring=True, seconds=7.0)
     path = animate({"a < b": moved, "c": moved}, tmp_path / "ring.svg")
     root = ElementTree.parse(path).getroot()
     turns = [x.get("values") for x in root.iter(f"{SVG}animateTransform")]
     assert len(turns) == 6
-    middle = moved.position[::15] - 0.5 * moved.length  # a key frame every 1.5 s
+    shown = np.linspace(0, len(moved.time) - 1, 6).round().astype(int)  # to the end, near 1.5 s
+    middle = moved.position[shown] - 0.5 * moved.length
     found = np.array([text.split(";") for text in turns[:3]], float).T
     assert found == pytest.approx(-360.0 / 500.0 * middle, abs=0.051)
     assert len(list(root.iter(f"{SVG}circle"))) == 2 + 2  # two roads, two marks
