@@ -327,6 +327,48 @@ def test_a_parameter_of_shipped_models_is_not_described_anew(make_episodes):
         fit(make_episodes([15.0], [1.0]), model=f"{__name__}.Redeclared")
 
 
+SEEN: dict[str, float] = {"last": 0.0}
+
+
+class Mindful(Helly):
+    """A law that keeps the last approach rate in a variable of its module."""
+
+    def wish(self, speed, gap, approach_rate, *own):
+        SEEN["last"] = 0.9 * SEEN["last"] + 0.1 * float(approach_rate.mean())
+        return super().wish(speed, gap, approach_rate + SEEN["last"], *own)
+
+
+class Mixing(Helly):
+    """A law that mixes drivers."""
+
+    def wish(self, speed, *more):
+        return super().wish(speed, *more) - speed.mean()
+
+
+class Smoothing(Helly):
+    """A law that returns its memory as a controller does."""
+
+    def wish(self, *motion):
+        return super().wish(*motion), motion[2]
+
+
+class Declaring(Smoothing):
+    """The same law, which declares it."""
+
+    remembers = ("smooth",)
+
+
+def test_a_calibrated_law_is_a_function_of_the_present() -> None:
+    words = {
+        "Mindful": "Mindful remembers in its variable 'SEEN', which .*; evaluate one with memory",
+        "Mixing": "Mixing gives an episode other acceleration alone",
+        "Smoothing": "Smoothing: wish must return one tensor",
+        "Declaring": "Declaring has remembers: a calibrated law .* as a DriverModel",
+    }
+    cases = [(f"{__name__}.{name}", text) for name, text in words.items()]
+    check_refused(lambda model: Calibrator(model=model), cases, ConfigError)
+
+
 def test_a_law_without_machine_code_is_simulated_by_tensors(uneven_lengths):
     observed, candidates = observe(uneven_lengths), torch.tensor([[20.0, 1.0]]).double()
     found = []
