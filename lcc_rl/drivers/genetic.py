@@ -1,4 +1,4 @@
-"""Genetic algorithm that solves many independent problems at once."""
+"""Genetic algorithm and Newton's method that solve many independent problems at once."""
 
 from __future__ import annotations
 
@@ -18,9 +18,13 @@ Fitness = Callable[[Tensor], Tensor]
 Progress = Callable[[int, int, str], None]
 
 Individuals = Annotated[int, Field(ge=1, le=100_000)]
-LATE, STEADY = 0.75, (0.99, 1e-3)  # see Evolution.converged
 # Least patience, as a share of the generations: earlier, the mutation is too wide to improve a fit.
 LEAST_PATIENCE = 1 / 3
+# Newton's method: shift that measures derivatives, as a share of the bounds; largest number of
+# rounds; damping tried, as a share of the largest curvature; relative and absolute decrease of the
+# objective below which a problem is solved.
+SHIFT, ROUNDS, SOLVED, NOTHING = 1e-5, 100, 5e-5, 1e-6
+DAMPING = (1e-9, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
@@ -50,13 +54,10 @@ class Evolution:
     Args:
         best: fittest individual of every problem, ``[problems, dims]``, in the bounds' units.
         fitness: its objective, ``[problems]``; infinite if no individual was valid.
-        converged: whether it fell by less than 1 %, or 0.001, in the last quarter of the
-            generations, ``[problems]``.
     """
 
     best: Tensor
     fitness: Tensor
-    converged: Tensor
 
 
 def minimise(
@@ -95,6 +96,64 @@ def minimise(
     return replace(found, best=lower + found.best * (upper - lower))
 
 
+def polish(terms: Fitness, best: Tensor, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+    """Move solutions to the next minimum by damped Newton steps; no objective increases.
+
+    The objective is a sum of roots of smooth terms. Steps minimise the terms' squares, each divided
+    by its present root. Derivatives are differences. Negative curvatures count as positive ones,
+    and a parameter stays on a bound that the slope leads beyond.
+
+    Args:
+        terms: returns the summands of the objective, ``[problems, population, summands]``, for
+            ``[problems, population, dims]``, in float64.
+        best: solutions ``[problems, dims]``.
+        lower, upper: bounds, ``[dims]``.
+
+    Returns:
+        The solutions, and whether each is a minimum, ``[problems]``.
+    """
+    span, count = upper - lower, len(lower)
+    evaluate = _in_units(terms, lower, upper)
+    one = torch.eye(count).to(best)
+    row, column = torch.triu_indices(count, count, 1)
+    shifts = SHIFT * torch.cat([one, one[row] + one[column]])
+    shifts = torch.cat([0.0 * one[:1], shifts, -shifts])
+    damping = torch.tensor(DAMPING).to(best)
+    genes = ((best - lower) / span).clamp(0.0, 1.0).unsqueeze(1)
+    least, solved = evaluate(genes).sum(-1), torch.zeros(len(best), dtype=torch.bool)
+    for _ in range(ROUNDS):
+        values = evaluate(genes.clamp(SHIFT, 1.0 - SHIFT) + shifts)
+        values = (values.square() / values[:, :1].clamp(min=NOTHING**2)).sum(-1)
+        slope, curve = _derivatives(values, count)
+        place = genes.squeeze(1)
+        free = ~((place <= 0.0) & (slope > 0.0) | (place >= 1.0) & (slope < 0.0))
+        sizes, ways = torch.linalg.eigh(curve * (free.unsqueeze(1) & free.unsqueeze(2)))
+        sizes = sizes.abs().unsqueeze(-1)
+        along = ways.mT @ (slope * free).unsqueeze(-1)
+        steps = ways @ (along / (sizes + damping * sizes.amax(1, keepdim=True))).nan_to_num()
+        tried = torch.cat([genes, (genes - steps.mT).clamp(0.0, 1.0)], 1)
+        genes, found = _fittest(tried, evaluate(tried).sum(-1), 1)
+        solved = (found >= least * (1.0 - SOLVED) - NOTHING).squeeze(1)
+        least = found
+        if bool(solved.all()):
+            break
+    return lower + genes.squeeze(1) * span, solved
+
+
+def _derivatives(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return slopes ``[problems, count]`` and curvatures of values at the shifts of polish."""
+    values = torch.where(values.isfinite(), values, values[:, :1]).nan_to_num(posinf=0.0)
+    more, less = values[:, 1:].chunk(2, 1)
+    slope = (more - less)[:, :count] / (2.0 * SHIFT)
+    twice = (more + less - 2.0 * values[:, :1]) / SHIFT**2
+    single, both = twice[:, :count], twice[:, count:]
+    row, column = torch.triu_indices(count, count, 1)
+    curve = torch.diag_embed(single)
+    curve[:, row, column] = 0.5 * (both - single[:, row] - single[:, column])
+    curve[:, column, row] = curve[:, row, column]
+    return slope, curve
+
+
 def _evolve(
     evaluate: Fitness,
     problems: int,
@@ -106,7 +165,7 @@ def _evolve(
     genes = _latin_hypercube(random, settings.founders * settings.population)
     genes = genes.expand(problems, -1, -1).contiguous()
     genes, fitness = _fittest(genes, evaluate(genes), settings.population)
-    best = late = fitness[:, 0]
+    best = fitness[:, 0]
     stale = torch.zeros_like(best)
     patience = max(settings.patience, LEAST_PATIENCE * settings.generations)
     for generation in range(1, settings.generations + 1):
@@ -117,13 +176,11 @@ def _evolve(
         fitness = torch.where(stopped, fitness, evolved[1])
         stale = torch.where(fitness[:, 0] < best * (1.0 - settings.tolerance), 0.0, stale + 1.0)
         best = fitness[:, 0]
-        late = best if generation <= LATE * settings.generations else late
         if progress is not None:
             progress(generation, settings.generations, f"mean best {best.mean().item():.5g}")
         if bool((stale >= patience).all()):
             break
-    least = torch.minimum(late * STEADY[0], late - STEADY[1])
-    return Evolution(genes[:, 0], best, best >= least)
+    return Evolution(genes[:, 0], best)
 
 
 class _Random:

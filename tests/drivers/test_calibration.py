@@ -213,7 +213,6 @@ def test_rows_keep_the_order_and_identity_of_the_input(uneven_lengths):
         *(f"{PARAMETERS[x].column}_{end}" for end in ("low", "high") for x in fitted("global")[2:]),
     ]
     assert seen == [(1, 2), (2, 2)] * 2
-    assert "more generations? (calibration.global_genetic.generations=6)" in " ".join(found.report)
     renamed = uneven_lengths.rename(columns={"episode": "event", "recording": "period"})
     pd.testing.assert_frame_equal(both(renamed).drivers, drivers)
 

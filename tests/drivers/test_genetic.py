@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lcc_rl.drivers.genetic import GeneticSettings, minimise
+from lcc_rl.drivers.genetic import GeneticSettings, minimise, polish
 
 SETTINGS = GeneticSettings(population=40, generations=80, patience=80)
 
@@ -60,12 +60,22 @@ def test_a_problem_does_not_depend_on_its_neighbours():
             assert torch.equal(together.best[one], alone.best[0]), (settings, one)
 
 
-def test_a_search_that_still_improves_has_not_converged():
-    centre = torch.tensor([[1.0, 2.0]], dtype=torch.float64)
-    for generations, converged in ((80, True), (8, False)):
-        settings = GeneticSettings(population=8, generations=generations, founders=1)
-        found = solve(spheres(centre), 1, settings=settings, low=-50.0, high=50.0)
-        assert found.converged.tolist() == [converged], generations
+def test_polished_solutions_are_minima_within_the_bounds(monkeypatch):
+    def terms(x):  # two roots of squares, in a narrow valley; the second minimum is on a bound
+        valley = 30.0 * (x[..., 1] - x[..., 0] ** 2), x[..., 0] - torch.tensor([[0.5], [3.0]])
+        return torch.stack([(valley[0].square() + valley[1].square()).sqrt(), valley[1].abs()], -1)
+
+    ends = torch.tensor([-1.0, -1.0]).double(), torch.tensor([2.0, 4.0]).double()
+    start = torch.tensor([[-0.5, 3.0], [0.0, 0.0]]).double()
+    best, solved = polish(terms, start, *ends)
+    assert solved.all()
+    torch.testing.assert_close(
+        best, torch.tensor([[0.5, 0.25], [2.0, 4.0]]).double(), atol=1e-4, rtol=0
+    )
+    monkeypatch.setattr("lcc_rl.drivers.genetic.ROUNDS", 2)
+    worse, solved = polish(terms, start, *ends)
+    assert not solved.any()
+    assert (terms(worse.unsqueeze(1)).sum(-1) < terms(start.unsqueeze(1)).sum(-1)).all()
 
 
 def test_equal_seeds_give_equal_results_and_others_do_not():
