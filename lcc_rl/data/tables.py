@@ -424,7 +424,12 @@ def _shown(cell: pa.Scalar) -> str:
 
 
 def _seconds(cells: Cells) -> Cells:
-    """Return ISO 8601 times as seconds since 1970, clock times since midnight; others unchanged."""
+    """Return ISO 8601 times as seconds since 1970, clock times since midnight, else the numbers.
+
+    Those in single precision become their shortest decimals: 407.9, not 407.89999.
+    """
+    if pa.types.is_float32(cells.type):
+        return pc.cast(pc.cast(cells, pa.string()), pa.float64())
     if not (pa.types.is_string(cells.type) or pa.types.is_timestamp(cells.type)):
         return cells
     for kind in (pa.timestamp("ns"), pa.timestamp("ns", "UTC")):

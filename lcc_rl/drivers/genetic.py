@@ -23,8 +23,8 @@ LEAST_PATIENCE = 1 / 3
 # Newton's method: shift that measures derivatives, as a share of the bounds; largest number of
 # rounds; damping tried, as a share of the largest curvature; relative and absolute decrease of the
 # objective below which a problem is solved.
-SHIFT, ROUNDS, SOLVED, NOTHING = 1e-5, 100, 5e-5, 1e-6
-DAMPING = (1e-9, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
+SHIFTED, ROUNDS, SOLVED, NEGLIGIBLE = 1e-5, 100, 5e-5, 1e-6
+DAMPINGS = (1e-9, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
@@ -116,14 +116,14 @@ def polish(terms: Fitness, best: Tensor, lower: Tensor, upper: Tensor) -> tuple[
     evaluate = _in_units(terms, lower, upper)
     one = torch.eye(count).to(best)
     row, column = torch.triu_indices(count, count, 1)
-    shifts = SHIFT * torch.cat([one, one[row] + one[column]])
+    shifts = SHIFTED * torch.cat([one, one[row] + one[column]])
     shifts = torch.cat([0.0 * one[:1], shifts, -shifts])
-    damping = torch.tensor(DAMPING).to(best)
+    damping = torch.tensor(DAMPINGS).to(best)
     genes = ((best - lower) / span).clamp(0.0, 1.0).unsqueeze(1)
     least, solved = evaluate(genes).sum(-1), torch.zeros(len(best), dtype=torch.bool)
     for _ in range(ROUNDS):
-        values = evaluate(genes.clamp(SHIFT, 1.0 - SHIFT) + shifts)
-        values = (values.square() / values[:, :1].clamp(min=NOTHING**2)).sum(-1)
+        values = evaluate(genes.clamp(SHIFTED, 1.0 - SHIFTED) + shifts)
+        values = (values.square() / values[:, :1].clamp(min=NEGLIGIBLE**2)).sum(-1)
         slope, curve = _derivatives(values, count)
         place = genes.squeeze(1)
         free = ~((place <= 0.0) & (slope > 0.0) | (place >= 1.0) & (slope < 0.0))
@@ -133,7 +133,7 @@ def polish(terms: Fitness, best: Tensor, lower: Tensor, upper: Tensor) -> tuple[
         steps = ways @ (along / (sizes + damping * sizes.amax(1, keepdim=True))).nan_to_num()
         tried = torch.cat([genes, (genes - steps.mT).clamp(0.0, 1.0)], 1)
         genes, found = _fittest(tried, evaluate(tried).sum(-1), 1)
-        solved = (found >= least * (1.0 - SOLVED) - NOTHING).squeeze(1)
+        solved = (found >= least * (1.0 - SOLVED) - NEGLIGIBLE).squeeze(1)
         least = found
         if bool(solved.all()):
             break
@@ -144,8 +144,8 @@ def _derivatives(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return slopes ``[problems, count]`` and curvatures of values at the shifts of polish."""
     values = torch.where(values.isfinite(), values, values[:, :1]).nan_to_num(posinf=0.0)
     more, less = values[:, 1:].chunk(2, 1)
-    slope = (more - less)[:, :count] / (2.0 * SHIFT)
-    twice = (more + less - 2.0 * values[:, :1]) / SHIFT**2
+    slope = (more - less)[:, :count] / (2.0 * SHIFTED)
+    twice = (more + less - 2.0 * values[:, :1]) / SHIFTED**2
     single, both = twice[:, :count], twice[:, count:]
     row, column = torch.triu_indices(count, count, 1)
     curve = torch.diag_embed(single)

@@ -27,7 +27,7 @@ MODEL = "model"  # column of a driver's model; without it all drivers are IDM dr
 # Distance from a bound within which a parameter counts as on it, as a share of the range.
 BOUND_TOLERANCE = 0.005
 
-PRESENT = (
+OF_PRESENT = (
     "a calibrated law is a function of the present motion; evaluate one with memory as a "
     "DriverModel, see docs/extend.md"
 )
@@ -63,7 +63,7 @@ def find_law(name: str) -> type[DriverConstants]:
 
 def _check_law(kind: type[DriverConstants], name: str) -> None:
     """Refuse a law that remembers, or whose acceleration of a driver depends on other drivers."""
-    require(not getattr(kind, "remembers", ()), f"{name} has remembers: {PRESENT}")
+    require(not getattr(kind, "remembers", ()), f"{name} has remembers: {OF_PRESENT}")
     with raised_as(ConfigError, name, Exception):
         law = kind()
 
@@ -75,7 +75,7 @@ def _check_law(kind: type[DriverConstants], name: str) -> None:
             require(isinstance(wish, torch.Tensor), "wish must return one tensor, an acceleration")
             return wish
 
-        check_forgets([law], play, PRESENT)
+        check_forgets([law], play, OF_PRESENT)
         beside, alone, again = play(0), play(0, 1), play(0, 1)
         check_independent(kind.__name__, "acceleration", beside[1:], alone, again)
 

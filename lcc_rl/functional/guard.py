@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, compiler, nn
 
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.settings import is_ours
 
 AS_ENTRY = (
     "a state must be an entry, which a controller of a class names in remembers, see "
@@ -107,7 +106,7 @@ def _variables(module: Any) -> dict[str, Any]:
     while waiting:
         function = getattr(item := waiting.pop(), "__func__", item)  # of a static method
         home = getattr(function, "__module__", None)
-        if not isinstance(function, FunctionType) or home is None or is_ours(home):
+        if not isinstance(function, FunctionType) or home is None or home.startswith("lcc_rl."):
             continue
         known = inspect.getclosurevars(function)
         for name, value in {**known.globals, **known.nonlocals}.items():
