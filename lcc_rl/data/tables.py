@@ -181,9 +181,6 @@ class TableFile:
             if column.key == "leader_speed":
                 message = f"column {name!r} is relative: name it data.columns.relative_speed"
             raise DataError(f"{self.path}: {message}")
-        if column.key == "gap" and re.search("headway|hdwy|dhw", name.lower()):
-            message = f"{self.path}: column {name!r}: does the gap include the leader's length?"
-            self.notes.append(Concern(f"{message} It is bumper to bumper; subtract the length"))
         named = named_unit(name, column.quantity)
         if option and named and UNITS[column.quantity][named] != scale:
             where = f"{option.removesuffix('columns')}units.{column.key}={named}"

@@ -440,8 +440,8 @@ def compare_twins(
         f"reaction delay {reaction.delay:g} s and acceleration noise {reaction.noise:g} m/s²"
         f"{f', noise of perceived gaps {reaction.gap_noise:g},' * bool(reaction.gap_noise)} "
         "chosen together so that energies are those recorded, no estimate of a reaction time "
-        f"({100 * np.expm1(tries[reaction].growth):+.0f} % of energy from the first to the {CARS}th "
-        "in a row); below, each driver has the choice on others"
+        f"({100 * np.expm1(tries[reaction].growth):+.0f} % of energy from the first to the "
+        f"{CARS}th in a row); below, each driver has the choice on others"
     )
     lines = [Concern(line), *(_line(kind, found, one) for kind, one in errors.items())]
     return reaction, _together(found, observed), lines

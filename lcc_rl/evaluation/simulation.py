@@ -25,7 +25,7 @@ from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import POPULATION, Inputs, build_drivers, build_energy, constant_profiles
-from lcc_rl.errors import ConfigError, in_short, raised_as, require
+from lcc_rl.errors import ConfigError, DataError, in_short, raised_as, require
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.metrics import (
@@ -189,8 +189,13 @@ def _record(leader: Any, time_step: float) -> Tensor:
     hard = Plausible(max_hard=1.0)  # tests of brakes; the column names the unit
     if isinstance(leader, pd.DataFrame):  # is read as its file
         with TemporaryDirectory() as folder:
-            leader.to_parquet(file := Path(folder) / "leader.parquet")
-            return _record(file, time_step)
+            file = Path(folder) / "leader.parquet"
+            with raised_as(DataError, "the data frame", TypeError, ValueError):
+                leader.to_parquet(file)
+                try:
+                    return _record(file, time_step)
+                except DataError as error:
+                    raise DataError(str(error).removeprefix(f"{file}: ")) from error
     if isinstance(leader, (str, PathLike)):
         return resample(*read_speed_record(fspath(leader), hard), time_step)
     message = "simulate: leader must be speeds [m/s], a shipped cycle or a file"
