@@ -217,7 +217,7 @@ class _Fit:
         generator = torch.Generator().manual_seed(self.seed)
         problems = self.observed.count
         found = minimise(error, lower, upper, problems, generator, genetic, self.progress)
-        box = (x.to("cpu", torch.float64) for x in (found.best, lower, upper))
+        box = (x.to("cpu", torch.float64) for x in (found, lower, upper))
         best, solved = polish(self.exact[""].terms, *box)
         drivers = self.table(best, solved)
         if falling := int((~solved).sum()):

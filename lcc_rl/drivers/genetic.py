@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -18,8 +17,6 @@ Fitness = Callable[[Tensor], Tensor]
 Progress = Callable[[int, int, str], None]
 
 Individuals = Annotated[int, Field(ge=1, le=100_000)]
-# Least patience, as a share of the generations: earlier, the mutation is too wide to improve a fit.
-LEAST_PATIENCE = 1 / 3
 # Newton's method: shift that measures derivatives, as a share of the bounds; largest number of
 # rounds; damping tried, as a share of the largest curvature; relative and absolute decrease of the
 # objective below which a problem is solved.
@@ -32,7 +29,7 @@ class GeneticSettings(Settings):
     """Settings of the genetic algorithm."""
 
     population: Annotated[int, Field(ge=4, le=100_000)] = 32  # individuals per problem
-    generations: Individuals = 20  # largest number of generations
+    generations: Individuals = 20
     founders: Individuals = 8  # size of the first generation, in populations; the fittest survive
     elites: Probability = 0.5  # share of a generation that may survive by its fitness
     tournament: Individuals = 2  # individuals drawn per tournament; the fittest is a parent
@@ -42,22 +39,6 @@ class GeneticSettings(Settings):
     mutation_rate: Probability = 0.3  # probability of Gaussian noise on a gene
     mutation_start: Positive = 0.1  # standard deviation of that noise, as a share of the bounds
     mutation_end: Positive = 1e-4  # that in the last generation; geometric in between
-    # Generations without improvement after which a problem stops; at least a third of all.
-    patience: Individuals = 20
-    tolerance: NonNegative = 1e-5  # least relative improvement of the best fitness
-
-
-@dataclass(frozen=True)
-class Evolution:
-    """Result of the genetic algorithm.
-
-    Args:
-        best: fittest individual of every problem, ``[problems, dims]``, in the bounds' units.
-        fitness: its objective, ``[problems]``; infinite if no individual was valid.
-    """
-
-    best: Tensor
-    fitness: Tensor
 
 
 def minimise(
@@ -68,13 +49,12 @@ def minimise(
     generator: torch.Generator,
     settings: GeneticSettings | None = None,
     progress: Progress | None = None,
-) -> Evolution:
+) -> Tensor:
     """Minimise an objective inside a box, for all problems at once.
 
     The algorithm uses tournament selection, blend crossover (Eshelman & Schaffer 1993), mutation by
     differences of individuals and by annealed Gaussian noise, and elitist survival. All problems
-    share the random numbers of a generation, and each stops by its own patience, so a result does
-    not depend on other problems.
+    share the random numbers of a generation; a result does not depend on other problems.
 
     Args:
         objective: maps ``[problems, population, dims]`` to ``[problems, population]``; values that
@@ -85,6 +65,9 @@ def minimise(
         settings: settings of the algorithm.
         progress: called as ``progress(generation, total, text)`` after each generation.
 
+    Returns:
+        The fittest individual of every problem, ``[problems, dims]``.
+
     Raises:
         ConfigError: if the bounds are empty or crossed.
     """
@@ -92,8 +75,8 @@ def minimise(
     if lower.ndim != 1 or lower.shape != upper.shape or not bool((lower < upper).all()):
         raise ConfigError("bounds must be two vectors of one length with lower < upper")
     evaluate = _in_units(objective, lower, upper)
-    found = _evolve(evaluate, problems, _Random(generator, lower), settings, progress)
-    return replace(found, best=lower + found.best * (upper - lower))
+    best = _evolve(evaluate, problems, _Random(generator, lower), settings, progress)
+    return lower + best * (upper - lower)
 
 
 def polish(terms: Fitness, best: Tensor, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
@@ -160,27 +143,18 @@ def _evolve(
     random: _Random,
     settings: GeneticSettings,
     progress: Progress | None,
-) -> Evolution:
+) -> Tensor:
     """Evolve in the unit box, where all parameters have one scale of mutations."""
     genes = _latin_hypercube(random, settings.founders * settings.population)
     genes = genes.expand(problems, -1, -1).contiguous()
     genes, fitness = _fittest(genes, evaluate(genes), settings.population)
-    best = fitness[:, 0]
-    stale = torch.zeros_like(best)
-    patience = max(settings.patience, LEAST_PATIENCE * settings.generations)
     for generation in range(1, settings.generations + 1):
         children = _children(genes, fitness, random, settings, generation)
-        evolved = _survivors(genes, fitness, children, evaluate(children), settings)
-        stopped = (stale >= patience).unsqueeze(-1)
-        genes = torch.where(stopped.unsqueeze(-1), genes, evolved[0])
-        fitness = torch.where(stopped, fitness, evolved[1])
-        stale = torch.where(fitness[:, 0] < best * (1.0 - settings.tolerance), 0.0, stale + 1.0)
-        best = fitness[:, 0]
+        genes, fitness = _survivors(genes, fitness, children, evaluate(children), settings)
         if progress is not None:
-            progress(generation, settings.generations, f"mean best {best.mean().item():.5g}")
-        if bool((stale >= patience).all()):
-            break
-    return Evolution(genes[:, 0], best)
+            text = f"mean best {fitness[:, 0].mean().item():.5g}"
+            progress(generation, settings.generations, text)
+    return genes[:, 0]
 
 
 class _Random:

@@ -33,7 +33,7 @@ from lcc_rl.functional.driver_models import (
 from lcc_rl.functional.laws import LAWS
 
 QUICK = GeneticSettings(population=8, generations=2, founders=1)
-THOROUGH = GeneticSettings(population=128, generations=150, patience=20)
+THOROUGH = GeneticSettings(population=128, generations=150)
 EXPONENT = ("idm", {"exponent": 2.5})
 EACH = pytest.mark.parametrize("model", list(LAWS))
 KNOWN: dict[str, dict[str, float]] = {
