@@ -11,7 +11,6 @@ import pytest
 import torch
 from commands import tiny
 
-import lcc_rl
 from lcc_rl.api import Run
 from lcc_rl.commands import evaluation
 from lcc_rl.config import load
@@ -20,7 +19,6 @@ from lcc_rl.data.profiles import from_records
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.named import controller_of
 from lcc_rl.evaluation.rows import leader_faster
-from lcc_rl.pieces import Controller
 from lcc_rl.results.measures import FASTER, REACH
 from lcc_rl.results.names import in_words
 from lcc_rl.results.remarks import leader_too_fast, remarks
@@ -36,40 +34,23 @@ def test_the_share_of_time_by_hand() -> None:
     assert shares.tolist() == [1.0, 0.5, 0.5, 0.0, 1.0]
 
 
-@pytest.mark.parametrize(("v0", "said"), [(2.0, True), (40.0, False)])
-def test_slow_drivers_behind_faster_leaders_are_said(tmp_path, caplog, v0, said) -> None:
-    words = ["variant=alcc", "agent=none", "scenario.string=human", "drivers=fixed"]
+OTHERS = [
+    "controller@scenario.controllers.human=acc",
+    "scenario.start.human=${scenario.start.automated}",
+]
+
+
+@pytest.mark.parametrize(
+    ("v0", "others", "said"), [(2.0, [], True), (40.0, [], False), (2.0, OTHERS, False)]
+)
+def test_slow_drivers_behind_faster_leaders_are_said(tmp_path, caplog, v0, others, said) -> None:
+    words = [*others, "variant=alcc", "agent=none", "scenario.string=human", "drivers=fixed"]
     cfg = tiny("evaluate", *words, f"drivers.desired_speed={v0}", agent=False)
     with caplog.at_level(logging.WARNING, logger="lcc_rl"):
         rows = evaluation.run(cfg, tmp_path, quiet=True)
     assert (rows[FASTER].mean() > 0.5) == said
+    assert rows[["desired_speed_mps", "time_gap_s"]].isna().all(axis=None) == bool(others)
     assert ("Raise v0: drivers=highway" in caplog.text) == said
-
-
-class Keeping(Controller):
-    """A human driver of one's own."""
-
-    reads = ("self.speed", "self.gap", "self.relative_speed")
-
-    def command(self, speed, gap, relative_speed):
-        return 0.1 * (gap - 2.0 - 1.4 * speed) + 0.8 * relative_speed
-
-
-def test_drivers_that_never_drive_have_no_desired_speed(tmp_path, caplog) -> None:
-    own = f"scenario.controllers.human={{_target_: {__name__}.Keeping}}"
-    words = [own, "scenario.start.human=${scenario.start.automated}", "drivers=fixed"]
-    words += ["drivers.desired_speed=2"]
-    cfg = tiny(
-        "evaluate", "variant=alcc", "agent=none", "scenario.string=human", *words, agent=False
-    )
-    with caplog.at_level(logging.WARNING, logger="lcc_rl"):
-        rows = evaluation.run(cfg, tmp_path, quiet=True)
-        lcc_rl.simulate(np.full(200, 10.0), "human", overrides=words)
-    assert rows[["desired_speed_mps", "time_gap_s", FASTER]].isna().all(axis=None)
-    assert "desired speed" not in caplog.text
-    caplog.clear()
-    lcc_rl.simulate(np.full(200, 10.0), "human", overrides=words[2:])
-    assert "exceeds the desired speed of 1 of 1 human drivers" in caplog.text
 
 
 def test_every_baseline_with_a_desired_speed_is_warned_of() -> None:

@@ -50,7 +50,7 @@ def test_a_problem_does_not_depend_on_its_neighbours():
         assert torch.equal(together[one], solve(spheres(centres[one : one + 1]), 1)[0])
 
 
-def test_polished_solutions_are_minima_within_the_bounds(monkeypatch):
+def test_polished_solutions_are_minima_within_the_bounds():
     def terms(x):  # two roots of squares, in a narrow valley; the second minimum is on a bound
         valley = 30.0 * (x[..., 1] - x[..., 0] ** 2), x[..., 0] - torch.tensor([[0.5], [3.0]])
         return torch.stack([(valley[0].square() + valley[1].square()).sqrt(), valley[1].abs()], -1)
@@ -59,13 +59,7 @@ def test_polished_solutions_are_minima_within_the_bounds(monkeypatch):
     start = torch.tensor([[-0.5, 3.0], [0.0, 0.0]]).double()
     best, solved = polish(terms, start, *ends)
     assert solved.all()
-    torch.testing.assert_close(
-        best, torch.tensor([[0.5, 0.25], [2.0, 4.0]]).double(), atol=1e-4, rtol=0
-    )
-    monkeypatch.setattr("lcc_rl.drivers.genetic.ROUNDS", 2)
-    worse, solved = polish(terms, start, *ends)
-    assert not solved.any()
-    assert (terms(worse.unsqueeze(1)).sum(-1) < terms(start.unsqueeze(1)).sum(-1)).all()
+    assert torch.allclose(best, torch.tensor([[0.5, 0.25], [2.0, 4.0]]).double(), atol=1e-4)
 
 
 def test_equal_seeds_give_equal_results_and_others_do_not():

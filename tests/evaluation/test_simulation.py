@@ -231,6 +231,10 @@ def test_wrong_arguments_are_named(tmp_path) -> None:
 
 def test_settings_without_effect_are_said(caplog) -> None:
     quiet, drawn = ["scenario.controllers.human.noise=0"], "repeats=2, seed=3"
+    others = [
+        "controller@scenario.controllers.human=acc",
+        "scenario.start.human=${scenario.start.automated}",
+    ]
     lost = ["+event=lost_target", "scenario.sensors.automated.lost_from=2"]
     cases = [
         ("automated", Follow(), fixed(33.0, 1.3), [], f"drivers, {drawn}"),
@@ -238,6 +242,7 @@ def test_settings_without_effect_are_said(caplog) -> None:
         ("automated", None, fixed(33.0, 1.3, min_gap=3.0), [], drawn),
         ("automated", None, fixed(33.0, 1.3), lost, "drivers"),
         ("human", None, fixed(33.0, 1.3), quiet, drawn),
+        ("human", None, fixed(2.0, 1.3), others, f"drivers, {drawn}"),
         ("automated human", "pretrained/alcc", fixed(33.0, 1.3), quiet, drawn),
         ("automated human", "pretrained/alcc", fixed(33.0, 1.3), [], ""),
     ]
