@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -80,7 +80,6 @@ class Calibration:
         return self.compared()[1]
 
 
-# Parameters that the local mode does not fit; None: the default of the driver model.
 DEFAULT_CONSTANTS = dict.fromkeys(list(PARAMETERS)[len(INDIVIDUAL) :])
 
 
@@ -201,30 +200,26 @@ class _Fit:
         self.parts = {"": observed}
         if settings.holdout:
             self.parts[""], self.parts[OUT] = observed.split(settings.holdout)
-        self.simulated = self.parts[""].to(device, torch.float32)
-        others = settings.shared, self.names, settings.objective
-        self.exact = {
-            end: FitError(part.to("cpu", torch.float64), *others)
-            for end, part in self.parts.items()
-        }
+        law, objective = settings.shared, settings.objective
+        error = partial(FitError, law=law, names=self.names, objective=objective)
+        self.error = error(self.parts[""].to(device, torch.float32))
+        self.exact = {end: error(x.to("cpu", torch.float64)) for end, x in self.parts.items()}
 
     def drivers(self) -> tuple[pd.DataFrame, list[str]]:
         """Return one row per driver, and the lines of the report."""
         settings, lines = self.settings, list[str]()
-        error = FitError(self.simulated, settings.shared, self.names, settings.objective)
         genetic = getattr(settings, f"{self.mode}_genetic")
-        lower, upper = self.simulated.gaps.new_tensor([self.limits[name] for name in self.names]).T
-        generator = torch.Generator().manual_seed(self.seed)
-        problems = self.observed.count
-        found = minimise(error, lower, upper, problems, generator, genetic, self.progress)
+        gaps, generator = self.error.observed.gaps, torch.Generator().manual_seed(self.seed)
+        lower, upper = gaps.new_tensor([self.limits[name] for name in self.names]).T
+        args = lower, upper, self.observed.count, generator, genetic, self.progress
+        found = minimise(self.error, *args)
         box = (x.to("cpu", torch.float64) for x in (found, lower, upper))
         best, solved = polish(self.exact[""].terms, *box)
         drivers = self.table(best, solved)
         if falling := int((~solved).sum()):
             line = f"{falling} of {len(drivers)} records have not converged and have no intervals"
-            line = f"{line}: more generations?"
-            more = f"{self.mode}_genetic.generations={3 * genetic.generations}"
-            lines.append(Concern(f"{line} (calibration.{more})"))
+            more = f"calibration.{self.mode}_genetic.generations={3 * genetic.generations}"
+            lines.append(Concern(f"{line}: more generations? ({more})"))
         return drivers, [*lines, *self.quality(drivers), *map(Concern, self.concerns(drivers))]
 
     def table(self, best: Tensor, solved: Tensor) -> pd.DataFrame:
@@ -255,9 +250,8 @@ class _Fit:
             raise DataError(
                 f"episode {drivers['episode'].iloc[lost.argmax()]} (and {lost.sum() - 1} others): "
                 f"no {self.mode} parameters within the bounds give a finite "
-                f"{self.settings.objective}; a "
-                "follower that never moves has no relative speed error, see "
-                "selection.min_mean_speed_mps"
+                f"{self.settings.objective}; a follower that never moves has no relative speed "
+                "error, see selection.min_mean_speed_mps"
             )
         ends = intervals(self.exact[""], best, [self.limits[name] for name in self.names])
         for end, values in zip(("low", "high"), ends, strict=True):

@@ -189,13 +189,12 @@ def _record(leader: Any, time_step: float) -> Tensor:
     hard = Plausible(max_hard=1.0)  # tests of brakes; the column names the unit
     if isinstance(leader, pd.DataFrame):  # is read as its file
         with TemporaryDirectory() as folder:
-            file = Path(folder) / "leader.parquet"
-            with raised_as(DataError, "the data frame", TypeError, ValueError):
-                leader.to_parquet(file)
-                try:
-                    return _record(file, time_step)
-                except DataError as error:
-                    raise DataError(str(error).removeprefix(f"{file}: ")) from error
+            try:
+                leader.to_parquet(file := Path(folder) / "leader.parquet")
+                return _record(file, time_step)
+            except (TypeError, ValueError) as error:
+                text = str(error).removeprefix(f"{file}: ")
+                raise DataError(f"the data frame: {text}") from error
     if isinstance(leader, (str, PathLike)):
         return resample(*read_speed_record(fspath(leader), hard), time_step)
     message = "simulate: leader must be speeds [m/s], a shipped cycle or a file"
