@@ -231,10 +231,8 @@ def test_wrong_arguments_are_named(tmp_path) -> None:
 
 def test_settings_without_effect_are_said(caplog) -> None:
     quiet, drawn = ["scenario.controllers.human.noise=0"], "repeats=2, seed=3"
-    others = [
-        "controller@scenario.controllers.human=acc",
-        "scenario.start.human=${scenario.start.automated}",
-    ]
+    start = "scenario.start.human=${scenario.start.automated}"
+    others = ["controller@scenario.controllers.human=acc", start]
     lost = ["+event=lost_target", "scenario.sensors.automated.lost_from=2"]
     cases = [
         ("automated", Follow(), fixed(33.0, 1.3), [], f"drivers, {drawn}"),
