@@ -35,6 +35,9 @@ LOUD, LOUD_RATE, LOUD_FACTOR = 0.3, 0.3, 1.15  # reported: lag [s], bias of a sp
 STANDING, LEAST_STANDING = 0.5, 300  # speed [m/s], samples
 # Gap that may be in feet [m]; time gaps of speeds in m/s read as km/h, and of the reverse [s].
 FAR_STANDING, FAR_BEHIND, BEHIND = 15.0, 4.0, 0.5
+PROVES = 0.1  # largest error of a slope that proves the units
+# Speed below which some gaps are shorter than a car [m/s], least records, and length [m].
+CREEPING, LEAST_SLOW, SHORT_CAR = 2.0, 5, 4.0
 OF_LOGS = "relative_speed"  # key of a log's column from which the leader's speed is computed
 RATES = (5, 10, 15, 20, 25, 30, 50, 60)  # frames per second of recordings
 
@@ -375,11 +378,19 @@ def medians(episodes: pd.DataFrame, clear: pd.DataFrame, pairs: int, units: Unit
         f"{behind:.2g} s above 1 m/s; {', '.join(phrases)}"
     )
     key = "speed" if "speed" in units else "follower_speed"
-    short = OF_LOGS in units and behind < BEHIND  # gaps agree with relative speeds whatever the own
-    unit = "km/h" if short else "m/s" if behind > FAR_BEHIND else ""
+    own = OF_LOGS in units  # gaps agree with relative speeds whatever the own, else prove its unit
+    unit = "m/s" if behind > FAR_BEHIND and (own or not abs(slope - 1.0) < PROVES) else ""
+    unit = "km/h" if own and behind < BEHIND else unit
     if unit and unit != units.get(key, SI["speed"]):
         return Concern(f"{line}; is the own speed in {unit} (data.units.{key}={unit})?")
-    stand = gap[episodes[["follower_speed_mps", "leader_speed_mps"]].max(axis=1) < STANDING]
-    if len(stand) < LEAST_STANDING or stand.median() < FAR_STANDING or "ft" in units.values():
+    fastest = episodes[["follower_speed_mps", "leader_speed_mps"]].max(axis=1)
+    stand, slow = gap[fastest < STANDING], episodes[fastest < CREEPING]
+    far = len(stand) >= LEAST_STANDING and stand.median() >= FAR_STANDING
+    if far and "ft" not in units.values():
+        return Concern(f"{line}; cars stand {stand.median():.3g} m apart: are all columns in feet?")
+    length = slow.get("leader_length_m", 0.0 * slow["gap_m"])
+    least = (slow["gap_m"] - length.where(length > 0.0, SHORT_CAR)).quantile(0.01)
+    if least <= 0.0 or slow["episode"].nunique() < LEAST_SLOW:
         return line
-    return Concern(f"{line}; cars stand {stand.median():.3g} m apart: are all columns in feet?")
+    text = f"even below {CREEPING:g} m/s no gap is shorter than a car: do gaps include the leader's"
+    return Concern(f"{line}; {text} length? Subtract it")

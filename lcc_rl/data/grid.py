@@ -25,6 +25,7 @@ from lcc_rl.errors import Concern, DataError
 HOLE, SPREAD, LATE_SHARE = 1.75, 6.0, 0.1
 BRIDGE_S = FRAME  # default of ``bridge_s``: such holes lie between two samples of the result
 LongestHole = Annotated[float, Field(ge=0.0, le=10.0)]  # longest hole that is interpolated [s]
+MANY, SHORT_HOLE = 3, 1.0  # parts of a record, and length of holes that may be interpolated [s]
 UNEVEN = 0.1  # deviation from the usual step from which a step is irregular, as a share of it
 REGULAR = 0.01  # tolerance of the grid as a share of 0.1 s; float32 times are off by 10 µs
 SHORTEST_STEP, LONGEST_STEP = 0.002, 10.0  # steps beyond these are not in seconds [s]
@@ -137,8 +138,13 @@ def continuous(
     report.drop("alone between holes", int(alone.sum()))
     if records.empty:
         raise DataError(f"{report.source}: no {what} has two samples in a row")
-    counts = f"{count:,} {what}s into {records['episode'].nunique():,}"
-    line = f"{int(hole.sum()):,} holes longer than {setting}{other} divide {counts}"
+    parts, late = records["episode"].nunique(), steps[hole & (steps > longest)]
+    line = f"{int(hole.sum()):,} holes longer than {setting}{other} divide {count:,} {what}s into"
+    line = f"{line} {parts:,}"
+    usually = float(np.quantile(late, 0.9)) if len(late) else np.inf
+    if node and parts > MANY * count and usually <= SHORT_HOLE:
+        enough = np.ceil(usually / FRAME - REGULAR) * FRAME
+        line = Concern(f"{line}; {node}.bridge_s={enough:.1f} interpolates 90 % of them")
     report.notes += [line] * bool(hole.any())
     return records
 

@@ -191,8 +191,8 @@ def copies(names: Any, motion: pd.DataFrame) -> list[Concern]:
     codes, distinct = pd.factorize(names)
     sums = pd.util.hash_pandas_object(motion, index=False).groupby(codes).sum().sort_values()
     twice = listed([str(distinct[x]) for x in sums.index[sums.duplicated(keep=False)]])
-    line = f"recordings {twice} hold the same motion; is a file read twice? One may be held out"
-    return [Concern(f"{line} while a policy learns another")] * bool(twice)
+    line = f"recordings {twice} hold the same motion; is a file read twice?"
+    return [Concern(line)] * bool(twice)
 
 
 def read_as(columns: Iterable[Column], names: Names, units: Units) -> str:

@@ -84,7 +84,8 @@ class TableSource(TrajectorySource):
         keys = {key for key, name in self.columns.items() if name is not None}
         sized = "length" in keys or self.vehicle_length is not None
         if not ("leader" in keys or {"lane", "position"} <= keys):
-            raise ConfigError("data.columns must name leader, or lane and position")
+            text = "data.columns must name leader, or lane and position"
+            raise ConfigError(f"{text}, of a table with a row per vehicle and time")
         if not ("gap" in keys or ("position" in keys and sized)):
             raise ConfigError(
                 "data.columns must name gap, or position and length (or set data.vehicle_length)"

@@ -181,9 +181,6 @@ class TableFile:
             if column.key == "leader_speed":
                 message = f"column {name!r} is relative: name it data.columns.relative_speed"
             raise DataError(f"{self.path}: {message}")
-        if column.key == "gap" and re.search("headway|hdwy|dhw", name.lower()):
-            message = f"{self.path}: column {name!r}: does the gap include the leader's length?"
-            self.notes.append(Concern(f"{message} It is bumper to bumper; subtract the length"))
         named = named_unit(name, column.quantity)
         if option and named and UNITS[column.quantity][named] != scale:
             where = f"{option.removesuffix('columns')}units.{column.key}={named}"
@@ -424,7 +421,12 @@ def _shown(cell: pa.Scalar) -> str:
 
 
 def _seconds(cells: Cells) -> Cells:
-    """Return ISO 8601 times as seconds since 1970, clock times since midnight; others unchanged."""
+    """Return ISO 8601 times as seconds since 1970, clock times since midnight, else the numbers.
+
+    Those in single precision become their shortest decimals: 407.9, not 407.89999.
+    """
+    if pa.types.is_float32(cells.type):
+        return pc.cast(pc.cast(cells, pa.string()), pa.float64())
     if not (pa.types.is_string(cells.type) or pa.types.is_timestamp(cells.type)):
         return cells
     for kind in (pa.timestamp("ns"), pa.timestamp("ns", "UTC")):

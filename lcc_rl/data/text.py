@@ -286,6 +286,9 @@ def lacking(source: str, missing: Sequence[str], header: Sequence[str], option: 
             hints[0] = f" (set data.columns.relative_speed={relative})"
     if "gap_m" in missing and any("pos" in name.lower() for name in header):
         fix = OF_POSITIONS
+    stems = Counter(name.rstrip("0123456789") for name in header if name[-1:].isdigit())
+    if sum(count > 1 for count in stems.values()) > 1:  # speed1, speed2, gap1, gap2
+        fix = "; does a row hold several vehicles? Expected a row per vehicle, or pair, and time"
     if sum(map(bool, header)) == 1 or header[0].startswith(("#", "%")):
         fix = ": is it a title or a comment? The first line must name the columns"
     if all(re.fullmatch(NUMBER, name) for name in header if name):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from lcc_rl.drivers.fit_error import (
     FitMeasure,
     intervals,
 )
-from lcc_rl.drivers.genetic import GeneticSettings, Progress, minimise
+from lcc_rl.drivers.genetic import GeneticSettings, Progress, minimise, polish
 from lcc_rl.drivers.observed import Observed, Selection, observe
 from lcc_rl.drivers.parameters import (
     DEFAULT_BOUNDS,
@@ -80,7 +80,6 @@ class Calibration:
         return self.compared()[1]
 
 
-# Parameters that the local mode does not fit; None: the default of the driver model.
 DEFAULT_CONSTANTS = dict.fromkeys(list(PARAMETERS)[len(INDIVIDUAL) :])
 
 
@@ -201,26 +200,32 @@ class _Fit:
         self.parts = {"": observed}
         if settings.holdout:
             self.parts[""], self.parts[OUT] = observed.split(settings.holdout)
-        self.simulated = self.parts[""].to(device, torch.float32)
+        law, objective = settings.shared, settings.objective
+        error = partial(FitError, law=law, names=self.names, objective=objective)
+        self.error = error(self.parts[""].to(device, torch.float32))
+        self.exact = {end: error(x.to("cpu", torch.float64)) for end, x in self.parts.items()}
 
     def drivers(self) -> tuple[pd.DataFrame, list[str]]:
         """Return one row per driver, and the lines of the report."""
         settings, lines = self.settings, list[str]()
-        error = FitError(self.simulated, settings.shared, self.names, settings.objective)
         genetic = getattr(settings, f"{self.mode}_genetic")
-        lower, upper = self.simulated.gaps.new_tensor([self.limits[name] for name in self.names]).T
-        generator = torch.Generator().manual_seed(self.seed)
-        problems = self.observed.count
-        found = minimise(error, lower, upper, problems, generator, genetic, self.progress)
-        drivers = self.table(found.best.to("cpu", torch.float64))
-        if falling := int((~found.converged).sum()):
-            line = f"{falling} of {len(drivers)} records have not converged: more generations?"
-            more = f"{self.mode}_genetic.generations={3 * genetic.generations}"
-            lines.append(Concern(f"{line} (calibration.{more})"))
+        gaps, generator = self.error.observed.gaps, torch.Generator().manual_seed(self.seed)
+        lower, upper = gaps.new_tensor([self.limits[name] for name in self.names]).T
+        args = lower, upper, self.observed.count, generator, genetic, self.progress
+        found = minimise(self.error, *args)
+        box = (x.to("cpu", torch.float64) for x in (found, lower, upper))
+        best, solved = polish(self.exact[""].terms, *box)
+        drivers = self.table(best, solved)
+        if falling := int((~solved).sum()):
+            line = f"{falling} of {len(drivers)} records have not converged and have no intervals"
+            more = f"calibration.{self.mode}_genetic.generations={3 * genetic.generations}"
+            lines.append(Concern(f"{line}: more generations? ({more})"))
         return drivers, [*lines, *self.quality(drivers), *map(Concern, self.concerns(drivers))]
 
-    def table(self, best: Tensor) -> pd.DataFrame:
+    def table(self, best: Tensor, solved: Tensor) -> pd.DataFrame:
         """Return identities, parameters ``[drivers, names]``, errors and flags, a row per driver.
+
+        Drivers whose search has not ended in a minimum, ``[drivers]``, have no intervals.
 
         Raises:
             DataError: if no parameters give a finite error.
@@ -231,31 +236,26 @@ class _Fit:
         for name, one in self.table_of.items():
             columns[one.column] = own.get(name, getattr(constants, name, None))
         columns |= self.equilibrium(own)
-        objective, exact = self.settings.objective, {}
-        for end, part in self.parts.items():
-            exact[end] = FitError(part.to("cpu", torch.float64), constants, self.names, objective)
-            measures = exact[end].measures(best.unsqueeze(1))
+        for end, error in self.exact.items():
+            measures = error.measures(best.unsqueeze(1))
             for name, column in ERROR_COLUMNS.items():
                 columns[column + end] = measures[name].squeeze(1).numpy()
-            columns[f"samples{end}"] = part.samples
+            columns[f"samples{end}"] = self.parts[end].samples
         for name in self.table_of:
             columns[f"{name}_at_bound"] = name in own and at_bound(own[name], self.limits[name])
         drivers = pd.DataFrame({**columns, "mode": self.mode, MODEL: self.model})
-        needed = (
-            [ERROR_COLUMNS[objective]]
-            if objective in ERROR_COLUMNS
-            else [ERROR_COLUMNS[SPEED_RMSPE], ERROR_COLUMNS[GAP_NRMSE]]
-        )
+        needed = [ERROR_COLUMNS[name] for name in self.exact[""].summands]
         lost = ~np.isfinite(drivers[needed].to_numpy()).all(axis=1)
         if lost.any():
             raise DataError(
                 f"episode {drivers['episode'].iloc[lost.argmax()]} (and {lost.sum() - 1} others): "
-                f"no {self.mode} parameters within the bounds give a finite {objective}; a "
-                "follower that never moves has no relative speed error, see "
-                "selection.min_mean_speed_mps"
+                f"no {self.mode} parameters within the bounds give a finite "
+                f"{self.settings.objective}; a follower that never moves has no relative speed "
+                "error, see selection.min_mean_speed_mps"
             )
-        ends = intervals(exact[""], best, [self.limits[name] for name in self.names])
+        ends = intervals(self.exact[""], best, [self.limits[name] for name in self.names])
         for end, values in zip(("low", "high"), ends, strict=True):
+            values[~solved] = torch.nan
             drivers[[f"{self.table_of[x].column}_{end}" for x in self.names]] = values.numpy()
         # The episodes are sorted by length; the table has the order of the input.
         return drivers.sort_values("episode", kind="stable", ignore_index=True)

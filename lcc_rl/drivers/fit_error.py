@@ -48,6 +48,7 @@ class FitError:
     ) -> None:
         self.observed, self.law, self.objective = observed, law, objective
         self.names = tuple(names)
+        self.summands = [SPEED_RMSPE, GAP_NRMSE] if objective == "both" else [objective]
         series = (observed.follower_speed, observed.gaps)
         self._norms = [values.square().sum(0).unsqueeze(-1) for values in series]
         self._samples = observed.gaps.new_tensor(observed.samples.tolist()).unsqueeze(-1)
@@ -62,10 +63,12 @@ class FitError:
 
         The law's parameters may be tensors that broadcast to ``[drivers, candidates]``.
         """
+        return self.terms(candidates).sum(-1)
+
+    def terms(self, candidates: Tensor) -> Tensor:
+        """Return the summands of the error, ``[drivers, candidates, summands]``."""
         measures = self.measures(candidates, self.objective != SPEED_RMSPE)
-        if self.objective in measures:
-            return measures[self.objective]
-        return measures[SPEED_RMSPE] + measures[GAP_NRMSE]
+        return torch.stack([measures[name] for name in self.summands], -1)
 
     def measures(self, candidates: Tensor, apart: bool = True) -> dict[str, Tensor]:
         """Return every error by name, each as :meth:`__call__` does.

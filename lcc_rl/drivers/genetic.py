@@ -1,10 +1,9 @@
-"""Genetic algorithm that solves many independent problems at once."""
+"""Genetic algorithm and Newton's method that solve many independent problems at once."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -18,9 +17,11 @@ Fitness = Callable[[Tensor], Tensor]
 Progress = Callable[[int, int, str], None]
 
 Individuals = Annotated[int, Field(ge=1, le=100_000)]
-LATE, STEADY = 0.75, (0.99, 1e-3)  # see Evolution.converged
-# Least patience, as a share of the generations: earlier, the mutation is too wide to improve a fit.
-LEAST_PATIENCE = 1 / 3
+# Newton's method: shift that measures derivatives, as a share of the bounds; largest number of
+# rounds; damping tried, as a share of the largest curvature; relative and absolute decrease of the
+# objective below which a problem is solved.
+SHIFTED, ROUNDS, SOLVED, NEGLIGIBLE = 1e-5, 100, 5e-5, 1e-6
+DAMPINGS = (1e-9, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
@@ -28,7 +29,7 @@ class GeneticSettings(Settings):
     """Settings of the genetic algorithm."""
 
     population: Annotated[int, Field(ge=4, le=100_000)] = 32  # individuals per problem
-    generations: Individuals = 20  # largest number of generations
+    generations: Individuals = 20
     founders: Individuals = 8  # size of the first generation, in populations; the fittest survive
     elites: Probability = 0.5  # share of a generation that may survive by its fitness
     tournament: Individuals = 2  # individuals drawn per tournament; the fittest is a parent
@@ -38,25 +39,6 @@ class GeneticSettings(Settings):
     mutation_rate: Probability = 0.3  # probability of Gaussian noise on a gene
     mutation_start: Positive = 0.1  # standard deviation of that noise, as a share of the bounds
     mutation_end: Positive = 1e-4  # that in the last generation; geometric in between
-    # Generations without improvement after which a problem stops; at least a third of all.
-    patience: Individuals = 20
-    tolerance: NonNegative = 1e-5  # least relative improvement of the best fitness
-
-
-@dataclass(frozen=True)
-class Evolution:
-    """Result of the genetic algorithm.
-
-    Args:
-        best: fittest individual of every problem, ``[problems, dims]``, in the bounds' units.
-        fitness: its objective, ``[problems]``; infinite if no individual was valid.
-        converged: whether it fell by less than 1 %, or 0.001, in the last quarter of the
-            generations, ``[problems]``.
-    """
-
-    best: Tensor
-    fitness: Tensor
-    converged: Tensor
 
 
 def minimise(
@@ -67,13 +49,12 @@ def minimise(
     generator: torch.Generator,
     settings: GeneticSettings | None = None,
     progress: Progress | None = None,
-) -> Evolution:
+) -> Tensor:
     """Minimise an objective inside a box, for all problems at once.
 
     The algorithm uses tournament selection, blend crossover (Eshelman & Schaffer 1993), mutation by
     differences of individuals and by annealed Gaussian noise, and elitist survival. All problems
-    share the random numbers of a generation, and each stops by its own patience, so a result does
-    not depend on other problems.
+    share the random numbers of a generation; a result does not depend on other problems.
 
     Args:
         objective: maps ``[problems, population, dims]`` to ``[problems, population]``; values that
@@ -84,6 +65,9 @@ def minimise(
         settings: settings of the algorithm.
         progress: called as ``progress(generation, total, text)`` after each generation.
 
+    Returns:
+        The fittest individual of every problem, ``[problems, dims]``.
+
     Raises:
         ConfigError: if the bounds are empty or crossed.
     """
@@ -91,8 +75,66 @@ def minimise(
     if lower.ndim != 1 or lower.shape != upper.shape or not bool((lower < upper).all()):
         raise ConfigError("bounds must be two vectors of one length with lower < upper")
     evaluate = _in_units(objective, lower, upper)
-    found = _evolve(evaluate, problems, _Random(generator, lower), settings, progress)
-    return replace(found, best=lower + found.best * (upper - lower))
+    best = _evolve(evaluate, problems, _Random(generator, lower), settings, progress)
+    return lower + best * (upper - lower)
+
+
+def polish(terms: Fitness, best: Tensor, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+    """Move solutions to the next minimum by damped Newton steps; no objective increases.
+
+    The objective is a sum of roots of smooth terms. Steps minimise the terms' squares, each divided
+    by its present root. Derivatives are differences. Negative curvatures count as positive ones,
+    and a parameter stays on a bound that the slope leads beyond.
+
+    Args:
+        terms: returns the summands of the objective, ``[problems, population, summands]``, for
+            ``[problems, population, dims]``, in float64.
+        best: solutions ``[problems, dims]``.
+        lower, upper: bounds, ``[dims]``.
+
+    Returns:
+        The solutions, and whether each is a minimum, ``[problems]``.
+    """
+    span, count = upper - lower, len(lower)
+    evaluate = _in_units(terms, lower, upper)
+    one = torch.eye(count).to(best)
+    row, column = torch.triu_indices(count, count, 1)
+    shifts = SHIFTED * torch.cat([one, one[row] + one[column]])
+    shifts = torch.cat([0.0 * one[:1], shifts, -shifts])
+    damping = torch.tensor(DAMPINGS).to(best)
+    genes = ((best - lower) / span).clamp(0.0, 1.0).unsqueeze(1)
+    least, solved = evaluate(genes).sum(-1), torch.zeros(len(best), dtype=torch.bool)
+    for _ in range(ROUNDS):
+        values = evaluate(genes.clamp(SHIFTED, 1.0 - SHIFTED) + shifts)
+        values = (values.square() / values[:, :1].clamp(min=NEGLIGIBLE**2)).sum(-1)
+        slope, curve = _derivatives(values, count)
+        place = genes.squeeze(1)
+        free = ~((place <= 0.0) & (slope > 0.0) | (place >= 1.0) & (slope < 0.0))
+        sizes, ways = torch.linalg.eigh(curve * (free.unsqueeze(1) & free.unsqueeze(2)))
+        sizes = sizes.abs().unsqueeze(-1)
+        along = ways.mT @ (slope * free).unsqueeze(-1)
+        steps = ways @ (along / (sizes + damping * sizes.amax(1, keepdim=True))).nan_to_num()
+        tried = torch.cat([genes, (genes - steps.mT).clamp(0.0, 1.0)], 1)
+        genes, found = _fittest(tried, evaluate(tried).sum(-1), 1)
+        solved = (found >= least * (1.0 - SOLVED) - NEGLIGIBLE).squeeze(1)
+        least = found
+        if bool(solved.all()):
+            break
+    return lower + genes.squeeze(1) * span, solved
+
+
+def _derivatives(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return slopes ``[problems, count]`` and curvatures of values at the shifts of polish."""
+    values = torch.where(values.isfinite(), values, values[:, :1]).nan_to_num(posinf=0.0)
+    more, less = values[:, 1:].chunk(2, 1)
+    slope = (more - less)[:, :count] / (2.0 * SHIFTED)
+    twice = (more + less - 2.0 * values[:, :1]) / SHIFTED**2
+    single, both = twice[:, :count], twice[:, count:]
+    row, column = torch.triu_indices(count, count, 1)
+    curve = torch.diag_embed(single)
+    curve[:, row, column] = 0.5 * (both - single[:, row] - single[:, column])
+    curve[:, column, row] = curve[:, row, column]
+    return slope, curve
 
 
 def _evolve(
@@ -101,29 +143,18 @@ def _evolve(
     random: _Random,
     settings: GeneticSettings,
     progress: Progress | None,
-) -> Evolution:
+) -> Tensor:
     """Evolve in the unit box, where all parameters have one scale of mutations."""
     genes = _latin_hypercube(random, settings.founders * settings.population)
     genes = genes.expand(problems, -1, -1).contiguous()
     genes, fitness = _fittest(genes, evaluate(genes), settings.population)
-    best = late = fitness[:, 0]
-    stale = torch.zeros_like(best)
-    patience = max(settings.patience, LEAST_PATIENCE * settings.generations)
     for generation in range(1, settings.generations + 1):
         children = _children(genes, fitness, random, settings, generation)
-        evolved = _survivors(genes, fitness, children, evaluate(children), settings)
-        stopped = (stale >= patience).unsqueeze(-1)
-        genes = torch.where(stopped.unsqueeze(-1), genes, evolved[0])
-        fitness = torch.where(stopped, fitness, evolved[1])
-        stale = torch.where(fitness[:, 0] < best * (1.0 - settings.tolerance), 0.0, stale + 1.0)
-        best = fitness[:, 0]
-        late = best if generation <= LATE * settings.generations else late
+        genes, fitness = _survivors(genes, fitness, children, evaluate(children), settings)
         if progress is not None:
-            progress(generation, settings.generations, f"mean best {best.mean().item():.5g}")
-        if bool((stale >= patience).all()):
-            break
-    least = torch.minimum(late * STEADY[0], late - STEADY[1])
-    return Evolution(genes[:, 0], best, best >= least)
+            text = f"mean best {fitness[:, 0].mean().item():.5g}"
+            progress(generation, settings.generations, text)
+    return genes[:, 0]
 
 
 class _Random:

@@ -6,11 +6,13 @@ from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from lcc_rl.config.nodes import find_target
-from lcc_rl.errors import ConfigError, require_known
+from lcc_rl.errors import ConfigError, raised_as, require, require_known
 from lcc_rl.functional.driver_models import PARAMETERS, DriverConstants, Parameter
+from lcc_rl.functional.guard import check_forgets, check_independent
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.settings import Number
 
@@ -25,6 +27,11 @@ MODEL = "model"  # column of a driver's model; without it all drivers are IDM dr
 # Distance from a bound within which a parameter counts as on it, as a share of the range.
 BOUND_TOLERANCE = 0.005
 
+OF_PRESENT = (
+    "a calibrated law is a function of the present motion; evaluate one with memory as a "
+    "DriverModel, see docs/extend.md"
+)
+
 Mode = Literal["local", "global"]
 BoundPair = tuple[Number, Number]  # lower and upper
 DEFAULT_BOUNDS: dict[str, BoundPair] = {name: one.bounds for name, one in PARAMETERS.items()}
@@ -38,7 +45,8 @@ def find_law(name: str) -> type[DriverConstants]:
             ``my_models.Helly``, which is added to them.
 
     Raises:
-        ConfigError: if there is none, it is no driver model, or ``own`` names a shipped parameter.
+        ConfigError: if there is none, it is no driver model, ``own`` names a shipped parameter, or
+            it depends on more than the present motion of a driver.
     """
     if name not in LAWS and "." in name:
         found = find_target(name, "model")
@@ -47,9 +55,29 @@ def find_law(name: str) -> type[DriverConstants]:
         for shipped in found.own.keys() & PARAMETERS.keys():
             remedy = f"remove it there; calibration.bounds.{shipped}=[…] sets other bounds"
             raise ConfigError(f"{name}.own names {shipped!r} of shipped models: {remedy}")
+        _check_law(found, name)
         LAWS[name] = found
     require_known("model of drivers", name, LAWS)
     return LAWS[name]
+
+
+def _check_law(kind: type[DriverConstants], name: str) -> None:
+    """Refuse a law that remembers, or whose acceleration of a driver depends on other drivers."""
+    require(not getattr(kind, "remembers", ()), f"{name} has remembers: {OF_PRESENT}")
+    with raised_as(ConfigError, name, Exception):
+        law = kind()
+
+        def play(number: int, first: int = 0) -> torch.Tensor:
+            motion = (10.0 + number, 20.0 + number, 1.0 + number, 30.0, 1.5)
+            speed, gap, rate, v0, headway = (torch.tensor([x, 1.1 * x])[first:] for x in motion)
+            law.equilibrium_gap(speed, v0, headway)
+            wish = law.wish(speed, gap, rate, v0, headway)
+            require(isinstance(wish, torch.Tensor), "wish must return one tensor, an acceleration")
+            return wish
+
+        check_forgets([law], play, OF_PRESENT)
+        beside, alone, again = play(0), play(0, 1), play(0, 1)
+        check_independent(kind.__name__, "acceleration", beside[1:], alone, again)
 
 
 def parameters_of(models: Iterable[str]) -> dict[str, Parameter]:

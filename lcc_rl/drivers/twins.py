@@ -439,7 +439,8 @@ def compare_twins(
     line = (
         f"reaction delay {reaction.delay:g} s and acceleration noise {reaction.noise:g} m/s²"
         f"{f', noise of perceived gaps {reaction.gap_noise:g},' * bool(reaction.gap_noise)} "
-        f"chosen ({100 * np.expm1(tries[reaction].growth):+.0f} % of energy from the first to the "
+        "chosen together so that energies are those recorded, no estimate of a reaction time "
+        f"({100 * np.expm1(tries[reaction].growth):+.0f} % of energy from the first to the "
         f"{CARS}th in a row); below, each driver has the choice on others"
     )
     lines = [Concern(line), *(_line(kind, found, one) for kind, one in errors.items())]

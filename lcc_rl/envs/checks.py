@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import inspect
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from types import FunctionType, ModuleType
-from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 
 from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, entries_of, tick, written
 from lcc_rl.errors import ConfigError, LccError, nearest, require
-from lcc_rl.functional.guard import changed, changes, check_independent
+from lcc_rl.functional.guard import changed, check_forgets, check_independent
 from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
-from lcc_rl.settings import is_ours
 
 BATCH = 2
 # Options that add pieces, by the entries, or the group of them, that these write.
@@ -112,77 +107,6 @@ def check_alone(piece: Piece, before: State, reached: State) -> None:
         piece.derive(states[0], other)
     for key in piece.targets:
         check_independent(piece.title, ".".join(key), reached[key][1:], alone[key], again[key])
-
-
-def _kept(piece: Piece) -> dict[str, list[Any]]:
-    """Return what a piece may remember in, with counts or items that show changes."""
-    kept: dict[str, Any] = {}
-    for path, module in piece.named_modules():
-        attributes = {**vars(module), **dict(module.named_buffers(recurse=False))}
-        attributes.pop("_buffers")
-        at = f"{path}." if path else ""
-        kept |= {f"attribute '{at}{name}'": value for name, value in attributes.items()}
-        kept |= {f"variable {name!r}": value for name, value in _variables(module).items()}
-    return {name: _contents(value) for name, value in kept.items()}
-
-
-def _contents(value: Any) -> list[Any]:
-    """Return a value, its items, and numbers that change with its array or tensors."""
-    values = [value]
-    if isinstance(value, Mapping):
-        values += value.values()
-    elif isinstance(value, (list, set, deque)):
-        values += value
-    elif isinstance(value, np.ndarray):
-        values.append(hash(value.tobytes()))
-    return values + changes([x for x in values if isinstance(x, Tensor)])
-
-
-def _variables(module: nn.Module) -> dict[str, Any]:
-    """Return the variables outside of a user's functions that these read, by name."""
-    kinds = [kind for kind in type(module).__mro__ if kind not in Piece.__mro__]
-    waiting, found = [x for of in (module, *kinds) for x in vars(of).values()], {}
-    while waiting:
-        function = getattr(item := waiting.pop(), "__func__", item)  # of a static method
-        home = getattr(function, "__module__", None)
-        if not isinstance(function, FunctionType) or home is None or is_ours(home):
-            continue
-        known = inspect.getclosurevars(function)
-        for name, value in {**known.globals, **known.nonlocals}.items():
-            if name in found or isinstance(value, ModuleType):
-                continue
-            found[name] = value
-            if home in (getattr(value, "__module__", ""), type(value).__module__):
-                waiting.append(value)  # a function of the same module
-                found |= {f"{name}.{key}": x for key, x in getattr(value, "__dict__", {}).items()}
-    return found
-
-
-def check_forgets(pieces: Sequence[Piece], play: Callable[[int], object]) -> None:
-    """Refuse pieces that store state where all episodes would share it.
-
-    Args:
-        pieces: the pieces.
-        play: lets them act on values that differ by a number, 0 and 1.
-
-    Raises:
-        ConfigError: naming the piece, and the attribute or variable that changes.
-    """
-    play(0)
-    before = [_kept(piece) for piece in pieces]  # what the first step stored may be kept
-    play(1)
-    for piece, kept in zip(pieces, before, strict=True):
-        for name, values in _kept(piece).items():
-            old = kept.get(name, [])
-            if len(values) != len(old) or not all(
-                new is stored or (isinstance(new, int) and new == stored)
-                for new, stored in zip(values, old, strict=True)
-            ):
-                raise ConfigError(
-                    f"{piece.title} remembers in its {name}, which all episodes share; a state "
-                    "must be an entry, which a controller of a class names in remembers, see "
-                    "docs/controllers.md"
-                )
 
 
 def _attempt(piece: Piece, action: object) -> None:

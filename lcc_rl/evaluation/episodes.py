@@ -210,6 +210,8 @@ class Episodes:
         noted = repeat if plan.repeats > 1 else None
         given = inputs.evaluation, inputs.population, profile, driver, noted
         described = of_rows.describe(self.strategy, *given)
+        if not self.player.of_drivers:
+            described[["desired_speed_mps", "time_gap_s"]] = np.float32(np.nan)
         desired = of_rows.desired_speeds(self.strategy, described)
         described[FASTER] = of_rows.leader_faster(inputs.evaluation, profile, desired, self.warm_up)
         time_step = self.cfg.scenario.time_step

@@ -25,7 +25,7 @@ from lcc_rl.data.profiles import Profiles, from_records, no_profiles, resample
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import POPULATION, Inputs, build_drivers, build_energy, constant_profiles
-from lcc_rl.errors import ConfigError, in_short, raised_as, require
+from lcc_rl.errors import ConfigError, DataError, in_short, raised_as, require
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.metrics import (
@@ -46,7 +46,7 @@ from lcc_rl.pieces.connected import MESSAGES
 from lcc_rl.pieces.features import CLASS, GRADE
 from lcc_rl.pieces.rewards import CollisionPenalty
 from lcc_rl.pieces.slope import PLACE
-from lcc_rl.settings import TARGET, Count, Positive, Seed, checked, is_ours, path_of
+from lcc_rl.settings import TARGET, Count, Positive, Seed, checked, path_of
 
 log = logging.getLogger("lcc_rl")
 
@@ -189,8 +189,12 @@ def _record(leader: Any, time_step: float) -> Tensor:
     hard = Plausible(max_hard=1.0)  # tests of brakes; the column names the unit
     if isinstance(leader, pd.DataFrame):  # is read as its file
         with TemporaryDirectory() as folder:
-            leader.to_parquet(file := Path(folder) / "leader.parquet")
-            return _record(file, time_step)
+            try:
+                leader.to_parquet(file := Path(folder) / "leader.parquet")
+                return _record(file, time_step)
+            except (TypeError, ValueError) as error:
+                text = str(error).removeprefix(f"{file}: ")
+                raise DataError(f"the data frame: {text}") from error
     if isinstance(leader, (str, PathLike)):
         return resample(*read_speed_record(fspath(leader), hard), time_step)
     message = "simulate: leader must be speeds [m/s], a shipped cycle or a file"
@@ -219,10 +223,6 @@ def _driven(
     cfg, leaders, people = strategy.cfg, len(inputs.evaluation), len(inputs.population.time_gap)
     number = torch.arange(leaders * repeats)
     profile, repeat, batch = number // repeats, number % repeats, len(number)
-    slow = int((inputs.population.desired_speed < inputs.evaluation.speeds.max()).sum())
-    if slow and len(cfg.scenario.vehicles) > cfg.automated:
-        text = "the leader exceeds the desired speed of %d of %d human drivers, who fall behind; "
-        log.warning(text + "drivers=highway in overrides has faster ones", slow, people)
     env = build_env(cfg, inputs.evaluation, inputs.population, batch, 0, cfg.device, nominal=True)
     long, short = cfg.scenario.horizon >= LONG, len(cfg.scenario.vehicles) <= SHORT_STRING
     rows = long and short and not isinstance(strategy.policy, GivenPolicy)  # has its own memory
@@ -234,8 +234,13 @@ def _driven(
         for k in (0, 1)
     )
     drawn = [f"repeats={repeats}"] * (repeats > 1) + [f"seed={seed}"] * (seed > 0)
-    read = (x.reads_drivers or not is_ours(x.setup.__module__) for x, _ in player.step.pieces)
-    idle = [*given] * (not any(read)) + ([] if drawn and player.draws(options, other) else drawn)
+    slow = int((inputs.population.desired_speed < inputs.evaluation.speeds.max()).sum())
+    if slow and player.of_drivers and len(cfg.scenario.vehicles) > cfg.automated:
+        text = "the leader exceeds the desired speed of %d of %d human drivers, who fall behind; "
+        log.warning(text + "drivers=highway in overrides has faster ones", slow, people)
+    idle = [*given] * (not player.of_drivers) + (
+        [] if drawn and player.draws(options, other) else drawn
+    )
     if idle:
         log.warning("without effect on these vehicles: %s", ", ".join(idle))
     record, alive = player.play(options)

@@ -154,10 +154,10 @@ def sample_episode(steps: pd.DataFrame, strategy: str) -> Figure:
     axes[1].set(ylabel="acceleration [m/s²]")
     axes[2].set(xlabel="time [s]", ylabel="gap ahead [m]")
     legend_above(axes[0])
-    figure.suptitle(
-        f"{fill(in_words(strategy), 45)}\nhuman behind: desired speed "
-        f"{first['desired_speed_mps']:.1f} m/s, time gap {first['time_gap_s']:.2f} s"
-    )
+    title, own = fill(in_words(strategy), 45), first[["desired_speed_mps", "time_gap_s"]]
+    if own.notna().all():
+        title += "\nhuman behind: desired speed {:.1f} m/s, time gap {:.2f} s".format(*own)
+    figure.suptitle(title)
     return figure
 
 

@@ -1,14 +1,23 @@
-"""Checks that a function changes no inputs in place, and of each episode depends on that alone."""
+"""Checks that functions change no inputs in place, store nothing, and mix no episodes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import inspect
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from types import FunctionType, ModuleType
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor, compiler
+from torch import Tensor, compiler, nn
 
 from lcc_rl.errors import ConfigError, require
+
+AS_ENTRY = (
+    "a state must be an entry, which a controller of a class names in remembers, see "
+    "docs/controllers.md"
+)
 
 
 def unchanged(
@@ -63,3 +72,76 @@ def check_independent(title: str, entry: str, beside: Tensor, alone: Tensor, aga
         f"{title} gives an episode other {entry} alone, or in the same step again: it must not mix "
         "episodes (mean() of a batch), remember, or draw random numbers but by the episode's seed",
     )
+
+
+def _kept(item: Any) -> dict[str, list[Any]]:
+    """Return what an object may remember in, with counts or items that show changes."""
+    kept: dict[str, Any] = {}
+    modules = item.named_modules() if isinstance(item, nn.Module) else [("", item)]
+    for path, module in modules:
+        attributes = {**vars(module), **vars(module).get("_buffers", {})}
+        attributes.pop("_buffers", None)
+        at = f"{path}." if path else ""
+        kept |= {f"attribute '{at}{name}'": value for name, value in attributes.items()}
+        kept |= {f"variable {name!r}": value for name, value in _variables(module).items()}
+    return {name: _contents(value) for name, value in kept.items()}
+
+
+def _contents(value: Any) -> list[Any]:
+    """Return a value, its items, and numbers that change with its array or tensors."""
+    values = [value]
+    if isinstance(value, Mapping):
+        values += value.values()
+    elif isinstance(value, (list, set, deque)):
+        values += value
+    elif isinstance(value, np.ndarray):
+        values.append(hash(value.tobytes()))
+    return values + changes([x for x in values if isinstance(x, Tensor)])
+
+
+def _variables(module: Any) -> dict[str, Any]:
+    """Return the variables outside of a user's functions that these read, by name."""
+    kinds = [kind for kind in type(module).__mro__ if kind not in nn.Module.__mro__]
+    waiting, found = [x for of in (module, *kinds) for x in vars(of).values()], {}
+    while waiting:
+        function = getattr(item := waiting.pop(), "__func__", item)  # of a static method
+        home = getattr(function, "__module__", None)
+        if not isinstance(function, FunctionType) or home is None or home.startswith("lcc_rl."):
+            continue
+        known = inspect.getclosurevars(function)
+        for name, value in {**known.globals, **known.nonlocals}.items():
+            if name in found or isinstance(value, ModuleType):
+                continue
+            found[name] = value
+            if home in (getattr(value, "__module__", ""), type(value).__module__):
+                waiting.append(value)  # a function of the same module
+                found |= {f"{name}.{key}": x for key, x in getattr(value, "__dict__", {}).items()}
+    return found
+
+
+def check_forgets(
+    pieces: Sequence[Any], play: Callable[[int], object], remedy: str = AS_ENTRY
+) -> None:
+    """Refuse pieces, or driver models, that store state where all episodes would share it.
+
+    Args:
+        pieces: the pieces.
+        play: lets them act on values that differ by a number, 0 and 1.
+        remedy: what to do instead.
+
+    Raises:
+        ConfigError: naming the piece, and the attribute or variable that changes.
+    """
+    play(0)
+    before = [_kept(piece) for piece in pieces]  # what the first step stored may be kept
+    play(1)
+    for piece, kept in zip(pieces, before, strict=True):
+        for name, values in _kept(piece).items():
+            old = kept.get(name, [])
+            if len(values) != len(old) or not all(
+                new is stored or (isinstance(new, int) and new == stored)
+                for new, stored in zip(values, old, strict=True)
+            ):
+                title = getattr(piece, "title", type(piece).__name__)
+                where = f"{title} remembers in its {name}, which all episodes share"
+                raise ConfigError(f"{where}; {remedy}")

@@ -16,11 +16,12 @@ from lcc_rl.config import load
 from lcc_rl.config.schemas import TimeStep
 from lcc_rl.config.words import FILTERED
 from lcc_rl.drivers.population import bootstrap
-from lcc_rl.envs.checks import BATCH, check_alone, check_forgets, check_step
+from lcc_rl.envs.checks import BATCH, check_alone, check_step
 from lcc_rl.envs.clock import checked_seed
 from lcc_rl.envs.rowwise import Array, Rowwise
 from lcc_rl.errors import ConfigError, Diverged, raised_as, require, unknown_name
 from lcc_rl.evaluation.named import controller_of, is_policy, one_of
+from lcc_rl.functional.guard import check_forgets
 from lcc_rl.functional.machine_code import kept
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.recorder import Untranslatable

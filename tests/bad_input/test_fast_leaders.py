@@ -34,13 +34,18 @@ def test_the_share_of_time_by_hand() -> None:
     assert shares.tolist() == [1.0, 0.5, 0.5, 0.0, 1.0]
 
 
-@pytest.mark.parametrize(("v0", "said"), [(2.0, True), (40.0, False)])
-def test_slow_drivers_behind_faster_leaders_are_said(tmp_path, caplog, v0, said) -> None:
+@pytest.mark.parametrize(
+    ("v0", "others", "said"), [(2.0, False, True), (40.0, False, False), (2.0, True, False)]
+)
+def test_slow_drivers_behind_faster_leaders_are_said(tmp_path, caplog, v0, others, said) -> None:
     words = ["variant=alcc", "agent=none", "scenario.string=human", "drivers=fixed"]
+    start = "scenario.start.human=${scenario.start.automated}"
+    words += ["controller@scenario.controllers.human=acc", start] * others
     cfg = tiny("evaluate", *words, f"drivers.desired_speed={v0}", agent=False)
     with caplog.at_level(logging.WARNING, logger="lcc_rl"):
         rows = evaluation.run(cfg, tmp_path, quiet=True)
     assert (rows[FASTER].mean() > 0.5) == said
+    assert rows[["desired_speed_mps", "time_gap_s"]].isna().all(axis=None) == others
     assert ("Raise v0: drivers=highway" in caplog.text) == said
 
 

@@ -105,6 +105,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
         csv(TABLE.rename(columns={"v": "V", "ahead": "front", "id": "ID"})),
         r"lacks the column id \(is it 'ID'\?\), v \(is it 'V'\?\), ahead; it has.*columns=",
     ),
+    ("table", "t,v1,v2,s1,s2\n0,1,1,2,2\n", "lacks .*; does a row hold several vehicles"),
     ("table", csv(pd.concat([TABLE, TABLE["v"]], axis=1)), "has column 'v' twice"),
     ("table", "id,t,v,ahead,gap,x\n1,0,1,0,2\n", "data row 1, the last, has 5 columns"),
     ("table", "id,t,v,ahead,gap,x\n1,0,1,0,2\n1,1,1,0,2,3\n", "row 1 has 5 columns; expected 6$"),

@@ -64,14 +64,6 @@ def test_the_name_of_a_column_may_say_its_unit(tmp_path) -> None:
         assert len(loaded.episodes) == 800, name
 
 
-def test_a_gap_by_the_name_of_a_headway_is_loud(tmp_path) -> None:
-    for name, loud in (("Space_Headway", 1), ("leadDHW", 1), ("space_hdwy", 1), ("hdw", 0)):
-        path = written(tmp_path, long_table(rows=400).rename(columns={"gap": name}))
-        report = TableSource(path=path, columns={**BY_GAP, "gap": name}).load().report
-        found = [x for x in report if isinstance(x, Concern) and f"column {name!r}: does" in x]
-        assert len(found) == loud, (name, report)
-
-
 def test_a_known_column_that_nothing_reads_is_loud(tmp_path) -> None:
     pairs = {"time": "t", "follower_speed": "v", "leader_speed": "w", "gap": "d"}
     log = pd.DataFrame({"t": 0.1 * np.arange(200), "v": 9.0, "w": 9.0, "d": 20.0, "valid": 1})

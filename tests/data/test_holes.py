@@ -68,7 +68,7 @@ def test_single_rows_are_missing(read) -> None:
     words = ["100 holes up to data.bridge_s=0.1 are interpolated"]
     check(read(log().drop(index=missing)), 1, words)
     check(read(cars(log()).reset_index(drop=True).drop(index=ROWS + missing), CARS), 1, words)
-    divided = "100 holes longer than data.bridge_s=0 divide 1 episodes into 101"
+    divided = "100 holes longer than data.bridge_s=0 divide 1 episodes into 101; data.bridge_s=0.1"
     check(read(log().drop(index=missing), bridge_s=0.0), 101, [divided])
 
 

@@ -455,6 +455,24 @@ BIASES = [
 ]
 
 
+def test_gaps_that_include_the_leaders_length_are_known_by_slow_cars() -> None:
+    one = wavy().assign(gap_m=8.0, **dict.fromkeys(SPEEDS, 1.0))
+    table = pd.concat([one, one.assign(episode=one["episode"] + 3)], ignore_index=True)
+    words = "no gap is shorter than a car: do gaps include the leader's length"
+    assert words in judged(table)[-1]
+    near = table.assign(gap_m=table["gap_m"].where(table["episode"] > 0, 2.0))
+    for other in (near, table.assign(leader_length_m=9.0), one):
+        assert words not in judged(other)[-1]
+    assert words in judged(table.assign(leader_length_m=0.0))[-1]
+
+
+def test_a_slope_of_one_proves_the_units_of_speeds() -> None:
+    far = wavy().assign(gap_m=lambda x: x["gap_m"] + 120.0)
+    last = judged(far, {"follower_speed": "km/h", "leader_speed": "km/h"})[-1]
+    assert "time gap" in last
+    assert not isinstance(last, Concern), last
+
+
 def test_a_biased_speed_or_a_slow_clock_is_reported_with_its_remedy() -> None:
     for table, words in BIASES:
         loud = " ".join(line for line in judged(table) if isinstance(line, Concern))

@@ -33,7 +33,6 @@ from lcc_rl.functional.driver_models import (
 from lcc_rl.functional.laws import LAWS
 
 QUICK = GeneticSettings(population=8, generations=2, founders=1)
-THOROUGH = GeneticSettings(population=128, generations=150, patience=20)
 EXPONENT = ("idm", {"exponent": 2.5})
 EACH = pytest.mark.parametrize("model", list(LAWS))
 KNOWN: dict[str, dict[str, float]] = {
@@ -158,9 +157,9 @@ def test_known_drivers_are_recovered(model, known_drivers, make_episodes):
 def test_all_parameters_of_known_drivers_are_recovered(model, known_drivers, make_episodes):
     speeds, gaps = (known_drivers[name].tolist()[:8] for name in ("desired_speed", "time_gap"))
     episodes = make_episodes(speeds, gaps, LAWS[model](**KNOWN[model]), model=model)
-    free = fit(episodes, "global", model=model, global_genetic=THOROUGH).drivers
-    assert free["rmspe"].median() < 0.001
-    assert (free["time_gap_s"] / gaps - 1.0).abs().median() < 0.1
+    free = fit(episodes, "global", model=model).drivers
+    assert free["rmspe"].median() < 1e-4
+    assert (free["time_gap_s"] / gaps - 1.0).abs().median() < 0.01
 
 
 def test_the_equilibrium_gap_is_that_at_the_recorded_speed(uneven_lengths):
@@ -213,7 +212,6 @@ def test_rows_keep_the_order_and_identity_of_the_input(uneven_lengths):
         *(f"{PARAMETERS[x].column}_{end}" for end in ("low", "high") for x in fitted("global")[2:]),
     ]
     assert seen == [(1, 2), (2, 2)] * 2
-    assert "more generations? (calibration.global_genetic.generations=6)" in " ".join(found.report)
     renamed = uneven_lengths.rename(columns={"episode": "event", "recording": "period"})
     pd.testing.assert_frame_equal(both(renamed).drivers, drivers)
 
@@ -325,6 +323,36 @@ def test_a_parameter_of_shipped_models_is_not_described_anew(make_episodes):
         ConfigError, match=r"Redeclared\.own names 'speed_gain' .*bounds\.speed_gain=\["
     ):
         fit(make_episodes([15.0], [1.0]), model=f"{__name__}.Redeclared")
+
+
+SEEN: dict[str, float] = {"last": 0.0}
+
+
+class Mindful(Helly):
+    """A law that keeps the last approach rate in a variable of its module."""
+
+    def wish(self, speed, gap, approach_rate, *own):
+        SEEN["last"] = 0.9 * SEEN["last"] + 0.1 * float(approach_rate.mean())
+        return super().wish(speed, gap, approach_rate + SEEN["last"], *own)
+
+
+def extended(name: str, wish, **attributes) -> type[Helly]:
+    return type(name, (Helly,), {"wish": wish, "__module__": __name__, **attributes})
+
+
+Mixing = extended("Mixing", lambda self, v, *more: Helly.wish(self, v, *more) - v.mean())
+Smoothing = extended("Smoothing", lambda self, *motion: (Helly.wish(self, *motion), motion[2]))
+Declaring = extended("Declaring", Smoothing.wish, remembers=("smooth",))
+
+
+def test_a_calibrated_law_is_a_function_of_the_present() -> None:
+    cases = {
+        "Mindful": "Mindful remembers in its variable 'SEEN', which .*; evaluate one with memory",
+        "Mixing": "Mixing gives an episode other acceleration alone",
+        "Smoothing": "Smoothing: wish must return one tensor",
+        "Declaring": "Declaring has remembers: a calibrated law .* as a DriverModel",
+    }
+    check_refused(lambda x: Calibrator(model=f"{__name__}.{x}"), [*cases.items()], ConfigError)
 
 
 def test_a_law_without_machine_code_is_simulated_by_tensors(uneven_lengths):

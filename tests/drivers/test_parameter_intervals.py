@@ -80,6 +80,27 @@ def test_intervals_cover_known_parameters(known, mode, objective, where):
             assert (high - low).median() < 8.0 * (found[column] - real).std(), name
 
 
+def test_without_noise_drivers_are_found_exactly(known, monkeypatch):
+    observed, truth = known
+    for objective in ("speed_rmspe", "both"):
+        found = Calibrator(modes=["global"], objective=objective)(observed).drivers
+        for name, real in zip(fitted("global"), truth.T.numpy(), strict=True):
+            column = LAWS["idm"].table()[name].column
+            low, high = found[f"{column}_low"], found[f"{column}_high"]
+            assert (~(low > real) & ~(high < real)).mean() >= 0.95, name
+    assert (found["time_gap_s"] - truth[:, 1].numpy()).abs().median() < 1e-3
+    monkeypatch.setattr("lcc_rl.drivers.genetic.ROUNDS", 1)
+    stopped = Calibrator(modes=["global"])(observed)
+    rows = stopped.drivers["time_gap_s_low"].isna() & stopped.drivers["time_gap_s_high"].isna()
+    words = (
+        " of 80 records have not converged and have no intervals: more generations? (calibration"
+    )
+    assert rows.any()
+    [line] = [line for line in stopped.report if words in line]
+    assert line.startswith(f"global: {rows.sum()} of 80")
+    assert line.endswith("global_genetic.generations=180)")
+
+
 def test_what_a_record_does_not_determine_has_no_end(make_episodes):
     episodes = make_episodes([35.0, 20.0], [1.2, 1.2])
     calibrated = Calibrator(bounds={"desired_speed": [5.0, 30.0]})(episodes)

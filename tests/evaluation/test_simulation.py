@@ -187,7 +187,8 @@ def test_wrong_arguments_are_named(tmp_path) -> None:
         ({"leader": [3.0, -1.0]}, "speed 1, at 0.1 s, is -1, not from 0 to 70 m/s"),
         ({"leader": [3.0, np.inf], "time_step": 0.2}, "speed 1, at 0.2 s, is inf, not from 0"),
         ({"leader": np.ones((2, 3))}, r"speeds .*shape \[2, 3\]; give a column"),
-        ({"leader": pd.DataFrame({"v": WAVE})}, r"leader\.parquet: .*time_s"),
+        ({"leader": pd.DataFrame({"v": WAVE})}, "^the data frame: lacks .*time_s"),
+        ({"leader": pd.DataFrame({"v": [1, "x"]})}, "^the data frame: .*Could not convert 'x'"),
         ({"leader": 12.0 * WAVE}, r"leader must be speeds .*is 96, not .*in km/h"),
         ({"leader": np.ma.masked_greater(WAVE, 9.0)}, "speed 14, at 1.4 s, is nan, not from 0"),
         ({"leader": WAVE, "drivers": {"a": 1}}, "drivers: not a population: "),
@@ -230,6 +231,8 @@ def test_wrong_arguments_are_named(tmp_path) -> None:
 
 def test_settings_without_effect_are_said(caplog) -> None:
     quiet, drawn = ["scenario.controllers.human.noise=0"], "repeats=2, seed=3"
+    start = "scenario.start.human=${scenario.start.automated}"
+    others = ["controller@scenario.controllers.human=acc", start]
     lost = ["+event=lost_target", "scenario.sensors.automated.lost_from=2"]
     cases = [
         ("automated", Follow(), fixed(33.0, 1.3), [], f"drivers, {drawn}"),
@@ -237,6 +240,7 @@ def test_settings_without_effect_are_said(caplog) -> None:
         ("automated", None, fixed(33.0, 1.3, min_gap=3.0), [], drawn),
         ("automated", None, fixed(33.0, 1.3), lost, "drivers"),
         ("human", None, fixed(33.0, 1.3), quiet, drawn),
+        ("human", None, fixed(2.0, 1.3), others, f"drivers, {drawn}"),
         ("automated human", "pretrained/alcc", fixed(33.0, 1.3), quiet, drawn),
         ("automated human", "pretrained/alcc", fixed(33.0, 1.3), [], ""),
     ]

@@ -93,6 +93,11 @@ def test_trips_of_files_rates_and_with_holes(tmp_path, path, subtests) -> None:
             found = lcc_rl.trip_energies(folder, words)
             assert found["trip"].tolist() == ["a", "b"]
             np.testing.assert_allclose(found["energy_kj"], whole["energy_kj"], rtol=5e-3)
+    with subtests.test("a clock in single precision"):
+        time = (0.1 * np.arange(4080)).astype("float32")
+        pd.DataFrame({"t": time, "v": 10.0}).to_parquet(tmp_path / "one.parquet")
+        found = lcc_rl.trip_energies(tmp_path / "one.parquet", words)
+        assert found["duration_s"].tolist() == [407.9]
     with subtests.test("a hole"):
         trips = made()
         trips[~trips["t"].between(25.0, 33.0)].to_csv(path, index=False)
