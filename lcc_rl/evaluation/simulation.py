@@ -37,7 +37,7 @@ from lcc_rl.evaluation.metrics import (
     safety_measures,
 )
 from lcc_rl.evaluation.named import controller_of, is_policy, one_of
-from lcc_rl.evaluation.rollout import Player, Record, reset_options, warn_of_idle
+from lcc_rl.evaluation.rollout import Player, Record, reset_options, warn_of_brakes, warn_of_idle
 from lcc_rl.evaluation.rows import INDEX, highest
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
@@ -229,6 +229,7 @@ def _driven(
     ahead = [("leader", name) for name in ("speed", "acceleration", PLACE, GRADE)]
     keys = [*ahead, CLASS, INDEX, *(("vehicles", name) for name in (*MOTION, *SERIES))]
     player = Player(env, strategy.policy, keys, strategy.title, long and not rows, rows)
+    warn_of_brakes([player])
     options, other = (
         reset_options(env, profile, (repeat + k) % people, seed + k, people, repeat // people)
         for k in (0, 1)

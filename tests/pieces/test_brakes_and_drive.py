@@ -15,6 +15,7 @@ from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import Strategy, baseline, trained
+from lcc_rl.functional.pattern import RING, parse_string
 from lcc_rl.pieces import Action, Actuation, FollowerStopper
 from lcc_rl.pieces.cruise import IDMACC
 from lcc_rl.pieces.world import World
@@ -74,6 +75,31 @@ def test_no_policy_collides_behind_a_leader_that_brakes_as_hard_as_declared(name
         words = (*FILTERED, "scenario=platoon", "scenario.horizon=100")
     cfg = composed(f"variant={own.variant}", f"scenario.name={own.scenario.name}", *words)
     check_safe(trained(cfg, f"pretrained/{name}", policy, POPULATION))
+
+
+def test_filters_that_expect_weaker_brakes_than_the_cars_ahead_have(caplog) -> None:
+    leader = [25.0] * 51 + [max(0.0, 25.0 - 0.26 * n) for n in range(150)]
+    assumed, weak = (
+        f"scenario.filters.automated.{x}" for x in ("braking_ahead=3", "max_acceleration=2.6")
+    )
+    cases = [
+        ("automated*8", (), True, True),
+        ("automated*8", (assumed,), False, False),
+        ("automated*8", (weak,), False, False),
+        ({"size": 8, "penetration": 0.5}, (), None, True),
+        ("automated human automated", (), None, False),
+    ]
+    for string, overrides, collides, said in cases:
+        caplog.clear()
+        settings = ["+filter=cbf", *overrides]
+        found = lcc_rl.simulate(leader, string, "constant_filtered", overrides=settings)
+        assert collides in (None, found.vehicles["collided"].any()), (string, overrides)
+        lines = [x for x in caplog.messages if "behind another may collide" in x]
+        assert len(lines) == said, (string, overrides)
+        assert not said or ("scenario.max_braking" in lines[0] and assumed in lines[0])
+    ring = parse_string("automated human automated", RING)
+    assert ring.follows("automated")
+    assert not ring.follows("human")
 
 
 def test_the_limits_hold_for_commands_of_every_kind() -> None:
