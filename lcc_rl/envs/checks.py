@@ -16,7 +16,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, entries_of, tick, written
-from lcc_rl.errors import ConfigError, LccError, nearest, require
+from lcc_rl.errors import ConfigError, LccError, error_line, naming, nearest, require
 from lcc_rl.functional.guard import changed, changes, check_independent
 from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
@@ -188,16 +188,16 @@ def check_forgets(pieces: Sequence[Piece], play: Callable[[int], object]) -> Non
 def _attempt(piece: Piece, action: object) -> None:
     """Call a function; an error names the piece."""
     try:
-        action()  # type: ignore[operator]
+        with naming(piece.title):
+            action()  # type: ignore[operator]
     except LccError:
         raise
     except Exception as error:
         shape = ", ".join(map(str, ("batch", *piece.event_shape)))
         returned = " and ".join(".".join(key) for key in piece.targets)
-        branch = " (use torch.where in place of if)" if "Boolean value" in str(error) else ""
         raise ConfigError(
-            f"{piece.title} does not fit the string of vehicles: {error}{branch}; it must return "
-            f"{returned} as tensors [{shape}]"
+            f"{piece.title} does not fit the string of vehicles: {error_line(error)}; it must "
+            f"return {returned} as tensors [{shape}]"
         ) from error
 
 

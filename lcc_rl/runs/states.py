@@ -16,7 +16,15 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, input_error, one_line
+from lcc_rl.errors import (
+    ConfigError,
+    Interrupted,
+    LccError,
+    ResultsError,
+    error_line,
+    input_error,
+    one_line,
+)
 from lcc_rl.io.atomic import SUBFOLDERS, atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json, read_text
 from lcc_rl.runs.interrupts import was_interrupted
@@ -182,7 +190,7 @@ def record(folder: Path, error: BaseException) -> None:
 
 def described_error(error: BaseException) -> str:
     """Return an error in one line, with its type unless it is an input error."""
-    return one_line(str(input_error(error) or f"{type(error).__name__}: {error}"))
+    return one_line(error_line(input_error(error) or error, True))
 
 
 def _is_whole(table: Path) -> bool:

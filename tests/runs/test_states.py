@@ -79,7 +79,7 @@ def test_a_failure_is_recorded_and_forgotten_when_tried_again(tmp_path) -> None:
     with pytest.raises(ZeroDivisionError):  # a bug keeps its traceback
         fails(tmp_path, ZeroDivisionError("by zero"))
     text = (tmp_path / "error.txt").read_text()
-    assert text.startswith("ZeroDivisionError: by zero\n")
+    assert text.startswith(f"ZeroDivisionError: by zero ({__file__}:")
     assert "in fails" in text
     with pytest.raises(Interrupted):
         fails(tmp_path, Interrupted("stopped"))
