@@ -145,6 +145,8 @@ class Comparison:
         if heard:
             log.warning("sensors change no messages, which are read by %s", "; ".join(heard))
         warn_of_brakes(one.player for one in self.players)
+        if settings.rows == "episodes" and not any(x.player.reads_drivers for x in self.players):
+            log.warning("no row depends on the human drivers: drivers=… has no effect")
         count, steps, moment = max((x.largest for x in self.players), key=math.prod)
         size = f"an evaluation of {count} episodes of {steps} steps side by side"
         require_memory({size: count * steps * moment}, cfg.device)

@@ -26,6 +26,7 @@ from lcc_rl.pieces.base import ACTION, SEED, STEP, Key, State, as_key
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.leader import PROFILE, PROFILE_START
 from lcc_rl.pieces.string import COMMAND, WANTED
+from lcc_rl.settings import is_ours
 
 log = logging.getLogger("lcc_rl")
 
@@ -134,6 +135,12 @@ class Player:
                     record[key][0] = before[key]
                 record[key][step + first] = value
         return self._checked(record, torch.stack(alive), named)
+
+    @property
+    def reads_drivers(self) -> bool:
+        """Whether a piece depends, or one of a user may depend, on the human drivers."""
+        pieces = [piece for piece, _ in self.step.pieces]
+        return any(x.reads_drivers or not is_ours(x.setup.__module__) for x in pieces)
 
     def draws(self, given: TensorDictBase, other: TensorDictBase) -> bool:
         """Return whether episodes depend on the drivers and seeds in which two options differ."""

@@ -46,7 +46,7 @@ from lcc_rl.pieces.connected import MESSAGES
 from lcc_rl.pieces.features import CLASS, GRADE
 from lcc_rl.pieces.rewards import CollisionPenalty
 from lcc_rl.pieces.slope import PLACE
-from lcc_rl.settings import TARGET, Count, Positive, Seed, checked, is_ours, path_of
+from lcc_rl.settings import TARGET, Count, Positive, Seed, checked, path_of
 
 log = logging.getLogger("lcc_rl")
 
@@ -235,8 +235,8 @@ def _driven(
         for k in (0, 1)
     )
     drawn = [f"repeats={repeats}"] * (repeats > 1) + [f"seed={seed}"] * (seed > 0)
-    read = (x.reads_drivers or not is_ours(x.setup.__module__) for x, _ in player.step.pieces)
-    idle = [*given] * (not any(read)) + ([] if drawn and player.draws(options, other) else drawn)
+    idle = [] if player.reads_drivers else [*given]
+    idle += [] if drawn and player.draws(options, other) else drawn
     if idle:
         log.warning("without effect on these vehicles: %s", ", ".join(idle))
     record, alive = player.play(options)
