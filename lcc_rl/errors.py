@@ -79,7 +79,7 @@ def raised_as(kind: type[LccError], words: str, *caught: type[Exception]) -> Ite
     try:
         yield
     except caught as error:
-        raise kind(f"{words}: {error_line(error)}".removeprefix(": ")) from error
+        raise kind(f"{words}: {line_of(error)}".removeprefix(": ")) from error
 
 
 def is_users(file: str | Path) -> bool:
@@ -97,10 +97,10 @@ def place_of(error: BaseException) -> str:
     return f"{steps[-1].filename}:{steps[-1].lineno}" if steps else ""
 
 
-def error_line(error: BaseException, typed: bool = False) -> str:
+def line_of(error: BaseException, typed: bool = False) -> str:
     """Return an error in one line; one of a user's code, or if ``typed``, with its type."""
     if isinstance(error, LccError):
-        return str(error)
+        return one_line(str(error))
     text, place = one_line(str(error))[:500], place_of(error)
     text = f"{type(error).__name__}: {text}" if typed or place else text
     return f"{text} ({place})" if place else text
@@ -117,7 +117,7 @@ def naming(title: str) -> Iterator[None]:
         if not place_of(error):
             raise
         hint = " (use torch.where in place of if)" if "Boolean value" in str(error) else ""
-        raise ConfigError(f"{title} fails: {error_line(error)}{hint}") from error
+        raise ConfigError(f"{title} fails: {line_of(error)}{hint}") from error
 
 
 @contextmanager

@@ -10,8 +10,8 @@ from typing import Any, NoReturn
 
 from lcc_rl.errors import (
     Interrupted,
-    error_line,
     input_error,
+    line_of,
     of_hydra,
     one_line,
     out_of_memory,
@@ -48,10 +48,9 @@ def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
             if cause is None and out_of_memory(error):
                 first = str(error).strip().partition("\n")[0]
                 stop(f"error: too little memory: {first}", BAD_INPUT)
-            given = cause or isinstance(error, OSError) or of_hydra(error) or place_of(error)
-            if not given:
+            if not (cause or isinstance(error, OSError) or of_hydra(error) or place_of(error)):
                 raise
-            stop(f"error: {cause or error_line(error) or type(error).__name__}", BAD_INPUT)
+            stop(f"error: {cause or line_of(error) or type(error).__name__}", BAD_INPUT)
 
     return guarded
 

@@ -16,7 +16,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, entries_of, tick, written
-from lcc_rl.errors import ConfigError, LccError, error_line, naming, nearest, require
+from lcc_rl.errors import ConfigError, LccError, line_of, naming, nearest, require
 from lcc_rl.functional.guard import changed, changes, check_independent
 from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
@@ -196,7 +196,7 @@ def _attempt(piece: Piece, action: object) -> None:
         shape = ", ".join(map(str, ("batch", *piece.event_shape)))
         returned = " and ".join(".".join(key) for key in piece.targets)
         raise ConfigError(
-            f"{piece.title} does not fit the string of vehicles: {error_line(error)}; it must "
+            f"{piece.title} does not fit the string of vehicles: {line_of(error)}; it must "
             f"return {returned} as tensors [{shape}]"
         ) from error
 

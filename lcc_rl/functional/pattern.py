@@ -51,8 +51,7 @@ class VehicleString:
 
     def follows(self, role: str) -> bool:
         """Return whether a vehicle of a role drives, or may be drawn, directly behind another."""
-        behind = self.roles[1:] + self.roles[: int(self.ring)]
-        pairs = zip(self.roles, behind, strict=False)
+        pairs = zip(self.roles, self.roles[1:] + self.roles[: int(self.ring)], strict=False)
         return (role, role) in pairs or (self.drawn and self.count(role) > 1)
 
     @property

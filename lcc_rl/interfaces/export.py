@@ -12,6 +12,7 @@ import logging
 import re
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -244,13 +245,13 @@ def _rule(given: Any, trust: Sequence[str], time_step: Any = 0.1, **more: Any) -
 
     def tried(piece: Piece, before: State, reached: State) -> None:
         piece.derive(before, reached)
-        fits = all(
-            reached[key].isfinite().all() for key in piece.targets if key[-1] in (WANTED, COMMAND)
+        commands = [reached[key] for key in piece.targets if key[-1] in (WANTED, COMMAND)]
+        text = (
+            f"{driver.name} cannot be exported: its command is not finite where all inputs are 10"
         )
-        text = "its command is not finite where all inputs are 10"
-        require(fits, f"{driver.name} cannot be exported: {text}")
+        require(all(x.isfinite() for x in commands), text)
 
-    driver.program.step(*driver.examples(1, 10.0), apply=tried)
+    partial(driver.program.step, apply=tried)(*driver.examples(1, 10.0))
     return driver.program
 
 

@@ -317,18 +317,15 @@ def signed(value: float, form: str = "{:+.1f}") -> str:
     return re.sub("[+-]", "", text) if zero else text.replace("-", "−")
 
 
-TINY = 1e-9  # of single rounding errors, whose sign means nothing
-
-
 def between(low: float, high: float, form: str = "{:.1f}") -> str:
-    """Return the bounds of an interval, see :func:`signed`; also one rounded to 0 keeps its minus.
+    """Return the bounds of an interval, see :func:`signed`; if rounded to 0, too, with a minus.
 
     Examples:
         >>> between(-0.04, 0.04), between(-1.2, -0.04)
         ('−0.0 … 0.0', '−1.2 … −0.0')
     """
     texts = [(x, signed(x, form)) for x in (low, high)]
-    return " … ".join("−" * bool(x < -TINY and text[0] != "−") + text for x, text in texts)
+    return " … ".join("−" * bool(x < -1e-9 and text[0] != "−") + text for x, text in texts)
 
 
 def heading(column: str) -> str:

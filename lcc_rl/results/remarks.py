@@ -69,7 +69,7 @@ def flow_note(table: pd.DataFrame) -> str:
     return f"{MARK.strip()}: flow lost against {against}: {'; '.join(losses)}." if len(lost) else ""
 
 
-def flow_fronts_note(table: pd.DataFrame) -> str:
+def front_note(table: pd.DataFrame) -> str:
     """Return sentences on fronts with more, or less, flow than the recorded drivers have."""
     rows = table[table[MORE_FLOW] > MORE_NAMED]
     named = zip(rows["strategy"], rows[MORE_FLOW], strict=True)
@@ -78,10 +78,8 @@ def flow_fronts_note(table: pd.DataFrame) -> str:
     lines = [f"{more}which exceeds that of the recorded drivers by: {names}."] * bool(names)
     less = table[table["flow_saving"].isna() & table[MORE_FLOW].notna() & ~crashed(table)]
     names = ", ".join(map(in_words, less["strategy"]))
-    lines += [f"No saving at their flow: less flow at all points of the front: {names}."] * bool(
-        names
-    )
-    return " ".join(lines)
+    fewer = "No saving at their flow: less flow at all points of the front: "
+    return " ".join(lines + [f"{fewer}{names}."] * bool(names))
 
 
 def seeds_note(table: pd.DataFrame) -> str:
