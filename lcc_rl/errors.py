@@ -6,6 +6,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from numbers import Real
+from pathlib import Path
+from sysconfig import get_path
+from traceback import extract_tb
 from typing import Any
 
 
@@ -76,8 +79,45 @@ def raised_as(kind: type[LccError], words: str, *caught: type[Exception]) -> Ite
     try:
         yield
     except caught as error:
-        text = str(error) if isinstance(error, LccError) else one_line(str(error))[:500]
-        raise kind(f"{words}: {text}".removeprefix(": ")) from error
+        raise kind(f"{words}: {line_of(error)}".removeprefix(": ")) from error
+
+
+def is_users(file: str | Path) -> bool:
+    """Whether a file of code is not of this package, Python or an installed package."""
+    path = Path(file)
+    installed = {"site-packages", "dist-packages"}.intersection(path.parts)
+    ours, python = Path(__file__).parent, get_path("stdlib")
+    other = path.is_relative_to(ours) or path.is_relative_to(python) or str(file)[:1] == "<"
+    return not (installed or other)
+
+
+def place_of(error: BaseException) -> str:
+    """Return file and line of the user's code in which an error was raised, or nothing."""
+    steps = [step for step in extract_tb(error.__traceback__) if is_users(step.filename)]
+    return f"{steps[-1].filename}:{steps[-1].lineno}" if steps else ""
+
+
+def line_of(error: BaseException, typed: bool = False) -> str:
+    """Return an error in one line; one of a user's code, or if ``typed``, with its type."""
+    if isinstance(error, LccError):
+        return one_line(str(error))
+    text, place = one_line(str(error))[:500], place_of(error)
+    text = f"{type(error).__name__}: {text}" if typed or place else text
+    return f"{text} ({place})" if place else text
+
+
+@contextmanager
+def naming(title: str) -> Iterator[None]:
+    """Raise an error of a user's code as a ConfigError: its class, then the error's type, line."""
+    try:
+        yield
+    except LccError:
+        raise
+    except Exception as error:
+        if not place_of(error):
+            raise
+        hint = " (use torch.where in place of if)" if "Boolean value" in str(error) else ""
+        raise ConfigError(f"{title} fails: {line_of(error)}{hint}") from error
 
 
 @contextmanager

@@ -44,6 +44,7 @@ from lcc_rl.errors import (
     ConfigError,
     LccError,
     in_short,
+    line_of,
     nearest,
     unknown_name,
 )
@@ -298,8 +299,8 @@ def load_module(module: str, where: str, target: str = "") -> Any:
     except Exception as error:  # a user's module may raise any error
         hint = ""
         if not isinstance(error, (ImportError, AttributeError, ValueError)):
-            raise ConfigError(f"{where}: {module} cannot be imported: {error}") from error
+            raise ConfigError(f"{where}: {module} cannot be imported: {line_of(error)}") from error
         if isinstance(error, ModuleNotFoundError) and not is_ours(error.name):
             hint = "; for your own file, export PYTHONPATH=<its folder>"
-        text = f"{where}: cannot find {target or module!r}: {error}{hint}"
+        text = f"{where}: cannot find {target or module!r}: {line_of(error)}{hint}"
         raise ConfigError(text) from error

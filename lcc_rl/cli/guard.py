@@ -8,7 +8,15 @@ from contextlib import suppress
 from functools import wraps
 from typing import Any, NoReturn
 
-from lcc_rl.errors import Interrupted, input_error, of_hydra, one_line, out_of_memory
+from lcc_rl.errors import (
+    Interrupted,
+    input_error,
+    line_of,
+    of_hydra,
+    one_line,
+    out_of_memory,
+    place_of,
+)
 from lcc_rl.runs.interrupts import BAD_INPUT, INTERRUPTED, interruptible
 from lcc_rl.runs.output import unbroken_output
 
@@ -16,9 +24,9 @@ from lcc_rl.runs.output import unbroken_output
 def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
     """Decorate a function as a command with streams, signals and exit codes.
 
-    Wrong input (this package's errors, Hydra's, OSError) and too little memory give one line on
-    stderr and exit code 2, an interrupt exit code 130, any other error its traceback and exit
-    code 1. Commands may be nested.
+    Wrong input (this package's errors, Hydra's, OSError), an error in a user's code and too little
+    memory give one line on stderr and exit code 2, an interrupt exit code 130, any other error its
+    traceback and exit code 1. Commands may be nested.
     """
 
     @wraps(function)
@@ -40,9 +48,9 @@ def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
             if cause is None and out_of_memory(error):
                 first = str(error).strip().partition("\n")[0]
                 stop(f"error: too little memory: {first}", BAD_INPUT)
-            if cause is None and not (isinstance(error, OSError) or of_hydra(error)):
+            if not (cause or isinstance(error, OSError) or of_hydra(error) or place_of(error)):
                 raise
-            stop(f"error: {cause or str(error) or type(error).__name__}", BAD_INPUT)
+            stop(f"error: {cause or line_of(error) or type(error).__name__}", BAD_INPUT)
 
     return guarded
 

@@ -29,14 +29,7 @@ from lcc_rl.results.platoons import case_report
 from lcc_rl.results.remarks import few_windows, leader_too_fast, remarks
 from lcc_rl.results.render import WIDTH, print_table, terminal
 from lcc_rl.results.report import Report, report, together, windows_for
-from lcc_rl.results.runs import (
-    EPISODES,
-    RECORD,
-    STEPS,
-    check_folder,
-    resumed_config,
-    save_config,
-)
+from lcc_rl.results.runs import EPISODES, RECORD, STEPS, check_folder, resumed_config, save_config
 from lcc_rl.results.windows import by_source
 from lcc_rl.runs.output import log_report
 from lcc_rl.runs.precision import prepare_torch

@@ -30,13 +30,7 @@ from lcc_rl.errors import ConfigError, DataError, Diverged, ResultsError, requir
 from lcc_rl.evaluation.comparison import Comparison
 from lcc_rl.evaluation.entrants import check_effective, check_installed
 from lcc_rl.evaluation.fit import task_of
-from lcc_rl.evaluation.named import (
-    DIRECT,
-    controller_of,
-    is_policy,
-    is_shipped,
-    label_of,
-)
+from lcc_rl.evaluation.named import DIRECT, controller_of, is_policy, is_shipped, label_of
 from lcc_rl.evaluation.strategies import Strategy, TrainedPolicy, applies, baseline, trained
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
 from lcc_rl.io.atomic import atomic_path, own_folder

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import hashlib
-import sysconfig
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -17,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 
 from lcc_rl.config.nodes import settings_at
 from lcc_rl.config.words import FILTERED, YAML, module_named
-from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.errors import ConfigError, ResultsError, is_users
 from lcc_rl.io.paths import matching
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.settings import TARGET, is_ours, load_module
@@ -26,8 +25,6 @@ FileHashes = dict[str, dict[str, str]]
 NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
 NAMING_SECTIONS = ("compare", "policy")  # sections that name policies, controllers and classes
 FRESH = 2.0  # a file may change again within the resolution of its times [s]
-PYTHON = Path(sysconfig.get_path("stdlib"))
-INSTALLED = {"site-packages", "dist-packages"}
 
 
 def inputs_of(content: Mapping[str, Any]) -> FileHashes:
@@ -99,8 +96,7 @@ def _own_files(module: str) -> Iterator[Path]:
     if not is_ours(module) and "/" not in module:
         with suppress(ConfigError):
             path = Path(getattr(load_module(module, TARGET), "__file__", None) or "")
-    installed = INSTALLED.intersection(path.parts) or path.is_relative_to(PYTHON)
-    if path.suffix != ".py" or installed:
+    if path.suffix != ".py" or not is_users(path):
         return
     depth = module.count(".") + (path.name == "__init__.py")
     files, root = [path], path.parents[depth]

@@ -12,7 +12,7 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Self
 
-from lcc_rl.errors import LARGEST, ConfigError, LccError, require, unknown_name
+from lcc_rl.errors import LARGEST, ConfigError, LccError, line_of, require, unknown_name
 from lcc_rl.settings import TARGET, Settings, defaults, find_target, parse, values
 from lcc_rl.settings import as_plain as as_plain
 
@@ -144,7 +144,7 @@ class Node:
         except (LccError, OSError):  # an OSError names its file
             raise
         except Exception as error:  # a user's class may raise any error
-            reason = f"{self.kind.__name__} cannot be built: {type(error).__name__}: {error}"
+            reason = f"{self.kind.__name__} cannot be built: {line_of(error, True)}"
             raise ConfigError(f"{self.where}: {reason}") from error
 
     def _check_names(self) -> None:

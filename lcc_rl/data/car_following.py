@@ -102,9 +102,7 @@ class ExtractionReport:
 
 
 def extract(
-    trajectories: Trajectories,
-    criteria: Criteria,
-    place: Places = places,
+    trajectories: Trajectories, criteria: Criteria, place: Places = places
 ) -> tuple[pd.DataFrame, ExtractionReport]:
     """Extract episodes of car following.
 

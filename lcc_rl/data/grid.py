@@ -89,12 +89,7 @@ def places(
 
 
 def continuous(
-    samples: pd.DataFrame,
-    what: str,
-    place: Places,
-    report: ReadReport,
-    node: str,
-    bridge: float,
+    samples: pd.DataFrame, what: str, place: Places, report: ReadReport, node: str, bridge: float
 ) -> pd.DataFrame:
     """Sort records by time, keep the first row of each time, and divide records at holes.
 

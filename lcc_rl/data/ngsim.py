@@ -96,9 +96,7 @@ NgsimColumns = dict[str, NDArray]
 
 
 def read_ngsim(
-    path: str | Path | Sequence[str | Path],
-    location: str | None = None,
-    units: str = "feet",
+    path: str | Path | Sequence[str | Path], location: str | None = None, units: str = "feet"
 ) -> Trajectories:
     """Read one or several NGSIM files of any published layout and convert them to SI.
 

@@ -149,11 +149,14 @@ class Plausible(Settings):
         off, wrong = gap_jumps(table, self.max_jump)
         if not wrong.any():
             return table, []
-        row, rest = int(np.argmax(wrong)), divided(table, wrong, wrong, SHORTEST_PART)
+        first, rest = int(np.argmax(wrong)), divided(table, wrong, wrong, SHORTEST_PART)
+        near = slice(first, first + round(JUMP_S / FRAME))  # the change is over several samples
+        gap, change = table["gap_m"].to_numpy()[near], off[near]
+        row = first + int(np.argmax(np.abs(np.diff(gap, prepend=gap[0]))))
         fault = (
             f"{int(wrong.sum()):,} sample(s) where the gap jumps or is held, the first: "
-            f"{place(table)(row, 'gap_m')} changes by {off[row]:.3g} m more than the speeds give, "
-            f"{setting}.max_jump={self.max_jump:g}"
+            f"{place(table)(row, 'gap_m')} changes by {change[np.abs(change).argmax()]:.3g} m more "
+            f"than the speeds give, {setting}.max_jump={self.max_jump:g}"
         )
         if len(rest) < (1 - MOST_JUMPS) * len(table):
             raise DataError(f"{source}: has {fault}; expected the gap to one leader")

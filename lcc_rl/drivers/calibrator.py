@@ -36,12 +36,7 @@ from lcc_rl.drivers.parameters import (
 )
 from lcc_rl.drivers.twins import HELD, accelerate, compare_twins, measure_recorded
 from lcc_rl.errors import Concern, ConfigError, DataError, require_known
-from lcc_rl.functional.driver_models import (
-    INDIVIDUAL,
-    PARAMETERS,
-    DriverConstants,
-    Reaction,
-)
+from lcc_rl.functional.driver_models import INDIVIDUAL, PARAMETERS, DriverConstants, Reaction
 from lcc_rl.functional.laws import LAWS
 from lcc_rl.settings import Positive, Settings
 
@@ -285,10 +280,11 @@ class _Fit:
         v0, headway = (self.table_of[x].column for x in INDIVIDUAL)
         open_share = 100 * drivers[[f"{v0}_low", f"{v0}_high"]].isna().any(axis=1).mean()
         width = (drivers[f"{headway}_high"] - drivers[f"{headway}_low"]).median()
+        of_t = f"; median width of T {width:.2g} s" * bool(width > 0.0)
         return [
             *lines,
             f"95 % intervals: v0 is not identified for {open_share:.0f} % of the records (an end "
-            f"is not within calibration.bounds); median width of T {width:.2g} s",
+            f"is not within calibration.bounds){of_t}",
         ]
 
     def concerns(self, drivers: pd.DataFrame) -> list[str]:

@@ -60,6 +60,8 @@ class VehicleClass(Settings):
         motion = torch.full((2,), PROBE), torch.tensor([0.0, 0.1])
         with raised_as(ConfigError, f"{kind}.power", Exception):
             power = unchanged(self.energy.power, motion, kind, ("speed", "acceleration"))
+            shape = [*power.shape]
+            require(shape == [2], f"its shape is {shape} for speeds of shape [2]")
             alone, again = (self.energy.power(*(x[1:] for x in motion)) for _ in range(2))
             check_independent(kind, "power", power[1:], alone, again)
             risen, stored = float(power[1] - power[0]) / 0.1, PROBE * self.energy.inertia / share

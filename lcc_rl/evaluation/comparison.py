@@ -18,7 +18,7 @@ from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import ResultsError
 from lcc_rl.evaluation.cases import Cases
 from lcc_rl.evaluation.episodes import Episodes, plan_of
-from lcc_rl.evaluation.rollout import warn_of_idle
+from lcc_rl.evaluation.rollout import warn_of_brakes, warn_of_idle
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import Rows, as_rows, parquet_metadata, read_parquet, write_parquet
 from lcc_rl.io.memory import require_memory
@@ -144,6 +144,9 @@ class Comparison:
         heard = [in_words(x.name) for x, one in rows if hears(pieces_of(one.player.env))]
         if heard:
             log.warning("sensors change no messages, which are read by %s", "; ".join(heard))
+        warn_of_brakes(one.player for one in self.players)
+        if settings.rows == "episodes" and not any(x.player.reads_drivers for x in self.players):
+            log.warning("no row depends on the human drivers: drivers=… has no effect")
         count, steps, moment = max((x.largest for x in self.players), key=math.prod)
         size = f"an evaluation of {count} episodes of {steps} steps side by side"
         require_memory({size: count * steps * moment}, cfg.device)

@@ -210,7 +210,7 @@ class Episodes:
         noted = repeat if plan.repeats > 1 else None
         given = inputs.evaluation, inputs.population, profile, driver, noted
         described = of_rows.describe(self.strategy, *given)
-        if not self.player.of_drivers:
+        if not self.player.reads_drivers:
             described[["desired_speed_mps", "time_gap_s"]] = np.float32(np.nan)
         desired = of_rows.desired_speeds(self.strategy, described)
         described[FASTER] = of_rows.leader_faster(inputs.evaluation, profile, desired, self.warm_up)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.energy import AVERAGED, AVERAGES, Fleet, as_fleet
-from lcc_rl.errors import ConfigError, LccError, in_short, require, require_known
+from lcc_rl.errors import ConfigError, LccError, line_of, require, require_known
 from lcc_rl.functional.safety import NEVER
 from lcc_rl.results.measures import CALM, MEASURES, SHIPPED, Measure
 from lcc_rl.results.platoons import PLATOON
@@ -310,7 +310,7 @@ def register(measure: Measure, metric: Metric, every: bool = False) -> None:
         raise
     except Exception as error:
         hint = " (speed has a row more than steps: speed[1:])" * ("speed" in entries)
-        raise ConfigError(f"measure {key}: {in_short(error, 200)}{hint}") from error
+        raise ConfigError(f"measure {key}: {line_of(error, True)}{hint}") from error
     for table in (MEASURES, PLATOON):
         table[:] = [row for row in table if row.key != key] + [measure]
     for metrics in (METRICS, ROAD_METRICS):

@@ -21,6 +21,7 @@ from lcc_rl.functional.finite import require_finite
 from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.functional.random import LOW_BITS, STREAM_INCREMENT, hash_bits
+from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.base import ACTION, SEED, STEP, Key, State, as_key
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.leader import PROFILE, PROFILE_START
@@ -136,8 +137,8 @@ class Player:
         return self._checked(record, torch.stack(alive), named)
 
     @property
-    def of_drivers(self) -> bool:
-        """Whether the motion may depend on the population of drivers."""
+    def reads_drivers(self) -> bool:
+        """Whether a piece depends, or one of a user may depend, on the human drivers."""
         pieces = [piece for piece, _ in self.step.pieces]
         return any(x.reads_drivers or not is_ours(x.setup.__module__) for x in pieces)
 
@@ -153,7 +154,8 @@ class Player:
     ) -> tuple[Record, Tensor]:
         """Return the entries to keep, and which steps belong to running episodes."""
         after = {key: record[key][-self.horizon :] for key in self.checked}
-        if require_finite(after, alive, label=self.label, named=named):
+        writers = {key: piece.title for piece in self.pieces for key in piece.targets}
+        if require_finite(after, alive, label=self.label, named=named, writers=writers):
             for value in after.values():
                 value.nan_to_num_(0.0, 0.0, 0.0)
         for piece in self.events:
@@ -242,6 +244,14 @@ def warn_of_idle(idle: Iterable[Mapping[str, bool]]) -> None:
         if all(never for name, never in given if name == title):
             text = "the event of %s happened in no episode: they ended before it, or the gap of a "
             log.warning(text + "cut-in is above the present one", title)
+
+
+def warn_of_brakes(players: Iterable[Player]) -> None:
+    """Log the safety filters that assume weaker brakes ahead than automated cars have."""
+    every = {p.label: x for p in players for x in p.pieces if isinstance(x, CBFFilter)}
+    texts = {label: text for label, piece in every.items() if (text := piece.exceeded)}
+    for text in dict.fromkeys(texts.values()):
+        log.warning("%s: %s", ", ".join(x for x in texts if texts[x] == text), text)
 
 
 def reset_options(

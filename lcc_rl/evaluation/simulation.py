@@ -37,7 +37,7 @@ from lcc_rl.evaluation.metrics import (
     safety_measures,
 )
 from lcc_rl.evaluation.named import controller_of, is_policy, one_of
-from lcc_rl.evaluation.rollout import Player, Record, reset_options, warn_of_idle
+from lcc_rl.evaluation.rollout import Player, Record, reset_options, warn_of_brakes, warn_of_idle
 from lcc_rl.evaluation.rows import INDEX, highest
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
@@ -229,18 +229,18 @@ def _driven(
     ahead = [("leader", name) for name in ("speed", "acceleration", PLACE, GRADE)]
     keys = [*ahead, CLASS, INDEX, *(("vehicles", name) for name in (*MOTION, *SERIES))]
     player = Player(env, strategy.policy, keys, strategy.title, long and not rows, rows)
+    warn_of_brakes([player])
     options, other = (
         reset_options(env, profile, (repeat + k) % people, seed + k, people, repeat // people)
         for k in (0, 1)
     )
     drawn = [f"repeats={repeats}"] * (repeats > 1) + [f"seed={seed}"] * (seed > 0)
     slow = int((inputs.population.desired_speed < inputs.evaluation.speeds.max()).sum())
-    if slow and player.of_drivers and len(cfg.scenario.vehicles) > cfg.automated:
+    if slow and player.reads_drivers and len(cfg.scenario.vehicles) > cfg.automated:
         text = "the leader exceeds the desired speed of %d of %d human drivers, who fall behind; "
         log.warning(text + "drivers=highway in overrides has faster ones", slow, people)
-    idle = [*given] * (not player.of_drivers) + (
-        [] if drawn and player.draws(options, other) else drawn
-    )
+    idle = [] if player.reads_drivers else [*given]
+    idle += [] if drawn and player.draws(options, other) else drawn
     if idle:
         log.warning("without effect on these vehicles: %s", ", ".join(idle))
     record, alive = player.play(options)

@@ -29,6 +29,7 @@ def require_finite(
     first: int = 1,
     label: str = "",
     named: Callable[[int], str] = str,
+    writers: Mapping[tuple[str, ...], str] | None = None,
 ) -> bool:
     """Check that entries of episodes side by side are finite numbers.
 
@@ -38,6 +39,7 @@ def require_finite(
         first: number of the first step.
         label: name of the policy in the message.
         named: returns the name of an episode in the message from its index.
+        writers: what computes entries, by key.
 
     Returns:
         Whether an entry may be NaN or infinite after the end of an episode.
@@ -59,4 +61,5 @@ def require_finite(
     values = entries[key][step, episode]
     number = values[~values.isfinite()][0].item()
     where = f"{label}: {'.'.join(key)}" if label else ".".join(key)
+    where += f" of {writers[key]}" if writers and key in writers else ""
     raise Diverged(f"{where} is {number} at step {first + step} of episode {named(episode)}")

@@ -49,6 +49,11 @@ class VehicleString:
         """Return the places of a role, 0 at the front; not meaningful if places are drawn."""
         return tuple(place for place, name in enumerate(self.roles) if name == role)
 
+    def follows(self, role: str) -> bool:
+        """Return whether a vehicle of a role drives, or may be drawn, directly behind another."""
+        pairs = zip(self.roles, self.roles[1:] + self.roles[: int(self.ring)], strict=False)
+        return (role, role) in pairs or (self.drawn and self.count(role) > 1)
+
     @property
     def names(self) -> tuple[str, ...]:
         """The roles in the string, in the order of their first vehicles."""

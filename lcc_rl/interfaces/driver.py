@@ -140,10 +140,11 @@ class Driver:
                     f"{self.name} reads {name}, which is not measured here, only {measurable}"
                 )
         step, alone = (partial(self.program.step, apply=x) for x in (check_step, check_alone))
-        check_forgets(self.program.pieces, lambda n: step(*self._examples(BATCH, 1.0 + n)))
-        alone(*self._examples(BATCH))
+        check_forgets(self.program.pieces, lambda n: step(*self.examples(BATCH, 1.0 + n)))
+        alone(*self.examples(BATCH))
 
-    def _examples(self, count: int, value: float = 1.0) -> list[Tensor]:
+    def examples(self, count: int, value: float = 1.0) -> list[Tensor]:
+        """Return inputs of some cars and, if there is one, their memory; all first values equal."""
         state, seeds = torch.full((count, len(self.names)), value), torch.zeros(count, 1).long()
         state += torch.arange(count).unsqueeze(-1)  # no two cars alike
         return [state, self.program.begin(state.double(), seeds)] if self.program.width else [state]
@@ -262,7 +263,7 @@ class Driver:
     def _rows(self) -> Rowwise:
         """The program by rows, compiled on demand."""
         make = partial(kept, fused=True) if self.program.width <= WIDEST else _by_tensors
-        return Rowwise(self.program.step, self._examples(1), self.name, make)
+        return Rowwise(self.program.step, self.examples(1), self.name, make)
 
 
 def _ids(cars: Iterable[Hashable]) -> list[Hashable]:

@@ -12,6 +12,7 @@ import logging
 import re
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -32,8 +33,9 @@ from lcc_rl.interfaces.exported import DrivingProgram, Safety, described_input, 
 from lcc_rl.interfaces.onnx_policy import MAKES, TAKES
 from lcc_rl.interfaces.ring_page import ring_page
 from lcc_rl.io.atomic import atomic_path, new_file
-from lcc_rl.pieces.base import SEED
+from lcc_rl.pieces.base import SEED, Piece, State
 from lcc_rl.pieces.controllers import Controller
+from lcc_rl.pieces.string import COMMAND, WANTED
 from lcc_rl.version import __version__
 
 HEAD = """\
@@ -240,6 +242,16 @@ def _rule(given: Any, trust: Sequence[str], time_step: Any = 0.1, **more: Any) -
     driver = Driver(given, time_step, trust, **more)
     noisy = SEED in driver.program.kept
     require(not noisy, f"{driver.name} draws noise from seeds: it cannot be exported")
+
+    def tried(piece: Piece, before: State, reached: State) -> None:
+        piece.derive(before, reached)
+        commands = [reached[key] for key in piece.targets if key[-1] in (WANTED, COMMAND)]
+        text = (
+            f"{driver.name} cannot be exported: its command is not finite where all inputs are 10"
+        )
+        require(all(x.isfinite() for x in commands), text)
+
+    partial(driver.program.step, apply=tried)(*driver.examples(1, 10.0))
     return driver.program
 
 

@@ -142,6 +142,18 @@ class CBFFilter(RoleTransform):
         self.declare(world, [*reads, *["episode.step"] * (self.from_step > 0)])
         self.limits = Braking(self.response.braking, self.braking_ahead, self.time_to_collision)
 
+    @property
+    def exceeded(self) -> str:
+        """Why vehicles of the role may brake harder than it assumes of those ahead, or nothing."""
+        if not self.string.follows(self.role) or self.braking_ahead >= -self.least - ROUNDING:
+            return ""
+        setting = f"scenario.filters.{self.role}.braking_ahead"
+        return (
+            f"an automated car directly behind another may collide: the one ahead brakes by up to "
+            f"{-self.least:g} m/s² (scenario.max_braking), and its filter assumes at most "
+            f"{self.braking_ahead:g} m/s²; set {setting}={-self.least:g}"
+        )
+
     def watch(self) -> CBFGuarantee:
         """Return the piece that records the steps which the filter's guarantee covers."""
         world = World(self.string, replaced=self.replaced)

@@ -136,9 +136,15 @@ class MotorPower(StepTransform):
         Entry("role.predicted_power", "W", "motor power at the predicted acceleration"),
     )
 
+    @property
+    def title(self) -> str:
+        """Its name in messages, with the energy models."""
+        models = dict.fromkeys(type(model).__name__ for model in self.energy.models)
+        return f"{type(self).__name__} ({', '.join(models)})"
+
     def setup(self, world: World) -> None:
         """Read the motion of the vehicles, and their classes if there are several."""
-        self.energy = world.given("energy", self.title)
+        self.energy = world.given("energy", type(self).__name__)
         every, self.role = self.vehicles == VEHICLES, self.vehicles
         space = VEHICLES if every else SELF
         names = [f"{space}.speed", f"{NEXT}.{self.vehicles}.{self.acceleration}"]

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 
 from tensordict.utils import NestedKey
 
-from lcc_rl.errors import require
+from lcc_rl.errors import naming, require
 from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION, VehicleString
 from lcc_rl.settings import Settings, values
 
@@ -164,7 +164,8 @@ class Part(Settings):
         """
         bound = type(self)(**values(self))
         bound.name = name or self.name  # type: ignore[misc]
-        bound.setup(world or World())
+        with naming(type(self).__name__):
+            bound.setup(world or World())
         return bound
 
     def setup(self, world: World) -> None:

@@ -318,8 +318,14 @@ def signed(value: float, form: str = "{:+.1f}") -> str:
 
 
 def between(low: float, high: float, form: str = "{:.1f}") -> str:
-    """Return the bounds of an interval, see :func:`signed`."""
-    return f"{signed(low, form)} … {signed(high, form)}"
+    """Return the bounds of an interval, see :func:`signed`; if rounded to 0, too, with a minus.
+
+    Examples:
+        >>> between(-0.04, 0.04), between(-1.2, -0.04)
+        ('−0.0 … 0.0', '−1.2 … −0.0')
+    """
+    texts = [(x, signed(x, form)) for x in (low, high)]
+    return " … ".join("−" * bool(x < -1e-9 and text[0] != "−") + text for x, text in texts)
 
 
 def heading(column: str) -> str:

@@ -81,7 +81,9 @@ def strategy_named(given: str, known: Iterable[object]) -> str:
         ConfigError: if there is none, naming the nearest.
     """
     names = list(map(str, known))
-    stored = {label: name for label, name in FORMER.items() if name in names}
+    rules = [x for x in RULE_ROWS if x in names]  # headings have "the rule" for the first
+    stored = dict(zip([RULE], rules, strict=False))
+    stored |= {label: name for label, name in FORMER.items() if name in names}
     stored |= {in_words(name): name for name in names} | {name: name for name in names}
     name = " ".join(given.split()).rstrip(f" {MARKS}")
     if name not in stored:

@@ -69,13 +69,17 @@ def flow_note(table: pd.DataFrame) -> str:
     return f"{MARK.strip()}: flow lost against {against}: {'; '.join(losses)}." if len(lost) else ""
 
 
-def more_flow_note(table: pd.DataFrame) -> str:
-    """Return a sentence on savings at more flow than the recorded drivers have; empty for none."""
+def front_note(table: pd.DataFrame) -> str:
+    """Return sentences on fronts with more, or less, flow than the recorded drivers have."""
     rows = table[table[MORE_FLOW] > MORE_NAMED]
     named = zip(rows["strategy"], rows[MORE_FLOW], strict=True)
     names = ", ".join(f"{in_words(str(name))} {share:.1%}" for name, share in named)
     more = "Saved at their flow: not at equal flow, but at the least flow on the strategy's front, "
-    return f"{more}which exceeds that of the recorded drivers by: {names}." if names else ""
+    lines = [f"{more}which exceeds that of the recorded drivers by: {names}."] * bool(names)
+    less = table[table["flow_saving"].isna() & table[MORE_FLOW].notna() & ~crashed(table)]
+    names = ", ".join(map(in_words, less["strategy"]))
+    fewer = "No saving at their flow: less flow at all points of the front: "
+    return " ".join(lines + [f"{fewer}{names}."] * bool(names))
 
 
 def seeds_note(table: pd.DataFrame) -> str:

@@ -40,7 +40,7 @@ from lcc_rl.results.remarks import (
     crashed,
     crashes,
     flow_note,
-    more_flow_note,
+    front_note,
     remarks,
     seeds_note,
     verdict,
@@ -310,7 +310,7 @@ def report(
     text = "" if task else verdict(windows, table, few)
     seen, shown_windows = (x[x["strategy"].isin(short["strategy"])] for x in (table, windows))
     notes = [*remarks(shown_windows), *crashes(seen)]
-    notes += filter(None, [flow_note(seen), more_flow_note(seen), by_ends(seen), seeds_note(seen)])
+    notes += filter(None, [flow_note(seen), front_note(seen), by_ends(seen), seeds_note(seen)])
     fields |= {"full_caption": FULL, "verdict": text, "remarks": notes}
     ends = {"_low": "_high", "_high": "_low"}
     bounds = {f"{FLOW_SHARE.key}{x}": -100.0 * table[f"{FLOW_LOST}{y}"] for x, y in ends.items()}

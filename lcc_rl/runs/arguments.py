@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable, Sequence
 from os.path import exists  # false, too, for what is too long for a path
@@ -20,6 +21,8 @@ FINITE = ConfigDict(allow_inf_nan=False)
 class Arguments(ArgumentParser):
     """A parser that keeps the examples in its description and raises a ConfigError."""
 
+    trusts = False
+
     def __init__(self, description: str | None = None, **settings: Any) -> None:
         settings.setdefault("formatter_class", RawDescriptionHelpFormatter)
         settings.setdefault("allow_abbrev", False)
@@ -29,6 +32,14 @@ class Arguments(ArgumentParser):
         """Add ``--trust``, whose modules are separated by commas; it may be repeated."""
         how: Any = {"action": "extend", "type": lambda word: word.split(","), "default": []}
         self.add_argument("--trust", help="modules that files may name, with commas", **how)
+        self.trusts = True
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse words, also ``trust=[…]`` as training and evaluation write it."""
+        words = sys.argv[1:] if args is None else [*args]
+        if self.trusts:
+            words = [re.sub(r"^trust=\[?(.*?)\]?$", r"--trust=\1", word) for word in words]
+        return super().parse_known_args(words, namespace)
 
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message} ({self.prog} -h lists all flags)")

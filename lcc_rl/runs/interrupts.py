@@ -96,7 +96,7 @@ def was_interrupted(error: BaseException | None) -> bool:
 
 @contextmanager
 def stop_signal() -> Iterator[threading.Event]:
-    """Set the event on the first signal; a signal a second later has its default action.
+    """Set the event on the first signal, with a line; one a second later has its default action.
 
     SIGINT counts even if the shell ignores it for background processes; an ignored SIGHUP
     (``nohup``) does not.
@@ -109,6 +109,8 @@ def stop_signal() -> Iterator[threading.Event]:
         if not event.is_set():
             event.set()
             last = time.monotonic() + TOGETHER
+            with suppress(OSError):
+                os.write(2, b"lcc_rl: stopping once this iteration is saved\n")
         elif time.monotonic() > last:
             restore()
             signal.raise_signal(number)

@@ -52,7 +52,8 @@ def overview_line(root: Path, states: Sequence[RunState], planned: int) -> str:
     parts = [f"{count} {kind}" for kind, count in numbers.items() if count]
     left = remaining(states, planned)
     eta = f"; about {clock(left)} left" if left is not None else ""
-    return f"{root}: {max(planned, len(states))} runs: {', '.join(parts) or 'none'}{eta}"
+    runs = max(planned, len(states))
+    return f"{root}: {runs} run{'s' * (runs != 1)}: {', '.join(parts) or 'none'}{eta}"
 
 
 def left(state: RunState) -> str:

@@ -45,10 +45,7 @@ def bar(console: Console, shown: bool, transient: bool = False) -> Progress:
 
 @contextmanager
 def phases(
-    title: str,
-    console: Console,
-    emit: Callable[[Sequence[str]], None],
-    every: float = 10.0,
+    title: str, console: Console, emit: Callable[[Sequence[str]], None], every: float = 10.0
 ) -> Iterator[Callable[[int, int, str], None]]:
     """Report the progress of a job in phases with separate counts.
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, input_error, one_line
+from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, input_error, line_of
 from lcc_rl.io.atomic import SUBFOLDERS, atomic_path, remove_leftovers
 from lcc_rl.io.settings import read_json, read_text
 from lcc_rl.runs.interrupts import was_interrupted
@@ -192,7 +192,7 @@ def record(folder: Path, error: BaseException) -> None:
 
 def described_error(error: BaseException) -> str:
     """Return an error in one line, with its type unless it is an input error."""
-    return one_line(str(input_error(error) or f"{type(error).__name__}: {error}"))
+    return line_of(input_error(error) or error, True)
 
 
 def _is_whole(table: Path) -> bool:
@@ -219,7 +219,7 @@ def _inspected(folder: Path, name: str) -> RunState:
     state, why = "stopped", ""
     with suppress(ResultsError):
         lines = read_text(folder / ERROR).splitlines()
-        state, why = "failed", one_line(lines[0] if lines else "")
+        state, why = "failed", "".join(lines[:1])
     for table in filter(Path.exists, (folder / table for table in RESULT_TABLES)):
         if not _is_whole(table):
             return RunState(name, "failed", done, total, error=f"{table.name} is cut or damaged")

@@ -97,10 +97,7 @@ def test_nothing_that_is_there_is_written_over(run, tmp_path) -> None:
 
 
 def test_so_do_the_benchmarks(run, tmp_path, monkeypatch) -> None:
-    cases = (
-        ("env --out run/episodes.parquet", "exists already"),
-        ("reed", "Did you mean 'read'"),
-    )
+    cases = (("env --out run/episodes.parquet", "exists already"), ("reed", "Did you mean 'read'"))
     monkeypatch.chdir(tmp_path)
     check_refused(lambda typed: benchmarks.main(typed.split()), cases)
 

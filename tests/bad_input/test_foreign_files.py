@@ -27,6 +27,7 @@ from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.pieces import SafetyReward
 from lcc_rl.results.policies import load_policy
 from lcc_rl.results.runs import load_config
+from lcc_rl.runs.arguments import Arguments
 
 
 def changed(text: str, changes: dict[str, object]) -> str:
@@ -108,6 +109,9 @@ def test_ones_own_module_can_be_trusted_by_name_but_not_by_the_folder(
     monkeypatch.syspath_prepend(tmp_path)
     change(run, {TARGET: "comforts.Comfort", "trust": ["os"]})
     assert load_config(run, ["comforts"]).trust == ["comforts"]
+    (parser := Arguments()).add_trust()  # of lcc-rl repeat and table
+    for words in (["trust=[comforts,os]"], ["--trust", "comforts,os"]):
+        assert parser.parse_args(words).trust == ["comforts", "os"]
     with pytest.raises(ResultsError, match=r"trust=\[comforts\]"):
         load_config(run, ["other"])
 

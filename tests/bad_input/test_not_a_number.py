@@ -78,10 +78,10 @@ def test_an_evaluation_names_strategy_entry_step_and_episode(tmp_path) -> None:
 
     which = r"of episode \d+ \(profile \S.*, driver \d+, seed \d+\)$"
     cases = [
-        (*CONTROL, f"strategy NanControl: automated.command is nan at step 4 {which}"),
-        (*CONTROL, *FILTER, f"strategy NanControl: automated.wanted is nan at step 4 {which}"),
-        (*DRIVER, f"strategy direct: human.command is nan at step 4 {which}"),
-        (*POWER, f"strategy direct: vehicles.power is -?inf at step 1 {which}"),
+        (*CONTROL, f"NanControl: automated.command of NanControl is nan at step 4 {which}"),
+        (*CONTROL, *FILTER, f"NanControl: automated.wanted of NanControl is nan at step 4 {which}"),
+        (*DRIVER, f"strategy direct: human.command of NanDriver is nan at step 4 {which}"),
+        (*POWER, rf"vehicles.power of InfinitePower \(PaperMotor\) is -?inf at step 1 {which}"),
     ]
     check_refused(evaluate, cases, Diverged)
     assert not list(tmp_path.glob("run/*.parquet"))

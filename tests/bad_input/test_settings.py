@@ -246,10 +246,7 @@ def test_drivers_have_an_effect_on_whatever_drives_as_they_do() -> None:
 def test_a_bad_setting_of_a_calibration_is_named(tmp_path) -> None:
     check_refused(
         lambda typed: calibration.run(load("calibrate", [typed]), tmp_path),
-        [
-            ("calibration.modes=[loacl]", "mode"),
-            ("calibration._target_=os.getcwd", "calibration"),
-        ],
+        [("calibration.modes=[loacl]", "mode"), ("calibration._target_=os.getcwd", "calibration")],
         ConfigError,
     )
 

@@ -126,16 +126,8 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("record", RECORD, "holds 0 samples"),
     # Cells that are blank, words, not finite or out of range.
     ("ngsim", ngsim(v_Vel="abc"), "data row 3, column 'v_Vel' holds 'abc'; expected a number"),
-    (
-        "ngsim",
-        ngsim(Local_Y="NaN"),
-        "row 3, column 'Local_Y' holds nothing; expected a number",
-    ),
-    (
-        "ngsim",
-        ngsim(Vehicle_ID=""),
-        "row 3, column 'Vehicle_ID' holds nothing; expected a whole",
-    ),
+    ("ngsim", ngsim(Local_Y="NaN"), "row 3, column 'Local_Y' holds nothing; expected a number"),
+    ("ngsim", ngsim(Vehicle_ID=""), "row 3, column 'Vehicle_ID' holds nothing; expected a whole"),
     ("ngsim", ngsim(v_Acc="inf"), "data row 3, column 'v_Acc' holds 'inf'"),
     ("ngsim", ngsim(Vehicle_ID="7.5"), "column 'Vehicle_ID' holds '7.5'; expected a whole number"),
     ("ngsim", ngsim(Lane_ID="70000"), "data row 3, column 'Lane_ID' holds '70000'"),
@@ -207,11 +199,7 @@ BAD: list[tuple[str, str | bytes, str]] = [
     ("table", csv(TABLE.assign(t=MINUTES)), "row 301, .*: 95959.9 s, then 100000 s, .* hh:mm:ss"),
     ("table", csv(TABLE.assign(x=-TABLE["x"], v=-TABLE["v"])), "must grow in the direction of tr"),
     ("drives", later(0.6, "d", 4.6), r"\(leader\.units\.speed=m/s\), or do they need smoothing"),
-    (
-        "lengths",
-        csv(TABLE.assign(length=2.3)),
-        r"is 2\.3 m; is it in ft or half\? Set data\.units",
-    ),
+    ("lengths", csv(TABLE.assign(length=2.3)), r"is 2\.3 m; is it in ft or half\? Set data\.units"),
     ("drives", later(1, "d", 6), r"holds 7.* correct .* leader\.units\.speed=m/s, or raise"),
     ("drives", WIDE, r"row 1 has \d+ columns; expected 10: is it a whole trajectory, as in pNEUMA"),
     ("table", csv(TABLE.assign(v=3.6 * TABLE["v"])), "by their positions the vehicles drive"),

@@ -14,14 +14,7 @@ from ngsim_text import cells, csv_text, pair
 from table_text import openacc_text, speed
 
 from lcc_rl.config import load
-from lcc_rl.data.leaders import (
-    DriveLeaders,
-    Mixture,
-    RecordLeaders,
-    apart,
-    hashed,
-    stretch,
-)
+from lcc_rl.data.leaders import DriveLeaders, Mixture, RecordLeaders, apart, hashed, stretch
 from lcc_rl.data.profiles import Split, at_step, joined, leader_profiles
 from lcc_rl.data.sources import SHIPPED_FILES, NgsimSource
 from lcc_rl.data.speed_records import read_speed_record

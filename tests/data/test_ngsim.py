@@ -8,15 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from ngsim_text import (
-    OFFICIAL,
-    START_MS,
-    cells,
-    csv_text,
-    native_text,
-    pair,
-    portal_text,
-)
+from ngsim_text import OFFICIAL, START_MS, cells, csv_text, native_text, pair, portal_text
 
 from lcc_rl.data import text
 from lcc_rl.data.ngsim import read_ngsim

@@ -39,12 +39,7 @@ KNOWN: dict[str, dict[str, float]] = {
     "idm": {"acceleration": 1.8, "deceleration": 2.5, "min_gap": 3.0},
     "ovm": {"sensitivity": 2.2, "form": 0.8, "min_gap": 3.0},
     "fvdm": {"sensitivity": 0.6, "form": 1.0, "min_gap": 3.0, "speed_gain": 0.8},
-    "gipps": {
-        "acceleration": 1.4,
-        "deceleration": 2.5,
-        "leader_deceleration": 2.8,
-        "min_gap": 3.0,
-    },
+    "gipps": {"acceleration": 1.4, "deceleration": 2.5, "leader_deceleration": 2.8, "min_gap": 3.0},
 }
 
 
@@ -90,8 +85,7 @@ def reference_measures(observed, candidates, model, constants) -> dict[str, torc
 
 @pytest.mark.parametrize("compiled", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
-    ("model", "more"),
-    slow_but([("gipps", {}), EXPONENT], [*((x, {}) for x in LAWS), EXPONENT]),
+    ("model", "more"), slow_but([("gipps", {}), EXPONENT], [*((x, {}) for x in LAWS), EXPONENT])
 )
 def test_errors_are_those_of_the_plain_simulation(model, more, compiled, uneven_lengths):
     observed, names = observe(uneven_lengths), fitted("global", model)

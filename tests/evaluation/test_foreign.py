@@ -71,9 +71,7 @@ def networks() -> tuple[nn.Sequential, dict[str, nn.Module]]:
             frames, TensorDictModule(nn.Sequential(earlier, nn.Tanh()), ["frames"], ["action"])
         ),
         "lagged": TensorDictModule(
-            Lagged(network),
-            ["observation", "is_init", "before"],
-            ["action", ("next", "before")],
+            Lagged(network), ["observation", "is_init", "before"], ["action", ("next", "before")]
         ),
     }
 

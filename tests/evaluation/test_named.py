@@ -178,7 +178,7 @@ class Winding(Steady):
 
 
 def test_a_memory_that_is_no_number_ends_an_evaluation(tmp_path) -> None:
-    with pytest.raises(LccError, match=r"Winding: automated\.wound is inf at step 1 of"):
+    with pytest.raises(LccError, match=r"Winding: automated\.wound of Winding is inf at step 1 of"):
         lcc_rl.compare([Winding], overrides=SMALL, folder=tmp_path)
 
 

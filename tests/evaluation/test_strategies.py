@@ -13,11 +13,12 @@ from helpers import ACTION, POPULATION, check_refused, compose, wavy_profiles
 from tensordict.nn import TensorDictModule
 
 from lcc_rl.commands.pipeline import _episodes, read_once
-from lcc_rl.config.compose import with_inputs
+from lcc_rl.config.compose import load, with_inputs
 from lcc_rl.config.nodes import Node
-from lcc_rl.envs import build_env
+from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation import strategies
+from lcc_rl.evaluation.comparison import Comparison
 from lcc_rl.evaluation.entrants import check_distinct, named_apart
 from lcc_rl.evaluation.fit import check_policy, other_traffic
 from lcc_rl.evaluation.named import TUNED
@@ -45,6 +46,15 @@ def test_a_tuned_rule_behind_the_filter_is_called_so_and_has_constants_for_it(na
     # A human driver has no filter.
     human = baseline(compose("alcc", "+filter=cbf"), "idm").cfg.scenario
     assert human.filters.get(AUTOMATED) is None
+
+
+def test_drivers_on_whom_no_row_depends_are_said(caplog) -> None:
+    inputs = Inputs(wavy_profiles(), wavy_profiles(), POPULATION)
+    for string in ("automated", "automated human"):
+        cfg = load("evaluate", ["variant=idm", f"scenario.string={string}", "scenario.horizon=250"])
+        caplog.clear()
+        Comparison(cfg, inputs, [baseline(cfg, "acc")])
+        assert ("depends on the human drivers" in caplog.text) == (string == "automated")
 
 
 def test_policies_of_one_variant_are_named_by_what_they_learned_with() -> None:

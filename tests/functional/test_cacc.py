@@ -10,19 +10,8 @@ import torch
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.braking import Braking, safe_acceleration
-from lcc_rl.functional.cacc import (
-    Errors,
-    Gains,
-    cacc_acceleration,
-    find_chains,
-    platoon_errors,
-)
-from lcc_rl.functional.hcfs import (
-    PlatoonPlace,
-    PlatoonReward,
-    hybrid_decision,
-    jerk_interval,
-)
+from lcc_rl.functional.cacc import Errors, Gains, cacc_acceleration, find_chains, platoon_errors
+from lcc_rl.functional.hcfs import PlatoonPlace, PlatoonReward, hybrid_decision, jerk_interval
 from lcc_rl.functional.kinematics import advance_gap, advance_speed
 from lcc_rl.functional.string import entries_ahead
 from lcc_rl.studies.hcfs.tables import weight_table

@@ -266,6 +266,10 @@ def test_a_measurement_that_is_no_number_brakes_or_shows(exported, tmp_path) -> 
                     assert np.isfinite(one[1:]).all()
 
 
+def nothing(gap):
+    return gap * torch.nan
+
+
 def test_bad_input_is_one_clear_error() -> None:
     cases = [
         (["pretrained/alcc", "x.tflite"], "ending"),
@@ -284,6 +288,8 @@ def test_bad_input_is_one_clear_error() -> None:
         (["idm_acc", "x.c", "time_step=20"], "time_step must be less than or equal to 0.5, got"),
         (["idm_ac", "x.onnx"], "idm_acc"),
         (["idm_acc", "x.html"], r"idm_acc: a page \(.html\) needs a run or a policy file"),
+        ([f"{__name__}.nothing", "x.c"], "nothing cannot be exported: its command is not finite"),
+        ([f"{__name__}.nothing_filtered", "x.c"], "nothing_filtered cannot be exported: its comm"),
         (["human", "x.c"], "human draws noise from seeds: it cannot be exported"),
     ]
     check_refused(main, cases, ConfigError)

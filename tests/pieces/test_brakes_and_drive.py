@@ -15,6 +15,7 @@ from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import Strategy, baseline, trained
+from lcc_rl.functional.pattern import RING, parse_string
 from lcc_rl.pieces import Action, Actuation, FollowerStopper
 from lcc_rl.pieces.cruise import IDMACC
 from lcc_rl.pieces.world import World
@@ -74,6 +75,25 @@ def test_no_policy_collides_behind_a_leader_that_brakes_as_hard_as_declared(name
         words = (*FILTERED, "scenario=platoon", "scenario.horizon=100")
     cfg = composed(f"variant={own.variant}", f"scenario.name={own.scenario.name}", *words)
     check_safe(trained(cfg, f"pretrained/{name}", policy, POPULATION))
+
+
+def test_filters_that_expect_weaker_brakes_than_the_cars_ahead_have(caplog) -> None:
+    leader = [25.0] * 51 + [max(0.0, 25.0 - 0.26 * n) for n in range(150)]
+    hint, weak = (f"scenario.filters.automated.{x}" for x in ("braking_ahead=3", "max_accel"))
+    for string, override, collides, said in (
+        ("automated*8", "", True, True),
+        ("automated*8", hint, False, False),
+        ("automated*8", f"{weak}eration=2.6", False, False),
+        ({"size": 8, "penetration": 0.5}, "", None, True),
+        ("automated human automated", "", None, False),
+    ):
+        caplog.clear()
+        settings = ["+filter=cbf", *filter(None, [override])]
+        found = lcc_rl.simulate(leader, string, "constant_filtered", overrides=settings)
+        assert collides in (None, found.vehicles["collided"].any()), (string, override)
+        lines = [x for x in caplog.messages if "(scenario.max_braking)" in x and hint in x]
+        assert len(lines) == said, (string, override)
+    assert parse_string("automated human automated", RING).follows("automated")
 
 
 def test_the_limits_hold_for_commands_of_every_kind() -> None:

@@ -89,10 +89,7 @@ def test_a_larger_batch_does_not_change_a_member(numbers, given_actions) -> None
     # Vectorised kernels may round differently at other sizes: 1e-5 is a hundred times less than
     # what a step changes.
     torch.testing.assert_close(
-        two["next", *OBSERVATION][: len(numbers)],
-        one["next", *OBSERVATION],
-        rtol=1e-5,
-        atol=1e-5,
+        two["next", *OBSERVATION][: len(numbers)], one["next", *OBSERVATION], rtol=1e-5, atol=1e-5
     )
 
 

@@ -17,10 +17,7 @@ from lcc_rl.envs.inputs import constant_profiles
 RING = ("variant=reference", "scenario=ring", "agent=none", "drivers=ring")
 SPEED = ("vehicles", "speed")
 # The one vehicle: a human driver like all others until 300 s.
-HANDOVER = (
-    string("automated human*21"),
-    "controller@scenario.controllers.automated=handover",
-)
+HANDOVER = (string("automated human*21"), "controller@scenario.controllers.automated=handover")
 
 
 def speeds(seconds: float, circumference: float, *overrides: str) -> Tensor:

@@ -207,8 +207,7 @@ def test_evaluations(name, tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name",
-    slow_but(["alcc_ddpg", "alcc_analytic", "ddpg"], sorted(COMMANDS["training"])),
+    "name", slow_but(["alcc_ddpg", "alcc_analytic", "ddpg"], sorted(COMMANDS["training"]))
 )
 def test_trainings(name, tmp_path) -> None:
     cfg = load("train", COMMANDS["training"][name])

@@ -92,7 +92,10 @@ def test_a_table_marks_savings_at_more_flow_than_the_recorded_drivers_have() -> 
     assert one.table.set_index("strategy").loc["alcc", "more_flow"] == pytest.approx(0.15, abs=0.01)
     found = [line for line in one.remarks if "not at equal flow" in line]
     assert [line.rpartition(": ")[2] for line in found] == ["network 15.4%."]
-    assert not any("not at equal flow" in line for line in report(windows_for(rows())).remarks)
+    assert not any("their flow" in line for line in report(windows_for(rows())).remarks)
+    slower = rows(flow_vph={**FLOWS, "alcc": 900.0, "alcc X=1": 950.0})
+    less = "No saving at their flow: less flow at all points of the front: network."
+    assert less in report(windows_for(slower)).remarks
 
 
 def test_fronts_are_compared_by_equal_seeds() -> None:

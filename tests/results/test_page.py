@@ -59,12 +59,7 @@ def test_a_page_holds_everything_and_fetches_nothing(page) -> None:
     assert "default-src 'none'" in html
     assert html.count("<table>") == 2
     assert html.count("<details>") == 1
-    for words in (
-        "First &amp; last",
-        "One &lt; two.</p>",
-        "lcc-rl run",
-        "<td>torch</td>",
-    ):
+    for words in ("First &amp; last", "One &lt; two.</p>", "lcc-rl run", "<td>torch</td>"):
         assert words in html
     assert f"Its trainings ran on: {processor()} (1)." in html
 

@@ -239,6 +239,7 @@ def test_a_table_marks_strategies_that_lose_more_than_2_percent_of_the_flow() ->
     crowd = driven("direct", 1.0, flow_vph=1800.0)  # no path energy of automated cars: no row
     rows = pd.concat([rows.assign(total_path_energy_kj=1.0), crowd])
     assert [lost] == report(windows_for(rows), energy=MOTOR).remarks
+    assert report(windows_for(rows), energy=MOTOR, against="rule").against == "idm_acc"
     marked = ["simulated drivers", "tuned IDM †", "PI with saturation †"]
     assert one.short["driver"].tolist() == marked
     assert found["kept"].all()
@@ -316,18 +317,15 @@ def test_signs_of_a_name_stay_in_its_cell() -> None:
     assert printed.isascii()
 
 
-def test_no_table_has_a_negative_zero_or_thousandths_of_a_per_cent() -> None:
+def test_zeros_have_no_sign_but_as_bounds() -> None:
     table = pd.DataFrame({"saved_pct": [-0.0, -1e-9], "n": [0, 1]})
-    for text in (
-        as_markdown(table),
-        as_latex(table),
-        as_csv(table[:1]),
-        saved_text(-0.04, -0.04, 0),
-    ):
+    zero = saved_text(-0.04, -1e-12, 0.0)
+    for text in (as_markdown(table), as_latex(table), as_csv(table[:1]), zero):
         assert not re.search(r"[-−]\$?0\.?0*\b", text), text
     small = pd.DataFrame({"flow_pct": [0.0, 0.033], "flow\n[%]": [0.0, 0.033]})
     assert as_markdown(small).endswith("| 0.03 | 0.03 |")
     assert saved_text(-0.04, -0.06, 0.0) == "0.0 (−0.1 … 0.0)"
+    assert saved_text(0.2, -0.04, 0.3) == "+0.2 (−0.0 … 0.3)"  # within the uncertainty
     shares = report(windows_for(episodes().assign(share_ttc_unsafe=1.0 / 3.0))).short
     assert shares["unsafe_ttc_pct"].iloc[0] == pytest.approx(100.0 / 3.0, rel=1e-12)
     assert as_csv(pd.DataFrame({"x": [-0.0, 1.5]}), "comma").split() == ["x", "0,0", "1,5"]

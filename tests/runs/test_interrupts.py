@@ -107,12 +107,13 @@ def test_a_program_that_imports_the_package_keeps_its_handlers(tmp_path) -> None
     subprocess.run([sys.executable, "-m", "mine"], cwd=tmp_path, check=True, timeout=60)
 
 
-def test_the_first_signal_asks_and_one_that_comes_later_acts(monkeypatch) -> None:
+def test_the_first_signal_asks_and_one_that_comes_later_acts(monkeypatch, capfd) -> None:
     for kind in SENT:
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL  # importing changes no handler
         with interruptible(), stop_signal() as stop:
             os.kill(os.getpid(), kind)
             assert stop.is_set()
+            assert capfd.readouterr().err == "lcc_rl: stopping once this iteration is saved\n"
             os.kill(os.getpid(), kind)  # as a scheduler does, to this process and by its parent
             with monkeypatch.context() as later:
                 later.setattr("lcc_rl.runs.interrupts.time.monotonic", lambda: math.inf)

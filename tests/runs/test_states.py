@@ -17,7 +17,7 @@ from rich.console import Console
 from lcc_rl.commands import training
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.results.runs import load_config
-from lcc_rl.runs.overview import main, states_table
+from lcc_rl.runs.overview import main, overview_line, states_table
 from lcc_rl.runs.plans import unfinished
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import (
@@ -81,7 +81,7 @@ def test_a_failure_is_recorded_and_forgotten_when_tried_again(tmp_path) -> None:
     with pytest.raises(ZeroDivisionError):  # a bug keeps its traceback
         fails(tmp_path, ZeroDivisionError("by zero"))
     text = (tmp_path / "error.txt").read_text()
-    assert text.startswith("ZeroDivisionError: by zero\n")
+    assert text.startswith(f"ZeroDivisionError: by zero ({__file__}:")
     assert "in fails" in text
     with pytest.raises(Interrupted):
         fails(tmp_path, Interrupted("stopped"))
@@ -176,6 +176,7 @@ def test_a_folder_that_is_no_run_is_refused_with_the_runs_and_tables_in_it(tmp_p
 
 def test_nothing_to_see(tmp_path) -> None:
     assert status(tmp_path)[-1].endswith("0 runs: none")
+    assert overview_line(tmp_path, [], 1).endswith("1 run: 1 waiting")
     done = run_command("status", "", cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "the name of the folder is empty" in done.stderr

@@ -29,13 +29,7 @@ def test_gap():
 
 def test_lines_code_and_guards_of_a_module() -> None:
     # The function check_gap, five lines without its docstring, and its call guard.
-    assert size.measured(MODULE) == {
-        "modules": 1,
-        "lines": 19,
-        "code": 10,
-        "guards": 6,
-        "tests": 1,
-    }
+    assert size.measured(MODULE) == {"modules": 1, "lines": 19, "code": 10, "guards": 6, "tests": 1}
 
 
 def test_the_table_adds_lcc_rl_and_tools(monkeypatch, tmp_path) -> None:
