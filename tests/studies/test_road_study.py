@@ -37,7 +37,7 @@ def test_one_command_writes_table_figure_and_reports(tmp_path) -> None:
     assert rule["fuel_saved_pct"] == pytest.approx(share)
     assert humans["co2_g_per_km"] == pytest.approx(23.48 * humans["fuel_l_per_100km"])
     page = (tmp_path / "road" / "results.md").read_text(encoding="utf-8")
-    assert "4 vehicles, 1 times behind each of 2 windows of 6 s, the first 1 s not counted" in page
+    assert "4 vehicles, 1 time behind each of 2 windows of 6 s, the first 1 s not counted" in page
     assert "## Data\n\n* read 6 episodes" in page
     assert "## Drivers" in page
     assert "RMSPE of 6 " in page
