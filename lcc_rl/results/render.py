@@ -177,6 +177,7 @@ def as_rich(table: pd.DataFrame, shown: Sequence[Shown], title: str, caption: st
     widest, *others = (max(map(len, "\n".join(text).split("\n"))) for text in texts)
     if widest > (room := WIDTH - sum(others) - len(others)) and first <= WIDTH // 4:
         drawn.columns[0].width = max(first, room)  # before the cells of others are wrapped
+        drawn.width = WIDTH if first > room else None
     for row in zip(*(cells for _, *cells in texts), strict=True):
         drawn.add_row(*map(escape, row))
     return drawn
