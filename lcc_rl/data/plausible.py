@@ -150,9 +150,10 @@ class Plausible(Settings):
         if not wrong.any():
             return table, []
         first, rest = int(np.argmax(wrong)), divided(table, wrong, wrong, SHORTEST_PART)
-        near = slice(first, first + round(JUMP_S / FRAME))  # the change is over several samples
-        gap, change = table["gap_m"].to_numpy()[near], off[near]
+        near = table.iloc[first : first + round(JUMP_S / FRAME)]  # a change is over several samples
+        gap = near.loc[near["episode"] == near["episode"].iloc[0], "gap_m"].to_numpy()
         row = first + int(np.argmax(np.abs(np.diff(gap, prepend=gap[0]))))
+        change = off[first : first + len(gap)]
         fault = (
             f"{int(wrong.sum()):,} sample(s) where the gap jumps or is held, the first: "
             f"{place(table)(row, 'gap_m')} changes by {change[np.abs(change).argmax()]:.3g} m more "

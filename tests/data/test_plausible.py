@@ -393,6 +393,7 @@ JUMPS = [
     ("255 m for none", with_gap(slice(300, 360), 255.0), 60, 70, 300),
     ("none for longer than the least part", with_gap(slice(300, 450), 100.0), 150, 160, 300),
     ("none at the end", with_gap(slice(450, 600), 100.0), 150, 160, 450),
+    ("another for the last two samples", with_gap(slice(598, 600), lambda x: x - 5.0), 2, 12, 598),
     ("none at the begin", with_gap(slice(0, 150), 0.0), 150, 160, 0),
     ("held over a dropout", held_while(irregular()), 40, 45, 200),
 ]
