@@ -131,6 +131,7 @@ def test_a_choice_that_is_there_cannot_be_added() -> None:
     assert small.training.episodes == 24
     assert small.training.segment == small.scenario.horizon == 60  # no warning of nobody's setting
     assert load("train", ["experiment=smoke"]).training.segment == 20
+    assert identity(load("train", ["~learning"])) == identity(load("train"))
 
 
 def test_the_papers_recipes_are_the_defaults() -> None:

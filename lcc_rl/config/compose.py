@@ -62,8 +62,8 @@ NAMES_HINT = (
     "; names before a colon consist of letters, digits, spaces and _-+./%*@?|, begin with a letter "
     "and have no quotes; lcc_rl.compare accepts any name"
 )
-# Groups that no file of the package chooses.
 OPTIONAL = ("learning", "surrogates")  # groups that Hydra lets choose a missing file
+# Groups that no file of the package chooses.
 ADDED = ("event", "faults", "filter", "fleet", "knowledge", "slope")
 OF_NODE = re.compile(r"([\w.: ]+): expected a node with .*, got (?:'(\w+)'|{.*)$")
 OWN_FILES = re.compile(r"path=(?!pkg://|structured://)")  # in Hydra's search path
@@ -187,7 +187,7 @@ def check_recipes(word: str, names: Sequence[str]) -> None:
 def check_optional(word: str) -> None:
     """Refuse an unknown choice of a group whose file may be missing, which Hydra passes over."""
     group, names = key_of(word).partition("@")[0], word.partition("=")[2].strip("[]")
-    for name in names.split(",") if group in OPTIONAL and "${" not in names else ():
+    for name in names.split(",") if names and group in OPTIONAL and "${" not in names else ():
         if name.strip() not in (known := choices(group)):
             raise unknown_choice(group, name.strip(), known)
 
