@@ -14,6 +14,7 @@ from torch import Tensor, compiler, nn
 
 from lcc_rl.errors import ConfigError, require
 
+LIBRARIES = {"None", "lcc_rl", "torch", "torchrl", "tensordict"}  # whose functions are not examined
 AS_ENTRY = (
     "a state must be an entry, which a controller of a class names in remembers, see "
     "docs/controllers.md"
@@ -101,12 +102,12 @@ def _contents(value: Any) -> list[Any]:
 
 def _variables(module: Any) -> dict[str, Any]:
     """Return the variables outside of a user's functions that these read, by name."""
-    kinds = [kind for kind in type(module).__mro__ if kind not in nn.Module.__mro__]
-    waiting, found = [x for of in (module, *kinds) for x in vars(of).values()], {}
+    holders = (module, *type(module).__mro__)
+    waiting, found = [x for of in holders for x in vars(of).values()], {}
     while waiting:
         function = getattr(item := waiting.pop(), "__func__", item)  # of a static method
         home = getattr(function, "__module__", None)
-        if not isinstance(function, FunctionType) or home is None or home.startswith("lcc_rl."):
+        if not isinstance(function, FunctionType) or str(home).partition(".")[0] in LIBRARIES:
             continue
         known = inspect.getclosurevars(function)
         for name, value in {**known.globals, **known.nonlocals}.items():
