@@ -29,7 +29,6 @@ class Scene:
         observation_size: entries of the observation of one automated vehicle.
         seed: seed of the initial weights and of the random numbers of updates.
         device: device of the networks.
-        world: see :class:`lcc_rl.pieces.world.World`.
         observation: the observation, for policies that are rules.
         max_acceleration: acceleration of action 1 [m/s²], for rules; None if the controller of
             automated vehicles has no such setting.
@@ -109,7 +108,6 @@ def anneal(
     """Set learning rates that fall from their initial value to a fraction of it.
 
     Args:
-        optimizers: the optimizers.
         share: share of the training that is over.
         final_lr_fraction: final rate as a fraction of the initial one; 1: constant.
         schedule: half a cosine, or a line.

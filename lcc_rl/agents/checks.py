@@ -43,7 +43,6 @@ def check_learner(
     """Check that the results of an update and the policy's weights are finite.
 
     Args:
-        policy: the policy.
         values: losses and other results by name.
         advice: the remedy in the message.
 

@@ -75,7 +75,6 @@ class TrainingLoop(ABC, Generic[AgentT]):
     """Runs iterations to the end and keeps their record; a subclass defines the iteration.
 
     Args:
-        agent: the agent.
         env: the training environment, ``[environments]`` parallel episodes.
         settings: settings ``training``.
         seed: seed of all random numbers.

@@ -54,7 +54,6 @@ class Objective:
     Args:
         settings: see :class:`Aiming`; its ``limits_each`` if it has any.
         device: device of the terms.
-        world: see :class:`lcc_rl.pieces.world.World`.
 
     Raises:
         ConfigError: if a node or a limit is wrong.

@@ -73,7 +73,6 @@ class Residual(nn.Module):
     """A rule with fixed constants plus a network that is zero at the start.
 
     Args:
-        rule: the rule.
         network: maps an observation to a number.
         bound: largest action that the network adds.
     """

@@ -198,7 +198,6 @@ class Run:
         folder: folder of the configuration, the parquet tables, and the policy of a training.
         rows: one row per episode, or vehicle of an episode, as in episodes.parquet; many rows as a
             dataset, which is read on demand.
-        cfg: its configuration.
 
     ``print(run)`` shows the tables that commands print. A run stands for the path of its folder.
     """

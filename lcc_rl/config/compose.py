@@ -453,7 +453,6 @@ def identity(cfg: Any, *unused: str) -> str:
     Defaults of classes do not count, so settings of later versions change no hash.
 
     Args:
-        cfg: the configuration.
         *unused: keys of further settings that do not count.
     """
     content = without_defaults(cfg)

@@ -303,7 +303,6 @@ class Block:
     """Consecutive rows of a table; cells are converted and checked on demand.
 
     Args:
-        file: the table.
         cells: unconverted cells by the names in the header.
         before: number of rows before these in the file.
     """

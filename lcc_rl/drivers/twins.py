@@ -155,7 +155,6 @@ def drive_twins(
     """Drive calibrated drivers from the first speed and gap of the recorded ones.
 
     Args:
-        observed: the records.
         drivers: their calibrated parameters by one model, a row for each episode.
         reactions: reactions with one delay; all have the same draws of the noise.
         repeats: draws of the noise.
@@ -405,7 +404,6 @@ def compare_twins(
     """Compare calibrated drivers with the recorded ones.
 
     Args:
-        observed: the records.
         drivers: see :func:`drive_twins`.
         react: also choose a reaction that all drivers share.
         progress, perception: see :func:`tried`.

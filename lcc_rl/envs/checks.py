@@ -73,7 +73,6 @@ def check_step(piece: Piece, before: State, reached: State) -> None:
     """Compare the entries that a piece writes for :data:`BATCH` episodes with its specs.
 
     Args:
-        piece: the piece.
         before: entries of the state before the step.
         reached: entries of the state after the step, to which the written ones are added.
 
@@ -93,7 +92,6 @@ def check_alone(piece: Piece, before: State, reached: State) -> None:
     """Refuse a piece that gives an episode other numbers alone than beside another, or again.
 
     Args:
-        piece: the piece.
         before: see :func:`check_step`.
         reached: see :func:`check_step`.
 

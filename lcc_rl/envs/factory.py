@@ -182,7 +182,6 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
 
     Args:
         cfg: configuration with the nodes ``scenario``, ``observation`` and ``reward``.
-        world: see :class:`lcc_rl.pieces.world.World`.
 
     Raises:
         ConfigError: naming the option at fault.

@@ -124,7 +124,6 @@ class Episodes:
     strategies, and the batch size changes rows by rounding only.
 
     Args:
-        strategy: the strategy.
         inputs: held-out windows and drivers.
         plan: the episodes.
         seed: seed of the noise.

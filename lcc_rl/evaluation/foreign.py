@@ -195,7 +195,6 @@ class StableBaselinesPolicy(nn.Module):
     It contains the statistics of ``VecNormalize`` and the scale of ``RescaleAction``.
 
     Args:
-        model: the model.
         normalize: a vector with its ``VecNormalize``; None: the model's environment, if it has one.
 
     Raises:

@@ -349,7 +349,6 @@ def unroll(motions: Mapping[str, SampleMotion], path: Path, ending: str) -> None
 
     Args:
         motions: motions on an open road with equal times, by title.
-        path: the file.
         ending: ``.svg`` or ``.gif``.
 
     Raises:

@@ -60,7 +60,6 @@ def write_sections(
     Args:
         folder: folder of the page.
         title: title of the page.
-        sections: its sections.
         commands: the commands, oldest first.
 
     Raises:

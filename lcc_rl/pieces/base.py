@@ -153,11 +153,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
         super().__setattr__(name, value)
 
     def setup(self, world: World) -> None:
-        """Derive everything that depends on a world; an override calls :meth:`declare`.
-
-        Args:
-            world: see :class:`lcc_rl.pieces.world.World`.
-        """
+        """Derive everything that depends on a world; an override calls :meth:`declare`."""
         self.declare(world)
 
     def declare(
@@ -170,7 +166,6 @@ class Piece(Part, TensorDictModuleBase, Transform):
         """Set the entries that the piece reads and writes; by default those of its class.
 
         Args:
-            world: see :class:`lcc_rl.pieces.world.World`.
             reads: arguments of :meth:`compute`, in order.
             writes: results of :meth:`compute`, in order, without ``"next"``.
             keeps: constants of an episode.

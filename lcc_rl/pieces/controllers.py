@@ -98,7 +98,6 @@ class Controller(RoleTransform):
         """Set the entries read and written, by default those of the class.
 
         Args:
-            world: see :class:`lcc_rl.pieces.world.World`.
             reads: names of the arguments of :meth:`command` before the memory.
             writes: entries that :meth:`command` returns after the command and the memory.
             keeps: see :meth:`lcc_rl.pieces.base.Piece.declare`.

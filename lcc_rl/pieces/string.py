@@ -74,7 +74,6 @@ class Start(Protocol):
 
         Args:
             start: the first state of the episodes.
-            role: the role.
             speed: the leader's speed, ``[*batch, n, 1]`` [m/s].
         """
 

@@ -159,7 +159,6 @@ class Part(Settings):
         """Return a copy that is bound to a world.
 
         Args:
-            world: see :class:`World`.
             name: its role, or its key in the configuration.
         """
         bound = type(self)(**values(self))
@@ -169,8 +168,4 @@ class Part(Settings):
         return bound
 
     def setup(self, world: World) -> None:
-        """Derive everything that depends on a world.
-
-        Args:
-            world: see :class:`World`.
-        """
+        """Derive everything that depends on a world."""

@@ -88,9 +88,7 @@ def row_of(
 
     Args:
         table: result of :func:`lcc_rl.results.report.summary`.
-        task: the task.
         source: name of the leaders.
-        strategy: the strategy.
         drivers: number of drivers of the evaluation.
         future: entries of the leader's future that it reads.
 

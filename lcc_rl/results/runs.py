@@ -91,8 +91,6 @@ def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:
     """Refuse a folder with results, or a stopped run, of other settings.
 
     Args:
-        cfg: the settings.
-        folder: the folder.
         *but: settings and sections that may differ, besides ``trust``.
 
     Raises:

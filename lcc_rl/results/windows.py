@@ -220,8 +220,6 @@ def savings(
     Args:
         rows: rows of an evaluation, or result of :func:`windows_of`.
         column: the energy.
-        strategy: the strategy.
-        baseline: its baseline.
         per: columns of distances; the total energy is divided by their sum. Without them energies
             of whole episodes are compared, which falling behind lowers.
 

@@ -58,7 +58,6 @@ def objective(observed: Observed, index: int, error: Objective) -> Objective:
     """Return the RMSPE (0.07 is 7 %) of one driver as a function of (v0, T).
 
     Args:
-        observed: the episodes.
         index: which of them.
         error: :func:`squared_error` as numba compiled it.
     """
