@@ -123,8 +123,7 @@ def tasks(reference: Path, docs: Path) -> None:
         table = board.leaderboard(documents)
     fill(docs / "leaderboard.md", {"board": table})
     fill(docs / "notes" / "results.md", {**found, "tasks": "\n\n".join(parts)})
-    kept = read_parquet(reference / "averaged.parquet")
-    fill(docs / "limits.md", {"averaged": averaged(kept)})
+    fill(docs / "limits.md", {"averaged": averaged(read_parquet(reference / "averaged.parquet"))})
 
 
 def averaged(rows: pd.DataFrame) -> str:

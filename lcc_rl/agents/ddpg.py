@@ -38,8 +38,7 @@ class DDPG(OffPolicy):
         self.count += 1
         if not self.mask_terminal:
             batch = batch.clone(False)
-            ended = batch["next", "terminated"]
-            batch["next", "terminated"] = torch.zeros_like(ended)
+            batch["next", "terminated"] = torch.zeros_like(batch["next", "terminated"])
         losses = self._losses(batch)
         self._step("all")
         every = {"actor": self.target_every["actor"], "value": self.target_every["critic"]}

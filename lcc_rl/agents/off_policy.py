@@ -197,8 +197,7 @@ class OffPolicy(Sampling):
 
     def _penalty(self, batch: TensorDictBase) -> Tensor:
         """Return the penalty on the actor's output before its tanh."""
-        raw = self.actor.module[0](batch["observation"])
-        return self.saturation * raw.square().mean()
+        return self.saturation * self.actor.module[0](batch["observation"]).square().mean()
 
     def _differentiate(self, loss: Tensor) -> None:
         """Write the gradient of a loss by automatic differentiation."""

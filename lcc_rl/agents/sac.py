@@ -37,8 +37,7 @@ class Head(nn.Module):
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return both, each ``[*batch, actions]``."""
-        logarithm = -2.0 + 3.0 * torch.tanh(self.spread(observation))
-        return self.mean(observation), logarithm.exp()
+        return self.mean(observation), (-2.0 + 3.0 * torch.tanh(self.spread(observation))).exp()
 
 
 class SampledAction(TensorDictModuleBase):
@@ -158,8 +157,7 @@ class SAC(OffPolicy):
         chosen = whole * (first <= second)
         slope = networks.through_critics([chosen, whole - chosen], 1)
         self._learn_policy(now, slope, alpha, networks)
-        entropy = now.log_prob.mean().add_(self.loss.target_entropy)
-        self.log_alpha.grad.copy_(entropy.neg_())
+        self.log_alpha.grad.copy_(now.log_prob.mean().add_(self.loss.target_entropy).neg_())
         return loss_actor, loss_value
 
     def _sample(self, seen: Tensor, noise: Tensor, networks: ActorCritic) -> Sample:

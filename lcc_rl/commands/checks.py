@@ -54,8 +54,7 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
         check_lengths(cfg)
         env = training_env(trial, profiles, population)
         require_memory(training_bytes(cfg, env), cfg.device)
-        agent = build_agent(cfg, population, cfg.device)
-        make_trainer(trial, agent, env, folder)
+        make_trainer(trial, build_agent(cfg, population, cfg.device), env, folder)
 
 
 def training_bytes(cfg: StudyConfig, env: TransformedEnv) -> dict[str, float]:
@@ -66,8 +65,7 @@ def training_bytes(cfg: StudyConfig, env: TransformedEnv) -> dict[str, float]:
     transition = 4 * (2 * width + 2)  # before, after, action and reward
     needs = {f"training.episodes={settings.episodes}": settings.episodes / count * RECORD_BYTES}
     if isinstance(hidden := agent.get("hidden"), list):
-        sizes = [width, *hidden, 1]
-        weights = sum((before + 1) * after for before, after in pairwise(sizes))
+        weights = sum((before + 1) * after for before, after in pairwise([width, *hidden, 1]))
         copies = 10 if "buffer_size" in agent else 4  # gradient, two moments; critic, targets
         needs[f"agent.hidden={hidden}"] = 4.0 * copies * weights
     if "buffer_size" in agent:

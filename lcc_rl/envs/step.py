@@ -165,8 +165,7 @@ class Pieces(Compose):
 
     def pop(self, index: int | None = None) -> Transform:
         """Remove and return a transform; the sum of all terms no longer holds a reward term."""
-        removed = self.transforms[-1 if index is None else index]
-        self._leave_out([removed])
+        self._leave_out([self.transforms[-1 if index is None else index]])
         return super().pop(index)
 
     def __delitem__(self, index: Any) -> None:

@@ -85,8 +85,7 @@ def write_figures(
         file = in_file(stem)
         while file.casefold() in drawn:
             file += "_"
-        path = folder / "figures" / f"{file}.png"
-        drawn[file.casefold()] = save(figure, path, formats=formats)
+        drawn[file.casefold()] = save(figure, folder / "figures" / f"{file}.png", formats=formats)
     return list(drawn.values())
 
 
@@ -137,8 +136,7 @@ def study_figures(
         whole = not episodes.loc[episodes["strategy"] == name, "collided"].any()
         for baseline in AGAINST if many and whole else ():
             if baseline in measured and baseline != name:
-                figure = paired_improvement(means, name, baseline)
-                yield f"improvement {name} vs {baseline}", figure
+                yield f"improvement {name} vs {baseline}", paired_improvement(means, name, baseline)
 
 
 @paper

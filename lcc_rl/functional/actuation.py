@@ -48,8 +48,7 @@ class Response:
 
     def next(self, acceleration: Tensor, command: Tensor) -> Tensor:
         """Return the acceleration of a step from that of the step before [m/s²]."""
-        wanted = command.clamp(min=-self.braking)
-        return acceleration + self.share * (wanted - acceleration)
+        return acceleration + self.share * (command.clamp(min=-self.braking) - acceleration)
 
 
 @dataclass(frozen=True)

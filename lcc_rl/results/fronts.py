@@ -93,7 +93,7 @@ def energy_at(energy: Floats, share: Floats, at: Any, most: float | None = np.na
 
     def read(at: float, share: Floats, energy: Floats) -> float:
         order = np.argsort(share)
-        (least, *_, x), (first, *_, y) = share[order][[0, -1]], energy[order][[0, -1]]
+        (least, x), (first, y) = (values[order[[0, -1]]] for values in (share, energy))
         found = float(np.interp(at, share[order], energy[order], left=np.nan, right=most))
         if not (several and np.isnan(found)):
             return found

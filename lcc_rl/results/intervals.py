@@ -119,11 +119,6 @@ def means_without(values: Floats, groups: Sequence[object]) -> Floats:
     return np.asarray((values.sum(-1, keepdims=True) - sums) / (len(codes) - counts))
 
 
-def whole(drives: Sequence[object]) -> list[object]:
-    """Return the drive of each window, without minutes."""
-    return [of.drive if isinstance(of, Minute) else of for of in drives]
-
-
 def clusters(drives: Sequence[object]) -> list[object]:
     """Return the group of each window: drives, or minutes of a single one; else empty.
 
@@ -133,8 +128,8 @@ def clusters(drives: Sequence[object]) -> list[object]:
         >>> clusters([Minute(drive, 0) for drive in "aab"])
         ['a', 'a', 'b']
     """
-    groups = (whole(drives), list(drives))
-    return next((group for group in groups if len(set(group)) > 1), [])
+    whole = [of.drive if isinstance(of, Minute) else of for of in drives]
+    return next((group for group in (whole, list(drives)) if len(set(group)) > 1), [])
 
 
 def mean(values: ArrayLike) -> Estimate:

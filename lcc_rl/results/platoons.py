@@ -96,5 +96,4 @@ def case_report(rows: pd.DataFrame, case: str, of: str) -> Report:
     table = with_drivers(case_table(rows, case)).astype({"collisions": int})
     shown = [Shown(one.key, one.short) for one in PLATOON if one.short]
     short = shortened(table, shown)
-    caption = f"{BELOW}; {ALL}"
-    return Report(of, table, *short, PLATOON, caption, BELOW)
+    return Report(of, table, *short, PLATOON, f"{BELOW}; {ALL}", BELOW)

@@ -71,8 +71,7 @@ def run(given: Namespace) -> None:
 
 
 def _study(given: Namespace, recipe: str | None) -> Study:
-    overrides = tuple(given.overrides)
-    return Study(given.out, given.recipe or recipe, given.seeds, overrides, given.jobs)
+    return Study(given.out, given.recipe or recipe, given.seeds, tuple(given.overrides), given.jobs)
 
 
 def parser() -> ArgumentParser:
