@@ -233,7 +233,6 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     Args:
         cfg: the composed configuration.
         entry: the command.
-        overrides: overrides of the command line.
         sweep: allow settings that this run does not use, because the runs of a sweep share them.
     """
     for item in overrides:

@@ -18,7 +18,6 @@ class Sections:
     On a ring road the section of the last automated vehicle continues at the front.
 
     Args:
-        string: the string of vehicles.
         of: ``"vehicles"`` if all have the entry, or the one role that has it.
 
     Attributes:

@@ -53,7 +53,6 @@ class Views:
     """Views of the vehicles of one role, as tensors of one row per vehicle.
 
     Args:
-        string: the string of vehicles.
         role: role of the vehicles.
         names: dotted names, and keys as tuples.
         behind: number of vehicles behind in each view ``behind.x``, nearest first.

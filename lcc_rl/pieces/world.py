@@ -29,7 +29,6 @@ class World:
     """Properties that all pieces share; by default one automated vehicle at 10 Hz.
 
     Args:
-        string: the string of vehicles.
         time_step: duration of a step [s].
         horizon: steps of an episode.
         profiles: speed profiles of the leader.
