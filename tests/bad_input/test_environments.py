@@ -17,6 +17,7 @@ from lcc_rl.config.nodes import Node
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs import DifferentiableRollout, StringCollector, build_env, make_env
 from lcc_rl.errors import ConfigError
+from lcc_rl.functional.guard import _variables
 from lcc_rl.interfaces.driver import Driver
 from lcc_rl.pieces import Controller, Feature, Law
 from lcc_rl.pieces.base import REWARD
@@ -258,6 +259,7 @@ def test_a_function_that_remembers_in_a_variable_is_refused() -> None:
         cases,
     )
     check_refused(lambda law: Driver(law, 0.1), cases)
+    assert "TensorDictModuleBase" not in _variables(Law(law="f"))  # libraries are not examined
     driven_by("controllers", "automated", {"_target_": path_of(Law), "law": f"{__name__}.still"})
     with pytest.raises(ConfigError, match="Derived remembers in its variable 'LAST'"):
         driven_by("controllers", "automated", {"_target_": f"{__name__}.Derived"})
