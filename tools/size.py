@@ -31,7 +31,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
     "lcc_rl + tools": {"lines": 45_015, "code": 29_930},
-    "tests": {"lines": 27_196},
+    "tests": {"lines": 27_215},
     "conf": {"yaml": 165},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py

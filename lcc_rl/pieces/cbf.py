@@ -147,11 +147,11 @@ class CBFFilter(RoleTransform):
         """Why vehicles of the role may brake harder than it assumes of those ahead, or nothing."""
         if not self.string.follows(self.role) or self.braking_ahead >= -self.least - ROUNDING:
             return ""
-        setting = f"scenario.filters.{self.role}.braking_ahead"
         return (
             f"an automated car directly behind another may collide: the one ahead brakes by up to "
             f"{-self.least:g} m/s² (scenario.max_braking), and its filter assumes at most "
-            f"{self.braking_ahead:g} m/s²; set {setting}={-self.least:g}"
+            f"{self.braking_ahead:g} m/s²; set scenario.filters.{self.role}.braking_ahead="
+            f"{-self.least:g}, of a policy's own filter safety.braking_ahead={-self.least:g}"
         )
 
     def watch(self) -> CBFGuarantee:

@@ -49,8 +49,9 @@ class Sensors(RoleTransform):
     delay: NonNegative = 0.0  # age of an arriving measurement, multiple of a step [s]
     dropouts: Share = 0.0  # probability that a measurement is missing; the last one is kept
     longest_dropout: NonNegative = 0.0  # longest drop-out, multiple of a step [s]
-    # Time of the last measurement before the target is lost for longest_dropout; None: never [s].
+    # Time of the last measurement before the target is lost; None: never [s].
     lost_from: NonNegative | None = None
+    lost_for: NonNegative = 0.0  # duration of this loss, multiple of a step [s]
 
     measured = (
         Entry("role.sensed_gap", "m", "gap as measured"),
@@ -66,11 +67,12 @@ class Sensors(RoleTransform):
     index: ClassVar[Tensor]
 
     def validate(self) -> None:
-        missing = self.dropouts > 0.0 or self.lost_from is not None
-        if missing != (self.longest_dropout > 0.0):
-            raise ValueError(
-                "dropouts or lost_from and longest_dropout belong together: give both or none"
-            )
+        for name, given, duration in (
+            ("dropouts", self.dropouts > 0.0, "longest_dropout"),
+            ("lost_from", self.lost_from is not None, "lost_for"),
+        ):
+            if given != (getattr(self, duration) > 0.0):
+                raise ValueError(f"{name} and {duration} belong together: give both or none")
 
     def setup(self, world: World) -> None:
         role, self.time_step = self.name, world.time_step
@@ -100,23 +102,22 @@ class Sensors(RoleTransform):
         Raises:
             ConfigError: if a duration is no multiple of the time step, or too long.
         """
-        late, longest = (
+        late, self.longest, self.lost = (
             world.late(getattr(self, name), f"scenario.sensors.{role}.{name}")
-            for name in ("delay", "longest_dropout")
+            for name in ("delay", "longest_dropout", "lost_for")
         )
         errors = (self.gap_error, self.speed_error, self.ahead_error, self.scale_error)
-        return Sensing(*errors, late, longest)
+        return Sensing(*errors, late, max(self.longest, self.lost))
 
     def compute(self, memory: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
         *now, seed, step = inputs
         frames = join([*now, memory[..., AGES : -len(TRUE_STATE)]], -1)
-        own = lost = uniform(seed, step, self.missing + self.index) < self.dropouts
+        ages, missing = memory[..., :AGES], uniform(seed, step, self.missing + self.index)
+        kept = (missing < self.dropouts) & (ages < self.sensing.late + self.longest)
         if self.lost_from is not None:
-            lost = lost | (
-                (step > self.first_lost) & (step <= self.first_lost + self.sensing.longest)
-            )
-        ages = memory[..., :AGES]
-        kept = join([lost, own], -1) & (ages < self.sensing.oldest)
+            lost = (step > self.first_lost) & (step <= self.first_lost + self.lost)
+            target, own = kept.split(1, -1)
+            kept = join([target | lost & (ages[..., :1] < self.sensing.oldest), own], -1)
         ages = torch.where(kept, ages + 1.0, float(self.sensing.late))
         return self._measured(frames, ages, seed, step)
 

@@ -190,7 +190,7 @@ def test_the_age_of_a_target_is_the_same_in_simulation_driver_onnx_and_c(tmp_pat
     exec("".join(texts), vars(sys.modules.setdefault("my_page", types.ModuleType("my_page"))))
     paths = {end: lcc_rl.export("my_page.coast", tmp_path / f"to{end}") for end in (".onnx", ".c")}
     lost, behind = ["+event=lost_target"], ["+filter=cbf", "safety.robust=false"]
-    lost += [f"scenario.sensors.automated.{x}" for x in ("lost_from=5", "longest_dropout=3")]
+    lost += [f"scenario.sensors.automated.{x}" for x in ("lost_from=5", "lost_for=3")]
     leader = 20.0 + 2.0 * np.sin(0.05 * np.arange(121))
     drive = functools.partial(lcc_rl.simulate, leader, "automated")
     driven = {"my_page.coast": [], paths[".onnx"]: [], "my_page.coast_filtered": behind}

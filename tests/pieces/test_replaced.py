@@ -125,6 +125,23 @@ def test_a_lost_target_keeps_its_last_measurement_and_the_guarantee() -> None:
     assert (found["ttc"][:, :, :1, 0][promised] >= 4.0).all()
 
 
+def test_a_target_is_lost_as_long_beside_faults_of_sensors() -> None:
+    both = ["+event=lost_target", "+faults=sensors"]
+    one, other = config(*both), config(*both[::-1])
+    assert one.scenario.sensors == other.scenario.sensors
+    exact = [f"{x}=0" for x in ("gap_error", "speed_error", "ahead_error")]
+    words = [f"scenario.sensors.automated.{x}" for x in ("lost_from=4", *exact)]
+    held = driven([*both, *words], 1.0, wavy_profiles())["sensed_gap"][..., 0, 0].diff(dim=0) == 0.0
+    longest = torch.zeros(4, dtype=torch.long)
+    run = longest.clone()
+    for step, still in enumerate(held[5:], 5):
+        run = torch.where(still, run + 1, 0)
+        assert step in range(39, 66) or run.max() <= 4  # a drop-out ends after 0.4 s
+        longest = longest.maximum(run)
+    assert (longest >= 16).all()
+    assert (longest <= 20).all()
+
+
 def test_a_memory_starts_anew_behind_another_vehicle() -> None:
     for kind in ("filtered", "stacked"):
         words = ["+knowledge=memory", f"scenario.pieces.memory.kind={kind}"]
@@ -142,12 +159,12 @@ def test_what_does_not_fit_is_refused() -> None:
         build_pieces(cfg, world_of(cfg, STEADY, POPULATION))
 
     cut, lost = "+event=cut_in", "+event=lost_target"
-    never = f"{lost} scenario.sensors.automated.longest_dropout=0"
+    never = f"{lost} scenario.sensors.automated.lost_for=0"
     cases = {
         f"{cut} {LEADER}.at=[20,30]": r"leader.at=\[20.* 15 s \(scenario.hor",
         f"{cut} +{LEADER}.farther=[1,2]": r"give gap \(cut-in\) or farther",
         f"{cut} {LEADER}.at=[2,3] +knowledge=preview": "a preview reads the rec",
-        never: "lost_from and longest_dropout belong together",
+        never: "lost_from and lost_for belong together",
         lost: r"lost_from=30.0 must lie within the episode of 15 s .*lost_from=2",
     }
     check_refused(lambda words: built(*words.split()), cases.items(), ConfigError)
