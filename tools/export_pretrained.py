@@ -39,7 +39,8 @@ def export(run: str | Path, origin: str, folder: Path = FOLDER, name: str | None
     cfg = cfg.with_(**dict.fromkeys(x for x in LOCAL if hasattr(cfg, x)), inputs=inputs)
     path = folder / f"{name or cfg.variant}.pt"
     provenance = f"{origin}; lcc_rl {version('lcc_rl')}"
-    write_torch({"weights": weights, "config": as_text(cfg), "provenance": provenance}, path)
+    content = {"weights": weights, "config": as_text(cfg), "provenance": provenance}
+    write_torch(content, path)
     return path
 
 

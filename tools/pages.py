@@ -123,7 +123,8 @@ def tasks(reference: Path, docs: Path) -> None:
         table = board.leaderboard(documents)
     fill(docs / "leaderboard.md", {"board": table})
     fill(docs / "notes" / "results.md", {**found, "tasks": "\n\n".join(parts)})
-    fill(docs / "limits.md", {"averaged": averaged(read_parquet(reference / "averaged.parquet"))})
+    kept = read_parquet(reference / "averaged.parquet")
+    fill(docs / "limits.md", {"averaged": averaged(kept)})
 
 
 def averaged(rows: pd.DataFrame) -> str:

@@ -30,7 +30,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 45_015, "code": 29_930},
+    "lcc_rl + tools": {"lines": 45_060, "code": 29_965},
     "tests": {"lines": 27_215},
     "conf": {"yaml": 165},
 }

@@ -38,7 +38,8 @@ class DDPG(OffPolicy):
         self.count += 1
         if not self.mask_terminal:
             batch = batch.clone(False)
-            batch["next", "terminated"] = torch.zeros_like(batch["next", "terminated"])
+            ended = batch["next", "terminated"]
+            batch["next", "terminated"] = torch.zeros_like(ended)
         losses = self._losses(batch)
         self._step("all")
         every = {"actor": self.target_every["actor"], "value": self.target_every["critic"]}

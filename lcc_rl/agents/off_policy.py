@@ -197,7 +197,8 @@ class OffPolicy(Sampling):
 
     def _penalty(self, batch: TensorDictBase) -> Tensor:
         """Return the penalty on the actor's output before its tanh."""
-        return self.saturation * self.actor.module[0](batch["observation"]).square().mean()
+        raw = self.actor.module[0](batch["observation"])
+        return self.saturation * raw.square().mean()
 
     def _differentiate(self, loss: Tensor) -> None:
         """Write the gradient of a loss by automatic differentiation."""

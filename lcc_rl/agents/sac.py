@@ -37,7 +37,8 @@ class Head(nn.Module):
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return both, each ``[*batch, actions]``."""
-        return self.mean(observation), (-2.0 + 3.0 * torch.tanh(self.spread(observation))).exp()
+        logarithm = -2.0 + 3.0 * torch.tanh(self.spread(observation))
+        return self.mean(observation), logarithm.exp()
 
 
 class SampledAction(TensorDictModuleBase):
@@ -157,7 +158,8 @@ class SAC(OffPolicy):
         chosen = whole * (first <= second)
         slope = networks.through_critics([chosen, whole - chosen], 1)
         self._learn_policy(now, slope, alpha, networks)
-        self.log_alpha.grad.copy_(now.log_prob.mean().add_(self.loss.target_entropy).neg_())
+        entropy = now.log_prob.mean().add_(self.loss.target_entropy)
+        self.log_alpha.grad.copy_(entropy.neg_())
         return loss_actor, loss_value
 
     def _sample(self, seen: Tensor, noise: Tensor, networks: ActorCritic) -> Sample:

@@ -116,5 +116,6 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--start", type=number, default=0.0, help="start [s]")
     parser.add_argument("--duration", type=number, help="duration, by default to the end [s]")
     given = parser.parse_args(words)
-    print(run(given.run, given.strategy, given.episode, given.out, given.start, given.duration))
+    file = run(given.run, given.strategy, given.episode, given.out, given.start, given.duration)
+    print(file)
     return 0

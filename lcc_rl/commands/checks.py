@@ -54,7 +54,8 @@ def check_settings(cfg: TrainConfig, folder: Path) -> None:
         check_lengths(cfg)
         env = training_env(trial, profiles, population)
         require_memory(training_bytes(cfg, env), cfg.device)
-        make_trainer(trial, build_agent(cfg, population, cfg.device), env, folder)
+        agent = build_agent(cfg, population, cfg.device)
+        make_trainer(trial, agent, env, folder)
 
 
 def training_bytes(cfg: StudyConfig, env: TransformedEnv) -> dict[str, float]:
@@ -65,7 +66,8 @@ def training_bytes(cfg: StudyConfig, env: TransformedEnv) -> dict[str, float]:
     transition = 4 * (2 * width + 2)  # before, after, action and reward
     needs = {f"training.episodes={settings.episodes}": settings.episodes / count * RECORD_BYTES}
     if isinstance(hidden := agent.get("hidden"), list):
-        weights = sum((before + 1) * after for before, after in pairwise([width, *hidden, 1]))
+        sizes = [width, *hidden, 1]
+        weights = sum((before + 1) * after for before, after in pairwise(sizes))
         copies = 10 if "buffer_size" in agent else 4  # gradient, two moments; critic, targets
         needs[f"agent.hidden={hidden}"] = 4.0 * copies * weights
     if "buffer_size" in agent:

@@ -53,7 +53,8 @@ def trip_energies(
     cfg = load("evaluate", settings)
     (model, *further), step = build_energy(cfg).models, cfg.scenario.time_step
     require(not further, "energy: a mixture has several models; choose one, such as fuel")
-    records, lines = cfg.leader.made(DriveLeaders).profiles(step)
+    source = cfg.leader.made(DriveLeaders)
+    records, lines = source.profiles(step)
     log_report(lines)
     blocks = (slice(first, first + BLOCK) for first in range(0, len(records), BLOCK))
     rows = pd.concat([_energies(records, block, model) for block in blocks])

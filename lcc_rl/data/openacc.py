@@ -55,7 +55,8 @@ class OpenAccSource(TrajectorySource):
         if self.driver is not None and not (rows["leader"] > 0).any():
             lines = [line for line in report.notes if "followers by driver" in line]
             raise DataError(f"data.driver={self.driver} keeps no follower: {'; '.join(lines)}")
-        return self.extracted(to_trajectories(rows, place, report, self.bridge_s), place=place)
+        trajectories = to_trajectories(rows, place, report, self.bridge_s)
+        return self.extracted(trajectories, place=place)
 
 
 def _cars(table: TableFile, driver: str | None, report: ReadReport) -> pd.DataFrame:

@@ -136,7 +136,8 @@ class NgsimSource(TrajectorySource):
             DataError: if a file is missing or not valid, no episode is left, or more are
                 implausible than ``plausible`` allows.
         """
-        trajectories = read_ngsim(find_files(self.path), self.location, self.units)
+        files = find_files(self.path)
+        trajectories = read_ngsim(files, self.location, self.units)
         if self.smoothing is not None:
             trajectories = self.smoothing(trajectories)
         remedy = "" if self.smoothing else f", smooth it ({SMOOTHING})"

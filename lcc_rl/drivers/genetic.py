@@ -145,18 +145,12 @@ def _evolve(
     progress: Progress | None,
 ) -> Tensor:
     """Evolve in the unit box, where all parameters have one scale of mutations."""
-    founders, count = settings.founders * settings.population, settings.population
-    elites, dims = max(1, round(settings.elites * count)), random.like.numel()
-    # A Latin hypercube: one individual in each of equally many parts of every range.
-    strata = torch.stack([random.permutation(founders) for _ in range(dims)], dim=1)
-    genes = (strata + random.uniform(founders, dims)) / founders
+    genes = _latin_hypercube(random, settings.founders * settings.population)
     genes = genes.expand(problems, -1, -1).contiguous()
-    genes, fitness = _fittest(genes, evaluate(genes), count)
+    genes, fitness = _fittest(genes, evaluate(genes), settings.population)
     for generation in range(1, settings.generations + 1):
         children = _children(genes, fitness, random, settings, generation)
-        united = torch.cat([genes[:, :elites], children], 1)  # the parents are sorted
-        born = torch.cat([fitness[:, :elites], evaluate(children)], 1)
-        genes, fitness = _fittest(united, born, count)
+        genes, fitness = _survivors(genes, fitness, children, evaluate(children), settings)
         if progress is not None:
             text = f"mean best {fitness[:, 0].mean().item():.5g}"
             progress(generation, settings.generations, text)
@@ -180,6 +174,13 @@ class _Random:
 
     def permutation(self, count: int) -> Tensor:
         return torch.randperm(count, generator=self.generator).to(self.like.device)
+
+
+def _latin_hypercube(random: _Random, count: int) -> Tensor:
+    """Return ``count`` individuals, one in each of ``count`` equal parts of every range."""
+    dims = random.like.numel()
+    strata = torch.stack([random.permutation(count) for _ in range(dims)], dim=1)
+    return (strata + random.uniform(count, dims)) / count
 
 
 def _in_units(objective: Fitness, lower: Tensor, upper: Tensor) -> Fitness:
@@ -209,7 +210,8 @@ def _children(
     chosen = random.uniform(count, dims) < settings.mutation_rate
     share = (generation - 1) / max(settings.generations - 1, 1)
     strength = settings.mutation_start ** (1.0 - share) * settings.mutation_end**share
-    child = child + torch.where(chosen, random.normal(count, dims) * strength, 0.0)
+    noise = random.normal(count, dims) * strength
+    child = child + torch.where(chosen, noise, 0.0)
     # Clamped, not reflected: an optimum on a bound is reached exactly and can be flagged.
     return child.clamp_(0.0, 1.0)
 
@@ -221,6 +223,16 @@ def _tournament(genes: Tensor, fitness: Tensor, random: _Random, size: int) -> T
     winner = fitness[:, entrants].argmin(-1, keepdim=True)
     parents = entrants.expand(genes.shape[0], -1, -1).gather(-1, winner)
     return genes.gather(1, parents.expand(-1, -1, genes.shape[-1]))
+
+
+def _survivors(
+    genes: Tensor, fitness: Tensor, children: Tensor, born: Tensor, settings: GeneticSettings
+) -> tuple[Tensor, Tensor]:
+    """Return the fittest of the parents' elite and the children, sorted."""
+    count = genes.shape[1]
+    elites = max(1, round(settings.elites * count))
+    united = torch.cat([genes[:, :elites], children], 1)  # the parents are sorted
+    return _fittest(united, torch.cat([fitness[:, :elites], born], 1), count)
 
 
 def _fittest(genes: Tensor, fitness: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -194,7 +194,8 @@ class StringCollector(BaseCollector):
         fresh = self.first.begin(seeds)
 
         def put(value: Tensor, new: Tensor) -> Tensor:
-            renewed = value.reshape(-1, *new.shape[1:]).index_put((rows,), new).view(value.shape)
+            flat = value.reshape(-1, *new.shape[1:])
+            renewed = flat.index_put((rows,), new).view(value.shape)
             return torch.empty_like(value).copy_(renewed)  # other strides need another graph
 
         return {key: put(value, fresh[key]) for key, value in state.items()}

@@ -165,7 +165,8 @@ class Pieces(Compose):
 
     def pop(self, index: int | None = None) -> Transform:
         """Remove and return a transform; the sum of all terms no longer holds a reward term."""
-        self._leave_out([self.transforms[-1 if index is None else index]])
+        removed = self.transforms[-1 if index is None else index]
+        self._leave_out([removed])
         return super().pop(index)
 
     def __delitem__(self, index: Any) -> None:

@@ -212,7 +212,8 @@ class Entrants:
             require(not lacking, f"{asked}: {lacking}; use trajectories of several vehicles")
         if lacking and RECORDED in self.cfg.evaluation.baselines:
             log.warning("%s is left out: %s", RECORDED, lacking)
-        return [s for s in baselines(self.cfg, self.rivals) if not lacking or s.name != RECORDED]
+        every = baselines(self.cfg, self.rivals)
+        return [s for s in every if not lacking or s.name != RECORDED]
 
     def _limits_of_record(self) -> list[str]:
         """Return the limits of the task that refer to the recorded drivers."""

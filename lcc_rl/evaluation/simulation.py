@@ -265,7 +265,8 @@ class _Motion:
         self.names = [name for name in MOTION if ("vehicles", name) in record]
         spaces = ["leader"] * (LEADER in record) + ["vehicles"]
         self.groups = [self._group(space, start) for space in spaces]
-        self.kinds = [*[None] * (LEADER in record), (record[CLASS][0] if CLASS in record else None)]
+        kind = record[CLASS][0] if CLASS in record else None
+        self.kinds = [*[None] * (LEADER in record), kind]
         self.vehicles = np.arange(len(cfg.scenario.vehicles) + 1)[LEADER not in record :]
 
     def _group(self, space: str, start: State) -> dict[str, Tensor]:

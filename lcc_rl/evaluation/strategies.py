@@ -104,7 +104,8 @@ def baseline(cfg: StudyConfig, name: str, spec: Any = None) -> Strategy:
         return Strategy(name, cfg.driven_by(controller))
     if cfg.variant == name and _kind(cfg) is controller.kind:
         return Strategy(name, cfg)
-    return Strategy(name, cfg.driven_by(controller).with_(scenario={"filters": {AUTOMATED: None}}))
+    alone = cfg.driven_by(controller).with_(scenario={"filters": {AUTOMATED: None}})
+    return Strategy(name, alone)
 
 
 def beside_filtered(cfg: StudyConfig, strategies: Sequence[Strategy]) -> list[Strategy]:

@@ -129,7 +129,8 @@ def dots(
         look: options of the dots, for ``Axes.plot``.
     """
     low, high = (table[f"{column}_{end}"].to_numpy(float) for end in ("low", "high"))
-    (axis.vlines if upright else axis.hlines)(places, low, high, color=hue, **INTERVAL)
+    draw = axis.vlines if upright else axis.hlines
+    draw(places, low, high, color=hue, **INTERVAL)
     pair = (places, table[column]) if upright else (table[column], places)
     axis.plot(*pair, "o", color=hue, **look)
 

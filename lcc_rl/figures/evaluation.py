@@ -85,7 +85,8 @@ def write_figures(
         file = in_file(stem)
         while file.casefold() in drawn:
             file += "_"
-        drawn[file.casefold()] = save(figure, folder / "figures" / f"{file}.png", formats=formats)
+        path = folder / "figures" / f"{file}.png"
+        drawn[file.casefold()] = save(figure, path, formats=formats)
     return list(drawn.values())
 
 
@@ -136,7 +137,8 @@ def study_figures(
         whole = not episodes.loc[episodes["strategy"] == name, "collided"].any()
         for baseline in AGAINST if many and whole else ():
             if baseline in measured and baseline != name:
-                yield f"improvement {name} vs {baseline}", paired_improvement(means, name, baseline)
+                figure = paired_improvement(means, name, baseline)
+                yield f"improvement {name} vs {baseline}", figure
 
 
 @paper

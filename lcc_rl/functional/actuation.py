@@ -48,7 +48,8 @@ class Response:
 
     def next(self, acceleration: Tensor, command: Tensor) -> Tensor:
         """Return the acceleration of a step from that of the step before [m/s²]."""
-        return acceleration + self.share * (command.clamp(min=-self.braking) - acceleration)
+        wanted = command.clamp(min=-self.braking)
+        return acceleration + self.share * (wanted - acceleration)
 
 
 @dataclass(frozen=True)

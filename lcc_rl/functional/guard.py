@@ -102,7 +102,8 @@ def _contents(value: Any) -> list[Any]:
 
 def _variables(module: Any) -> dict[str, Any]:
     """Return the variables outside of a user's functions that these read, by name."""
-    waiting, found = [x for of in (module, *type(module).__mro__) for x in vars(of).values()], {}
+    holders = (module, *type(module).__mro__)
+    waiting, found = [x for of in holders for x in vars(of).values()], {}
     while waiting:
         function = getattr(item := waiting.pop(), "__func__", item)  # of a static method
         home = getattr(function, "__module__", None)

@@ -48,7 +48,8 @@ def _episodes(
     require(
         render_mode in (None, *MODES), f"render_mode must be None or {MODES}, got {render_mode!r}"
     )
-    episodes = ArrayEpisodes(make_env(variant, count, overrides, held_out=held_out, single=True))
+    env = make_env(variant, count, overrides, held_out=held_out, single=True)
+    episodes = ArrayEpisodes(env)
     if render_mode is not None:
         from lcc_rl.interfaces.film import Film  # loads matplotlib
 

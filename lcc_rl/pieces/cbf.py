@@ -156,7 +156,8 @@ class CBFFilter(RoleTransform):
 
     def watch(self) -> CBFGuarantee:
         """Return the piece that records the steps which the filter's guarantee covers."""
-        return CBFGuarantee(safety=self).bind(World(self.string, replaced=self.replaced), self.role)
+        world = World(self.string, replaced=self.replaced)
+        return CBFGuarantee(safety=self).bind(world, self.role)
 
     def compute(self, wanted: Tensor, *state: Tensor) -> tuple[Tensor, Tensor]:
         """Return the filtered commands and the memory of gaps."""

@@ -167,7 +167,8 @@ def _of_platoon(rows: pd.DataFrame, scenario: Mapping[str, Any]) -> Found:
 
 def _driver_of(scenario: Mapping[str, Any]) -> Callable[[str], str]:
     """Return a function of a role: ``human`` for roles with human drivers, else the role."""
-    kinds = {role: node[TARGET] for role, node in scenario.get("controllers", {}).items() if node}
+    nodes = scenario.get("controllers", {})
+    kinds = {role: node[TARGET] for role, node in nodes.items() if node}
     people = {role for role, kind in kinds.items() if kind == kinds.get(HUMAN)} - {AUTOMATED}
     return lambda role: HUMAN if role in people else role
 

@@ -96,4 +96,5 @@ def case_report(rows: pd.DataFrame, case: str, of: str) -> Report:
     table = with_drivers(case_table(rows, case)).astype({"collisions": int})
     shown = [Shown(one.key, one.short) for one in PLATOON if one.short]
     short = shortened(table, shown)
-    return Report(of, table, *short, PLATOON, f"{BELOW}; {ALL}", BELOW)
+    caption = f"{BELOW}; {ALL}"
+    return Report(of, table, *short, PLATOON, caption, BELOW)

@@ -56,17 +56,19 @@ def as_markdown(frame: pd.DataFrame) -> str:
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
-    """Return a Markdown table with escaped cells.
+    """Return a Markdown table with escaped cells."""
+    return "\n".join(map(markdown_row, [head, ["---"] * len(head), *rows]))
+
+
+def markdown_row(cells: Iterable[str]) -> str:
+    """Return a row of a Markdown table with escaped cells.
 
     Examples:
-        >>> markdown_table(["a|b", "1"], [])
-        '| a\\\\|b | 1 |\\n| --- | --- |'
+        >>> print(markdown_row(["a|b", "1"]))
+        | a\\|b | 1 |
     """
-    lines = []
-    for cells in (head, ["---"] * len(head), *rows):
-        escaped = (" ".join(cell.split()).replace("|", r"\|") for cell in cells)
-        lines.append(f"| {' | '.join(escaped)} |")
-    return "\n".join(lines)
+    escaped = (" ".join(cell.split()).replace("|", r"\|") for cell in cells)
+    return f"| {' | '.join(escaped)} |"
 
 
 def as_csv(frame: pd.DataFrame, decimal: str = "point") -> str:

@@ -48,7 +48,8 @@ def remaining(states: Sequence[RunState], planned: int = 0) -> float | None:
 
 def overview_line(root: Path, states: Sequence[RunState], planned: int) -> str:
     """Return a summary of the folder in one line."""
-    parts = [f"{count} {kind}" for kind, count in counts(states, planned).items() if count]
+    numbers = counts(states, planned)
+    parts = [f"{count} {kind}" for kind, count in numbers.items() if count]
     left = remaining(states, planned)
     eta = f"; about {clock(left)} left" if left is not None else ""
     runs = max(planned, len(states))

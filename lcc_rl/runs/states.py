@@ -218,7 +218,8 @@ def _inspected(folder: Path, name: str) -> RunState:
         return RunState(name, "running", done, total, float(progress.get("eta_s", 0.0)))
     state, why = "stopped", ""
     with suppress(ResultsError):
-        state, why = "failed", "".join(read_text(folder / ERROR).splitlines()[:1])
+        lines = read_text(folder / ERROR).splitlines()
+        state, why = "failed", "".join(lines[:1])
     for table in filter(Path.exists, (folder / table for table in RESULT_TABLES)):
         if not _is_whole(table):
             return RunState(name, "failed", done, total, error=f"{table.name} is cut or damaged")

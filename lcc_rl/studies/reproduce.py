@@ -71,7 +71,8 @@ def run(given: Namespace) -> None:
 
 
 def _study(given: Namespace, recipe: str | None) -> Study:
-    return Study(given.out, given.recipe or recipe, given.seeds, tuple(given.overrides), given.jobs)
+    overrides = tuple(given.overrides)
+    return Study(given.out, given.recipe or recipe, given.seeds, overrides, given.jobs)
 
 
 def parser() -> ArgumentParser:

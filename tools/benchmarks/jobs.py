@@ -117,7 +117,8 @@ def analytic(options: Namespace) -> list[Row]:
 def evaluate(options: Namespace) -> list[Row]:
     """Return episodes per second of an untrained actor, rows and time series written."""
     cfg, inputs = study(options.quick)
-    strategy = Strategy("untrained", cfg, shared_policy(build_agent(cfg, inputs.population).policy))
+    agent = build_agent(cfg, inputs.population)
+    strategy = Strategy("untrained", cfg, shared_policy(agent.policy))
     settings, people = cfg.evaluation, len(inputs.population.time_gap)
     drivers = 2 if options.quick else settings.drivers
     plan = Plan(len(inputs.evaluation), people, drivers, settings.batch_size)
@@ -161,7 +162,8 @@ def update(options: Namespace) -> list[Row]:
         own, other = f"{kind.__name__}.update", f"{OTHER} {kind.__name__}"
         runs: dict[str, Run] = {own: own_updates(agent, played, count)}
         if installed():
-            runs[other] = partial(their_update(options, agent, played).train, count, batch)
+            model = their_update(options, agent, played)
+            runs[other] = partial(model.train, count, batch)
         rows += rates(options, runs, "updates/s", count, {own: [other]}, batch, grad=True)
     return rows
 

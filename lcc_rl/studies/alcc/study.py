@@ -267,7 +267,8 @@ def _awareness(study: StudyResults, means: Means) -> None:
     study.table("table_iv", caption, paper_tables.table_iv(means.drivers))
     study.table("holistic", "Saving per driver", paper_tables.holistic(means))
     caption = "Path energy of both vehicles and its saving, by driver behind (Fig. 10)"
-    study.figure("improvement", caption, run_figures.paired_improvement(means, *PAIR))
+    figure = run_figures.paired_improvement(means, *PAIR)
+    study.figure("improvement", caption, figure)
 
 
 def _generalization(study: StudyResults, windows: pd.DataFrame) -> None:

@@ -57,7 +57,8 @@ def per_run(episodes: pd.DataFrame) -> pd.DataFrame:
 
 def rounded(frame: pd.DataFrame) -> pd.DataFrame:
     """Return a table with the precision of figures."""
-    return frame.assign(**frame[frame.select_dtypes("number").columns].astype("float32").round(3))
+    numbers = frame.select_dtypes("number").columns
+    return frame.assign(**frame[numbers].astype("float32").round(3))
 
 
 def printed() -> pd.DataFrame:
