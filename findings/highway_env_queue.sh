@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # highway-env 1.12.1: cars that stop behind a stopped leader drive backwards, the IDM cars of its
-# traffic and the car of a policy. A constant of its class says it (MIN_SPEED = -40), no text does.
+# traffic and the car of a policy. Its reference lists a MIN_SPEED of -40 m/s among the constants.
 # Guess before: speeds end at 0, for IDM cars and under full braking.
 # Seen: of twelve IDM cars the first rolls back at 0.4 m/s, the twelfth at 2.5; a policy that brakes
 # in highway-v0 stands after 5 s, drives -40 m/s after 13 s, at the reward of a slow car.

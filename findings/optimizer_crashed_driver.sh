@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # A driver model is calibrated, and drivers that crash have no error: NaN, as numpy's mean gives it
-# (scipy 1.17.1, pymoo 0.6.2; their pages on these functions do not speak of NaN).
+# (scipy 1.17.1, pymoo 0.6.2). scipy's pages on the two functions do not speak of NaN.
 # Guess before: scipy's pass over crashed drivers, pymoo's GA too (right); none on pymoo's PSO.
 # Seen: scipy's `brute` and pymoo's PSO return a crashed driver as the best one, scipy's
 # `differential_evolution` too, with success False; `DE` and `GA` of pymoo find the driver.
-# Hurt: calibrations: one NaN in the first generation outranks every driver that follows.
+# Hurt: calibrations, and searches for controllers, whose simulations end without a result.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
