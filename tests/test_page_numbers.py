@@ -68,11 +68,11 @@ def findings() -> list[str]:
     energy = driven["energy_1.1s_j"] / driven["distance_1.1s_m"]
     net, columns = "total_net_energy_kj", ["variant", "limit"]
     fleets = pd.read_parquet(REFERENCE / "tasks" / "fleets_fronts.parquet")
-    fleets = fleets[fleets["setting"] == "drives_metres"]
+    fleets = fleets[fleets["setting"] == "drives_traffic"]
     fleets = fleets.groupby(columns)[[net, "distance_m", FLOW]].mean().reset_index(level=1)
     fleets["e"] = fleets[net] / fleets["distance_m"]
     rule, (own, humans) = (
-        fleets.loc[["idm_fleet"]].sort_values(FLOW),
+        fleets.loc[["ahead"]].sort_values(FLOW),
         (fleets.loc[[x]].mean() for x in ("learned", "human")),
     )
     at_its_flow = np.interp(own[FLOW], rule[FLOW], rule["e"])
@@ -93,9 +93,9 @@ def findings() -> list[str]:
     late = rings[(rings["delay_s"] == 0.5) & (rings["strategy"] == "pretrained")]["damping_time_s"]
     return [
         f"use {1.0 - energy['as calibrated'] / energy['recorded']:.0%} less",
-        f"4% learned cars save {1.0 - own['e'] / humans['e']:.1%} (",
+        f"save {1.0 - own['e'] / humans['e']:.1%} (",
         f"at {1.0 - own[FLOW] / humans[FLOW]:.1%} less flow",
-        f"They need {1.0 - own['e'] / at_its_flow:.1%} (",
+        f"a rule with them {1.0 - own['e'] / at_its_flow:.1%} (",
         f"driver behind saves {100.0 * least:.1f} to {most:.1%} in windows",
         f"ends {late.count()} of {len(late)} waves",
     ]

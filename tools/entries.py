@@ -55,7 +55,7 @@ def configurations() -> Iterator[StudyConfig]:
         yield cfg
         if cfg.deployed is not None:
             yield cfg.after_training()
-    knowledge = ["+knowledge=[spread,preview]", "scenario.pieces.memory.kind=stacked"]
+    knowledge = ["+knowledge=[spread,preview,traffic]", "scenario.pieces.memory.kind=stacked"]
     cfg = load("train", ["variant=alcc", SIZES, "+filter=cbf", "+faults=all", *knowledge])
     yield cfg
     held = "scenario.controllers.automated.hold=0.5"

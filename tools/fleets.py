@@ -30,12 +30,12 @@ SHARE, LEARNED = "penetration", "learned"
 SHOWN = {"saving": "fuel saved per km, all cars [%]", "mean_speed_mps": "mean speed [m/s]"}
 HUMAN, RULES = "human", ("idm_fleet", "idm_acc")  # the rule is the first that was evaluated
 SETTINGS = {  # labels of the stored fronts
-    "drives": "I-24, whole drives",
     "drives_taught": "I-24, whole drives, trained over 400 s",
     "drives_metres": "I-24, whole drives, trained with a price per metre",
-    "drives_wavy": "I-24, wavy half of the drives",
+    "drives_traffic": "I-24, whole drives, … and the speeds of the traffic ahead",
     "drives_wavy_taught": "I-24, wavy half of the drives, trained over 400 s",
     "drives_wavy_metres": "I-24, wavy half of the drives, trained with a price per metre",
+    "drives_wavy_traffic": "I-24, wavy half of the drives, … and the speeds of the traffic ahead",
     "front": "I-24, 100 s",
     "free": "free driving, 100 s",
     "long": "I-24, 400 s",

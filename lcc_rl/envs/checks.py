@@ -22,7 +22,7 @@ BATCH = 2
 ADDED_BY = {
     **{f"{x}.{y}": "+slope=hills" for x in ("vehicles", "leader") for y in ("place", "grade")},
     "terrain": "+slope=hills +knowledge=terrain",
-    **{name: f"+knowledge={name}" for name in ("memory", "preview", "spread")},
+    **{name: f"+knowledge={name}" for name in ("memory", "preview", "spread", "traffic")},
 }
 
 

@@ -13,7 +13,7 @@ from lcc_rl.pieces.drivers import FVDM, IDM, OVM, CalibratedDrivers, DriverModel
 from lcc_rl.pieces.estimator import DriverEstimator
 from lcc_rl.pieces.features import EnergyClasses, MotorPower, TimeGap, TimeToCollision
 from lcc_rl.pieces.hybrid import HCFS, Hybrid
-from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory
+from lcc_rl.pieces.knowledge import LeaderPreview, ObservationMemory, TrafficAhead
 from lcc_rl.pieces.leader import NGSIMLeader
 from lcc_rl.pieces.mpc import MPC
 from lcc_rl.pieces.observation import Observation

@@ -1,4 +1,4 @@
-"""Observations beyond the present state: a vehicle's memory and a preview of the leader."""
+"""Observations beyond a vehicle's present: its memory, a preview, the traffic further ahead."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.functional.layout import batch_innermost
+from lcc_rl.functional.layout import batch_innermost, join
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
+from lcc_rl.functional.string import gather
 from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP, Entry, Feature, Piece, StepTransform
 from lcc_rl.pieces.cbf import CBFFilter
 from lcc_rl.pieces.connected import Communication
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.leader import NEXT_SPEED, PROFILE, PROFILE_START, NGSIMLeader
 from lcc_rl.pieces.sensors import Sensors
-from lcc_rl.pieces.views import EPISODE, NEXT, Key, Views
+from lcc_rl.pieces.views import EPISODE, LEADER, NEXT, VEHICLES, Key, Views
 from lcc_rl.pieces.world import World
-from lcc_rl.settings import NonNegative
+from lcc_rl.settings import Count, NonNegative
 
 Seconds = Annotated[float, Field(ge=0.0, le=3600.0)]  # ages of memories, horizons of previews
 Times = Annotated[tuple[Seconds, ...], Field(min_length=1)]
@@ -73,6 +74,39 @@ class LeaderPreview(Feature):
         return speed.unsqueeze(-2)
 
 
+class TrafficAhead(Feature):
+    """Speeds of vehicles further ahead, as they or sensors at the road report them by radio.
+
+    Writes ``("traffic", "speed")`` [m/s], ``[*batch, A, places]``. Ahead of the string no vehicle
+    is known but the leader, whose present speed stands for theirs. A ring has no first vehicle.
+    """
+
+    places: Annotated[tuple[Count, ...], Field(min_length=1)] = (5, 10, 20, 40)  # 1: the next one
+
+    reported = Entry("traffic.speed", "m/s", "speed of the vehicle at each number of places ahead")
+    own: ClassVar[Tensor]
+    far: ClassVar[Tensor]
+
+    def setup(self, world: World) -> None:
+        string = world.string
+        reads: list[Key] = [(VEHICLES, "speed")]
+        reads += [] if string.ring else [(LEADER, "speed")]
+        reads += [(AUTOMATED, "index")] if string.drawn else []
+        self.declare(world, reads, [self.reported.wide(len(self.places))])
+        self.register_buffer("own", torch.tensor(string.places(AUTOMATED)))
+        self.register_buffer("far", torch.tensor(self.places))
+
+    def compute(self, speed: Tensor, *more: Tensor) -> Tensor:
+        own = more[-1] if self.string.drawn else self.own.expand(*speed.shape[:-2], -1)
+        place = own.unsqueeze(-1) - self.far  # -1: the leader's
+        if self.string.ring:
+            place = place % speed.shape[-2]
+        else:
+            speed = join([more[0].unsqueeze(-2), speed], -2)
+            place = (place + 1).clamp(min=0)
+        return gather(speed, place.flatten(-2)).view(*place.shape)
+
+
 def driving_reads(pieces: Sequence[Piece]) -> set[Key]:
     """Return the entries that controllers and filters of the automated vehicles read.
 
@@ -105,7 +139,8 @@ def foreseen(pieces: Sequence[Piece]) -> list[str]:
 def hears(pieces: Sequence[Piece]) -> bool:
     """Whether automated vehicles with sensors are driven by messages, which have no faults."""
     sensed = any(isinstance(piece, Sensors) and piece.role == AUTOMATED for piece in pieces)
-    heard = {x for piece in pieces if isinstance(piece, Communication) for x in piece.targets}
+    radio = (Communication, TrafficAhead)
+    heard = {x for piece in pieces if isinstance(piece, radio) for x in piece.targets}
     return sensed and not heard.isdisjoint(driving_reads(pieces))
 
 

@@ -95,6 +95,7 @@ from lcc_rl.pieces import (
     TimeGapStart,
     TimeToCollision,
     TotalReward,
+    TrafficAhead,
     VehicleString,
     VelocityReward,
 )
@@ -255,6 +256,7 @@ def makers(road: str) -> dict[str, Callable[[], Piece]]:
         "MotorPower, mixed": MotorPower(power="mixed_power"),
         "MotorPower, estimated": believed,
         "Collision": Collision(),
+        "TrafficAhead": TrafficAhead(places=(1, 2)),
         "ObservationMemory": memory,
         "ObservationMemory, spread": ObservationMemory(seconds=[0.5, 1.0], kind="spread"),
         "Observation": Observation(scales=SCALES, visible=2, widths={"memory": 4}),

@@ -7,8 +7,9 @@ import math
 import pytest
 import torch
 from helpers import OBSERVATION, small_env, steady, wavy_profiles
+from tensordict import TensorDict
 
-from lcc_rl.pieces import LeaderPreview
+from lcc_rl.pieces import LeaderPreview, TrafficAhead, parse_string
 from lcc_rl.pieces.world import World
 
 FIRST = ("scenario.pieces.leader.start=first", "scenario.pieces.leader.profile=2")
@@ -93,3 +94,30 @@ def test_filtered_memory_is_an_average_and_the_spread_the_average_distance_from_
     assert torch.allclose(spread, torch.tensor(distances), atol=1e-4)
     assert distances[-1] > 0.01
     assert torch.allclose(data[OBSERVATION][0, :, 0, -1], 0.5 * spread)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "road"),
+    [
+        ("human automated human*2 automated*2", "open"),
+        ({"size": 6, "penetration": 0.4}, "open"),
+        ("human automated human*3 automated", "ring"),
+    ],
+)
+def test_traffic_ahead_is_the_speed_of_the_vehicles_at_these_places(pattern, road: str) -> None:
+    string = parse_string(pattern, road)
+    piece = TrafficAhead(places=(1, 3)).bind(World(string))
+    own = torch.tensor([[0, 4], [2, 5]]) if string.drawn else None
+    speed, leader = torch.rand(2, 6, 1), torch.rand(2, 1)
+    given = {("vehicles", "speed"): speed, ("leader", "speed"): leader, ("automated", "index"): own}
+    seen = piece(TensorDict({key: given[key] for key in piece.in_keys}, [2]))["traffic", "speed"]
+    for episode in range(2):
+        places = string.places("automated") if own is None else own[episode].tolist()
+        everyone = [*speed[episode].flatten().tolist()]
+        for row, place in zip(seen[episode].tolist(), places, strict=True):
+            beyond = [place < far and road == "open" for far in (1, 3)]
+            there = [everyone[(place - far) % 6] for far in (1, 3)]
+            wanted = [
+                leader[episode].item() if b else x for b, x in zip(beyond, there, strict=True)
+            ]
+            assert row == wanted
