@@ -6,10 +6,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from numbers import Real
-from pathlib import Path
-from sysconfig import get_path
-from traceback import extract_tb
+from traceback import walk_tb
 from typing import Any
+
+from lcc_rl.version import is_users
 
 
 class LccError(Exception):
@@ -82,19 +82,13 @@ def raised_as(kind: type[LccError], words: str, *caught: type[Exception]) -> Ite
         raise kind(f"{words}: {line_of(error)}".removeprefix(": ")) from error
 
 
-def is_users(file: str | Path) -> bool:
-    """Whether a file of code is not of this package, Python or an installed package."""
-    path = Path(file)
-    installed = {"site-packages", "dist-packages"}.intersection(path.parts)
-    ours, python = Path(__file__).parent, get_path("stdlib")
-    other = path.is_relative_to(ours) or path.is_relative_to(python) or str(file)[:1] == "<"
-    return not (installed or other)
-
-
 def place_of(error: BaseException) -> str:
     """Return file and line of the user's code in which an error was raised, or nothing."""
-    steps = [step for step in extract_tb(error.__traceback__) if is_users(step.filename)]
-    return f"{steps[-1].filename}:{steps[-1].lineno}" if steps else ""
+    place = ""
+    for frame, line in walk_tb(error.__traceback__):
+        file = frame.f_code.co_filename
+        place = f"{file}:{line}" if is_users(frame.f_globals.get("__name__", ""), file) else place
+    return place
 
 
 def line_of(error: BaseException, typed: bool = False) -> str:

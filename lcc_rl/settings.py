@@ -48,6 +48,7 @@ from lcc_rl.errors import (
     nearest,
     unknown_name,
 )
+from lcc_rl.version import is_ours
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
@@ -262,11 +263,6 @@ def path_of(kind: Any) -> str:
             "a module, a script or a notebook"
         )
     return f"{module}.{name}"
-
-
-def is_ours(path: Any) -> bool:
-    """Whether a module, class or function is of this package, by its dotted path."""
-    return f"{path}.".startswith("lcc_rl.")
 
 
 def find_target(target: str, where: str) -> Any:

@@ -21,7 +21,8 @@ from lcc_rl.io.files import parquet_metadata
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.runs import differing, flatten
 from lcc_rl.results.task import OF_FUEL, Task, burns_one_fuel, check_unit
-from lcc_rl.settings import TARGET, is_ours, parse
+from lcc_rl.settings import TARGET, parse
+from lcc_rl.version import is_ours
 
 MESSAGES = "communication"  # name of the piece with messages between connected vehicles
 FIRST_LAYER = "module.0.0.weight"  # first layer of a policy's network

@@ -26,7 +26,7 @@ from lcc_rl.pieces.base import ACTION, SEED, STEP, Key, State, as_key
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.leader import PROFILE, PROFILE_START
 from lcc_rl.pieces.string import COMMAND, WANTED
-from lcc_rl.settings import is_ours
+from lcc_rl.version import is_ours
 
 log = logging.getLogger("lcc_rl")
 

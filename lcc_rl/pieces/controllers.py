@@ -30,7 +30,8 @@ from lcc_rl.pieces.base import ACTION, ROLE, Entry, RoleTransform, as_key, retur
 from lcc_rl.pieces.string import COMMANDED, WISHED
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF
 from lcc_rl.pieces.world import World
-from lcc_rl.settings import NonNegative, Number, Positive, find_target, is_ours
+from lcc_rl.settings import NonNegative, Number, Positive, find_target
+from lcc_rl.version import is_ours
 
 # Names of the random streams; a seed gives the same episode under either name.
 STREAMS = {AUTOMATED: "cav", HUMAN: "hdv"}
