@@ -16,11 +16,10 @@ from hydra.core.hydra_config import HydraConfig
 
 from lcc_rl.config.nodes import settings_at
 from lcc_rl.config.words import FILTERED, YAML, module_named
-from lcc_rl.errors import ConfigError, ResultsError
+from lcc_rl.errors import ConfigError, ResultsError, is_ours, is_users
 from lcc_rl.io.paths import matching
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.settings import TARGET, load_module
-from lcc_rl.version import is_ours, is_users
 
 FileHashes = dict[str, dict[str, str]]
 NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")

@@ -41,7 +41,7 @@ from lcc_rl.results.names import ON_FRONT, RULE, in_words, several, size_of
 from lcc_rl.results.render import column_cells
 from lcc_rl.results.report import AGAINST, ALL, COUNTS, Report
 from lcc_rl.results.runs import CONFIG, read_settings
-from lcc_rl.results.windows import Means, by_driver, varied
+from lcc_rl.results.windows import Means, by_driver, varied_in
 
 LINES = "{}; lines: 95 % intervals"  # of a figure, after its numbers of windows and drivers
 VEHICLE_STYLES = {
@@ -298,7 +298,7 @@ def _mean_line(axis: Axes, found: Estimate, rows: pd.DataFrame) -> None:
     text = f"mean {signed(value)} %"
     if np.isfinite(low):
         seeds = min(rows["training_seed"].nunique(), 2)
-        over = f"{varied(rows)}{('', ', 1 seed', ' and seeds')[seeds]}"
+        over = f"{varied_in(rows)}{('', ', 1 seed', ' and seeds')[seeds]}"
         limits = axis.get_ylim()  # of few drives the band may be far wider than all bars
         axis.axhspan(low, high, color=SOFT, alpha=0.3, lw=0)
         axis.set_ylim(limits)

@@ -129,7 +129,13 @@ def clusters(drives: Sequence[object]) -> list[object]:
         ['a', 'a', 'b']
     """
     whole = [of.drive if isinstance(of, Minute) else of for of in drives]
-    return next((group for group in (whole, list(drives)) if len(set(group)) > 1), [])
+    unit = varied(len({*whole}), len({*drives}))
+    return {"drives": whole, "minutes": [*drives]}.get(unit, [])
+
+
+def varied(drives: int, minutes: int = 0) -> str:
+    """Return what intervals are over: several drives, else minutes of the only one, or windows."""
+    return "drives" if drives > 1 else "minutes" if minutes > 1 else "windows"
 
 
 def mean(values: ArrayLike) -> Estimate:

@@ -13,8 +13,8 @@ from helpers import check_refused
 import lcc_rl
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.energy import EnergyModel
+from lcc_rl.errors import is_users
 from lcc_rl.pieces import Controller
-from lcc_rl.version import is_users
 
 
 def at_first(speed):
