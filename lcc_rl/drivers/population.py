@@ -12,7 +12,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from lcc_rl.data.sources import ASSETS
+from lcc_rl.assets import ASSETS
 from lcc_rl.drivers.observed import PAIR_IDENTITY
 from lcc_rl.drivers.parameters import (
     DEFAULT_BOUNDS,

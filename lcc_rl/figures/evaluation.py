@@ -56,7 +56,7 @@ def write_figures(
     rows: str = "episodes",
     reports: Sequence[Report] = (),
     own: Collection[str] = (),
-) -> list[Path]:
+) -> None:
     """Draw the figures of an evaluation into its folder ``figures``.
 
     Args:
@@ -64,9 +64,6 @@ def write_figures(
         rows: subject of a row of episodes.parquet, ``episodes`` or ``vehicles``.
         reports: reports of the evaluation; ``overview`` shows the savings of a single one.
         own: strategies that are the user's controllers.
-
-    Returns:
-        The paths of the figures.
 
     Raises:
         ResultsError: if a table is missing or a figure cannot be written.
@@ -80,14 +77,13 @@ def write_figures(
         bound = float((cfg.get("deployed") or {}).get("jerk_bound", 30.0))
         found = platoon_figures(steps, bound)
     formats = cfg.get("figure_formats", ())
-    drawn: dict[str, Path] = {}  # files by case-folded name, for file systems that ignore case
+    drawn: set[str] = set()  # case-folded names, for file systems that ignore case
     for stem, figure in found:
         file = in_file(stem)
         while file.casefold() in drawn:
             file += "_"
-        path = folder / "figures" / f"{file}.png"
-        drawn[file.casefold()] = save(figure, path, formats=formats)
-    return list(drawn.values())
+        drawn.add(file.casefold())
+        save(figure, folder / "figures" / f"{file}.png", formats=formats)
 
 
 def study_figures(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 from pydantic import AfterValidator, Field
 
+from lcc_rl.assets import ASSETS
 from lcc_rl.config.schemas import StudyConfig, as_text
 from lcc_rl.errors import ConfigError, ResultsError, raised_as
 from lcc_rl.io.settings import parse_yaml
@@ -21,7 +21,7 @@ from lcc_rl.runs.states import CONFIG, no_run, run_folders
 from lcc_rl.settings import S, Settings, parse
 
 PRETRAINED = "pretrained"
-SHIPPED_POLICIES = Path(str(files("lcc_rl.assets"))) / PRETRAINED
+SHIPPED_POLICIES = ASSETS / PRETRAINED
 # Variants that use the policy of another one.
 BUILDS_ON = {"hcfs": "ddpg"}
 
