@@ -185,8 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("baseline", nargs="?", default="human", help="strategy to compare with")
     table = savings(**vars(parser.parse_args(arguments)))
     lines = [
-        [model, *(saved_text(100.0 * x.value, 100.0 * x.low, 100.0 * x.high) for x in row.values())]
-        for model, row in table.items()
+        [model, *(saved_text(*x.percent) for x in row.values())] for model, row in table.items()
     ]
     print(markdown_table(["", *next(iter(table.values()))], lines))
     print(*disagreements(table), sep="\n")

@@ -290,7 +290,7 @@ def _by_driver(means: Means, column: str, names: dict[str, str], owner: str) -> 
 
 def _mean_line(axis: Axes, found: Estimate, rows: pd.DataFrame) -> None:
     """Draw the mean saving and its interval, and label both."""
-    value, low, high = (100 * x for x in (found.value, found.low, found.high))
+    value, low, high = found.percent
     text = f"mean {signed(value)} %"
     if np.isfinite(low):
         seeds = min(rows["training_seed"].nunique(), 2)

@@ -18,6 +18,7 @@ from pyarrow import fs
 
 from lcc_rl.errors import ResultsError, raised_as
 from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.paths import check_file
 from lcc_rl.version import code_version
 
 SCHEMA_VERSION = "1"
@@ -211,8 +212,7 @@ def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:
     """Read a parquet file, or raise a ResultsError of one line."""
     path = Path(path)
     with raised_as(ResultsError, f"{path}: not readable as parquet", pa.ArrowException, OSError):
-        if not path.is_file():  # reading a pipe would block
-            raise ResultsError(f"{path}: no such file")
+        check_file(path)
         return reader(path)
 
 

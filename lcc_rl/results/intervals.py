@@ -39,6 +39,11 @@ class Estimate:
     high: float = np.nan
     more_flow: float = np.nan
 
+    @property
+    def percent(self) -> tuple[float, float, float]:
+        """The value and its bounds in per cent."""
+        return 100.0 * self.value, 100.0 * self.low, 100.0 * self.high
+
     def columns(self, name: str, factor: float = 1.0) -> dict[str, float]:
         """Return ``name``, ``name_low`` and ``name_high``, scaled."""
         values = zip(BOUNDED, (self.value, self.low, self.high), strict=True)
