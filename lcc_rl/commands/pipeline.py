@@ -53,7 +53,7 @@ from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import log_report, show_headline
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch_jobs
-from lcc_rl.runs.states import claim
+from lcc_rl.runs.states import CHECKPOINT, claim
 from lcc_rl.settings import TARGET, path_of
 from lcc_rl.version import __version__
 
@@ -153,7 +153,7 @@ def _run(
     except Interrupted:
         message = f"stopped; complete it with: lcc-rl run resume={folder}{trust_option(final)}"
         raise Interrupted(message) from None
-    learned = [name for name in trainings if (folder / name / "policy.pt").exists()]
+    learned = [name for name in trainings if (folder / name / runs.POLICY).exists()]
     final = final.with_(**traffic, compare=[str(folder / name) for name in learned])
     show_headline("evaluating them and the baselines on held-out windows")
     paged = final.evaluation.rows == "episodes"
@@ -272,7 +272,7 @@ def _train_one(cfg: TrainConfig, folder: str) -> None:
     """Train one variant with its own log file, in a process of the pool."""
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
-    if (target / "checkpoint.pt").exists():
+    if (target / CHECKPOINT).exists():
         cfg = cfg.with_(resume=folder)
     handler = logging.FileHandler(target / "train.log", encoding="utf-8")
     handler.setFormatter(logging.Formatter("[%(asctime)s][%(levelname)s] %(message)s"))

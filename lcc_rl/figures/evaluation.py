@@ -40,7 +40,7 @@ from lcc_rl.results.motion import most_varied, of_first_seed
 from lcc_rl.results.names import ON_FRONT, RULE, in_words, several, size_of
 from lcc_rl.results.render import column_cells
 from lcc_rl.results.report import AGAINST, ALL, COUNTS, Report
-from lcc_rl.results.runs import CONFIG, read_settings
+from lcc_rl.results.runs import CONFIG, EPISODES, STEPS, read_settings
 from lcc_rl.results.windows import Means, by_driver, varied_in
 
 LINES = "{}; lines: 95 % intervals"  # of a figure, after its numbers of windows and drivers
@@ -69,10 +69,10 @@ def write_figures(
         ResultsError: if a table is missing or a figure cannot be written.
     """
     folder = Path(folder)
-    steps, cfg = read_parquet(folder / "steps.parquet"), read_settings(folder / CONFIG)
+    steps, cfg = read_parquet(folder / STEPS), read_settings(folder / CONFIG)
     found: Iterable[tuple[str, Figure]]
     if rows == "episodes":
-        found = study_figures(read_parquet(folder / "episodes.parquet"), steps, cfg, reports, own)
+        found = study_figures(read_parquet(folder / EPISODES), steps, cfg, reports, own)
     else:
         bound = float((cfg.get("deployed") or {}).get("jerk_bound", 30.0))
         found = platoon_figures(steps, bound)

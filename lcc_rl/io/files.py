@@ -22,7 +22,8 @@ from lcc_rl.io.paths import check_file
 from lcc_rl.version import code_version
 
 SCHEMA_VERSION = "1"
-VERSION, PROCESSOR = "lcc_rl.version", "lcc_rl.processor"  # keys in a table's metadata
+# Keys in a table's metadata; the last one is of the hash of its configuration.
+VERSION, PROCESSOR, IDENTITY = "lcc_rl.version", "lcc_rl.processor", "lcc_rl.config"
 # The rows of a table, or, for many rows, a dataset that is read on demand.
 Rows: TypeAlias = pd.DataFrame | ds.Dataset
 NO_FRAME = "damaged, no data frame"

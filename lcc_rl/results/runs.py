@@ -22,7 +22,7 @@ from lcc_rl.errors import ResultsError, line_of, replacing
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.results.trust import LOGS, own_modules, trusted
-from lcc_rl.runs.states import CONFIG, no_run
+from lcc_rl.runs.states import CHECKPOINT, CONFIG, no_run
 from lcc_rl.version import PACKAGE, code_version
 
 log = logging.getLogger("lcc_rl")
@@ -34,7 +34,7 @@ ORIGIN = "origin.txt"  # where a run comes from
 PARTS, FINAL = ".parts", "evaluation"  # parts' settings and last part of a job of lcc-rl run
 SECTION = re.compile(r"^(?=[a-z])", re.MULTILINE)  # before the name of a section of settings
 # Results and states of stopped runs, which commands with other settings must not replace.
-RUN_FILES = (EPISODES, "drivers.parquet", "checkpoint.pt", "command.txt", "blocks")
+RUN_FILES = (EPISODES, "drivers.parquet", CHECKPOINT, "command.txt", "blocks")
 
 
 def save_config(cfg: BaseConfig, folder: Path, resumed: bool = False) -> None:

@@ -26,7 +26,7 @@ UNDRAWN = "undrawn"  # marks an evaluation whose figures are not drawn yet
 # The last table of a run: of a training or evaluation, of a calibration.
 RESULT_TABLES = ("episodes.parquet", "drivers.parquet")
 PARQUET = b"PAR1"  # last bytes of a parquet file
-CONFIG = "config.yaml"
+CONFIG, CHECKPOINT = "config.yaml", "checkpoint.pt"
 MARKS = {CONFIG, ERROR, LOCK, *RESULT_TABLES}
 MOST_NAMED = 3  # most runs or tables in a message
 STATES = ("finished", "running", "stopped", "failed")
