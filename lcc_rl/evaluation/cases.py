@@ -70,20 +70,16 @@ class Cases:
             rows.append(self._described(case, measured_series(series, time_step)))
             if case in self.inputs.cases:
                 drawn = trace(series, time_step)
-                labels = pd.DataFrame(self._labels(case, len(drawn)))
-                steps.append(pd.concat([labels, drawn], axis=1))
+                labels = {**self.strategy.labels(len(drawn)), "case": case.name}
+                steps.append(pd.concat([pd.DataFrame(labels), drawn], axis=1))
         trails = pd.concat(steps, ignore_index=True) if steps else pd.DataFrame()
         return pd.concat(rows, ignore_index=True), trails
-
-    def _labels(self, case: Case, rows: int) -> dict[str, Any]:
-        """Return the columns that name strategy and case in so many rows."""
-        seed = pd.array([self.strategy.seed] * rows, dtype="Int64")
-        return {"strategy": self.strategy.name, "training_seed": seed, "case": case.name}
 
     def _described(self, case: Case, frame: pd.DataFrame) -> pd.DataFrame:
         """Return measures with the names of their strategy, case and profile."""
         labels = {
-            **self._labels(case, len(frame)),
+            **self.strategy.labels(len(frame)),
+            "case": case.name,
             "profile": [case.profile.names[i] for i in frame["run_id"]],
             DRIVE: [case.profile.recordings[i] for i in frame["run_id"]],
             "followers": int(frame["follower"].max()),
