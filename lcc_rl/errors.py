@@ -151,13 +151,10 @@ def naming(title: str) -> AbstractContextManager[None]:
     return replacing(named)
 
 
-@contextmanager
-def needing(extra: str, words: str) -> Iterator[None]:
+def needing(extra: str, words: str) -> AbstractContextManager[None]:
     """Raise a ConfigError with the commands that install an extra if an import fails."""
-    try:
-        yield
-    except ImportError as error:
-        raise ConfigError(f"{words}: {how_to_install(extra)} ({error})") from error
+    text = f"{words}: {how_to_install(extra)}"
+    return replacing(lambda error: ConfigError(f"{text} ({error})"), ImportError)
 
 
 def how_to_install(extra: str) -> str:
