@@ -216,9 +216,9 @@ def checked(function: Callable[..., R]) -> Callable[..., R]:
     return checking
 
 
-def values(settings: Any) -> dict[str, Any]:
-    """Return the settings of an object by name."""
-    names = (field.name for field in dataclasses.fields(settings))
+def values(settings: Any, of: Any = None) -> dict[str, Any]:
+    """Return the settings of an object by name; ``of``: those of a class only."""
+    names = (field.name for field in dataclasses.fields(of or settings))
     return {name: getattr(settings, name) for name in names}
 
 

@@ -10,7 +10,7 @@ import shlex
 import threading
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -54,7 +54,7 @@ from lcc_rl.runs.output import log_report, show_headline
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch_jobs
 from lcc_rl.runs.states import CHECKPOINT, claim
-from lcc_rl.settings import TARGET, path_of
+from lcc_rl.settings import TARGET, path_of, values
 from lcc_rl.version import __version__
 
 log = logging.getLogger("lcc_rl")
@@ -210,7 +210,7 @@ def read_once(cfg: PipelineConfig, folder: Path, learns: bool = True) -> None:
 def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
     """Calibrate drivers to the trajectories in the folder, unless this is done."""
     drivers = folder / "calibration" / "drivers.parquet"
-    shared = {field.name: getattr(cfg, field.name) for field in fields(CalibrateConfig)}
+    shared = values(cfg, CalibrateConfig)
     settings = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})
     runs.check_folder(settings, drivers.parent)
     if not drivers.exists():
