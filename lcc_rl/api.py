@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import datetime
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from lcc_rl.errors import require
 from lcc_rl.evaluation.foreign import as_given
 from lcc_rl.evaluation.named import setting_of
 from lcc_rl.runs.output import repeated_warnings_left_out
+from lcc_rl.runs.states import fresh_folder
 
 
 def learn(
@@ -39,7 +39,7 @@ def learn(
         >>> run = learn("alcc", ["experiment=smoke"], "outputs/mine")  # doctest: +SKIP
         >>> run.table[["strategy", "total_path_energy_kj"]]  # doctest: +SKIP
     """
-    target = _folder("train", variant, folder)
+    target = Path(folder or fresh_folder("train", variant))
     cfg = load("train", with_variant(variant, overrides))
     return Run(target, training.run(cfg, target, quiet=True, resume=True), cfg)
 
@@ -73,7 +73,8 @@ def compare(
         >>> found = compare([run, "pretrained/alcc_limits", "idm_acc"])  # doctest: +SKIP
         >>> found = compare({"slow": PID(gain=0.1), "fast": PID(gain=0.4)})  # doctest: +SKIP
     """
-    target, typed = _folder("evaluate", variant, folder), with_variant(variant, overrides)
+    target = Path(folder or fresh_folder("evaluate", variant))
+    typed = with_variant(variant, overrides)
     cfg = load("evaluate", typed)
     if isinstance(strategies, (str, PathLike)) or not isinstance(strategies, Iterable):
         strategies = [strategies]
@@ -96,9 +97,3 @@ def compare(
     if folder is not None:
         evaluation.draw(rows, cfg, target)
     return Run(target, rows, cfg)
-
-
-def _folder(kind: str, variant: str, folder: str | Path | None) -> Path:
-    if folder is not None:
-        return Path(folder)
-    return Path("outputs") / kind / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{variant}"

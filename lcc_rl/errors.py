@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from difflib import get_close_matches
 from numbers import Real
 from pathlib import Path
 from sysconfig import get_path
-from traceback import extract_tb
+from traceback import walk_tb
 from typing import Any
 
 
@@ -58,6 +59,8 @@ class Diverged(LccError):
 LARGEST = 1e9
 # Exceeds any memory, which has its own error; and the largest seed.
 LARGEST_SIZE, LAST_SEED = 10**15, 2**32 - 1  # torch uses no more bits of a seed
+# Folders of code that is not the user's: package, tools of a clone, Python.
+NOT_USERS = (Path(__file__).parent, Path(__file__).parents[1] / "tools", get_path("stdlib"))
 
 
 def require(condition: object, message: str) -> None:
@@ -82,19 +85,36 @@ def raised_as(kind: type[LccError], words: str, *caught: type[Exception]) -> Ite
         raise kind(f"{words}: {line_of(error)}".removeprefix(": ")) from error
 
 
-def is_users(file: str | Path) -> bool:
-    """Whether a file of code is not of this package, Python or an installed package."""
-    path = Path(file)
+def is_ours(path: Any) -> bool:
+    """Whether a module, class or function is of this package, by its dotted path."""
+    return f"{path}.".startswith("lcc_rl.")
+
+
+def is_users(module: str, file: str | Path) -> bool:
+    """Whether a module is not of this project, Python or an installed package.
+
+    A module in a package belongs to the owner of the package: compilers store such modules in
+    folders of their own.
+
+    Args:
+        module: its dotted path, or ``__main__``.
+        file: its file.
+    """
+    outermost, inside, _ = module.partition(".")
+    whole = getattr(sys.modules.get(outermost), "__file__", None) if inside else None
+    path = Path(whole or file)
     installed = {"site-packages", "dist-packages"}.intersection(path.parts)
-    ours, python = Path(__file__).parent, get_path("stdlib")
-    other = path.is_relative_to(ours) or path.is_relative_to(python) or str(file)[:1] == "<"
+    other = any(path.is_relative_to(folder) for folder in NOT_USERS) or str(path)[:1] == "<"
     return not (installed or other)
 
 
 def place_of(error: BaseException) -> str:
     """Return file and line of the user's code in which an error was raised, or nothing."""
-    steps = [step for step in extract_tb(error.__traceback__) if is_users(step.filename)]
-    return f"{steps[-1].filename}:{steps[-1].lineno}" if steps else ""
+    place = ""
+    for frame, line in walk_tb(error.__traceback__):
+        file = frame.f_code.co_filename
+        place = f"{file}:{line}" if is_users(frame.f_globals.get("__name__", ""), file) else place
+    return place
 
 
 def line_of(error: BaseException, typed: bool = False) -> str:
@@ -107,26 +127,34 @@ def line_of(error: BaseException, typed: bool = False) -> str:
 
 
 @contextmanager
-def naming(title: str) -> Iterator[None]:
-    """Raise an error of a user's code as a ConfigError: its class, then the error's type, line."""
+def replacing(
+    other: Callable[[Exception], LccError | None], caught: Any = Exception
+) -> Iterator[None]:
+    """Raise errors of other code as those that a function returns; it returns None to keep one."""
     try:
         yield
     except LccError:
         raise
-    except Exception as error:
-        if not place_of(error):
+    except caught as error:
+        if (found := other(error)) is None:
             raise
+        raise found from error
+
+
+def naming(title: str) -> AbstractContextManager[None]:
+    """Raise an error of a user's code as a ConfigError: its class, then the error's type, line."""
+
+    def named(error: Exception) -> LccError | None:
         hint = " (use torch.where in place of if)" if "Boolean value" in str(error) else ""
-        raise ConfigError(f"{title} fails: {line_of(error)}{hint}") from error
+        return ConfigError(f"{title} fails: {line_of(error)}{hint}") if place_of(error) else None
+
+    return replacing(named)
 
 
-@contextmanager
-def needing(extra: str, words: str) -> Iterator[None]:
+def needing(extra: str, words: str) -> AbstractContextManager[None]:
     """Raise a ConfigError with the commands that install an extra if an import fails."""
-    try:
-        yield
-    except ImportError as error:
-        raise ConfigError(f"{words}: {how_to_install(extra)} ({error})") from error
+    text = f"{words}: {how_to_install(extra)}"
+    return replacing(lambda error: ConfigError(f"{text} ({error})"), ImportError)
 
 
 def how_to_install(extra: str) -> str:

@@ -42,10 +42,11 @@ from lcc_rl.errors import (
     LARGEST_SIZE,
     LAST_SEED,
     ConfigError,
-    LccError,
     in_short,
+    is_ours,
     line_of,
     nearest,
+    replacing,
     unknown_name,
 )
 
@@ -97,13 +98,10 @@ class Settings:
 
         @wraps(construct)
         def checked(self: Any, **settings: Any) -> None:
-            try:
+            # Of pydantic, whose ValidationError is one, or of validate.
+            with replacing(lambda error: refused(error, cls, cls.__name__), ValueError):
                 construct(self, **_converted(cls, settings, cls.__name__))
                 self.validate()
-            except LccError:
-                raise
-            except ValueError as error:  # includes pydantic's ValidationError
-                raise refused(error, cls, cls.__name__) from error
 
         cls.__init__ = checked  # type: ignore[method-assign]
 
@@ -218,9 +216,9 @@ def checked(function: Callable[..., R]) -> Callable[..., R]:
     return checking
 
 
-def values(settings: Any) -> dict[str, Any]:
-    """Return the settings of an object by name."""
-    names = (field.name for field in dataclasses.fields(settings))
+def values(settings: Any, of: Any = None) -> dict[str, Any]:
+    """Return the settings of an object by name; ``of``: those of a class only."""
+    names = (field.name for field in dataclasses.fields(of or settings))
     return {name: getattr(settings, name) for name in names}
 
 
@@ -264,11 +262,6 @@ def path_of(kind: Any) -> str:
     return f"{module}.{name}"
 
 
-def is_ours(path: Any) -> bool:
-    """Whether a module, class or function is of this package, by its dotted path."""
-    return f"{path}.".startswith("lcc_rl.")
-
-
 def find_target(target: str, where: str) -> Any:
     """Return the class or function of a ``_target_``.
 
@@ -292,15 +285,14 @@ def load_module(module: str, where: str, target: str = "") -> Any:
     Raises:
         ConfigError: naming the place in the configuration, if it cannot be imported.
     """
-    try:
-        return import_module(module)
-    except LccError:
-        raise
-    except Exception as error:  # a user's module may raise any error
-        hint = ""
+
+    def refused_import(error: Exception) -> ConfigError:
         if not isinstance(error, (ImportError, AttributeError, ValueError)):
-            raise ConfigError(f"{where}: {module} cannot be imported: {line_of(error)}") from error
+            return ConfigError(f"{where}: {module} cannot be imported: {line_of(error)}")
+        hint = ""
         if isinstance(error, ModuleNotFoundError) and not is_ours(error.name):
             hint = "; for your own file, export PYTHONPATH=<its folder>"
-        text = f"{where}: cannot find {target or module!r}: {line_of(error)}{hint}"
-        raise ConfigError(text) from error
+        return ConfigError(f"{where}: cannot find {target or module!r}: {line_of(error)}{hint}")
+
+    with replacing(refused_import):  # a user's module may raise any error
+        return import_module(module)

@@ -11,7 +11,6 @@ import torch
 from commands import QUICK, TINY, UNTRAINED, jobs_in_threads, run_command, tiny
 
 import lcc_rl
-from lcc_rl import api
 from lcc_rl.agents.replay import ReplayLoop
 from lcc_rl.commands import evaluation, training
 from lcc_rl.commands.pipeline import calibrate_once, read_once
@@ -19,6 +18,7 @@ from lcc_rl.config.words import with_variant
 from lcc_rl.errors import LccError
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.policies import load_policy
+from lcc_rl.runs.states import fresh_folder
 
 
 def test_train_leaves_everything_that_is_promised(trained) -> None:
@@ -182,7 +182,7 @@ def test_a_training_that_changed_nothing_says_so(tmp_path, caplog) -> None:
     cfg = tiny("train", "variant=alcc", "agent.batch_size=4096")  # more than it ever collects
     training.run(cfg, tmp_path, quiet=True)
     assert "changed nothing" in caplog.text
-    folders = [api._folder("evaluate", "alcc", None) for _ in range(2)]
+    folders = [fresh_folder("evaluate", "alcc") for _ in range(2)]
     assert folders[0] != folders[1]  # within one second
     assert with_variant("alcc", "seed=3") == ["variant=alcc", "seed=3"]  # not letters
 

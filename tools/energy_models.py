@@ -28,11 +28,11 @@ from lcc_rl.errors import DataError, require
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.intervals import Estimate, saving
 from lcc_rl.results.render import markdown_table, saved_text
+from lcc_rl.results.runs import STEPS
 from lcc_rl.runs.arguments import Arguments
 
 Speeds = NDArray[np.float64]  # [rows, time] [m/s]
 Price = Callable[[Speeds, float], NDArray[np.float64]]  # energy less the kinetic gain, [rows] [J]
-STEPS = "steps.parquet"
 PETROL = CirclesFuel()  # its heating value and worth of kinetic energy, for models of others
 RUN_UP = 1.0  # acceleration from standstill, which FASTSim needs before a record [m/s²]
 SUMO_CLASSES = ("HBEFA4/PC_petrol_Euro-4", "PHEMlight5/PC_EU4_G")
@@ -185,8 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("baseline", nargs="?", default="human", help="strategy to compare with")
     table = savings(**vars(parser.parse_args(arguments)))
     lines = [
-        [model, *(saved_text(100.0 * x.value, 100.0 * x.low, 100.0 * x.high) for x in row.values())]
-        for model, row in table.items()
+        [model, *(saved_text(*x.percent) for x in row.values())] for model, row in table.items()
     ]
     print(markdown_table(["", *next(iter(table.values()))], lines))
     print(*disagreements(table), sep="\n")

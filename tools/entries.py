@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tomllib
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
-from equations import EQUATIONS, PAPERS
 from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import load
@@ -45,6 +46,29 @@ otherwise. The classes are in `lcc_rl.pieces` and `lcc_rl.envs`. A *reset option
 `env.reset(options={key: value})`, with a value for each episode. `env.reset(td, set_state=True)`
 continues from the state in `td`; without `set_state` the state is ignored.
 """
+PAPERS = """A1–A20: Wang et al., *Adaptive Leading Cruise Control in Mixed Traffic Considering
+Human Behavioral Diversity* (ALCC). H1–H21: Yan et al., *Hybrid Car-Following Strategy Based on
+Deep Deterministic Policy Gradient and Cooperative Adaptive Cruise Control* (HCFS). Vehicles count
+from the front, 0 is the leader. T is the time step, in A4 and A15 the desired time gap. Import
+paths start with `lcc_rl.`. – means no unit, or no deviation."""
+
+
+class Equation(NamedTuple):
+    """One equation or several related ones.
+
+    number: as ``A3`` or ``H4–H6``; formula: in plain text; symbols: with units; functions: import
+    paths below ``lcc_rl``; deviation: difference of the code from the printed form.
+    """
+
+    number: str
+    formula: str
+    symbols: str
+    functions: list[str]
+    deviation: str = "–"
+
+
+TABLE = tomllib.loads(Path(__file__).with_name("equations.toml").read_text(encoding="utf-8"))
+EQUATIONS = [Equation(**row) for row in TABLE["equation"]]
 
 
 def configurations() -> Iterator[StudyConfig]:

@@ -104,7 +104,7 @@ def against(part: pd.DataFrame, name: str, measure: Statistic) -> Estimate:
 
 def percent(found: Estimate) -> str:
     """Return an estimate and its interval in per cent."""
-    value, low, high = (100.0 * x for x in (found.value, found.low, found.high))
+    value, low, high = found.percent
     return f"{signed(value, '{:.1f}')} % ({between(low, high)})"
 
 

@@ -26,12 +26,12 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import pandas as pd
 import torch
 from matplotlib.image import imread
 
 from lcc_rl.cli import console
 from lcc_rl.commands.pipeline import COMMAND_FILE
+from lcc_rl.commands.repeat import compared
 from lcc_rl.config import load
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.files import read_parquet, write_parquet
@@ -44,7 +44,6 @@ from lcc_rl.runs.states import LOCK, RESULT_TABLES, read_progress
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 WAITED = os.WEXITED | os.WNOHANG | os.WNOWAIT
 PATIENCE = 120.0  # timeout of a process after a signal [s]
-UNTIMED = "timing.parquet"  # its seconds differ
 READERS: dict[str, Callable[[Path], object]] = {
     ".parquet": read_parquet,
     ".pt": read_torch,
@@ -205,10 +204,8 @@ def compare(whole: Path, killed: Path) -> None:
     )
     differ = {name for name in names ^ others if Path(name).name != LOCK}
     assert not differ, f"files differ: {differ}"
-    for name in sorted(names):
-        if name.endswith(".parquet") and not name.endswith(UNTIMED):
-            expected, found = (read_parquet(root / name) for root in (whole, killed))
-            pd.testing.assert_frame_equal(found, expected, check_exact=True, obj=name)
+    wrong = [sentence for sentence, equal in compared(whole, killed) if not equal]
+    assert not wrong, "\n".join(wrong)
 
 
 def jobs(folder: Path) -> dict[str, Job]:

@@ -20,12 +20,11 @@ from pydantic import Field
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from lcc_rl.agents.actor import Activation, seeded_mlp
+from lcc_rl.agents.actor import seeded_mlp
 from lcc_rl.agents.agent import Fraction, Scene, Schedule, anneal, derived_seed
 from lcc_rl.agents.checks import check_batch
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, mean_of
 from lcc_rl.agents.objective import Aiming, Objective
-from lcc_rl.agents.rules import make_policy
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.errors import require
@@ -128,13 +127,7 @@ class Analytic(Aiming):
     Once started, ``policy`` is the module.
     """
 
-    # A network; a rule with learned constants (idm, acc, calm); or a network on top of a rule
-    # (residual_idm, residual_acc, residual_calm).
-    policy: Any = "network"
-    constants: dict[str, Positive] | None = None  # of a rule at the start; the others keep theirs
-    bound: Positive = 1.0  # largest action that a network adds to a rule
     hidden: Sequence[Count] = (200, 100, 50)  # layers of a network
-    activation: Activation = "relu"  # between the layers of networks
     # As limits, but behind each record of leaders by itself, each with a price of its own.
     limits_each: dict[str, Share | None] = field(default_factory=dict)
     learning_rate: LearningRate = 3e-3  # of the policy at the start
@@ -153,9 +146,6 @@ class Analytic(Aiming):
     # hardly more than one of them. 1 takes all.
     value_every: Count = 5
     tau: Fraction = 0.05  # share by which the value's target network follows at every update
-    # Time in which humans drive before every episode, without gradient: the policy takes over in
-    # developed traffic [s].
-    humans_first: NonNegative = 0.0
     # First seconds of every episode, which have no gradient and do not count, as in an evaluation:
     # a car may save there by opening its gap [s].
     warm_up: NonNegative = 0.0
@@ -168,11 +158,8 @@ class Analytic(Aiming):
         require(not self.bootstrap or self.gamma < 1.0, "agent.bootstrap needs agent.gamma below 1")
 
     def setup(self, scene: Scene) -> None:
-        self.objective = Objective(self, scene.device, scene.world)
-        given = self.hidden, self.constants, self.activation, self.bound
-        self.policy = make_policy(self.policy, scene, *given)
+        self.aim(scene)
         size, seed = scene.observation_size, scene.seed + 1
-        self.burn_in = scene.world.steps(self.humans_first, "agent.humans_first")
         self.uncounted = scene.world.steps(self.warm_up, "agent.warm_up")
         self.value, self.target = (
             seeded_mlp(size, 1, self.hidden, seed, self.activation).to(scene.device)

@@ -25,13 +25,15 @@ from lcc_rl.agents.checks import check_learner, check_restored, check_state
 from lcc_rl.agents.vectors import denormals_flushed
 from lcc_rl.config.schemas import TrainingConfig
 from lcc_rl.errors import ConfigError, Diverged, Interrupted, ResultsError, require
-from lcc_rl.io.files import write_parquet
+from lcc_rl.io.files import IDENTITY, write_parquet
 from lcc_rl.io.tensors import check_like, write_torch
 from lcc_rl.pieces.base import REWARD
 from lcc_rl.pieces.rewards import TERMS
 from lcc_rl.results.policies import read_checked
+from lcc_rl.results.runs import RECORD
 from lcc_rl.runs.interrupts import stop_signal
 from lcc_rl.runs.progress import ProgressReporter
+from lcc_rl.runs.states import CHECKPOINT
 from lcc_rl.settings import Settings, Whole
 
 log = logging.getLogger("lcc_rl")
@@ -159,7 +161,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
 
     def _numbers(self, source: Any) -> dict[str, float]:
         """Run an iteration; an error names it and the file of the last valid state."""
-        good = self.folder / "checkpoint.pt"
+        good = self.folder / CHECKPOINT
         where = f"in iteration {self.iteration + 1} of {self.iterations}"
         try:
             check_learner(self.agent.policy, {}, self.advice)
@@ -225,7 +227,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
     def save(self) -> None:
         """Write training.parquet, timing.parquet and checkpoint.pt, each whole or not at all."""
         rows, times = pd.DataFrame(self.rows), pd.DataFrame(self.times)
-        metadata = {"lcc_rl.config": self.identity}
+        metadata = {IDENTITY: self.identity}
         write_torch(
             {
                 "identity": self.identity,
@@ -236,9 +238,9 @@ class TrainingLoop(ABC, Generic[AgentT]):
                 "times": _columns(times),
                 "memory": self._memory(),
             },
-            self.folder / "checkpoint.pt",
+            self.folder / CHECKPOINT,
         )
-        write_parquet(rows, self.folder / "training.parquet", metadata)
+        write_parquet(rows, self.folder / RECORD, metadata)
         write_parquet(times, self.folder / "timing.parquet", metadata)
 
     def load(self) -> None:
@@ -247,7 +249,7 @@ class TrainingLoop(ABC, Generic[AgentT]):
         Raises:
             ResultsError: if it is missing, damaged or belongs to another configuration.
         """
-        path = self.folder / "checkpoint.pt"
+        path = self.folder / CHECKPOINT
         found = read_checked(path, Checkpoint, "checkpoint")
         if found.identity != self.identity:
             raise ResultsError(

@@ -13,8 +13,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from lcc_rl.agents.agent import Agent
+from lcc_rl.agents.actor import Activation
+from lcc_rl.agents.agent import Agent, Scene
 from lcc_rl.agents.limits import Limits, LimitsEach
+from lcc_rl.agents.rules import NETWORK_ALONE, make_policy
 from lcc_rl.config.schemas import all_of
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.errors import ConfigError, Diverged
@@ -22,15 +24,28 @@ from lcc_rl.functional.finite import any_nonfinite
 from lcc_rl.pieces.base import Key, as_key, next_key
 from lcc_rl.pieces.rewards import RewardTerm
 from lcc_rl.pieces.world import World
-from lcc_rl.settings import NonNegative, Positive, Share
+from lcc_rl.settings import Count, NonNegative, Positive, Share
 
 _ALL_TERMS = partial(all_of, kind=RewardTerm, added="<name>={_target_: …} adds one")
 Terms = Annotated[dict[str, Any], AfterValidator(_ALL_TERMS)]
 
 
 class Aiming(Agent):
-    """Settings of agents with an objective, which may differ from the reward."""
+    """Settings of agents with a policy of networks and rules, and an objective.
 
+    The objective may differ from the reward.
+    """
+
+    hidden: Sequence[Count]  # layers of a network
+    activation: Activation = "relu"  # between the layers of networks
+    # A network; a rule with learned constants (idm, acc, calm), of agent=analytic only; or a
+    # network on top of a rule (residual_idm, residual_acc, residual_calm).
+    policy: Any = NETWORK_ALONE
+    constants: dict[str, Positive] | None = None  # of a rule at the start; the others keep theirs
+    bound: Positive = 1.0  # largest action that a network adds to a rule
+    # Time in which humans drive before every episode; nothing is learned from it, and the policy
+    # takes over in developed traffic [s].
+    humans_first: NonNegative = 0.0
     # Reward terms that take the place of those of the same name in the objective; their
     # weights multiply the terms' own. Those of terms that the reward lacks are ignored.
     surrogates: Terms = field(default_factory=dict)
@@ -42,6 +57,13 @@ class Aiming(Agent):
     limit_damping: NonNegative = 2.0
     # Terms of the objective only.
     regularizers: Terms = field(default_factory=dict)
+
+    def aim(self, scene: Scene) -> None:
+        """Make objective and policy, and find the steps in which humans drive first."""
+        self.objective = Objective(self, scene.device, scene.world)
+        self.burn_in = scene.world.steps(self.humans_first, "agent.humans_first")
+        given = self.hidden, self.constants, self.activation, self.bound
+        self.policy = make_policy(self.policy, scene, *given)
 
     def take(self, profiles: Profiles) -> None:
         """Take the limits that recorded drivers set."""

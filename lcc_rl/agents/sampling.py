@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from lcc_rl.agents.actor import Activation
 from lcc_rl.agents.agent import Scene
-from lcc_rl.agents.objective import Aiming, Objective
-from lcc_rl.agents.rules import NETWORK_ALONE, RESIDUAL, Residual, make_policy
+from lcc_rl.agents.objective import Aiming
+from lcc_rl.agents.rules import NETWORK_ALONE, RESIDUAL, Residual
 from lcc_rl.errors import require
-from lcc_rl.settings import Count, NonNegative, Positive, Share
+from lcc_rl.settings import NonNegative, Positive, Share
 
 
 class Returns(nn.Module):
@@ -46,18 +44,11 @@ class Sampling(Aiming):
     """Settings of agents that learn from transitions between decisions."""
 
     gamma: Share  # discount per decision
-    hidden: Sequence[Count]
-    activation: Activation = "relu"  # between the layers of networks
-    policy: Any = NETWORK_ALONE  # or a network on top of a rule, such as residual_idm
-    constants: dict[str, Positive] | None = None  # of the rule; the others keep their defaults
-    bound: Positive = 1.0  # largest action that the network adds to the rule
     # Time between two decisions in training, in which the action is held [s]; 0: a step. A trained
     # policy decides in every step.
     hold: NonNegative = 0.0
     # Time after which a reward counts for 1/e, instead of gamma [s].
     horizon: Positive | None = None
-    # Time in which humans drive before every episode; nothing is learned from it [s].
-    humans_first: NonNegative = 0.0
     # Learn from rewards over the running standard deviation of their discounted sum.
     scale_rewards: bool = False
 
@@ -86,10 +77,8 @@ class Sampling(Aiming):
         """
         kind = self.policy
         self.every = max(scene.world.steps(self.hold, "agent.hold"), 1)
-        self.burn_in = scene.world.steps(self.humans_first, "agent.humans_first")
         if self.horizon is not None:
             self.gamma = math.exp(-self.every * scene.world.time_step / self.horizon)
-        self.objective = Objective(self, scene.device, scene.world)
         self.returns = Returns(self.gamma).to(scene.device) if self.scale_rewards else None
         self.rule = None
         require(
@@ -97,8 +86,7 @@ class Sampling(Aiming):
             f"agent.policy={kind}: only agent=analytic learns the constants of a rule; expected "
             f"{NETWORK_ALONE} or {RESIDUAL}{kind}",
         )
-        given = self.hidden, self.constants, self.activation, self.bound
-        self.policy = make_policy(kind, scene, *given)
+        self.aim(scene)
         whole = self.policy.module
         if not isinstance(whole, Residual):
             return self.policy

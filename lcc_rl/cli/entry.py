@@ -11,7 +11,6 @@ from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
 from importlib import import_module
-from importlib.resources import files
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -32,6 +31,7 @@ from lcc_rl.config.compose import (
     as_meant,
     check_own_files,
     choices,
+    conf_folder,
     explained,
     is_sweep,
     parsed,
@@ -131,7 +131,7 @@ def _option(entry: str, key: str, cfg: Any) -> Iterator[str]:
 
 def meaning(entry: str, key: str) -> str:
     """Return the comment of a setting in the first file of conf/ with one."""
-    folder, (root, _, last) = Path(str(files(CONF))), key.rpartition(".")
+    folder, (root, _, last) = conf_folder(), key.rpartition(".")
     places = [folder / f"{name}.yaml" for name in (entry, "study", "base")]
     if root:
         places = sorted((folder / root).glob("*.yaml"))

@@ -17,13 +17,13 @@ from lcc_rl.config.compose import identity, with_inputs
 from lcc_rl.config.schemas import EvaluateConfig, StudyConfig
 from lcc_rl.envs import Inputs, load_inputs
 from lcc_rl.envs.inputs import build_energy, second_energy
-from lcc_rl.evaluation.comparison import IDENTITY, Comparison
+from lcc_rl.evaluation.comparison import Comparison
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.episodes import plan_of
 from lcc_rl.evaluation.fit import check_table_unit, classes, other_drivers, task_of
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import is_shipped
-from lcc_rl.io.files import FEW, Rows, as_rows, parquet_metadata, read_parquet
+from lcc_rl.io.files import FEW, IDENTITY, Rows, as_rows, parquet_metadata, read_parquet
 from lcc_rl.results.names import size_of
 from lcc_rl.results.platoons import case_report
 from lcc_rl.results.remarks import few_windows, leader_too_fast, remarks

@@ -10,7 +10,7 @@ import shlex
 import threading
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -53,8 +53,8 @@ from lcc_rl.runs.interrupts import INTERRUPTED
 from lcc_rl.runs.output import log_report, show_headline
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch_jobs
-from lcc_rl.runs.states import claim
-from lcc_rl.settings import TARGET, path_of
+from lcc_rl.runs.states import CHECKPOINT, claim
+from lcc_rl.settings import TARGET, path_of, values
 from lcc_rl.version import __version__
 
 log = logging.getLogger("lcc_rl")
@@ -153,7 +153,7 @@ def _run(
     except Interrupted:
         message = f"stopped; complete it with: lcc-rl run resume={folder}{trust_option(final)}"
         raise Interrupted(message) from None
-    learned = [name for name in trainings if (folder / name / "policy.pt").exists()]
+    learned = [name for name in trainings if (folder / name / runs.POLICY).exists()]
     final = final.with_(**traffic, compare=[str(folder / name) for name in learned])
     show_headline("evaluating them and the baselines on held-out windows")
     paged = final.evaluation.rows == "episodes"
@@ -210,7 +210,7 @@ def read_once(cfg: PipelineConfig, folder: Path, learns: bool = True) -> None:
 def calibrate_once(cfg: PipelineConfig, folder: Path) -> Path:
     """Calibrate drivers to the trajectories in the folder, unless this is done."""
     drivers = folder / "calibration" / "drivers.parquet"
-    shared = {field.name: getattr(cfg, field.name) for field in fields(CalibrateConfig)}
+    shared = values(cfg, CalibrateConfig)
     settings = CalibrateConfig(**shared | {"data": _episodes(cfg, folder)})
     runs.check_folder(settings, drivers.parent)
     if not drivers.exists():
@@ -272,7 +272,7 @@ def _train_one(cfg: TrainConfig, folder: str) -> None:
     """Train one variant with its own log file, in a process of the pool."""
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
-    if (target / "checkpoint.pt").exists():
+    if (target / CHECKPOINT).exists():
         cfg = cfg.with_(resume=folder)
     handler = logging.FileHandler(target / "train.log", encoding="utf-8")
     handler.setFormatter(logging.Formatter("[%(asctime)s][%(levelname)s] %(message)s"))

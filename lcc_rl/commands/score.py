@@ -10,7 +10,6 @@ from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,7 +42,7 @@ from lcc_rl.results.report import summary, windows_for
 from lcc_rl.results.runs import EPISODES, save_config
 from lcc_rl.runs.output import show_headline
 from lcc_rl.runs.precision import prepare_torch
-from lcc_rl.runs.states import ERROR, LOCK, claim, forget, record
+from lcc_rl.runs.states import ERROR, LOCK, claim, forget, fresh_folder, record
 
 # Sources of leaders, with human drivers that are fast enough for them.
 LEADER_SOURCES: dict[str, tuple[str, ...]] = {
@@ -193,9 +192,8 @@ def run(options: Namespace, further: Sequence[str]) -> dict[str, Any]:
         check_effective(further, [entrant.label], [entrant.spec])
     name = entrant.label if options.name is None else _own_name(options.name)
     file = re.sub(r"\W+", "_", name)
-    default = Path("outputs") / "score" / f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{file}"
     mine = {*choices("task"), ERROR}.issuperset  # of a killed run, which is repeated
-    folder = own_folder(options.out or default, mine)
+    folder = own_folder(options.out or fresh_folder("score", file), mine)
     with claim(folder):
         own_folder(folder, mine)  # another process may just have ended
         try:

@@ -32,11 +32,11 @@ from lcc_rl.results.trust import trust_option
 from lcc_rl.runs.loggers import RowLogger, Silent
 from lcc_rl.runs.output import log_report
 from lcc_rl.runs.precision import prepare_torch
-from lcc_rl.runs.states import forget, working
+from lcc_rl.runs.states import CHECKPOINT, forget, working
 
 log = logging.getLogger("lcc_rl")
 
-POLICIES, LAST, CHECKPOINT = "policies", "policy_last.pt", "checkpoint.pt"
+POLICIES, LAST = "policies", "policy_last.pt"
 
 
 def run(cfg: TrainConfig, folder: str | Path, quiet: bool = False, resume: bool = False) -> Rows:

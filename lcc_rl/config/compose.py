@@ -79,6 +79,11 @@ def find_conf() -> None:
         spec.loader.exec_module(module)
 
 
+def conf_folder() -> Path:
+    """Return the folder of the package's configuration files."""
+    return Path(str(files(CONF)))
+
+
 def terms_of_energy(string: Any) -> float:
     """Return how many vehicles count in the energy of an automated one: itself and those behind."""
     plain = OmegaConf.to_container(string) if OmegaConf.is_config(string) else string
@@ -156,7 +161,7 @@ def as_meant(overrides: Sequence[str]) -> list[str]:
     for item in overrides:
         key, equals, value = item.partition("=")
         group = key.lstrip("+").partition("@")[0]
-        single = group not in (*ADDED, "experiment") and (Path(str(files(CONF))) / group).is_dir()
+        single = group not in (*ADDED, "experiment") and (conf_folder() / group).is_dir()
         if single and re.match(r"\[.+,", value):
             raise ConfigError(
                 f"{item}: {group} takes one choice; for a run of each: -m {key}={value.strip('[]')}"
@@ -201,7 +206,7 @@ def unknown_choice(group: str, name: str, options: Sequence[str]) -> ConfigError
 
 def _built_on(recipe: str) -> set[str]:
     """Return the shipped recipes that a shipped recipe is built on."""
-    path = Path(str(files(CONF))) / "experiment" / f"{recipe}.yaml"
+    path = conf_folder() / "experiment" / f"{recipe}.yaml"
     content: Any = OmegaConf.load(path) if path.is_file() else {}
     names = {name for name in content.get("defaults", ()) if isinstance(name, str)}
     return names.union(*map(_built_on, names))
@@ -219,7 +224,12 @@ def choices(group: str) -> list[str]:
     if GlobalHydra.instance().is_initialized():
         loader: Any = GlobalHydra.instance().config_loader()
         return list(loader.repository.get_group_options(group))  # its own copies all, for 4 ms
-    return sorted(path.stem for path in Path(str(files(CONF))).joinpath(group).glob("*.yaml"))
+    return shipped_files(group)
+
+
+def shipped_files(group: str) -> list[str]:
+    """Return the names of a group's files in the package."""
+    return sorted(path.stem for path in conf_folder().joinpath(group).glob("*.yaml"))
 
 
 @cache
@@ -394,7 +404,7 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
 
 
 def _groups() -> set[str]:
-    folder = Path(str(files(CONF)))
+    folder = conf_folder()
     return {path.parts[len(folder.parts)] for path in folder.glob("*/**/*.yaml")}
 
 
@@ -431,7 +441,7 @@ def check_own_files() -> None:
     for source in HydraConfig.get().runtime.config_sources:
         folder = Path(source.path)
         for path in folder.rglob("*.yaml") if source.provider == "command-line" else ():
-            if files(CONF).joinpath(*path.relative_to(folder).parts).is_file():
+            if (conf_folder() / path.relative_to(folder)).is_file():
                 raise ConfigError(f"{path}: the package has a file of this name: choose another")
 
 

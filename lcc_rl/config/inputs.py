@@ -16,10 +16,10 @@ from hydra.core.hydra_config import HydraConfig
 
 from lcc_rl.config.nodes import settings_at
 from lcc_rl.config.words import FILTERED, YAML, module_named
-from lcc_rl.errors import ConfigError, ResultsError, is_users
+from lcc_rl.errors import ConfigError, ResultsError, is_ours, is_users
 from lcc_rl.io.paths import matching
 from lcc_rl.io.settings import parse_yaml, read_text
-from lcc_rl.settings import TARGET, is_ours, load_module
+from lcc_rl.settings import TARGET, load_module
 
 FileHashes = dict[str, dict[str, str]]
 NOT_READ = ("inputs", "resume", "sweep", "logger", "trust")
@@ -96,7 +96,7 @@ def _own_files(module: str) -> Iterator[Path]:
     if not is_ours(module) and "/" not in module:
         with suppress(ConfigError):
             path = Path(getattr(load_module(module, TARGET), "__file__", None) or "")
-    if path.suffix != ".py" or not is_users(path):
+    if path.suffix != ".py" or not is_users(module, path):
         return
     depth = module.count(".") + (path.name == "__init__.py")
     files, root = [path], path.parents[depth]

@@ -12,7 +12,7 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Self
 
-from lcc_rl.errors import LARGEST, ConfigError, LccError, line_of, require, unknown_name
+from lcc_rl.errors import LARGEST, ConfigError, line_of, replacing, require, unknown_name
 from lcc_rl.settings import TARGET, Settings, defaults, find_target, parse, values
 from lcc_rl.settings import as_plain as as_plain
 
@@ -133,7 +133,13 @@ class Node:
             # A default need not have the annotated type, and may be any object.
             if not (key == TARGET or (key in presets and _same(as_plain(value), presets[key])))
         }
-        try:
+
+        def unbuilt(error: Exception) -> ConfigError | None:
+            reason = f"{self.kind.__name__} cannot be built: {line_of(error, True)}"
+            named = isinstance(error, OSError)  # it names its file
+            return None if named else ConfigError(f"{self.where}: {reason}")
+
+        with replacing(unbuilt):  # a user's class may raise any error
             arguments = {key: _objects(value) for key, value in arguments.items()}
             if has_settings(self.kind):
                 return parse(self.kind, arguments, self.where)
@@ -141,11 +147,6 @@ class Node:
             for key in (key for key, value in arguments.items() if value == MISSING):
                 raise ConfigError(f"{self.where}.{key} is required: use {self.where}.{key}=…")
             return self.kind(**arguments)
-        except (LccError, OSError):  # an OSError names its file
-            raise
-        except Exception as error:  # a user's class may raise any error
-            reason = f"{self.kind.__name__} cannot be built: {line_of(error, True)}"
-            raise ConfigError(f"{self.where}: {reason}") from error
 
     def _check_names(self) -> None:
         names = settings_of(self.kind)

@@ -9,9 +9,9 @@ from typing import Any
 from lcc_rl.config.nodes import nodes_in, takes_action
 from lcc_rl.config.schemas import BaseConfig, StudyConfig, TrainConfig
 from lcc_rl.config.words import RECORDED, key_of, typed_keys
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, is_ours
 from lcc_rl.functional.pattern import AUTOMATED, RING
-from lcc_rl.settings import TARGET, is_ours
+from lcc_rl.settings import TARGET
 
 NO_AGENT = ("agent=none", "agent=null")
 BASELINES = "evaluation.baselines"

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import pandas as pd
 from pydantic import Field
 
-import lcc_rl.assets
+from lcc_rl.assets import ASSETS
 from lcc_rl.data.agreement import PAIR_SIGNALS, check_positions
 from lcc_rl.data.car_following import Criteria, extract
 from lcc_rl.data.columns import SI, Column, Names, Units, check_map
@@ -34,7 +34,6 @@ from lcc_rl.errors import Concern, DataError, raised_as
 from lcc_rl.io.paths import matching
 from lcc_rl.settings import Settings
 
-ASSETS = Path(lcc_rl.assets.__file__).parent
 # Files of the package by name: recorded platoons and drives, drive cycles.
 SHIPPED_FILES = {
     path.stem: str(path)

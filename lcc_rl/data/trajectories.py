@@ -180,16 +180,13 @@ def _fill_headways(columns: dict[str, NDArray], report: ReadReport) -> None:
     follows = preceding > 0
     measured = follows & (headway != 0) & ~np.isnan(headway)
     headway[~measured] = np.nan
-    rows = np.flatnonzero(follows & ~measured)
-    if len(rows):
-        index, position = RowIndex(code, vehicle, frame), columns["position_m"]
-        leader = find(
-            index.keys(code[rows], preceding[rows], frame[rows]), index.keys(code, vehicle, frame)
-        )
-        rows, leader = rows[leader >= 0], leader[leader >= 0]
-        headway[rows] = position[leader] - position[rows]
-    report.headways_given, report.headways_derived = int(measured.sum()), len(rows)
-    report.headways_unknown = int(follows.sum()) - report.headways_given - len(rows)
+    report.headways_given, unknown = int(measured.sum()), follows & ~measured
+    if unknown.any():
+        leader = find_leaders(code, vehicle, frame, np.where(unknown, preceding, 0))
+        rows, position = np.flatnonzero(leader >= 0), columns["position_m"]
+        headway[rows] = position[leader[rows]] - position[rows]
+        report.headways_derived = len(rows)
+    report.headways_unknown = int(unknown.sum()) - report.headways_derived
 
 
 class RowIndex:
@@ -218,12 +215,6 @@ class RowIndex:
         return np.where(valid, key, -1)
 
 
-def find(wanted: NDArray[np.int64], ascending: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the row of each wanted key among ascending keys; −1 if it is missing."""
-    row = np.minimum(np.searchsorted(ascending, wanted), len(ascending) - 1)
-    return np.where(ascending[row] == wanted, row, -1)
-
-
 def find_leaders(
     recording: NDArray, vehicle: NDArray, frame: NDArray, preceding: NDArray
 ) -> NDArray[np.int64]:
@@ -237,7 +228,9 @@ def find_leaders(
         Row numbers; −1 if there is no vehicle ahead or it has no row in that frame.
     """
     index = RowIndex(recording, vehicle, frame)
-    return find(index.keys(recording, preceding, frame), index.keys(recording, vehicle, frame))
+    wanted, ascending = (index.keys(recording, x, frame) for x in (preceding, vehicle))
+    row = np.minimum(np.searchsorted(ascending, wanted), len(ascending) - 1)
+    return np.where(ascending[row] == wanted, row, -1)
 
 
 def starts_of(values: NDArray) -> NDArray[np.intp]:

@@ -12,7 +12,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from lcc_rl.data.sources import ASSETS
+from lcc_rl.assets import ASSETS
 from lcc_rl.drivers.observed import PAIR_IDENTITY
 from lcc_rl.drivers.parameters import (
     DEFAULT_BOUNDS,
@@ -279,7 +279,7 @@ def bootstrap(
         find_law(law)
     table = load_drivers(path, mode)
     calibrated = str(table["mode"].iloc[0]) if "mode" in table else None
-    found = replace(from_table(table), mode=calibrated)
+    found = replace(from_table(table, path or SHIPPED_DRIVERS), mode=calibrated)
     given = {"delay": reaction_delay, "noise": acceleration_noise, "gap_noise": gap_noise}
     changes = {name: value for name, value in given.items() if value is not None}
     found = replace(found, reaction=replace(found.reaction, **changes))
@@ -290,14 +290,14 @@ def bootstrap(
     return replace(found, desired_speed=speed, at_bound=found.at_bound & ~raised)
 
 
-def from_table(table: pd.DataFrame) -> DriverPopulation:
-    """Build a population from a driver table, one driver per row.
+def from_table(table: pd.DataFrame, name: str | Path = "driver table") -> DriverPopulation:
+    """Build a population from a driver table, one driver per row; ``name``: in messages.
 
     Raises:
         DataError: if the table is not valid.
     """
-    check_drivers(table, "driver table")
-    models = models_of(table, "driver table")
+    check_drivers(table, str(name))
+    models = models_of(table, str(name))
     shared = LAWS[DEFAULT_MODEL].shared() if (models == DEFAULT_MODEL).all() else ()
     own = {name: table[PARAMETERS[name].column].to_numpy(np.float64) for name in shared}
     constants = IDMConstants(
@@ -310,7 +310,7 @@ def from_table(table: pd.DataFrame) -> DriverPopulation:
         constants=constants.with_(**varying),
         ids=_identities(table),
         at_bound=_flags(table),
-        reaction=reaction_of(table, "driver table"),
+        reaction=reaction_of(table, str(name)),
     )
     if shared:
         return found

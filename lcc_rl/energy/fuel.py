@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import csv
 from functools import cache
-from importlib.resources import files
 
 import torch
 from torch import Tensor
 
+from lcc_rl.assets import ASSETS
 from lcc_rl.energy.base import EnergyModel, Grade
 from lcc_rl.errors import require_known
 from lcc_rl.settings import Positive
@@ -28,7 +28,7 @@ KILOWATT = 1e3
 @cache
 def coefficients() -> dict[str, dict[str, float]]:
     """Return the published coefficients of every vehicle; missing ones are zero."""
-    text = files("lcc_rl.assets").joinpath("energy", FUEL).read_text(encoding="utf-8")
+    text = (ASSETS / "energy" / FUEL).read_text(encoding="utf-8")
     rows = csv.DictReader(text.splitlines())
     return {
         row.pop("vehicle"): {name: float(value or 0.0) for name, value in row.items()}

@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lcc_rl.envs.step import DONE, TERMINATED, TRUNCATED, entries_of, tick, written
-from lcc_rl.errors import ConfigError, LccError, line_of, naming, nearest, require
+from lcc_rl.errors import ConfigError, line_of, naming, nearest, replacing, require
 from lcc_rl.functional.guard import changed, check_forgets, check_independent
 from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
@@ -109,18 +109,17 @@ def check_alone(piece: Piece, before: State, reached: State) -> None:
 
 def _attempt(piece: Piece, action: object) -> None:
     """Call a function; an error names the piece."""
-    try:
-        with naming(piece.title):
-            action()  # type: ignore[operator]
-    except LccError:
-        raise
-    except Exception as error:
+
+    def misfit(error: Exception) -> ConfigError:
         shape = ", ".join(map(str, ("batch", *piece.event_shape)))
         returned = " and ".join(".".join(key) for key in piece.targets)
-        raise ConfigError(
+        return ConfigError(
             f"{piece.title} does not fit the string of vehicles: {line_of(error)}; it must "
             f"return {returned} as tensors [{shape}]"
-        ) from error
+        )
+
+    with replacing(misfit), naming(piece.title):
+        action()  # type: ignore[operator]
 
 
 def _compare(piece: Piece, entries: Mapping[Key, Tensor], when: str) -> None:

@@ -70,8 +70,7 @@ class Cases:
             rows.append(self._described(case, measured_series(series, time_step)))
             if case in self.inputs.cases:
                 drawn = trace(series, time_step)
-                seed = pd.Series(self.strategy.seed, drawn.index, "Int64")
-                labels = {"strategy": self.strategy.name, "training_seed": seed, "case": case.name}
+                labels = {**self.strategy.labels(len(drawn)), "case": case.name}
                 steps.append(pd.concat([pd.DataFrame(labels), drawn], axis=1))
         trails = pd.concat(steps, ignore_index=True) if steps else pd.DataFrame()
         return pd.concat(rows, ignore_index=True), trails
@@ -79,8 +78,7 @@ class Cases:
     def _described(self, case: Case, frame: pd.DataFrame) -> pd.DataFrame:
         """Return measures with the names of their strategy, case and profile."""
         labels = {
-            "strategy": self.strategy.name,
-            "training_seed": pd.array([self.strategy.seed] * len(frame), dtype="Int64"),
+            **self.strategy.labels(len(frame)),
             "case": case.name,
             "profile": [case.profile.names[i] for i in frame["run_id"]],
             DRIVE: [case.profile.recordings[i] for i in frame["run_id"]],

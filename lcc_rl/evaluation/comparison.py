@@ -20,7 +20,7 @@ from lcc_rl.evaluation.cases import Cases
 from lcc_rl.evaluation.episodes import Episodes, plan_of
 from lcc_rl.evaluation.rollout import warn_of_brakes, warn_of_idle
 from lcc_rl.evaluation.strategies import Strategy
-from lcc_rl.io.files import Rows, as_rows, parquet_metadata, read_parquet, write_parquet
+from lcc_rl.io.files import IDENTITY, Rows, as_rows, parquet_metadata, read_parquet, write_parquet
 from lcc_rl.io.memory import require_memory
 from lcc_rl.pieces.knowledge import hears
 from lcc_rl.results.names import in_words
@@ -33,7 +33,6 @@ log = logging.getLogger("lcc_rl")
 
 BLOCKS = "blocks"
 BLOCK_MARK = "lcc_rl.block"  # in the metadata of a block's files
-IDENTITY = "lcc_rl.config"  # in the metadata of a table, hash of its configuration
 Tables = tuple[pd.DataFrame, pd.DataFrame]  # rows, time series of sample episodes
 
 

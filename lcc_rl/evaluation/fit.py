@@ -15,13 +15,13 @@ from lcc_rl.config.nodes import as_plain
 from lcc_rl.config.schemas import AUTO, StudyConfig
 from lcc_rl.energy import VehicleClass
 from lcc_rl.envs.inputs import MADE, build_energy, origin_of
-from lcc_rl.errors import ConfigError, require
+from lcc_rl.errors import ConfigError, is_ours, require
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN
 from lcc_rl.io.files import parquet_metadata
 from lcc_rl.results.policies import PRETRAINED
 from lcc_rl.results.runs import differing, flatten
 from lcc_rl.results.task import OF_FUEL, Task, burns_one_fuel, check_unit
-from lcc_rl.settings import TARGET, is_ours, parse
+from lcc_rl.settings import TARGET, parse
 
 MESSAGES = "communication"  # name of the piece with messages between connected vehicles
 FIRST_LAYER = "module.0.0.weight"  # first layer of a policy's network

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lcc_rl.energy import AVERAGED, AVERAGES, Fleet, as_fleet
-from lcc_rl.errors import ConfigError, LccError, line_of, require, require_known
+from lcc_rl.errors import ConfigError, line_of, replacing, require, require_known
 from lcc_rl.functional.safety import NEVER
 from lcc_rl.results.measures import CALM, MEASURES, SHIPPED, Measure
 from lcc_rl.results.platoons import PLATOON
@@ -304,13 +304,9 @@ def register(measure: Measure, metric: Metric, every: bool = False) -> None:
     valid = (*SERIES, *(("free",) if every else OF_FILTER))
     require_known(f"entry of the measure {key}", entries, valid)
     trial = {name: torch.ones(50 + (name == "speed"), 2, 2, 1) for name in valid}
-    try:
+    hint = " (speed has a row more than steps: speed[1:])" * ("speed" in entries)
+    with replacing(lambda error: ConfigError(f"measure {key}: {line_of(error, True)}{hint}")):
         safety_measures(trial, torch.ones(50, 2, 1, 1, dtype=torch.bool), 0.1, {key: metric})
-    except LccError:
-        raise
-    except Exception as error:
-        hint = " (speed has a row more than steps: speed[1:])" * ("speed" in entries)
-        raise ConfigError(f"measure {key}: {line_of(error, True)}{hint}") from error
     for table in (MEASURES, PLATOON):
         table[:] = [row for row in table if row.key != key] + [measure]
     for metrics in (METRICS, ROAD_METRICS):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from functools import cache
-from importlib.resources import files
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -13,7 +12,7 @@ from typing import Any, TypeGuard
 from omegaconf import OmegaConf
 from torch import nn
 
-from lcc_rl.config.compose import choices, composed, load, own_file
+from lcc_rl.config.compose import choices, composed, load, own_file, shipped_files
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import AUTO
 from lcc_rl.config.words import DOTTED, FILTERED, YAML
@@ -61,7 +60,8 @@ def is_shipped(name: str) -> bool:
 
     Names of variants, such as ``alcc``, are reserved for learned policies.
     """
-    return name.removesuffix(FILTERED) in {DIRECT, PEOPLE, *OF_CACC, *BASELINES, *_files()}
+    known = {DIRECT, PEOPLE, *OF_CACC, *BASELINES, *shipped_files("controller")}
+    return name.removesuffix(FILTERED) in known
 
 
 def setting_of(spec: Any, where: str = "compare") -> str | Node:
@@ -169,15 +169,10 @@ def _named(spec: str) -> Node | None:
 
 
 @cache
-def _files() -> frozenset[str]:
-    folder = Path(str(files("lcc_rl.conf"))) / "controller"
-    return frozenset(path.stem for path in folder.glob("*.yaml"))
-
-
-@cache
 def _shipped() -> dict[str, Node]:
     """Compose all controllers and baselines of the package at once, because composing is slow."""
-    names = sorted(_files() - {"action", "hcfs"})  # these need further settings
+    needing = {"action", "hcfs"}  # these need further settings
+    names = [name for name in shipped_files("controller") if name not in needing]
     drivers = [f"+controller@scenario.controllers.{name}={name}" for name in names]
     gains = ["+gains=tuned", *(f"+gains@gains.{name}={name}" for name in GAINS)]
     plain: Any = OmegaConf.to_container(composed(None, [*gains, *drivers]), resolve=True)

@@ -16,7 +16,7 @@ from lcc_rl.envs.clock import option_specs
 from lcc_rl.envs.compiled import Traced
 from lcc_rl.envs.rowwise import Rows, Rowwise
 from lcc_rl.envs.step import TERMINATED, Step, closure, entries_of, pieces_of, read_before, written
-from lcc_rl.errors import require
+from lcc_rl.errors import is_ours, require
 from lcc_rl.functional.finite import require_finite
 from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import HUMAN
@@ -26,7 +26,6 @@ from lcc_rl.pieces.base import ACTION, SEED, STEP, Key, State, as_key
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.leader import PROFILE, PROFILE_START
 from lcc_rl.pieces.string import COMMAND, WANTED
-from lcc_rl.settings import is_ours
 
 log = logging.getLogger("lcc_rl")
 

@@ -217,8 +217,7 @@ def describe(
 ) -> pd.DataFrame:
     """Return strategy, profile, driver and repeat of every episode of a batch."""
     columns = {
-        "strategy": strategy.name,
-        "training_seed": pd.array([strategy.seed] * len(profile), dtype="Int64"),
+        **strategy.labels(len(profile)),
         "profile": [profiles.names[i] for i in profile.tolist()],
         "profile_id": profile.numpy(),
         DRIVE: [profiles.recordings[i] for i in profile.tolist()],

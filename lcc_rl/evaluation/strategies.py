@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import pandas as pd
+
 from lcc_rl.config import load
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import StudyConfig
@@ -55,6 +57,10 @@ class Strategy:
     def title(self) -> str:
         """Name in messages."""
         return f"strategy {self.name}" + (f" (policy={self.source})" if self.source else "")
+
+    def labels(self, rows: int) -> dict[str, Any]:
+        """Return the columns that name it in so many rows of a table."""
+        return {"strategy": self.name, "training_seed": pd.array([self.seed] * rows, dtype="Int64")}
 
 
 def baselines(cfg: StudyConfig, further: Mapping[str, Any] | None = None) -> list[Strategy]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 from base64 import b64encode
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from html import escape
-from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -24,6 +22,7 @@ from PIL import (
     ImageDraw,
 )
 
+from lcc_rl.assets import page_of
 from lcc_rl.errors import ConfigError, unknown_name
 from lcc_rl.figures.drawing import INK, PAGE_WIDTH, legend_above, new_figure, paper
 from lcc_rl.figures.space_time import SPEED_COLOURS, side_by_side
@@ -105,10 +104,7 @@ def page(motion: SampleMotion, title: str) -> str:
         "colours": ROLE_COLOURS,
         "names": {"leader": "leader", AUTOMATED: ROLE_WORDS[1], HUMAN: ROLE_WORDS[0]},
     }
-    # No tag may begin within a script.
-    text = json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
-    template = files("lcc_rl.assets").joinpath("animation.html").read_text(encoding="utf-8")
-    return template.replace("DATA", text, 1)
+    return page_of("animation.html", data)
 
 
 def _numbers(values: MotionSeries) -> list[float]:

@@ -40,8 +40,8 @@ from lcc_rl.results.motion import most_varied, of_first_seed
 from lcc_rl.results.names import ON_FRONT, RULE, in_words, several, size_of
 from lcc_rl.results.render import column_cells
 from lcc_rl.results.report import AGAINST, ALL, COUNTS, Report
-from lcc_rl.results.runs import CONFIG, read_settings
-from lcc_rl.results.windows import Means, by_driver, varied
+from lcc_rl.results.runs import CONFIG, EPISODES, STEPS, read_settings
+from lcc_rl.results.windows import Means, by_driver, varied_in
 
 LINES = "{}; lines: 95 % intervals"  # of a figure, after its numbers of windows and drivers
 VEHICLE_STYLES = {
@@ -56,7 +56,7 @@ def write_figures(
     rows: str = "episodes",
     reports: Sequence[Report] = (),
     own: Collection[str] = (),
-) -> list[Path]:
+) -> None:
     """Draw the figures of an evaluation into its folder ``figures``.
 
     Args:
@@ -65,29 +65,25 @@ def write_figures(
         reports: reports of the evaluation; ``overview`` shows the savings of a single one.
         own: strategies that are the user's controllers.
 
-    Returns:
-        The paths of the figures.
-
     Raises:
         ResultsError: if a table is missing or a figure cannot be written.
     """
     folder = Path(folder)
-    steps, cfg = read_parquet(folder / "steps.parquet"), read_settings(folder / CONFIG)
+    steps, cfg = read_parquet(folder / STEPS), read_settings(folder / CONFIG)
     found: Iterable[tuple[str, Figure]]
     if rows == "episodes":
-        found = study_figures(read_parquet(folder / "episodes.parquet"), steps, cfg, reports, own)
+        found = study_figures(read_parquet(folder / EPISODES), steps, cfg, reports, own)
     else:
         bound = float((cfg.get("deployed") or {}).get("jerk_bound", 30.0))
         found = platoon_figures(steps, bound)
     formats = cfg.get("figure_formats", ())
-    drawn: dict[str, Path] = {}  # files by case-folded name, for file systems that ignore case
+    drawn: set[str] = set()  # case-folded names, for file systems that ignore case
     for stem, figure in found:
         file = in_file(stem)
         while file.casefold() in drawn:
             file += "_"
-        path = folder / "figures" / f"{file}.png"
-        drawn[file.casefold()] = save(figure, path, formats=formats)
-    return list(drawn.values())
+        drawn.add(file.casefold())
+        save(figure, folder / "figures" / f"{file}.png", formats=formats)
 
 
 def study_figures(
@@ -294,11 +290,11 @@ def _by_driver(means: Means, column: str, names: dict[str, str], owner: str) -> 
 
 def _mean_line(axis: Axes, found: Estimate, rows: pd.DataFrame) -> None:
     """Draw the mean saving and its interval, and label both."""
-    value, low, high = (100 * x for x in (found.value, found.low, found.high))
+    value, low, high = found.percent
     text = f"mean {signed(value)} %"
     if np.isfinite(low):
         seeds = min(rows["training_seed"].nunique(), 2)
-        over = f"{varied(rows)}{('', ', 1 seed', ' and seeds')[seeds]}"
+        over = f"{varied_in(rows)}{('', ', 1 seed', ' and seeds')[seeds]}"
         limits = axis.get_ylim()  # of few drives the band may be far wider than all bars
         axis.axhspan(low, high, color=SOFT, alpha=0.3, lw=0)
         axis.set_ylim(limits)

@@ -25,6 +25,7 @@ from lcc_rl.pieces import ExcessSpacing
 from lcc_rl.results.names import in_words, worded
 from lcc_rl.results.render import columns, for_print, full_rows
 from lcc_rl.results.report import AGAINST, UNTRAINED, Report
+from lcc_rl.results.runs import RECORD
 
 PACKAGES = ("lcc_rl", "torch", "torchrl", "tensordict", "numpy", "pandas", "scipy", "matplotlib")
 
@@ -69,7 +70,7 @@ def write_sections(
     rows += [("Python", platform.python_version()), ("machine", platform.machine())]
     written = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     text = f"This page was written on {written} from parquet files alone."
-    runs = sorted(folder.rglob("training.parquet"))
+    runs = sorted(folder.rglob(RECORD))
     places = Counter(parquet_metadata(run).get(PROCESSOR, "not recorded") for run in runs)
     if places:
         counted = (f"{place} ({count})" for place, count in places.most_common())

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from lcc_rl.errors import ResultsError, needing, raised_as, require
 from lcc_rl.functional.pattern import MAX_ACCELERATION
+from lcc_rl.io.paths import check_file
 from lcc_rl.pieces.base import Entry, Piece, declared
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF, TARGET_AGE, VEHICLES
@@ -84,8 +85,7 @@ class Program:
 
     def __init__(self, path: str) -> None:
         self.path = path
-        if not Path(path).is_file():
-            raise ResultsError(f"{path}: no such file")
+        check_file(Path(path))
         with needing("interfaces", f"{path} needs onnxruntime"):
             import onnxruntime as ort
         options = ort.SessionOptions()

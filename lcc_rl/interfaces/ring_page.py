@@ -7,16 +7,15 @@ It has the package's random numbers, so equal seeds give equal drives in both.
 
 from __future__ import annotations
 
-import json
 import shlex
 from base64 import b64encode
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from torch import nn
 
+from lcc_rl.assets import page_of
 from lcc_rl.config import load
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.unused import drawn_in_training, refuse
@@ -60,11 +59,7 @@ def ring_page(policy: str | Path, trust: Sequence[str] = (), overrides: Sequence
     Raises:
         LccError: if the policy cannot be read, or the page cannot compute it or the ring.
     """
-    data = page_data(policy, trust, overrides)
-    text = json.dumps(data, ensure_ascii=False, separators=(",", ":"))
-    template = files("lcc_rl.assets").joinpath("ring.html").read_text(encoding="utf-8")
-    # No tag may begin within a script.
-    return template.replace("DATA", text.replace("<", "\\u003c"), 1)
+    return page_of("ring.html", page_data(policy, trust, overrides))
 
 
 def page_data(policy: Any, trust: Sequence[str], overrides: Sequence[str]) -> dict[str, Any]:

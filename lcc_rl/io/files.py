@@ -18,10 +18,12 @@ from pyarrow import fs
 
 from lcc_rl.errors import ResultsError, raised_as
 from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.paths import check_file
 from lcc_rl.version import code_version
 
 SCHEMA_VERSION = "1"
-VERSION, PROCESSOR = "lcc_rl.version", "lcc_rl.processor"  # keys in a table's metadata
+# Keys in a table's metadata; the last one is of the hash of its configuration.
+VERSION, PROCESSOR, IDENTITY = "lcc_rl.version", "lcc_rl.processor", "lcc_rl.config"
 # The rows of a table, or, for many rows, a dataset that is read on demand.
 Rows: TypeAlias = pd.DataFrame | ds.Dataset
 NO_FRAME = "damaged, no data frame"
@@ -211,8 +213,7 @@ def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:
     """Read a parquet file, or raise a ResultsError of one line."""
     path = Path(path)
     with raised_as(ResultsError, f"{path}: not readable as parquet", pa.ArrowException, OSError):
-        if not path.is_file():  # reading a pipe would block
-            raise ResultsError(f"{path}: no such file")
+        check_file(path)
         return reader(path)
 
 

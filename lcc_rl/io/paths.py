@@ -5,6 +5,18 @@ from __future__ import annotations
 from glob import escape, glob
 from pathlib import Path
 
+from lcc_rl.errors import ResultsError
+
+
+def check_file(path: Path) -> None:
+    """Check that a path is a file; to read a pipe would block.
+
+    Raises:
+        ResultsError: if it is not.
+    """
+    if not path.is_file():
+        raise ResultsError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+
 
 def matching(name: str, deep: bool = True) -> list[str]:
     """Return the files of a path, sorted; none if there is no such file.

@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 from lcc_rl.errors import ResultsError, raised_as
+from lcc_rl.io.paths import check_file
 
 LARGEST_FILE = 2**20  # bytes; a configuration has thousands
 DAMAGED = (ValueError, TypeError, RecursionError)  # errors of parsers of damaged texts
@@ -25,8 +26,7 @@ def read_text(path: Path) -> str:
             not text.
     """
     with raised_as(ResultsError, f"{path}: cannot be read", OSError, ValueError):
-        if not path.is_file():
-            raise ResultsError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+        check_file(path)
         with path.open("rb") as file:
             content = file.read(LARGEST_FILE + 1)
         text = content.decode()

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lcc_rl.errors import ResultsError
 from lcc_rl.io.atomic import atomic_path
+from lcc_rl.io.paths import check_file
 
 # Types of stored tensors: weights, sums in double precision, counters, flags.
 TENSOR_TYPES = (torch.float32, torch.float64, torch.int64, torch.bool)
@@ -43,8 +44,7 @@ def read_torch(path: str | Path) -> Any:
             plain containers.
     """
     path = Path(path)
-    if not path.is_file():
-        raise ResultsError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+    check_file(path)
     try:
         with zipfile.ZipFile(path) as archive:  # torch does not check the checksums
             damaged = archive.testzip()

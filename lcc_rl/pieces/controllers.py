@@ -24,13 +24,14 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from lcc_rl.errors import is_ours
 from lcc_rl.functional.idm import IDMConstants
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, MAX_ACCELERATION, VehicleString
 from lcc_rl.pieces.base import ACTION, ROLE, Entry, RoleTransform, as_key, returned
 from lcc_rl.pieces.string import COMMANDED, WISHED
 from lcc_rl.pieces.views import AHEAD, BEHIND, SELF
 from lcc_rl.pieces.world import World
-from lcc_rl.settings import NonNegative, Number, Positive, find_target, is_ours
+from lcc_rl.settings import NonNegative, Number, Positive, find_target
 
 # Names of the random streams; a seed gives the same episode under either name.
 STREAMS = {AUTOMATED: "cav", HUMAN: "hdv"}

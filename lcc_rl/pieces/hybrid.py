@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from typing import Any, ClassVar
 
 import torch
@@ -35,7 +34,7 @@ from lcc_rl.pieces.connected import (
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.rewards import JerkReward, RewardTerm, SpacingReward, VelocityReward
 from lcc_rl.pieces.world import World
-from lcc_rl.settings import NonNegative, Positive
+from lcc_rl.settings import NonNegative, Positive, values
 
 WINNER = ("hybrid", "winner")
 COUNTERS = SWITCHES, CLAMPS, CAPS = tuple(
@@ -140,8 +139,7 @@ class HCFS(Hybrid):
         check_leader(self.lookahead, self)
         if self.choice == "first":
             check_platoon(self, "choice=first", "needs a string that is one platoon", "between")
-        settings = {field.name: getattr(self, field.name) for field in fields(PlatoonReward)}
-        self.reward = PlatoonReward(**settings)
+        self.reward = PlatoonReward(**values(self, PlatoonReward))
         self.both_brake = Braking(self.braking, self.braking, time_to_collision=0.0)
 
     def choose(self, rule: Tensor, learned: Tensor, *entries: Tensor) -> Decision:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from importlib.util import find_spec
 from typing import Annotated, Any
 
@@ -17,7 +16,7 @@ from lcc_rl.functional.power import POWER_COEFFICIENTS
 from lcc_rl.pieces.base import Entry
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.world import World
-from lcc_rl.settings import NonNegative, Number, Positive, Settings
+from lcc_rl.settings import NonNegative, Number, Positive, Settings, values
 
 LONGEST_GAP = 200.0  # longer gaps count as this one [m]
 Array = np.ndarray
@@ -78,9 +77,8 @@ class MPC(MPCSettings, Controller):
     def setup(self, world: World) -> None:
         self.check_installed()
         self.declare(world)
-        settings = {field.name: getattr(self, field.name) for field in fields(MPCSettings)}
         assert self.limits is not None
-        self.program = FollowingProgram(MPCSettings(**settings), self.limits)
+        self.program = FollowingProgram(MPCSettings(**values(self, MPCSettings)), self.limits)
 
     @staticmethod
     def check_installed() -> None:

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from lcc_rl.errors import in_short, require, require_known
 from lcc_rl.results import measures, render
+from lcc_rl.results.intervals import varied
 from lcc_rl.results.measures import FINAL_SPREAD, FLOW, MEASURES, Shown, signed
 from lcc_rl.results.names import in_words
 from lcc_rl.results.remarks import FLOW_LOST, FLOW_NAMED
@@ -178,7 +179,7 @@ def leaderboard(documents: Mapping[str, Mapping[str, Any]]) -> str:
         sources = list(dict.fromkeys(row["source"] for row in rows))
         lines = []
         for row in sorted(rows, key=lambda x: sources.index(x["source"])):
-            sample = "drives" if row["drives"] > 1 else "windows"
+            sample = varied(row["drives"])
             place = f"{row['source']}, {row[sample]} {sample}"
             mark = FUTURE * bool(row["future"])
             lines.append([place, f"`{row['by']}`{mark}", *_markdown(row)])

@@ -39,6 +39,11 @@ class Estimate:
     high: float = np.nan
     more_flow: float = np.nan
 
+    @property
+    def percent(self) -> tuple[float, float, float]:
+        """The value and its bounds in per cent."""
+        return 100.0 * self.value, 100.0 * self.low, 100.0 * self.high
+
     def columns(self, name: str, factor: float = 1.0) -> dict[str, float]:
         """Return ``name``, ``name_low`` and ``name_high``, scaled."""
         values = zip(BOUNDED, (self.value, self.low, self.high), strict=True)
@@ -129,7 +134,13 @@ def clusters(drives: Sequence[object]) -> list[object]:
         ['a', 'a', 'b']
     """
     whole = [of.drive if isinstance(of, Minute) else of for of in drives]
-    return next((group for group in (whole, list(drives)) if len(set(group)) > 1), [])
+    unit = varied(len({*whole}), len({*drives}))
+    return {"drives": whole, "minutes": [*drives]}.get(unit, [])
+
+
+def varied(drives: int, minutes: int = 0) -> str:
+    """Return what intervals are over: several drives, else minutes of the only one, or windows."""
+    return "drives" if drives > 1 else "minutes" if minutes > 1 else "windows"
 
 
 def mean(values: ArrayLike) -> Estimate:

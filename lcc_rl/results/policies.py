@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 from pydantic import AfterValidator, Field
 
+from lcc_rl.assets import ASSETS
 from lcc_rl.config.schemas import StudyConfig, as_text
 from lcc_rl.errors import ConfigError, ResultsError, raised_as
 from lcc_rl.io.settings import parse_yaml
 from lcc_rl.io.tensors import check_like, read_torch, write_torch
 from lcc_rl.results.runs import POLICY
 from lcc_rl.results.trust import trusted
-from lcc_rl.runs.states import CONFIG, no_run, run_folders
+from lcc_rl.runs.states import CHECKPOINT, CONFIG, no_run, run_folders
 from lcc_rl.settings import S, Settings, parse
 
 PRETRAINED = "pretrained"
-SHIPPED_POLICIES = Path(str(files("lcc_rl.assets"))) / PRETRAINED
+SHIPPED_POLICIES = ASSETS / PRETRAINED
 # Variants that use the policy of another one.
 BUILDS_ON = {"hcfs": "ddpg"}
 
@@ -104,7 +104,7 @@ def policy_file(path: str | Path, variant: str = "") -> Path:
     if first == PRETRAINED and not path.exists():
         path = pretrained_path(path.name if len(path.parts) > 1 else variant)
     file = path / POLICY if path.is_dir() else path
-    if not file.exists() and (path / "checkpoint.pt").is_file():
+    if not file.exists() and (path / CHECKPOINT).is_file():
         raise ConfigError(f"{path}: its training has not ended: lcc-rl train resume={path}")
     if path.is_dir() and not (file.exists() or (path / CONFIG).is_file()) and run_folders(path):
         raise no_run(path)

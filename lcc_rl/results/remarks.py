@@ -204,7 +204,7 @@ def verdict(windows: pd.DataFrame, found: pd.DataFrame, of_few: bool = True) -> 
 def _sentence(windows: pd.DataFrame, rows: Mapping[str, Any], name: str, other: str) -> str:
     """Return a sentence that compares a network with another strategy."""
     share = savings(windows, PATH, name, other, [DISTANCE])
-    saved, low, high = (100.0 * x for x in (share.value, share.low, share.high))
+    saved, low, high = share.percent
     less = "less"
     if saved < 0.0:
         less, saved, low, high = "more", -saved, -high, -low

@@ -16,7 +16,7 @@ from lcc_rl.functional.pattern import HUMAN
 from lcc_rl.io.files import Rows
 from lcc_rl.results import measures
 from lcc_rl.results.fronts import at_equal_flow
-from lcc_rl.results.intervals import BOUNDED, NOTHING
+from lcc_rl.results.intervals import BOUNDED, NOTHING, varied
 from lcc_rl.results.measures import (
     DISTANCE,
     FILTER_ACTS,
@@ -470,8 +470,8 @@ def with_interval(found: pd.DataFrame, words: str) -> str:
     """Return the words with the kind of the interval; ``found`` as for :func:`saved_against`."""
     names = ("windows", "drives", "minutes", "seeds")
     windows, drives, minutes, seeds = (int(found.get(x, pd.Series([0])).max()) for x in names)
-    counted = ((drives, "drives"), (minutes, "minutes"))
-    over = next((f"{n} {of}" for n, of in counted if n > 1), "windows")
+    unit, counts = varied(drives, minutes), {"drives": drives, "minutes": minutes}
+    over = f"{counts[unit]} {unit}" if unit in counts else unit
     over += " of one training" * (seeds == 1)
     if seeds > 1:
         up_to = "up to " if found.loc[found["seeds"] > 0, "seeds"].nunique() > 1 else ""

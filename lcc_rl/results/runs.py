@@ -9,7 +9,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from functools import cache, lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -18,11 +18,11 @@ from typing import Any
 from lcc_rl.config.inputs import inputs_of
 from lcc_rl.config.nodes import as_plain
 from lcc_rl.config.schemas import SECTIONS, BaseConfig, as_text
-from lcc_rl.errors import LccError, ResultsError
+from lcc_rl.errors import ResultsError, line_of, replacing
 from lcc_rl.io.atomic import atomic_path
 from lcc_rl.io.settings import parse_yaml, read_text
 from lcc_rl.results.trust import LOGS, own_modules, trusted
-from lcc_rl.runs.states import CONFIG, no_run
+from lcc_rl.runs.states import CHECKPOINT, CONFIG, no_run
 from lcc_rl.version import PACKAGE, code_version
 
 log = logging.getLogger("lcc_rl")
@@ -34,7 +34,7 @@ ORIGIN = "origin.txt"  # where a run comes from
 PARTS, FINAL = ".parts", "evaluation"  # parts' settings and last part of a job of lcc-rl run
 SECTION = re.compile(r"^(?=[a-z])", re.MULTILINE)  # before the name of a section of settings
 # Results and states of stopped runs, which commands with other settings must not replace.
-RUN_FILES = (EPISODES, "drivers.parquet", "checkpoint.pt", "command.txt", "blocks")
+RUN_FILES = (EPISODES, "drivers.parquet", CHECKPOINT, "command.txt", "blocks")
 
 
 def save_config(cfg: BaseConfig, folder: Path, resumed: bool = False) -> None:
@@ -186,20 +186,17 @@ def _settings(text: str, where: str) -> dict[str, Any]:
     return content
 
 
-@contextmanager
-def naming_run(path: Path) -> Iterator[None]:
+def naming_run(path: Path) -> AbstractContextManager[None]:
     """Convert errors of unexpected rows or settings to a ResultsError that names the run.
 
     Raises:
         ResultsError: in place of the error.
     """
-    try:
-        yield
-    except LccError:
-        raise
-    except (LookupError, ValueError, TypeError) as error:
-        text = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ResultsError(f"{path}: not written by a run: {text}") from error
+
+    def unlike(error: Exception) -> ResultsError:
+        return ResultsError(f"{path}: not written by a run: {line_of(error, True)}")
+
+    return replacing(unlike, (LookupError, ValueError, TypeError))
 
 
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:

@@ -18,11 +18,11 @@ from lcc_rl.results.intervals import (
     NOTHING,
     Estimate,
     Minute,
-    clusters,
     equal_seeds,
     estimate,
     saving,
     share_saved,
+    varied,
 )
 from lcc_rl.results.measures import (
     DAMPING,
@@ -295,10 +295,10 @@ def drives_of(windows: pd.DataFrame) -> list[object] | None:
     return [*map(Minute, drives, (windows[START] // 60.0).astype(int))]
 
 
-def varied(windows: pd.DataFrame) -> str:
-    """Return what intervals of these windows are over: drives, minutes or windows."""
-    groups = clusters(drives_of(windows) or ())
-    return ("minutes" if isinstance(groups[0], Minute) else "drives") if groups else "windows"
+def varied_in(windows: pd.DataFrame) -> str:
+    """Return what intervals of these windows are over, see :func:`varied`."""
+    drives = windows[DRIVE].nunique() if DRIVE in windows else 0
+    return varied(drives, len({*(drives_of(windows) or ())}))
 
 
 def _over(

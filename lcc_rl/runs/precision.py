@@ -24,7 +24,7 @@ def prepare_torch(cfg: BaseConfig) -> torch.device:
     return device
 
 
-def set_precision(name: str) -> float:
+def set_precision(name: str) -> None:
     """Set torch's precision of float32 matrix products and log their error on this machine.
 
     Below ``highest`` torch may choose faster kernels. Whether they compute in single precision
@@ -32,19 +32,15 @@ def set_precision(name: str) -> float:
 
     Args:
         name: ``highest``, ``high`` or ``medium``, as in ``torch.set_float32_matmul_precision``.
-
-    Returns:
-        The relative error of a product of the size of a network's layer.
     """
     torch.set_float32_matmul_precision("highest")
+    if name == "highest":
+        return
     best = product_error()
     torch.set_float32_matmul_precision(name)
-    if name == "highest":
-        return best
     error = product_error()
     report = log.info if error < SINGLE_PRECISION else log.warning
     report("matmul_precision=%s: relative error %.1g, at the highest %.1g", name, error, best)
-    return error
 
 
 def product_error() -> float:

@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -26,10 +27,15 @@ UNDRAWN = "undrawn"  # marks an evaluation whose figures are not drawn yet
 # The last table of a run: of a training or evaluation, of a calibration.
 RESULT_TABLES = ("episodes.parquet", "drivers.parquet")
 PARQUET = b"PAR1"  # last bytes of a parquet file
-CONFIG = "config.yaml"
+CONFIG, CHECKPOINT = "config.yaml", "checkpoint.pt"
 MARKS = {CONFIG, ERROR, LOCK, *RESULT_TABLES}
 MOST_NAMED = 3  # most runs or tables in a message
 STATES = ("finished", "running", "stopped", "failed")
+
+
+def fresh_folder(kind: str, name: str) -> Path:
+    """Return a new folder below ``outputs``, named by the time."""
+    return Path("outputs", kind, f"{datetime.now():%Y-%m-%d_%H-%M-%S-%f}_{name}")
 
 
 class Busy(LccError):

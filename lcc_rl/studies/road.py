@@ -29,7 +29,7 @@ from lcc_rl.results.names import several, with_drivers
 from lcc_rl.results.remarks import crashes
 from lcc_rl.results.report import Report, windows_for
 from lcc_rl.results.runs import CONFIG, EPISODES, differing, flatten, read_settings, without
-from lcc_rl.results.windows import DRIVE, savings
+from lcc_rl.results.windows import DRIVE, savings, varied_in
 from lcc_rl.studies.alcc.study import DRIVERS_FILE
 from lcc_rl.studies.study import StudyResults
 
@@ -168,14 +168,14 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     table = table.astype(dict.fromkeys(COUNTED[:2], int))
     windows, cfg = by_share[places[0].name], read_settings(places[0] / CONFIG)
     drives, scenario, settings = windows[DRIVE].nunique(), cfg["scenario"], cfg["evaluation"]
-    over = several(drives, "recording") + " (of a single one over its minutes)" * (drives == 1)
+    alone = f" (of a single one over its {varied_in(windows)})" * (drives == 1)
     study.table(
         "road",
         f"{scenario['string']['size']} vehicles, {several(settings['drivers'], 'time')} behind "
         f"each of {several(len(windows['profile_id'].unique()), 'window')} of "
         f"{scenario['horizon'] * scenario['time_step']:g} s, the first {settings['warm_up']:g} s "
         "not counted. Brackets: the value of human drivers times the 95 % interval of the ratio to "
-        f"it, over {over}",
+        f"it, over {several(drives, 'recording')}{alone}",
         table,
     )
     for share, rows in table.groupby("automated_pct"):

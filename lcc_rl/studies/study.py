@@ -71,8 +71,8 @@ class StudyResults:
         place = save(figure, self.folder / "figures" / f"{name}.png", formats=self.formats)
         self.blocks.append(f"![{caption}](figures/{place.name})\n\n{caption}")
 
-    def write(self, title: str) -> Path:
-        """Write ``results.md`` with all tables and figures; return its path.
+    def write(self, title: str) -> None:
+        """Write ``results.md`` with all tables and figures.
 
         Raises:
             ResultsError: if the page cannot be written.
@@ -80,4 +80,3 @@ class StudyResults:
         with atomic_path(self.folder / RESULTS_PAGE) as temporary:
             text = "\n\n".join([f"# {title}", *self.blocks])
             temporary.write_text(f"{text}\n", encoding="utf-8")
-        return self.folder / RESULTS_PAGE

@@ -224,12 +224,13 @@ def test_a_compared_policy_drives_with_its_own_controller(trained, tmp_path) -> 
 def test_what_is_no_file_is_not_waited_for(tmp_path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
-    for place in ("pipe", "folder", "nothing"):
+    for place, why in {"pipe": "not a file", "folder": "not a file", "nothing": "no such"}.items():
         with pytest.raises(DataError, match=place):
             NgsimSource(path=str(tmp_path / place)).load()
-        for read in (load_policy, read_parquet):
-            with pytest.raises(ResultsError, match=r"(not a file|no such file)$"):
-                read(tmp_path / place)
+        with pytest.raises(ResultsError, match=r"(not a file|no such file)$"):
+            load_policy(tmp_path / place)
+        with pytest.raises(ResultsError, match=f"{place}: {why}"):
+            read_parquet(tmp_path / place)
 
 
 # -- checkpoints -----------------------------------------------------------------------------------

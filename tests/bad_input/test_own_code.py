@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import linecache
 import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from helpers import check_refused
 import lcc_rl
 from lcc_rl.cli.guard import main_guard
 from lcc_rl.energy import EnergyModel
+from lcc_rl.errors import is_users
 from lcc_rl.pieces import Controller
 
 
@@ -81,3 +83,10 @@ def test_errors_of_a_users_code_name_type_and_line(capsys) -> None:
     assert re.fullmatch(f"lcc_rl: error: RuntimeError: no more fuel {place('late')}\n", said)
     with pytest.raises(ZeroDivisionError):  # no user's code: keeps its traceback
         main_guard(eval)("1 / 0")
+
+
+def test_code_of_tools_and_of_compilers_is_no_users(tmp_path) -> None:
+    tool, stored = Path(__file__).parents[2] / "tools" / "size.py", tmp_path / "c4.py"
+    assert not is_users("__main__", tool)
+    assert not is_users("torch._inductor.runtime.compile_tasks.c4", stored)
+    assert is_users("c4", stored)

@@ -11,10 +11,10 @@ import torch
 from helpers import POPULATION, check_refused, wavy_profiles
 
 import lcc_rl
+from lcc_rl.assets import ASSETS
 from lcc_rl.commands.simulate import main
 from lcc_rl.config import load
 from lcc_rl.data.profiles import from_records, no_profiles
-from lcc_rl.data.sources import ASSETS
 from lcc_rl.drivers.population import SHIPPED_DRIVERS, bootstrap, fixed
 from lcc_rl.envs import Inputs
 from lcc_rl.envs.inputs import build_energy

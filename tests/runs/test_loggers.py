@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lcc_rl.runs.loggers import RowLogger
-from lcc_rl.runs.precision import set_precision
+from lcc_rl.runs.precision import product_error, set_precision
 
 ROWS = [{"iteration": float(i), "episode_reward": -10.0 * i} for i in (1, 2)]
 
@@ -70,10 +70,13 @@ def test_the_error_of_a_reduced_precision_is_measured_and_logged(caplog) -> None
     caplog.set_level(logging.INFO, "lcc_rl")
     before = torch.get_float32_matmul_precision()
     try:
-        assert 0.0 < set_precision("highest") < 1e-5
+        set_precision("highest")
         assert not caplog.messages
-        error = set_precision("medium")
+        best = product_error()
+        set_precision("medium")
         assert torch.get_float32_matmul_precision() == "medium"
+        error = product_error()
     finally:
         torch.set_float32_matmul_precision(before)
-    assert f"{error:.1g}" in caplog.messages[0]
+    assert 0.0 < best < 1e-5
+    assert f"{error:.1g}, at the highest {best:.1g}" in caplog.messages[0]

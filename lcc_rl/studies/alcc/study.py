@@ -28,7 +28,7 @@ from lcc_rl.figures.calibration import calibration_figure, joint_figure
 from lcc_rl.figures.training import learning_curve
 from lcc_rl.io.files import read_parquet
 from lcc_rl.results.names import in_words
-from lcc_rl.results.runs import EPISODES, STEPS
+from lcc_rl.results.runs import EPISODES, RECORD, STEPS
 from lcc_rl.results.windows import LEADER_COLUMNS, WINDOWS, Means
 from lcc_rl.studies.alcc import figures, paper_tables, tables
 from lcc_rl.studies.alcc.paper_tables import PAIR
@@ -184,7 +184,6 @@ def _series(study: Study, parts: Sequence[str], ablations: Sequence[str]) -> dic
 # -- tables and figures from the parquet files -----------------------------------------------------
 
 ALCC_TITLE = "Adaptive Leading Cruise Control: the study"
-CURVES = "training.parquet"  # learning curves of the main trainings, if their folders are missing
 ITSELF = "this study"
 SHARE_COLUMNS = [
     f"{which}_{name}"
@@ -280,9 +279,9 @@ def _generalization(study: StudyResults, windows: pd.DataFrame) -> None:
 
 
 def _learning(study: StudyResults) -> None:
-    if (study.folder / CURVES).exists():
-        training = read_parquet(study.folder / CURVES)
-    elif any((study.folder / "train").rglob("training.parquet")):
+    if (study.folder / RECORD).exists():  # of the main trainings, if their folders are missing
+        training = read_parquet(study.folder / RECORD)
+    elif any((study.folder / "train").rglob(RECORD)):
         training = results.load(study.folder / "train", "training", strict=True)
     else:
         return

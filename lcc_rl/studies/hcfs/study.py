@@ -26,7 +26,7 @@ from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.io.files import read_parquet, write_parquet
 from lcc_rl.results.platoons import case_table
 from lcc_rl.results.policies import load_policy
-from lcc_rl.results.runs import EPISODES, STEPS, save_config
+from lcc_rl.results.runs import EPISODES, RECORD, STEPS, save_config
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.studies.hcfs import tables
 from lcc_rl.studies.hcfs.tables import LEARNED, per_run, rounded
@@ -37,7 +37,6 @@ log = logging.getLogger("lcc_rl")
 RECIPE = "paper_hcfs"
 BASELINES_FOLDER = "baselines"  # folder of the evaluation of untrained strategies
 UNTUNED = "paper_like"
-TRAINING = "training.parquet"
 # A second whole record besides that of the default leader.
 WLTC = "+leader.full_length.wltc={path: wltc_3b, scale: 0.5}"
 
@@ -93,12 +92,12 @@ def keep(folder: Path, trainings: Sequence[Path]) -> None:
     frames = [read_parquet(path / STEPS) for path in (root / BASELINES_FOLDER, *seeds[:1])]
     write_parquet(rounded(pd.concat(frames, ignore_index=True)), folder / STEPS)
     frames = [
-        read_parquet(path / TRAINING)[["episodes", "episode_reward"]].assign(
+        read_parquet(path / RECORD)[["episodes", "episode_reward"]].assign(
             variant=LEARNED, seed=int(path.name.removeprefix("seed_"))
         )
         for path in trainings
     ]
-    write_parquet(rounded(pd.concat(frames, ignore_index=True)), folder / TRAINING)
+    write_parquet(rounded(pd.concat(frames, ignore_index=True)), folder / RECORD)
 
 
 def hybrid_strategies(cfg: StudyConfig, learned: Strategy) -> list[Strategy]:
@@ -194,7 +193,7 @@ def study_results(folder: Path, formats: Iterable[str] = ()) -> StudyResults:
     if (folder / LENGTHS).exists():  # only with several studies
         lengths = tables.lengths(read_parquet(folder / LENGTHS))
         study.table("lengths", "Σ reward per window by the length of the training", lengths)
-    curve = learning_curve(read_parquet(folder / TRAINING))
+    curve = learning_curve(read_parquet(folder / RECORD))
     study.figure("learning_curve", "Learning curve of the DDPG parent", curve)
     study.write(HCFS_TITLE)
     return study
