@@ -30,9 +30,9 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 45_050, "code": 29_925},
-    "tests": {"lines": 27_230},
-    "conf": {"yaml": 165},
+    "lcc_rl + tools": {"lines": 45_090, "code": 29_955},
+    "tests": {"lines": 27_265},
+    "conf": {"yaml": 166},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py
 STRUCTURE = {
