@@ -91,7 +91,8 @@ def test_a_study_writes_files_and_fills_marked_tables(tmp_path) -> None:
     made.figure("line", "A line", figure)
     assert (tmp_path / "figures" / "line.svg").exists()
     pd.testing.assert_frame_equal(read_parquet(tmp_path / "tables" / "energies.parquet"), TABLE)
-    text = made.write("A study").read_text()
+    made.write("A study")
+    text = (tmp_path / "results.md").read_text()
     assert "![A line](figures/line.png)" in text
     assert as_markdown(worded(TABLE)) in text
 
