@@ -117,18 +117,23 @@ def conditions(rows: pd.DataFrame, runs: Mapping[str, Choices], root: Path) -> d
 def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str, str]]:
     """Return for each run the words by which it differs, ``efficiency.weight=0.5``, by key.
 
-    They are on what the commands varied and what only some of them set; or on stored settings, if
-    a run has no command or that does not tell them apart. Runs of equal settings share their words.
+    They are on what the commands varied and what only some of them set, and on stored settings if
+    a run has no command, or as far as that does not tell different settings apart. Equal settings
+    share their words, as equal values do: ``weight=1.0`` is ``weight=1``.
     """
     typed = [without(choices_of(folder), SHARED) for folder in folders]
-    kinds = {(str(one), str(other)) for one, other in zip(typed, stored, strict=True)}
-    if len(kinds) > len(set(map(str, typed))) or not all(typed):
+    if not all(typed):
         return differences(stored)
-    first = {str(own): words for own, words in reversed([*zip(stored, typed, strict=True)])}
-    each = first.values()
-    kept = [key for one in each for key in one if not all(key in other for other in each)]
-    whole = [{**{k: own[k] for k in kept if k in own}, **first[str(own)]} for own in stored]
-    return differences(whole, *kept)
+    pairs = [*zip(stored, typed, strict=True)][::-1]  # the first ones replace others
+    first = {str(own): words for own, words in pairs}
+    text = {(k, str(own[k])): x for own, words in pairs for k, x in words.items() if k in own}
+    keys = [*dict.fromkeys(key for words in first.values() for key in words)]
+    kept = [key for key in keys if not all(key in words for words in first.values())]
+    whole = []
+    for own in stored:
+        known = {k: own[k] for k in kept if k in own} | first[str(own)] | dict(own)
+        whole.append({k: text.get((k, str(x)), x) for k, x in known.items()})
+    return differences(whole, *kept, last=keys)
 
 
 def _settings(folders: Sequence[Path]) -> list[dict[str, Any]]:
