@@ -11,7 +11,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
 from shutil import which
@@ -89,11 +89,15 @@ def run_name(*, _root_: DictConfig) -> str:
 def _mark(root: DictConfig) -> str:
     """Return a short hash of a run's settings, or of the command line if they are invalid."""
     settings = OmegaConf.masked_copy(root, [str(key) for key in root if key != "hydra"])
-    typed = words_of(root)
+    return _checked(settings, root.hydra.job.config_name, words_of(root))[0]
+
+
+def _checked(settings: DictConfig, entry: str, typed: list[str]) -> tuple[str, LccError | None]:
+    """Return the hash of a run, see :func:`_mark`, and why its settings are invalid, if so."""
     try:
-        return identity(parsed(settings, root.hydra.job.config_name, typed, True), "inputs")[:8]
-    except LccError:
-        return hashlib.sha256(json.dumps(typed).encode()).hexdigest()[:8]
+        return identity(parsed(settings, entry, typed, sweep=True), "inputs")[:8], None
+    except LccError as error:
+        return hashlib.sha256(json.dumps(typed).encode()).hexdigest()[:8], error
 
 
 def words_of(config: DictConfig) -> list[str]:
@@ -157,7 +161,8 @@ class SweepCallback(Callback):
             refuse(f"a sweep has at most {MOST_RUNS} runs")
         warn_of_rounding(plan)
         if str(config.hydra.sweeper.get("_target_")).endswith(BasicSweeper.__name__):
-            check_cells(config, plan.varied)
+            marks = check_cells(config, plan.varied)
+            plan = replace(plan, runs=len({*marks}) or plan.runs, marks=marks)
         type(self).folder = type(self).target = folder
         with atomic_path(folder / PLAN) as temporary:
             whole = asdict(plan.after(read_plan(folder)))
@@ -237,30 +242,43 @@ def warn_of_rounding(plan: SweepPlan) -> None:
             log.warning(words, key, rounded[-1], key, listed)
 
 
-def check_cells(config: DictConfig, varied: Collection[str]) -> None:
-    """Log which cells of a sweep will fail, and why; the sweep runs the others.
+def check_cells(config: DictConfig, varied: Collection[str]) -> list[str]:
+    """Log which cells of a sweep will fail, and why, and which are one run.
 
     Args:
         config: Hydra's configuration of the sweep.
         varied: dotted keys that name a cell.
+
+    Returns:
+        The hash of each cell; nothing if it is known in a run only.
 
     Raises:
         SystemExit: for a choice that no file has, with which Hydra does not start a sweep.
     """
     read = OverridesParser.create().parse_overrides(words_of_sweep(config))
     entry = config.hydra.job.config_name
+    marks: dict[tuple[str, ...], str] = {}  # by the values of a cell
+    first: dict[str, list[str]] = {}
+    same: dict[str, None] = {}
     for words in BasicSweeper.split_arguments(read, None)[0]:
         try:
-            cell = composed(entry, words)
-        except ConfigError as error:
-            refuse(error)
-        try:
-            parsed(cell, entry, words, sweep=True)
-        except LccError as error:
-            if "HydraConfig was not set" in str(error):  # ${hydra:…} has its value in a run only
-                continue
-            name = " ".join(item.lstrip("+") for item in words if key_of(item) in varied)
-            log.error("will fail: %s: %s", name, error)
+            mark, error = _checked(composed(entry, words), entry, words)
+        except ConfigError as refused:
+            refuse(refused)
+        own = [item.lstrip("+") for item in words if key_of(item) in varied]
+        if "HydraConfig was not set" in str(error):  # ${hydra:…} has its value in a run only
+            marks[()] = ""
+        elif error:
+            log.error("will fail: %s%s", f"{' '.join(own)}: " * bool(own), error)
+        if others := [
+            x for x in zip(own, first.setdefault(mark, own), strict=True) if x[0] != x[1]
+        ]:
+            one, other = map(" ".join, zip(*others, strict=True))
+            same[f"{one} is the same run as {other}"] = None
+        marks[tuple(item.partition("=")[2] for item in own)] = mark
+    for line in same:
+        log.warning(line)
+    return [] if "" in marks.values() else [*marks.values()]
 
 
 def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path) -> Any:

@@ -84,6 +84,21 @@ def test_a_later_command_in_a_sweep_s_folder_forgets_no_cell(tmp_path) -> None:
     assert found == [waiting, waiting, sorted([*waiting, "seed=7"]), sorted([*waiting, "seed=7"])]
 
 
+def test_cells_that_are_one_run_wait_once_and_end_together(tmp_path) -> None:
+    first = SweepPlan(2, ["w", "seed"], [["1", "1.0"], ["0", "1"]], ["a" * 8, "b" * 8] * 2)
+    other = SweepPlan(2, ["seed"], [["0", "1"]], ["a" * 8, "b" * 8])
+    same_words = SweepPlan(2, ["seed"], [["0", "1"]], ["c" * 8, "a" * 8])
+    (tmp_path / f"w=1+seed=0_{'a' * 8}").mkdir()
+    (tmp_path / f"w=1+seed=0_{'a' * 8}" / EPISODES).write_bytes(b"PAR1 rows PAR1")
+    for plan, waiting in (
+        (first, ["w=1+seed=1"]),
+        (other.after(first), ["seed=1"]),
+        (same_words.after(other), ["seed=0", "seed=1"]),
+    ):
+        (tmp_path / PLAN).write_text(json.dumps(asdict(plan)))
+        assert [*unfinished(tmp_path)] == waiting
+
+
 def words_of(text: str) -> str:
     """Return a text without line breaks, frames and marks of comments."""
     return " ".join(re.sub(r"\n%|[\n\\]", " ", text).split())

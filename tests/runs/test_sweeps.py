@@ -143,6 +143,10 @@ CELLS = {
         "will fail: training.episodes=none: training.episodes"
     ],
     ("seed=0,1",): [],
+    ("reward.terms.safety.weight=1,1.0", "seed=0,1"): [
+        "reward.terms.safety.weight=1.0 is the same run as reward.terms.safety.weight=1"
+    ],
+    ("seed=",): ["will fail: seed"],
     ("seed=0,1", "data=episodes", "data.path=${hydra:runtime.cwd}/pairs.csv"): [],
 }
 
