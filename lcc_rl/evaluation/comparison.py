@@ -94,12 +94,12 @@ class Store:
         """Yield the rows of each block, strategy by strategy."""
         for block in self.blocks:
             frames = [self._read(index, block, 0) for index in range(len(self.marks))]
-            yield pd.concat(frames, ignore_index=True)
+            yield stacked(frames)
 
     def steps(self) -> pd.DataFrame:
         """Return the time series of all sample episodes, strategy by strategy."""
         every = [(index, block) for index in range(len(self.marks)) for block in self.blocks]
-        return pd.concat([self._read(*key, 1) for key in every], ignore_index=True)
+        return stacked([self._read(*key, 1) for key in every])
 
     def _read(self, strategy: int, block: int, which: int) -> pd.DataFrame:
         """Return the rows (0) or the time series (1) of a block."""
@@ -111,6 +111,16 @@ class Store:
     def clear(self) -> None:
         """Remove the folder of the blocks."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def stacked(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Return tables below each other; integers that some of them lack stay integers, with nulls."""
+    columns = [set(frame) for frame in frames if len(frame.columns)]
+    lacking = set().union(*columns).difference(set.intersection(*columns)) if columns else set()
+    parts = [
+        x.astype({y: "Int64" for y in x.select_dtypes("integer") if y in lacking}) for x in frames
+    ]
+    return pd.concat(parts, ignore_index=True)
 
 
 class Comparison:
