@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -79,7 +80,7 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
             }
             rows.loc[group.index, "strategy"] = group["run"].map(named)
     rows = rows.drop_duplicates([name for name in rows if name != "run"])
-    _check_one_study(root, rows)
+    _check_one_study(root, rows, runs)
     table = rows.drop(columns="run").reset_index(drop=True)
     missing = dict(loaded.attrs.get("unfinished", {}))
     for name, why in loaded.attrs.get("damaged", {}).items():
@@ -193,13 +194,18 @@ def _equal(folders: Sequence[Path], what: str, digest: Callable[[Path], Any]) ->
         yield f"{which} had no effect: the {what} are the same with {one}{also}."
 
 
-def _check_one_study(root: Path, rows: pd.DataFrame) -> None:
+def _check_one_study(root: Path, rows: pd.DataFrame, runs: Mapping[str, Choices]) -> None:
     if "leader_speed_mps" in rows:
         leaders = rows.groupby("profile_id")["leader_speed_mps"].nunique()
+        window = leaders.idxmax()
+        own = rows[rows["profile_id"] == window].drop_duplicates("leader_speed_mps")["run"]
+        found = labels([runs[name] for name in own], [root / name for name in own])
+        words = " and ".join(filter(None, (", ".join(one.values()) for one in found)))
+        first = shlex.quote(str(root / own.iloc[0]))
         require(
             leaders.max() == 1,
-            f"{root}: its runs have different leaders (profile_id {leaders.idxmax()}); "
-            f"lcc_rl.results.load({str(root)!r}) reads them",
+            f"{root}: its runs have different leaders ({words or f'profile_id {window}'}): each has "
+            f"a table, lcc-rl table {first}; lcc_rl.results.load({str(root)!r}) reads all",
         )
     twice = rows[rows.duplicated([key for key in EPISODE if key in rows], keep=False)]
     for (strategy, seed), group in twice.groupby([STRATEGY, TRAINED], dropna=False, observed=True):
