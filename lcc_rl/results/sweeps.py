@@ -204,8 +204,8 @@ def _check_one_study(root: Path, rows: pd.DataFrame, runs: Mapping[str, Choices]
         first = shlex.quote(str(root / own.iloc[0]))
         require(
             leaders.max() == 1,
-            f"{root}: its runs have different leaders ({words or f'profile_id {window}'}): each has "
-            f"a table, lcc-rl table {first}; lcc_rl.results.load({str(root)!r}) reads all",
+            f"{root}: its runs have different leaders ({words or f'profile_id {window}'}): "
+            f"each has a table, lcc-rl table {first}; lcc_rl.results.load({str(root)!r}) reads all",
         )
     twice = rows[rows.duplicated([key for key in EPISODE if key in rows], keep=False)]
     for (strategy, seed), group in twice.groupby([STRATEGY, TRAINED], dropna=False, observed=True):

@@ -140,10 +140,10 @@ def test_the_runs_of_a_sweep_are_read_as_one_evaluation(tmp_path) -> None:
     assert "source" not in sweep_of(tmp_path / "machines", *rounded)
     refusals = [
         ([{"seed": 0}, {"seed": 0, "table": "all"}], "training twice: alcc, seed 0: 0 and 1$"),
-        ([{"seed": 0}, {"seed": 1, "leader": 8.0}], r"leaders \(profile_id 0\): .*results\.load"),
+        ([{"seed": 0}, {"seed": 1, "leader": 8.0}], r"have different leaders .*results\.load"),
         (
-            [{"seed": 0, "step": x, "leader": 9.0 + x} for x in (0.1, 0.2)],
-            r"different leaders \(step=0.1 and step=0.2\): each has a table, lcc-rl table .*/0; ",
+            [{"seed": 0, "leader": x} for x in (8.0, 9.0)],
+            r"different leaders \(leader=8.0 and leader=9.0\): each has a table, lcc-rl table .*/0; ",
         ),
     ]
     for place, (runs, words) in enumerate(refusals):
