@@ -266,7 +266,7 @@ def sweep(command: Callable[[], Any]) -> None:
 
         for line in without_effect(folder):
             logging.getLogger("lcc_rl").warning(line)
-        conclude(folder)
+        conclude(folder, SweepCallback.plan)
 
 
 def explaining(function: Callable[..., Any]) -> Callable[..., Any]:

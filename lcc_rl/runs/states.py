@@ -69,7 +69,16 @@ class RunState:
     error: str = ""
 
     def __str__(self) -> str:
-        return f"{self.state}: {self.error}".removesuffix(": ")
+        return f"{self.state}: {self.remark}".removesuffix(": ")
+
+    @property
+    def remark(self) -> str:
+        """The error; of a finished run that it was not repeated."""
+        return (
+            f"not repeated: {self.error}" * bool(self.error)
+            if self.state == "finished"
+            else self.error
+        )
 
 
 _locks: dict[Path, int | None] = {}  # locks of the folders that this process claims

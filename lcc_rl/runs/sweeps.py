@@ -32,7 +32,7 @@ from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.runs.interrupts import BAD_INPUT, was_interrupted
 from lcc_rl.runs.overview import live
-from lcc_rl.runs.plans import MOST_RUNS, PLAN, SweepPlan, read_plan
+from lcc_rl.runs.plans import MOST_RUNS, PLAN, SweepPlan, mark_of, read_plan
 from lcc_rl.runs.states import (
     CONFIG,
     Busy,
@@ -133,6 +133,7 @@ class SweepCallback(Callback):
     """
 
     folder: Path | None = None  # folder of this process's sweep; Hydra does not store it
+    plan: ClassVar[SweepPlan] = SweepPlan()  # of that sweep
     target: ClassVar[Path | None] = None  # the folder that Hydra writes to
     made: ClassVar[list[Path]] = []  # it and its parents, if this command creates them
     table: Live | None = None
@@ -157,6 +158,8 @@ class SweepCallback(Callback):
         limit_batches(config)
         folder = Path(config.hydra.sweep.dir)
         plan = make_plan(config)
+        if not plan.runs:
+            refuse("nothing is swept: a list of values is empty")
         if plan.runs > MOST_RUNS:
             refuse(f"a sweep has at most {MOST_RUNS} runs")
         warn_of_rounding(plan)
@@ -164,6 +167,7 @@ class SweepCallback(Callback):
             marks = check_cells(config, plan.varied)
             plan = replace(plan, runs=len({*marks}) or plan.runs, marks=marks)
         type(self).folder = type(self).target = folder
+        type(self).plan = plan
         with atomic_path(folder / PLAN) as temporary:
             whole = asdict(plan.after(read_plan(folder)))
             temporary.write_text(json.dumps(whole), encoding="utf-8")
@@ -306,22 +310,30 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
         return None
 
 
-def conclude(folder: Path) -> None:
-    """Log the result of a sweep."""
-    states = survey(folder)
-    if not states:
-        raise LccError(f"nothing was swept, in {folder}: is a list of values empty?")
-    failed = [state for state in states if state.error]
-    finished = sum(state.state == "finished" and not state.error for state in states)
-    log.info("%d of %d runs finished, in %s", finished, len(states), folder)
-    if finished > 1 and next(folder.glob("*/episodes.parquet"), None):
+def conclude(folder: Path, plan: SweepPlan) -> None:
+    """Log the result of a sweep.
+
+    Raises:
+        LccError: if runs of the plan failed, or were refused; those of other commands do not count.
+    """
+    every, cells = survey(folder), {"", *plan.marks}
+    own = [x for x in every if not plan.marks or mark_of(Path(x.name)) in cells]
+    finished = [state for state in own if state.state == "finished"]
+    failed = [state for state in own if state.state == "failed"]
+    refused = [state for state in finished if state.error]
+    log.info("%d of %d runs finished, in %s", len(finished), len(own), folder)
+    if len(finished) > 1 and next(folder.glob("*/episodes.parquet"), None):
         log.info("side by side: lcc-rl table %s --figure sweep.png", shlex.quote(str(folder)))
-    for state in failed:
-        log.error("failed: %s: %s", state.name, state.error)
-    if failed:
-        begun = any(x.state == "failed" and (folder / x.name / CONFIG).is_file() for x in failed)
+    if others := sum(state.state == "failed" for state in every) - len(failed):
+        log.warning("%d failed runs in the folder are of other commands", others)
+    for state in (*failed, *refused):
+        log.error("failed: %s: %s", state.name, state.remark)
+    if failed or refused:
+        begun = any((folder / x.name / CONFIG).is_file() for x in failed)
         again = "; the same command repeats those that had begun" * begun
+        what = f"{len(failed)} of {len(own)} runs failed{again}" if failed else ""
+        kept = f"{len(refused)} of {len(own)} runs keep earlier rows" if refused else ""
         raise LccError(
-            f"{len(failed)} of {len(states)} runs failed{again} "
+            f"{' and '.join(filter(None, (what, kept)))} "
             f"(reasons: error.txt in the folder of each run, {folder})"
         )

@@ -184,7 +184,8 @@ def test_a_run_of_a_sweep_is_refused_what_has_no_effect(tmp_path) -> None:
 def test_a_sweep_of_nothing_is_one_line(tmp_path) -> None:
     done = run_command("train", *SWEEP, "seed=range(0)", cwd=tmp_path)
     assert done.returncode == 2
-    assert "nothing was swept" in done.stderr
+    assert "nothing is swept: a list of values is empty" in done.stderr
+    assert not [*tmp_path.iterdir()]
 
 
 def on_terminal(cwd: Path, *words: str) -> str:
