@@ -30,7 +30,7 @@ from lcc_rl.config.compose import NOT_IDENTITY, composed, identity, parsed
 from lcc_rl.config.words import key_of
 from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
-from lcc_rl.runs.interrupts import BAD_INPUT, was_interrupted
+from lcc_rl.runs.interrupts import BAD_INPUT, end_with_parent, was_interrupted
 from lcc_rl.runs.overview import live
 from lcc_rl.runs.plans import MOST_RUNS, PLAN, SweepPlan, mark_of, read_plan
 from lcc_rl.runs.states import (
@@ -291,6 +291,7 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
     Returns:
         The function's result; None if it failed.
     """
+    end_with_parent()  # as a process of joblib
     if sys.stdout.isatty():
         mute()
     try:

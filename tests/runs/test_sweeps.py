@@ -8,6 +8,7 @@ import pty
 import signal
 import subprocess
 import sys
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from pathlib import Path
 
@@ -77,6 +78,16 @@ def test_a_sweep_that_is_interrupted_names_the_way_to_resume(tmp_path, monkeypat
     assert (done.returncode, done.stderr) == (130, line)
     assert not list(tmp_path.rglob("error.txt"))
     assert len(list(tmp_path.rglob("train.log"))) == 1  # the second run has not begun
+
+
+def test_a_sweep_whose_process_is_killed_names_the_way_to_resume(tmp_path, monkeypatch) -> None:
+    def killed(*_: object) -> None:
+        raise BrokenProcessPool("a worker was unexpectedly terminated")
+
+    monkeypatch.setattr(sweeps.BasicSweeper, "sweep", killed)
+    done = run_command("train", *SWEEP, "seed=0,1", "sweep=mine", cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "the same command resumes the sweep in outputs/train/mine" in done.stderr
 
 
 def test_a_sweep_is_read_as_one_table(tmp_path, capsys) -> None:
