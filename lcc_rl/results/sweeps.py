@@ -6,7 +6,7 @@ import hashlib
 import os
 import shlex
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,8 @@ from lcc_rl.runs.states import run_folders
 
 # Settings in which the parts and the seeds of one study differ.
 SHARED = (*NOT_IDENTITY, "seed", SHARD)
+# Settings of the vehicles and their energy models.
+VEHICLES = ("energy.", "scenario.string.", "scenario.fleet.")
 EPISODE = [
     STRATEGY,
     TRAINED,
@@ -86,6 +88,7 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
     for name, why in loaded.attrs.get("damaged", {}).items():
         missing[name] = f"damaged: {why.removeprefix(f'{root / name}{os.sep}')}"
     remarks = [f"Without rows: {listed(missing)}."] * bool(missing) + without_effect(root)
+    remarks += _of_vehicles(runs, root) if not of else []
     remarks += [f"{x[0].upper()}{x[1:]}." for x in loaded.attrs.get("versions", ())]
     table.attrs |= {"remarks": remarks, "first": str(root / next(iter(runs)))}
     return table
@@ -109,10 +112,26 @@ def conditions(rows: pd.DataFrame, runs: Mapping[str, Choices], root: Path) -> d
                 break
         else:
             alike.append((numbers, [str(name)]))
-    firsts = [names[0] for _, names in alike]
-    found = labels([runs[name] for name in firsts], [root / name for name in firsts])
-    named = zip(found, alike, strict=True)
-    return {name: ", ".join(word.values()) for word, (_, names) in named if word for name in names}
+    found = _told_apart([names[0] for _, names in alike], runs, root)
+    return {
+        name: word for word, (_, names) in zip(found, alike, strict=True) if word for name in names
+    }
+
+
+def _told_apart(names: Iterable[str], runs: Mapping[str, Choices], root: Path) -> list[str]:
+    """Return the words by which runs of these names differ, see :func:`labels`."""
+    found = labels([runs[name] for name in names], [root / name for name in names])
+    return [", ".join(words.values()) for words in found]
+
+
+def _of_vehicles(runs: Mapping[str, Choices], root: Path) -> list[str]:
+    """Return a sentence if the vehicles of runs, or their energy models, differ."""
+    first: dict[str, str] = {}
+    for name, own in runs.items():
+        first.setdefault(str({k: x for k, x in own.items() if f"{k}.".startswith(VEHICLES)}), name)
+    words = " and ".join(_told_apart([*first.values()], runs, root))
+    sentence = f"Energies are not comparable, because energy models or vehicles differ: {words}."
+    return [sentence] * (len(first) > 1)
 
 
 def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str, str]]:
@@ -199,8 +218,7 @@ def _check_one_study(root: Path, rows: pd.DataFrame, runs: Mapping[str, Choices]
         leaders = rows.groupby("profile_id")["leader_speed_mps"].nunique()
         window = leaders.idxmax()
         own = rows[rows["profile_id"] == window].drop_duplicates("leader_speed_mps")["run"]
-        found = labels([runs[name] for name in own], [root / name for name in own])
-        words = " and ".join(filter(None, (", ".join(one.values()) for one in found)))
+        words = " and ".join(filter(None, _told_apart(own, runs, root)))
         first = shlex.quote(str(root / own.iloc[0]))
         require(
             leaders.max() == 1,

@@ -136,6 +136,11 @@ def test_the_runs_of_a_sweep_are_read_as_one_evaluation(tmp_path) -> None:
     rows = sweep_of(tmp_path / "events", *runs)  # each beside its own baseline
     found = rows.groupby("source", sort=False)["strategy"].unique().map(list).to_dict()
     assert found == {f"base={x}": ["idm", "alcc"] for x in (5.0, 6.0)}
+    assert not rows.attrs["remarks"]
+    # Runs of other vehicles may have no baseline in common.
+    energies = [{"seed": seed, "energy": {"scale": x}} for x in (1, 9) for seed in (0, 1)]
+    *_, remark = sweep_of(tmp_path / "energies", *energies).attrs["remarks"]
+    assert remark.endswith("vehicles differ: energy.scale=1 and energy.scale=9.")
     rounded = [{"seed": seed, "base": 5.0 + 1e-6 * seed} for seed in (0, 1)]
     assert "source" not in sweep_of(tmp_path / "machines", *rounded)
     refusals = [
