@@ -237,7 +237,7 @@ def train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
     todo = {name: cfg for name, cfg in parts.items() if not _finished(folder / name, cfg)}
     # A new interpreter per training: forking a process with torch's threads can hang.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, _begin) as pool:
+    with ProcessPoolExecutor(jobs, context, _prepare_process) as pool:
         futures: dict[str, Future[None]] = {
             name: pool.submit(_train_one, cfg, str(folder / name)) for name, cfg in todo.items()
         }
@@ -252,7 +252,7 @@ def train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
             raise Interrupted("stopped; the same command resumes it") from None
 
 
-def _begin() -> None:
+def _prepare_process() -> None:
     """Prepare a process of the pool."""
     gc.freeze()  # later garbage collection skips modules
     logging.getLogger().setLevel(logging.INFO)

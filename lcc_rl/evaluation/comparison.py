@@ -6,6 +6,7 @@ import hashlib
 import logging
 import math
 import shutil
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from lcc_rl.io.memory import require_memory
 from lcc_rl.pieces.knowledge import hears
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import EPISODES, STEPS
-from lcc_rl.runs.progress import ProgressReporter
+from lcc_rl.runs.progress import BETWEEN_LINES, ProgressReporter
 from lcc_rl.runs.states import check_present
 from lcc_rl.version import code_version
 
@@ -159,6 +160,7 @@ class Comparison:
         count, steps, moment = max((x.largest for x in self.players), key=math.prod)
         size = f"an evaluation of {count} episodes of {steps} steps side by side"
         require_memory({size: count * steps * moment}, cfg.device)
+        self.told = time.monotonic()  # time of the last line [s]
         self.every, most = 1, settings.sample_mb
         if most is not None:
             self.every = max(1, math.ceil(sum(x.sampled for x in self.players) / (most * 1e6)))
@@ -212,5 +214,6 @@ class Comparison:
                     steps = steps[number % self.every == 0]
                 store.put(index, block, (rows, steps))
                 done += counts[block]
-                if where is not None:
+                if where is not None or time.monotonic() - self.told >= BETWEEN_LINES:
                     progress.update(done)
+                    self.told = time.monotonic()

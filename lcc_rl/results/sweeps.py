@@ -30,7 +30,7 @@ from lcc_rl.runs.states import run_folders
 # Settings in which the parts and the seeds of one study differ.
 SHARED = (*NOT_IDENTITY, "seed", SHARD)
 # Settings of the vehicles and their energy models.
-VEHICLES = ("energy.", "scenario.string.", "scenario.fleet.")
+OF_ENERGY = ("energy.", "scenario.string.", "scenario.fleet.")
 EPISODE = [
     STRATEGY,
     TRAINED,
@@ -128,7 +128,7 @@ def _of_vehicles(runs: Mapping[str, Choices], root: Path) -> list[str]:
     """Return a sentence if the vehicles of runs, or their energy models, differ."""
     first: dict[str, str] = {}
     for name, own in runs.items():
-        first.setdefault(str({k: x for k, x in own.items() if f"{k}.".startswith(VEHICLES)}), name)
+        first.setdefault(str({k: x for k, x in own.items() if f"{k}.".startswith(OF_ENERGY)}), name)
     words = " and ".join(_told_apart([*first.values()], runs, root))
     sentence = f"Energies are not comparable, because energy models or vehicles differ: {words}."
     return [sentence] * (len(first) > 1)

@@ -15,7 +15,7 @@ from lcc_rl.io.settings import parse_yaml, read_json, read_text
 from lcc_rl.runs.states import HYDRA_FOLDER, run_folders, survey
 
 PLAN = "sweep.json"
-MARK = re.compile(r"(?:^|_)([0-9a-f]{8})$")  # hash of a run's settings at the end of its name
+RUN_HASH = re.compile(r"(?:^|_)([0-9a-f]{8})$")  # hash of a run's settings at the end of its name
 MOST_RUNS = 100_000  # most runs of a sweep: Hydra holds all of them in memory
 
 
@@ -69,9 +69,9 @@ def choices_of(folder: Path) -> dict[str, str]:
         return {}
 
 
-def mark_of(run: Path) -> str:
+def hash_in_name(run: Path) -> str:
     """Return the hash of its settings in the name of a run; empty for a name without one."""
-    found = MARK.search(run.name)
+    found = RUN_HASH.search(run.name)
     return found[1] if found else ""
 
 
@@ -96,7 +96,7 @@ def unfinished(root: Path) -> dict[str, str]:
 def _waiting(plans: Sequence[SweepPlan], runs: Sequence[Path]) -> list[str]:
     """Return the names of cells of the plans of a folder without a run, each run once."""
     plans = [plan for plan in plans if plan.values]
-    typed = [(mark_of(run), choices_of(run)) for run in runs] if plans else []
+    typed = [(hash_in_name(run), choices_of(run)) for run in runs] if plans else []
     known, names = {mark for mark, _ in typed} - {""}, []
     for plan in plans:
         by_words = [choices for mark, choices in typed if not (mark and plan.marks)]

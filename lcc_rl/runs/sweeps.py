@@ -32,7 +32,7 @@ from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.runs.interrupts import BAD_INPUT, end_with_parent, was_interrupted
 from lcc_rl.runs.overview import live
-from lcc_rl.runs.plans import MOST_RUNS, PLAN, SweepPlan, mark_of, read_plan
+from lcc_rl.runs.plans import MOST_RUNS, PLAN, SweepPlan, hash_in_name, read_plan
 from lcc_rl.runs.states import (
     CONFIG,
     Busy,
@@ -76,7 +76,9 @@ def run_name(*, _root_: DictConfig) -> str:
 
     An existing folder with the same hash is reused.
     """
-    mark, sweep = _mark(_root_), Path(_root_.hydra.sweep.dir)
+    settings = OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"])
+    mark, _ = _hashed(settings, _root_.hydra.job.config_name, words_of(_root_))
+    sweep = Path(_root_.hydra.sweep.dir)
     for folder in sorted(sweep.glob(f"*{mark}")):
         return folder.name
     typed, varied = result_overrides(words_of(_root_)), read_plan(sweep).varied
@@ -86,14 +88,11 @@ def run_name(*, _root_: DictConfig) -> str:
     return f"{text}_{mark}".lstrip("_")
 
 
-def _mark(root: DictConfig) -> str:
-    """Return a short hash of a run's settings, or of the command line if they are invalid."""
-    settings = OmegaConf.masked_copy(root, [str(key) for key in root if key != "hydra"])
-    return _checked(settings, root.hydra.job.config_name, words_of(root))[0]
+def _hashed(settings: DictConfig, entry: str, typed: list[str]) -> tuple[str, LccError | None]:
+    """Return a short hash of a run's settings, and why they are invalid, if so.
 
-
-def _checked(settings: DictConfig, entry: str, typed: list[str]) -> tuple[str, LccError | None]:
-    """Return the hash of a run, see :func:`_mark`, and why its settings are invalid, if so."""
+    The hash of invalid settings is that of the command line.
+    """
     try:
         return identity(parsed(settings, entry, typed, sweep=True), "inputs")[:8], None
     except LccError as error:
@@ -266,7 +265,7 @@ def check_cells(config: DictConfig, varied: Collection[str]) -> list[str]:
     same: dict[str, None] = {}
     for words in BasicSweeper.split_arguments(read, None)[0]:
         try:
-            mark, error = _checked(composed(entry, words), entry, words)
+            mark, error = _hashed(composed(entry, words), entry, words)
         except ConfigError as refused:
             refuse(refused)
         own = [item.lstrip("+") for item in words if key_of(item) in varied]
@@ -318,7 +317,7 @@ def conclude(folder: Path, plan: SweepPlan) -> None:
         LccError: if runs of the plan failed, or were refused; those of other commands do not count.
     """
     every, cells = survey(folder), {"", *plan.marks}
-    own = [x for x in every if not plan.marks or mark_of(Path(x.name)) in cells]
+    own = [x for x in every if not plan.marks or hash_in_name(Path(x.name)) in cells]
     finished = [state for state in own if state.state == "finished"]
     failed = [state for state in own if state.state == "failed"]
     refused = [state for state in finished if state.error]

@@ -137,6 +137,8 @@ def test_runs_without_rows_are_listed_wherever_a_sweep_is_read(root, capsys, cap
             assert all(one in printed for one in MISSING), printed
     one = report_of(root, "alcc efficiency.weight=4")
     figure = measures_of(one, [replace(one, short=one.short.drop(columns=one.shown[-2].key))])
+    equal = measures_of(replace(one, short=one.short.assign(collisions_per_seed=2.0)))
+    assert 0.0 in [x.get_xlim()[0] for x in equal.axes if x.get_xlabel().startswith("colli")]
     noted = words_of(figure._supxlabel.get_text())
     assert noted.startswith("6 windows × 3 drivers, 600 steps, after 20 s; lines: 95 % intervals ")
     assert all(one in noted for one in ("saved: against", *MISSING))
