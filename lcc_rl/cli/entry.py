@@ -260,9 +260,7 @@ def sweep(command: Callable[[], Any]) -> None:
         if folder is not None and was_interrupted(error):
             raise Interrupted(f"stopped; the same command resumes it in {folder}") from None
         if folder is not None and isinstance(error, BrokenExecutor):
-            words = (
-                "a process was killed (too little memory?); the same command resumes the sweep in"
-            )
+            words = "a process was killed; the same command resumes the sweep in"
             raise LccError(f"{words} {folder}") from None
         raise
     finally:

@@ -118,9 +118,8 @@ def stacked(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Return tables below each other; integers that some of them lack stay integers, with nulls."""
     columns = [set(frame) for frame in frames if len(frame.columns)]
     lacking = set().union(*columns).difference(set.intersection(*columns)) if columns else set()
-    parts = [
-        x.astype({y: "Int64" for y in x.select_dtypes("integer") if y in lacking}) for x in frames
-    ]
+    kinds = [dict.fromkeys(lacking & {*x.select_dtypes("integer")}, "Int64") for x in frames]
+    parts = [frame.astype(kind) for frame, kind in zip(frames, kinds, strict=True)]
     return pd.concat(parts, ignore_index=True)
 
 

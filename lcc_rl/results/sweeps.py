@@ -29,19 +29,9 @@ from lcc_rl.runs.states import run_folders
 
 # Settings in which the parts and the seeds of one study differ.
 SHARED = (*NOT_IDENTITY, "seed", SHARD)
-# Settings of the vehicles and their energy models.
-OF_ENERGY = ("energy.", "scenario.string.", "scenario.fleet.")
-EPISODE = [
-    STRATEGY,
-    TRAINED,
-    SOURCE,
-    "profile_id",
-    "driver_id",
-    "repeat",
-    "case",
-    "run_id",
-    "follower",
-]
+OF_ENERGY = ("energy.", "scenario.string.", "scenario.fleet.")  # models and vehicles
+EPISODE = [STRATEGY, TRAINED, SOURCE, "profile_id", "driver_id", "repeat"]
+EPISODE += ["case", "run_id", "follower"]
 Choices = Mapping[str, Any]  # of a run, by dotted key
 
 
@@ -113,9 +103,8 @@ def conditions(rows: pd.DataFrame, runs: Mapping[str, Choices], root: Path) -> d
         else:
             alike.append((numbers, [str(name)]))
     found = _told_apart([names[0] for _, names in alike], runs, root)
-    return {
-        name: word for word, (_, names) in zip(found, alike, strict=True) if word for name in names
-    }
+    named = zip(found, alike, strict=True)
+    return {name: word for word, (_, names) in named if word for name in names}
 
 
 def _told_apart(names: Iterable[str], runs: Mapping[str, Choices], root: Path) -> list[str]:
@@ -130,8 +119,8 @@ def _of_vehicles(runs: Mapping[str, Choices], root: Path) -> list[str]:
     for name, own in runs.items():
         first.setdefault(str({k: x for k, x in own.items() if f"{k}.".startswith(OF_ENERGY)}), name)
     words = " and ".join(_told_apart([*first.values()], runs, root))
-    sentence = f"Energies are not comparable, because energy models or vehicles differ: {words}."
-    return [sentence] * (len(first) > 1)
+    why = f"because energy models or vehicles differ: {words}"
+    return [f"Energies are not comparable, {why}."] * (len(first) > 1)
 
 
 def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str, str]]:

@@ -88,7 +88,7 @@ def states_table(
         colour = STATE_COLOURS[state.state]
         kind = f"[{colour}]{state.state}[/]"
         # The error is below the name, which has space.
-        name = f"{state.name}\n  {state.remark}" if state.error else state.name
+        name = f"{state.name}\n  {state.error}" if state.error else state.name
         table.add_row(escape(name), kind, progress(state), left(state))
     if most and len(shown) > most:
         table.add_row(f"… {len(shown) - most} more")
@@ -112,7 +112,7 @@ def show_states(root: Path, console: Console) -> None:
         console.print(states_table(root, states, planned))
         return
     for state in states:
-        line = f"{state.state:<9}{progress(state):>12}  {state.name}  {left(state) or state.remark}"
+        line = f"{state.state:<9}{progress(state):>12}  {state.name}  {left(state) or state.error}"
         console.print(line.rstrip(), markup=False, soft_wrap=True)
     console.print(overview_line(root, states, planned), markup=False, soft_wrap=True)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice, product, repeat
 from pathlib import Path
@@ -15,7 +15,7 @@ from lcc_rl.io.settings import parse_yaml, read_json, read_text
 from lcc_rl.runs.states import HYDRA_FOLDER, run_folders, survey
 
 PLAN = "sweep.json"
-RUN_HASH = re.compile(r"(?:^|_)([0-9a-f]{8})$")  # hash of a run's settings at the end of its name
+RUN_HASH = re.compile(r"(?:^|/|_)([0-9a-f]{8})$")  # hash of a run's settings at the end of its name
 MOST_RUNS = 100_000  # most runs of a sweep: Hydra holds all of them in memory
 
 
@@ -69,17 +69,10 @@ def choices_of(folder: Path) -> dict[str, str]:
         return {}
 
 
-def hash_in_name(run: Path) -> str:
-    """Return the hash of its settings in the name of a run; empty for a name without one."""
-    found = RUN_HASH.search(run.name)
-    return found[1] if found else ""
-
-
 def unfinished(root: Path) -> dict[str, str]:
     """Return the state of each run without results at or below a folder, by name.
 
-    Cells of a plan without a run are ``waiting``. The run of a cell is known by its hash, and by
-    its command if the plan or the run's name has none.
+    Cells of a plan without a run, known by its hash, else by its command, are ``waiting``.
     """
     folders = run_folders(root)
     found = {run.name: str(run) for run in survey(root, folders) if run.state != "finished"}
@@ -93,11 +86,12 @@ def unfinished(root: Path) -> dict[str, str]:
     return found
 
 
-def _waiting(plans: Sequence[SweepPlan], runs: Sequence[Path]) -> list[str]:
-    """Return the names of cells of the plans of a folder without a run, each run once."""
+def _waiting(plans: Sequence[SweepPlan], runs: Sequence[Path]) -> Iterator[str]:
+    """Yield the names of cells of the plans of a folder without a run, each run once."""
     plans = [plan for plan in plans if plan.values]
-    typed = [(hash_in_name(run), choices_of(run)) for run in runs] if plans else []
-    known, names = {mark for mark, _ in typed} - {""}, []
+    named = runs if plans else ()
+    typed = [("".join(RUN_HASH.findall(run.name)), choices_of(run)) for run in named]
+    known = {mark for mark, _ in typed} - {""}
     for plan in plans:
         by_words = [choices for mark, choices in typed if not (mark and plan.marks)]
         begun = {tuple(map(choices.get, plan.varied)) for choices in by_words}
@@ -105,6 +99,4 @@ def _waiting(plans: Sequence[SweepPlan], runs: Sequence[Path]) -> list[str]:
         for cell, mark in zip(cells, chain(plan.marks, repeat("")), strict=False):
             if cell not in begun and mark not in known:
                 known |= {mark} - {""}
-                each = zip(plan.varied, cell, strict=False)
-                names.append("+".join(f"{key}={value}" for key, value in each))
-    return names
+                yield "+".join(map("=".join, zip(plan.varied, cell, strict=False)))

@@ -69,16 +69,7 @@ class RunState:
     error: str = ""
 
     def __str__(self) -> str:
-        return f"{self.state}: {self.remark}".removesuffix(": ")
-
-    @property
-    def remark(self) -> str:
-        """The error; of a finished run that it was not repeated."""
-        return (
-            f"not repeated: {self.error}" * bool(self.error)
-            if self.state == "finished"
-            else self.error
-        )
+        return f"{self.state}: {self.error}".removesuffix(": ")
 
 
 _locks: dict[Path, int | None] = {}  # locks of the folders that this process claims
@@ -238,7 +229,7 @@ def _inspected(folder: Path, name: str) -> RunState:
     for table in filter(Path.exists, (folder / table for table in RESULT_TABLES)):
         if not _is_whole(table):
             return RunState(name, "failed", done, total, error=f"{table.name} is cut or damaged")
-        state = "finished"  # also if it could not be repeated
+        state, why = "finished", f"not repeated: {why}" * bool(why)
     return RunState(name, state, done, total, error=why)
 
 

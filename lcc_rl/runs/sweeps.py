@@ -32,7 +32,7 @@ from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
 from lcc_rl.runs.interrupts import BAD_INPUT, end_with_parent, was_interrupted
 from lcc_rl.runs.overview import live
-from lcc_rl.runs.plans import MOST_RUNS, PLAN, SweepPlan, hash_in_name, read_plan
+from lcc_rl.runs.plans import MOST_RUNS, PLAN, RUN_HASH, SweepPlan, read_plan
 from lcc_rl.runs.states import (
     CONFIG,
     Busy,
@@ -89,10 +89,7 @@ def run_name(*, _root_: DictConfig) -> str:
 
 
 def _hashed(settings: DictConfig, entry: str, typed: list[str]) -> tuple[str, LccError | None]:
-    """Return a short hash of a run's settings, and why they are invalid, if so.
-
-    The hash of invalid settings is that of the command line.
-    """
+    """Return a short hash of a run's settings, of its words if invalid, and why they are."""
     try:
         return identity(parsed(settings, entry, typed, sweep=True), "inputs")[:8], None
     except LccError as error:
@@ -246,14 +243,9 @@ def warn_of_rounding(plan: SweepPlan) -> None:
 
 
 def check_cells(config: DictConfig, varied: Collection[str]) -> list[str]:
-    """Log which cells of a sweep will fail, and why, and which are one run.
+    """Log which cells of a sweep will fail, and why, and which are one run; return their hashes.
 
-    Args:
-        config: Hydra's configuration of the sweep.
-        varied: dotted keys that name a cell.
-
-    Returns:
-        The hash of each cell; nothing if it is known in a run only.
+    Keys ``varied`` name a cell. There are no hashes if they are known in a run only.
 
     Raises:
         SystemExit: for a choice that no file has, with which Hydra does not start a sweep.
@@ -273,9 +265,8 @@ def check_cells(config: DictConfig, varied: Collection[str]) -> list[str]:
             marks[()] = ""
         elif error:
             log.error("will fail: %s%s", f"{' '.join(own)}: " * bool(own), error)
-        if others := [
-            x for x in zip(own, first.setdefault(mark, own), strict=True) if x[0] != x[1]
-        ]:
+        pairs = zip(own, first.setdefault(mark, own), strict=True)
+        if others := [pair for pair in pairs if pair[0] != pair[1]]:
             one, other = map(" ".join, zip(*others, strict=True))
             same[f"{one} is the same run as {other}"] = None
         marks[tuple(item.partition("=")[2] for item in own)] = mark
@@ -311,13 +302,9 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
 
 
 def conclude(folder: Path, plan: SweepPlan) -> None:
-    """Log the result of a sweep.
-
-    Raises:
-        LccError: if runs of the plan failed, or were refused; those of other commands do not count.
-    """
-    every, cells = survey(folder), {"", *plan.marks}
-    own = [x for x in every if not plan.marks or hash_in_name(Path(x.name)) in cells]
+    """Log the result of a sweep; raise if runs of its plan failed, or were refused."""
+    every, cells = survey(folder), {*plan.marks}
+    own = [x for x in every if not cells or {*RUN_HASH.findall(x.name)} <= cells]
     finished = [state for state in own if state.state == "finished"]
     failed = [state for state in own if state.state == "failed"]
     refused = [state for state in finished if state.error]
@@ -327,13 +314,10 @@ def conclude(folder: Path, plan: SweepPlan) -> None:
     if others := sum(state.state == "failed" for state in every) - len(failed):
         log.warning("%d failed runs in the folder are of other commands", others)
     for state in (*failed, *refused):
-        log.error("failed: %s: %s", state.name, state.remark)
+        log.error("failed: %s: %s", state.name, state.error)
     if failed or refused:
         begun = any((folder / x.name / CONFIG).is_file() for x in failed)
         again = "; the same command repeats those that had begun" * begun
-        what = f"{len(failed)} of {len(own)} runs failed{again}" if failed else ""
-        kept = f"{len(refused)} of {len(own)} runs keep earlier rows" if refused else ""
-        raise LccError(
-            f"{' and '.join(filter(None, (what, kept)))} "
-            f"(reasons: error.txt in the folder of each run, {folder})"
-        )
+        named = ((failed, f"failed{again}"), (refused, "keep earlier rows"))
+        what = " and ".join(f"{len(x)} of {len(own)} runs {how}" for x, how in named if x)
+        raise LccError(f"{what} (reasons: error.txt in the folder of each run, {folder})")

@@ -227,7 +227,6 @@ def test_runs_are_named_by_what_their_commands_varied(tmp_path) -> None:
     plain = [{"agent.gamma": 0.9, "agent.tau": tau, "w.a.x": tau, "w.b.x": 1} for tau in (1, 2)]
     sources = [{"w.x": 1.0, "inputs.reward.mine.py": digest} for digest in ("3f", "4a")]
     for typed, stored, expected in (
-        # A word without effect, or another spelling, explains no difference of files.
         (["a=1 w.x=1.0", "a=1"], sources, ["mine.py=3f", "mine.py=4a"]),
         (["w.x=1", "w.x=1.0"], sources, ["mine.py=3f", "mine.py=4a"]),
         (["ablation=full", "ablation=no_jerk"], plain, ["ablation=full", "ablation=no_jerk"]),
