@@ -30,8 +30,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 45_090, "code": 29_955},
-    "tests": {"lines": 27_265},
+    "lcc_rl + tools": {"lines": 46_000, "code": 31_000},
+    "tests": {"lines": 28_000},
     "conf": {"yaml": 166},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py

@@ -9,6 +9,7 @@ import sys
 import traceback
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
@@ -258,6 +259,9 @@ def sweep(command: Callable[[], Any]) -> None:
         folder = SweepCallback.end()
         if folder is not None and was_interrupted(error):
             raise Interrupted(f"stopped; the same command resumes it in {folder}") from None
+        if folder is not None and isinstance(error, BrokenExecutor):
+            words = "a process was killed; the same command resumes the sweep in"
+            raise LccError(f"{words} {folder}") from None
         raise
     finally:
         folder = SweepCallback.end()
@@ -266,7 +270,7 @@ def sweep(command: Callable[[], Any]) -> None:
 
         for line in without_effect(folder):
             logging.getLogger("lcc_rl").warning(line)
-        conclude(folder)
+        conclude(folder, SweepCallback.plan)
 
 
 def explaining(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -7,7 +7,6 @@ import logging
 import multiprocessing
 import os
 import shlex
-import threading
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
@@ -49,7 +48,7 @@ from lcc_rl.results.names import RULE, size_of
 from lcc_rl.results.render import print_table, terminal
 from lcc_rl.results.report import report, windows_for
 from lcc_rl.results.trust import own_modules, trust_option
-from lcc_rl.runs.interrupts import INTERRUPTED
+from lcc_rl.runs.interrupts import INTERRUPTED, end_with_parent
 from lcc_rl.runs.output import log_report, show_headline
 from lcc_rl.runs.precision import prepare_torch
 from lcc_rl.runs.progress import watch_jobs
@@ -238,7 +237,7 @@ def train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
     todo = {name: cfg for name, cfg in parts.items() if not _finished(folder / name, cfg)}
     # A new interpreter per training: forking a process with torch's threads can hang.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, _end_with_parent) as pool:
+    with ProcessPoolExecutor(jobs, context, _prepare_process) as pool:
         futures: dict[str, Future[None]] = {
             name: pool.submit(_train_one, cfg, str(folder / name)) for name, cfg in todo.items()
         }
@@ -253,19 +252,12 @@ def train_all(parts: dict[str, TrainConfig], folder: Path, jobs: int) -> None:
             raise Interrupted("stopped; the same command resumes it") from None
 
 
-def _end_with_parent() -> None:
-    """End this process when its parent is killed; else it would wait for work forever."""
+def _prepare_process() -> None:
+    """Prepare a process of the pool."""
     gc.freeze()  # later garbage collection skips modules
     logging.getLogger().setLevel(logging.INFO)
     logging.raiseExceptions = False  # a failing log must not end a training
-    parent = multiprocessing.parent_process()
-
-    def wait_for_end() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(INTERRUPTED)
-
-    threading.Thread(target=wait_for_end, daemon=True).start()
+    end_with_parent()
 
 
 def _train_one(cfg: TrainConfig, folder: str) -> None:

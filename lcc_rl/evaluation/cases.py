@@ -169,6 +169,7 @@ def measured_series(series: CaseSeries, time_step: float = 0.1) -> pd.DataFrame:
     columns |= safety_measures(entries, alive, time_step, registered())
     runs, vehicles = energy.shape
     frame = pd.DataFrame({name: value.flatten().cpu().numpy() for name, value in columns.items()})
+    frame = frame.astype({name: "Int64" for _, name in COUNTERS if name in frame})
     frame.insert(0, "run_id", np.repeat(np.arange(runs), vehicles))
     frame.insert(1, "follower", np.tile(np.arange(1, vehicles + 1), runs))
     frame["collided"] = frame["min_gap_m"] <= 0.0

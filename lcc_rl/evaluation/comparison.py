@@ -6,6 +6,7 @@ import hashlib
 import logging
 import math
 import shutil
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from lcc_rl.io.memory import require_memory
 from lcc_rl.pieces.knowledge import hears
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import EPISODES, STEPS
-from lcc_rl.runs.progress import ProgressReporter
+from lcc_rl.runs.progress import BETWEEN_LINES, ProgressReporter
 from lcc_rl.runs.states import check_present
 from lcc_rl.version import code_version
 
@@ -94,12 +95,12 @@ class Store:
         """Yield the rows of each block, strategy by strategy."""
         for block in self.blocks:
             frames = [self._read(index, block, 0) for index in range(len(self.marks))]
-            yield pd.concat(frames, ignore_index=True)
+            yield stacked(frames)
 
     def steps(self) -> pd.DataFrame:
         """Return the time series of all sample episodes, strategy by strategy."""
         every = [(index, block) for index in range(len(self.marks)) for block in self.blocks]
-        return pd.concat([self._read(*key, 1) for key in every], ignore_index=True)
+        return stacked([self._read(*key, 1) for key in every])
 
     def _read(self, strategy: int, block: int, which: int) -> pd.DataFrame:
         """Return the rows (0) or the time series (1) of a block."""
@@ -111,6 +112,15 @@ class Store:
     def clear(self) -> None:
         """Remove the folder of the blocks."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def stacked(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Return tables below each other; integers that some of them lack stay integers, with nulls."""
+    columns = [set(frame) for frame in frames if len(frame.columns)]
+    lacking = set().union(*columns).difference(set.intersection(*columns)) if columns else set()
+    kinds = [dict.fromkeys(lacking & {*x.select_dtypes("integer")}, "Int64") for x in frames]
+    parts = [frame.astype(kind) for frame, kind in zip(frames, kinds, strict=True)]
+    return pd.concat(parts, ignore_index=True)
 
 
 class Comparison:
@@ -149,6 +159,7 @@ class Comparison:
         count, steps, moment = max((x.largest for x in self.players), key=math.prod)
         size = f"an evaluation of {count} episodes of {steps} steps side by side"
         require_memory({size: count * steps * moment}, cfg.device)
+        self.told = time.monotonic()  # time of the last line [s]
         self.every, most = 1, settings.sample_mb
         if most is not None:
             self.every = max(1, math.ceil(sum(x.sampled for x in self.players) / (most * 1e6)))
@@ -202,5 +213,6 @@ class Comparison:
                     steps = steps[number % self.every == 0]
                 store.put(index, block, (rows, steps))
                 done += counts[block]
-                if where is not None:
+                if where is not None or time.monotonic() - self.told >= BETWEEN_LINES:
                     progress.update(done)
+                    self.told = time.monotonic()

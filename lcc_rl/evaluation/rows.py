@@ -163,7 +163,8 @@ def as_frame(columns: dict[str, Tensor], collided: Tensor) -> pd.DataFrame:
     """
     frame = pd.DataFrame({key: value.squeeze(-1).cpu().numpy() for key, value in columns.items()})
     if (frame["steps"] == 0).any():
-        frame = frame.where(frame["steps"] > 0).assign(steps=frame["steps"])
+        integers = dict.fromkeys(frame.select_dtypes("integer"), "Int64")  # NaN makes floats
+        frame = frame.astype(integers).where(frame["steps"] > 0).assign(steps=frame["steps"])
     frame.insert(len(frame.columns) - 1, "collided", collided.squeeze(-1).cpu().numpy())
     return frame
 

@@ -39,7 +39,7 @@ from lcc_rl.results.measures import between, signed
 from lcc_rl.results.motion import most_varied, of_first_seed
 from lcc_rl.results.names import ON_FRONT, RULE, in_words, several, size_of
 from lcc_rl.results.render import column_cells
-from lcc_rl.results.report import AGAINST, ALL, COUNTS, Report
+from lcc_rl.results.report import AGAINST, ALL, COLLISIONS, COUNTS, Report
 from lcc_rl.results.runs import CONFIG, EPISODES, STEPS, read_settings
 from lcc_rl.results.windows import Means, by_driver, varied_in
 
@@ -219,6 +219,7 @@ def measures_of(report: Report, seeds: Sequence[Report] = ()) -> Figure:
         bounds = {f"{key}_{end}": table.get(f"{key}_{end}", table[key]) for end in ("low", "high")}
         dots(axis, range(len(table)), table.assign(**bounds), key, INK)
         axis.set(xlabel=head.replace("-\n", ""))
+        axis.set_xlim(left=0.0 if key.startswith(COLLISIONS.key) else None)  # of equal counts, too
     axes[0].set_yticks(range(len(labels)), labels)
     axes[0].invert_yaxis()
     return figure

@@ -368,6 +368,8 @@ def _of_energy(table: pd.DataFrame, units: Sequence[str], second: Fleet | None) 
     of = "fuel" if second is not None and burns_one_fuel(second) else "second model"
     shown = [Shown(key, heading.format(of)) for key, heading in [*shown, COLLISIONS]]
     note += SHARES * (not fronts)
+    if AT_FLOW[0] in fronts and against != RECORDED:
+        note += f"saved at their flow: against {in_words(RECORDED)}, at the flow of these; "
     return {
         "short": shortened(cars.assign(**columns), shown, spread),
         "caption": CAPTION.format(note + behind_filter(cars)),

@@ -220,11 +220,14 @@ def flatten(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield name, str(value) if isinstance(value, list) else value
 
 
-def differences(settings: Sequence[Mapping[str, Any]], *kept: str) -> list[dict[str, str]]:
+def differences(
+    settings: Sequence[Mapping[str, Any]], *kept: str, last: Sequence[str] = ()
+) -> list[dict[str, str]]:
     """Return for each flat mapping the values by which it differs, ``key=value``, by key.
 
     As few keys as possible are used besides the kept ones, each with its last words:
-    ``safety.weight=0.5``. Hashes of files are used only if no setting differs.
+    ``safety.weight=0.5``. Hashes of files are used only if no setting differs, and keys other than
+    the ``last`` ones only if these do not tell the mappings apart.
     """
     every = list(dict.fromkeys(key for one in settings for key in one))
 
@@ -232,7 +235,8 @@ def differences(settings: Sequence[Mapping[str, Any]], *kept: str) -> list[dict[
         return len({tuple(str(one.get(key)) for key in keys) for one in settings})
 
     chosen = [key for key in every if kinds([key]) > 1]
-    for key in sorted(chosen, key=lambda key: (not key.startswith("inputs."), kinds([key]))):
+    ranks = {key: (not key.startswith("inputs."), key in last, kinds([key])) for key in chosen}
+    for key in sorted(chosen, key=ranks.__getitem__):
         rest = [x for x in chosen if x != key]
         chosen = rest if key not in kept and kinds(rest) == kinds(chosen) else chosen
     names = {key: _last_words(key, chosen) for key in chosen}

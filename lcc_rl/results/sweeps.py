@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shlex
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -28,17 +29,9 @@ from lcc_rl.runs.states import run_folders
 
 # Settings in which the parts and the seeds of one study differ.
 SHARED = (*NOT_IDENTITY, "seed", SHARD)
-EPISODE = [
-    STRATEGY,
-    TRAINED,
-    SOURCE,
-    "profile_id",
-    "driver_id",
-    "repeat",
-    "case",
-    "run_id",
-    "follower",
-]
+OF_ENERGY = ("energy.", "scenario.string.", "scenario.fleet.")  # models and vehicles
+EPISODE = [STRATEGY, TRAINED, SOURCE, "profile_id", "driver_id", "repeat"]
+EPISODE += ["case", "run_id", "follower"]
 Choices = Mapping[str, Any]  # of a run, by dotted key
 
 
@@ -79,12 +72,13 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
             }
             rows.loc[group.index, "strategy"] = group["run"].map(named)
     rows = rows.drop_duplicates([name for name in rows if name != "run"])
-    _check_one_study(root, rows)
+    _check_one_study(root, rows, runs)
     table = rows.drop(columns="run").reset_index(drop=True)
     missing = dict(loaded.attrs.get("unfinished", {}))
     for name, why in loaded.attrs.get("damaged", {}).items():
         missing[name] = f"damaged: {why.removeprefix(f'{root / name}{os.sep}')}"
     remarks = [f"Without rows: {listed(missing)}."] * bool(missing) + without_effect(root)
+    remarks += _of_vehicles(runs, root) if not of else []
     remarks += [f"{x[0].upper()}{x[1:]}." for x in loaded.attrs.get("versions", ())]
     table.attrs |= {"remarks": remarks, "first": str(root / next(iter(runs)))}
     return table
@@ -108,27 +102,47 @@ def conditions(rows: pd.DataFrame, runs: Mapping[str, Choices], root: Path) -> d
                 break
         else:
             alike.append((numbers, [str(name)]))
-    firsts = [names[0] for _, names in alike]
-    found = labels([runs[name] for name in firsts], [root / name for name in firsts])
+    found = _told_apart([names[0] for _, names in alike], runs, root)
     named = zip(found, alike, strict=True)
-    return {name: ", ".join(word.values()) for word, (_, names) in named if word for name in names}
+    return {name: word for word, (_, names) in named if word for name in names}
+
+
+def _told_apart(names: Iterable[str], runs: Mapping[str, Choices], root: Path) -> list[str]:
+    """Return the words by which runs of these names differ, see :func:`labels`."""
+    found = labels([runs[name] for name in names], [root / name for name in names])
+    return [", ".join(words.values()) for words in found]
+
+
+def _of_vehicles(runs: Mapping[str, Choices], root: Path) -> list[str]:
+    """Return a sentence if the vehicles of runs, or their energy models, differ."""
+    first: dict[str, str] = {}
+    for name, own in runs.items():
+        first.setdefault(str({k: x for k, x in own.items() if f"{k}.".startswith(OF_ENERGY)}), name)
+    words = " and ".join(_told_apart([*first.values()], runs, root))
+    why = f"because energy models or vehicles differ: {words}"
+    return [f"Energies are not comparable, {why}."] * (len(first) > 1)
 
 
 def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str, str]]:
     """Return for each run the words by which it differs, ``efficiency.weight=0.5``, by key.
 
-    They are on what the commands varied and what only some of them set; or on stored settings, if
-    a run has no command or that does not tell them apart. Runs of equal settings share their words.
+    They are on what the commands varied and what only some of them set, and on stored settings if
+    a run has no command, or as far as that does not tell different settings apart. Equal settings
+    share their words, as equal values do: ``weight=1.0`` is ``weight=1``.
     """
     typed = [without(choices_of(folder), SHARED) for folder in folders]
-    kinds = {(str(one), str(other)) for one, other in zip(typed, stored, strict=True)}
-    if len(kinds) > len(set(map(str, typed))) or not all(typed):
+    if not all(typed):
         return differences(stored)
-    first = {str(own): words for own, words in reversed([*zip(stored, typed, strict=True)])}
-    each = first.values()
-    kept = [key for one in each for key in one if not all(key in other for other in each)]
-    whole = [{**{k: own[k] for k in kept if k in own}, **first[str(own)]} for own in stored]
-    return differences(whole, *kept)
+    pairs = [*zip(stored, typed, strict=True)][::-1]  # the first ones replace others
+    first = {str(own): words for own, words in pairs}
+    text = {(k, str(own[k])): x for own, words in pairs for k, x in words.items() if k in own}
+    keys = [*dict.fromkeys(key for words in first.values() for key in words)]
+    kept = [key for key in keys if not all(key in words for words in first.values())]
+    whole = []
+    for own in stored:
+        known = {k: own[k] for k in kept if k in own} | first[str(own)] | dict(own)
+        whole.append({k: text.get((k, str(x)), x) for k, x in known.items()})
+    return differences(whole, *kept, last=keys)
 
 
 def _settings(folders: Sequence[Path]) -> list[dict[str, Any]]:
@@ -188,13 +202,17 @@ def _equal(folders: Sequence[Path], what: str, digest: Callable[[Path], Any]) ->
         yield f"{which} had no effect: the {what} are the same with {one}{also}."
 
 
-def _check_one_study(root: Path, rows: pd.DataFrame) -> None:
+def _check_one_study(root: Path, rows: pd.DataFrame, runs: Mapping[str, Choices]) -> None:
     if "leader_speed_mps" in rows:
         leaders = rows.groupby("profile_id")["leader_speed_mps"].nunique()
+        window = leaders.idxmax()
+        own = rows[rows["profile_id"] == window].drop_duplicates("leader_speed_mps")["run"]
+        words = " and ".join(filter(None, _told_apart(own, runs, root)))
+        first = shlex.quote(str(root / own.iloc[0]))
         require(
             leaders.max() == 1,
-            f"{root}: its runs have different leaders (profile_id {leaders.idxmax()}); "
-            f"lcc_rl.results.load({str(root)!r}) reads them",
+            f"{root}: its runs have different leaders ({words or f'profile_id {window}'}): "
+            f"each has a table, lcc-rl table {first}; lcc_rl.results.load({str(root)!r}) reads all",
         )
     twice = rows[rows.duplicated([key for key in EPISODE if key in rows], keep=False)]
     for (strategy, seed), group in twice.groupby([STRATEGY, TRAINED], dropna=False, observed=True):

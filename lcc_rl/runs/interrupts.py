@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import gc
+import multiprocessing
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from typing import Any, NoReturn
 
 from lcc_rl.io.memory import uncollected
@@ -37,6 +39,20 @@ def end_quietly() -> None:
         # A shell may have started this process in the background with SIGINT ignored.
         if signal.getsignal(kind) is not signal.SIG_IGN:
             signal.signal(kind, _end)
+
+
+@cache
+def end_with_parent() -> None:
+    """End a process of a pool when its parent is killed; else it would wait for work forever."""
+    parent = multiprocessing.parent_process()
+
+    def wait_for_end() -> None:
+        while parent is not None and os.getppid() == parent.pid:
+            time.sleep(TOGETHER)
+        os._exit(INTERRUPTED)
+
+    if parent is not None:
+        threading.Thread(target=wait_for_end, daemon=True).start()
 
 
 @contextmanager

@@ -229,7 +229,7 @@ def _inspected(folder: Path, name: str) -> RunState:
     for table in filter(Path.exists, (folder / table for table in RESULT_TABLES)):
         if not _is_whole(table):
             return RunState(name, "failed", done, total, error=f"{table.name} is cut or damaged")
-        state = "finished"  # also if it could not be repeated
+        state, why = "finished", f"not repeated: {why}" * bool(why)
     return RunState(name, state, done, total, error=why)
 
 

@@ -11,7 +11,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
 from shutil import which
@@ -30,9 +30,9 @@ from lcc_rl.config.compose import NOT_IDENTITY, composed, identity, parsed
 from lcc_rl.config.words import key_of
 from lcc_rl.errors import ConfigError, Interrupted, LccError
 from lcc_rl.io.atomic import atomic_path, remove_leftovers
-from lcc_rl.runs.interrupts import BAD_INPUT, was_interrupted
+from lcc_rl.runs.interrupts import BAD_INPUT, end_with_parent, was_interrupted
 from lcc_rl.runs.overview import live
-from lcc_rl.runs.plans import MOST_RUNS, PLAN, SweepPlan, read_plan
+from lcc_rl.runs.plans import MOST_RUNS, PLAN, RUN_HASH, SweepPlan, read_plan
 from lcc_rl.runs.states import (
     CONFIG,
     Busy,
@@ -76,7 +76,9 @@ def run_name(*, _root_: DictConfig) -> str:
 
     An existing folder with the same hash is reused.
     """
-    mark, sweep = _mark(_root_), Path(_root_.hydra.sweep.dir)
+    settings = OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"])
+    mark, _ = _hashed(settings, _root_.hydra.job.config_name, words_of(_root_))
+    sweep = Path(_root_.hydra.sweep.dir)
     for folder in sorted(sweep.glob(f"*{mark}")):
         return folder.name
     typed, varied = result_overrides(words_of(_root_)), read_plan(sweep).varied
@@ -86,14 +88,12 @@ def run_name(*, _root_: DictConfig) -> str:
     return f"{text}_{mark}".lstrip("_")
 
 
-def _mark(root: DictConfig) -> str:
-    """Return a short hash of a run's settings, or of the command line if they are invalid."""
-    settings = OmegaConf.masked_copy(root, [str(key) for key in root if key != "hydra"])
-    typed = words_of(root)
+def _hashed(settings: DictConfig, entry: str, typed: list[str]) -> tuple[str, LccError | None]:
+    """Return a short hash of a run's settings, of its words if invalid, and why they are."""
     try:
-        return identity(parsed(settings, root.hydra.job.config_name, typed, True), "inputs")[:8]
-    except LccError:
-        return hashlib.sha256(json.dumps(typed).encode()).hexdigest()[:8]
+        return identity(parsed(settings, entry, typed, sweep=True), "inputs")[:8], None
+    except LccError as error:
+        return hashlib.sha256(json.dumps(typed).encode()).hexdigest()[:8], error
 
 
 def words_of(config: DictConfig) -> list[str]:
@@ -129,6 +129,7 @@ class SweepCallback(Callback):
     """
 
     folder: Path | None = None  # folder of this process's sweep; Hydra does not store it
+    plan: ClassVar[SweepPlan] = SweepPlan()  # of that sweep
     target: ClassVar[Path | None] = None  # the folder that Hydra writes to
     made: ClassVar[list[Path]] = []  # it and its parents, if this command creates them
     table: Live | None = None
@@ -153,12 +154,16 @@ class SweepCallback(Callback):
         limit_batches(config)
         folder = Path(config.hydra.sweep.dir)
         plan = make_plan(config)
+        if not plan.runs:
+            refuse("nothing is swept: a list of values is empty")
         if plan.runs > MOST_RUNS:
             refuse(f"a sweep has at most {MOST_RUNS} runs")
         warn_of_rounding(plan)
         if str(config.hydra.sweeper.get("_target_")).endswith(BasicSweeper.__name__):
-            check_cells(config, plan.varied)
+            marks = check_cells(config, plan.varied)
+            plan = replace(plan, runs=len({*marks}) or plan.runs, marks=marks)
         type(self).folder = type(self).target = folder
+        type(self).plan = plan
         with atomic_path(folder / PLAN) as temporary:
             whole = asdict(plan.after(read_plan(folder)))
             temporary.write_text(json.dumps(whole), encoding="utf-8")
@@ -237,30 +242,37 @@ def warn_of_rounding(plan: SweepPlan) -> None:
             log.warning(words, key, rounded[-1], key, listed)
 
 
-def check_cells(config: DictConfig, varied: Collection[str]) -> None:
-    """Log which cells of a sweep will fail, and why; the sweep runs the others.
+def check_cells(config: DictConfig, varied: Collection[str]) -> list[str]:
+    """Log which cells of a sweep will fail, and why, and which are one run; return their hashes.
 
-    Args:
-        config: Hydra's configuration of the sweep.
-        varied: dotted keys that name a cell.
+    Keys ``varied`` name a cell. There are no hashes if they are known in a run only.
 
     Raises:
         SystemExit: for a choice that no file has, with which Hydra does not start a sweep.
     """
     read = OverridesParser.create().parse_overrides(words_of_sweep(config))
     entry = config.hydra.job.config_name
+    marks: dict[tuple[str, ...], str] = {}  # by the values of a cell
+    first: dict[str, list[str]] = {}
+    same: dict[str, None] = {}
     for words in BasicSweeper.split_arguments(read, None)[0]:
         try:
-            cell = composed(entry, words)
-        except ConfigError as error:
-            refuse(error)
-        try:
-            parsed(cell, entry, words, sweep=True)
-        except LccError as error:
-            if "HydraConfig was not set" in str(error):  # ${hydra:…} has its value in a run only
-                continue
-            name = " ".join(item.lstrip("+") for item in words if key_of(item) in varied)
-            log.error("will fail: %s: %s", name, error)
+            mark, error = _hashed(composed(entry, words), entry, words)
+        except ConfigError as refused:
+            refuse(refused)
+        own = [item.lstrip("+") for item in words if key_of(item) in varied]
+        if "HydraConfig was not set" in str(error):  # ${hydra:…} has its value in a run only
+            marks[()] = ""
+        elif error:
+            log.error("will fail: %s%s", f"{' '.join(own)}: " * bool(own), error)
+        pairs = zip(own, first.setdefault(mark, own), strict=True)
+        if others := [pair for pair in pairs if pair[0] != pair[1]]:
+            one, other = map(" ".join, zip(*others, strict=True))
+            same[f"{one} is the same run as {other}"] = None
+        marks[tuple(item.partition("=")[2] for item in own)] = mark
+    for line in same:
+        log.warning(line)
+    return [] if "" in marks.values() else [*marks.values()]
 
 
 def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path) -> Any:
@@ -269,6 +281,7 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
     Returns:
         The function's result; None if it failed.
     """
+    end_with_parent()  # as a process of joblib
     if sys.stdout.isatty():
         mute()
     try:
@@ -288,22 +301,23 @@ def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path
         return None
 
 
-def conclude(folder: Path) -> None:
-    """Log the result of a sweep."""
-    states = survey(folder)
-    if not states:
-        raise LccError(f"nothing was swept, in {folder}: is a list of values empty?")
-    failed = [state for state in states if state.error]
-    finished = sum(state.state == "finished" and not state.error for state in states)
-    log.info("%d of %d runs finished, in %s", finished, len(states), folder)
-    if finished > 1 and next(folder.glob("*/episodes.parquet"), None):
+def conclude(folder: Path, plan: SweepPlan) -> None:
+    """Log the result of a sweep; raise if runs of its plan failed, or were refused."""
+    every, cells = survey(folder), {*plan.marks}
+    own = [x for x in every if not cells or {*RUN_HASH.findall(x.name)} <= cells]
+    finished = [state for state in own if state.state == "finished"]
+    failed = [state for state in own if state.state == "failed"]
+    refused = [state for state in finished if state.error]
+    log.info("%d of %d runs finished, in %s", len(finished), len(own), folder)
+    if len(finished) > 1 and next(folder.glob("*/episodes.parquet"), None):
         log.info("side by side: lcc-rl table %s --figure sweep.png", shlex.quote(str(folder)))
-    for state in failed:
+    if others := sum(state.state == "failed" for state in every) - len(failed):
+        log.warning("%d failed runs in the folder are of other commands", others)
+    for state in (*failed, *refused):
         log.error("failed: %s: %s", state.name, state.error)
-    if failed:
-        begun = any(x.state == "failed" and (folder / x.name / CONFIG).is_file() for x in failed)
+    if failed or refused:
+        begun = any((folder / x.name / CONFIG).is_file() for x in failed)
         again = "; the same command repeats those that had begun" * begun
-        raise LccError(
-            f"{len(failed)} of {len(states)} runs failed{again} "
-            f"(reasons: error.txt in the folder of each run, {folder})"
-        )
+        named = ((failed, f"failed{again}"), (refused, "keep earlier rows"))
+        what = " and ".join(f"{len(x)} of {len(own)} runs {how}" for x, how in named if x)
+        raise LccError(f"{what} (reasons: error.txt in the folder of each run, {folder})")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 import torch
 from helpers import POPULATION, compose, steady, string, wavy_profiles
@@ -11,6 +12,7 @@ from helpers import POPULATION, compose, steady, string, wavy_profiles
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent
 from lcc_rl.envs import Inputs, build_env
+from lcc_rl.evaluation.comparison import stacked
 from lcc_rl.evaluation.episodes import Episodes, Plan, evaluate
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.strategies import Strategy, baseline
@@ -125,6 +127,13 @@ def test_a_collision_ends_the_count_and_counts_in_the_warm_up() -> None:
     assert (rows["steps"] == 0).any()
     assert rows.loc[rows["steps"] == 0, ["min_gap_m", "total_energy_kj"]].isna().all(axis=None)
     assert len(steps) == rows["steps"].sum()  # of every episode, also of those without any
+    # Integers stay integers where an episode, or another strategy, has none: files have one schema.
+    direct = run("direct", sample_episodes=1)
+    for own, other in zip((rows, steps), direct, strict=True):
+        for table in (own, stacked([other, own]), stacked([own, pd.DataFrame()])):
+            found = pa.Schema.from_pandas(table)
+            integers = [name for name in own if name in ("steps", "brakings_below_2", "cav_place")]
+            assert [found.field(name).type for name in integers] == [pa.int64()] * len(integers)
 
 
 def test_a_learned_policy_has_the_mean_of_each_reward_term_and_other_rows_none() -> None:

@@ -93,6 +93,10 @@ def test_a_table_marks_savings_at_more_flow_than_the_recorded_drivers_have() -> 
     found = [line for line in one.remarks if "not at equal flow" in line]
     assert [line.rpartition(": ")[2] for line in found] == ["network 15.4%."]
     assert not any("their flow" in line for line in report(windows_for(rows())).remarks)
+    # A chosen baseline is not that of savings at equal flow.
+    named = "saved at their flow: against the recorded drivers, at the flow of these; "
+    for against in (None, "alcc"):
+        assert (named in report(windows_for(rows()), against=against).note) == bool(against)
     slower = rows(flow_vph={**FLOWS, "alcc": 900.0, "alcc X=1": 950.0})
     less = "No saving at their flow: less flow at all points of the front: network."
     assert less in report(windows_for(slower)).remarks

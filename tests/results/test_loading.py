@@ -136,11 +136,16 @@ def test_the_runs_of_a_sweep_are_read_as_one_evaluation(tmp_path) -> None:
     rows = sweep_of(tmp_path / "events", *runs)  # each beside its own baseline
     found = rows.groupby("source", sort=False)["strategy"].unique().map(list).to_dict()
     assert found == {f"base={x}": ["idm", "alcc"] for x in (5.0, 6.0)}
+    assert not rows.attrs["remarks"]
+    energies = [{"seed": seed, "energy": {"scale": x}} for x in (1, 9) for seed in (0, 1)]
+    *_, remark = sweep_of(tmp_path / "energies", *energies).attrs["remarks"]
+    assert remark.endswith("vehicles differ: energy.scale=1 and energy.scale=9.")
     rounded = [{"seed": seed, "base": 5.0 + 1e-6 * seed} for seed in (0, 1)]
     assert "source" not in sweep_of(tmp_path / "machines", *rounded)
     refusals = [
         ([{"seed": 0}, {"seed": 0, "table": "all"}], "training twice: alcc, seed 0: 0 and 1$"),
         ([{"seed": 0}, {"seed": 1, "leader": 8.0}], r"have different leaders .*results\.load"),
+        ([{"seed": 0, "leader": x} for x in (8.0, 9.0)], r"\(leader=8.0 and leader=9.0\).*/0; "),
     ]
     for place, (runs, words) in enumerate(refusals):
         with pytest.raises(ConfigError, match=words):

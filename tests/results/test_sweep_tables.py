@@ -84,6 +84,21 @@ def test_a_later_command_in_a_sweep_s_folder_forgets_no_cell(tmp_path) -> None:
     assert found == [waiting, waiting, sorted([*waiting, "seed=7"]), sorted([*waiting, "seed=7"])]
 
 
+def test_cells_that_are_one_run_wait_once_and_end_together(tmp_path) -> None:
+    first = SweepPlan(2, ["w", "seed"], [["1", "1.0"], ["0", "1"]], ["a" * 8, "b" * 8] * 2)
+    other = SweepPlan(2, ["seed"], [["0", "1"]], ["a" * 8, "b" * 8])
+    same_words = SweepPlan(2, ["seed"], [["0", "1"]], ["c" * 8, "a" * 8])
+    (tmp_path / f"w=1+seed=0_{'a' * 8}").mkdir()
+    (tmp_path / f"w=1+seed=0_{'a' * 8}" / EPISODES).write_bytes(b"PAR1 rows PAR1")
+    for plan, waiting in (
+        (first, ["w=1+seed=1"]),
+        (other.after(first), ["seed=1"]),
+        (same_words.after(other), ["seed=0", "seed=1"]),
+    ):
+        (tmp_path / PLAN).write_text(json.dumps(asdict(plan)))
+        assert [*unfinished(tmp_path)] == waiting
+
+
 def words_of(text: str) -> str:
     """Return a text without line breaks, frames and marks of comments."""
     return " ".join(re.sub(r"\n%|[\n\\]", " ", text).split())
@@ -122,6 +137,8 @@ def test_runs_without_rows_are_listed_wherever_a_sweep_is_read(root, capsys, cap
             assert all(one in printed for one in MISSING), printed
     one = report_of(root, "alcc efficiency.weight=4")
     figure = measures_of(one, [replace(one, short=one.short.drop(columns=one.shown[-2].key))])
+    equal = measures_of(replace(one, short=one.short.assign(collisions_per_seed=2.0)))
+    assert 0.0 in [x.get_xlim()[0] for x in equal.axes if x.get_xlabel().startswith("colli")]
     noted = words_of(figure._supxlabel.get_text())
     assert noted.startswith("6 windows × 3 drivers, 600 steps, after 20 s; lines: 95 % intervals ")
     assert all(one in noted for one in ("saved: against", *MISSING))
@@ -208,7 +225,10 @@ def test_a_row_may_have_another_name_everywhere(root, capsys, monkeypatch) -> No
 
 def test_runs_are_named_by_what_their_commands_varied(tmp_path) -> None:
     plain = [{"agent.gamma": 0.9, "agent.tau": tau, "w.a.x": tau, "w.b.x": 1} for tau in (1, 2)]
+    sources = [{"w.x": 1.0, "inputs.reward.mine.py": digest} for digest in ("3f", "4a")]
     for typed, stored, expected in (
+        (["a=1 w.x=1.0", "a=1"], sources, ["mine.py=3f", "mine.py=4a"]),
+        (["w.x=1", "w.x=1.0"], sources, ["mine.py=3f", "mine.py=4a"]),
         (["ablation=full", "ablation=no_jerk"], plain, ["ablation=full", "ablation=no_jerk"]),
         (["++w.a.x=1", "++w.a.x=2"], plain, ["a.x=1", "a.x=2"]),
         # The seed is no setting, nor is what both have in common.

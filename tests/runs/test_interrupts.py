@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+import threading
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from commands import (
@@ -27,6 +30,7 @@ from lcc_rl.cli.guard import main_guard
 from lcc_rl.commands import training
 from lcc_rl.errors import ConfigError
 from lcc_rl.io.files import read_parquet
+from lcc_rl.runs import interrupts
 from lcc_rl.runs.interrupts import ENDING_SIGNALS, interruptible, stop_signal
 
 # SIGINT is heard again below; nohup ignores SIGHUP, for its children, too.
@@ -187,3 +191,12 @@ def test_an_interrupted_pipeline_starts_no_further_training(tmp_path, monkeypatc
         assert len(read_parquet(tmp_path / "job" / name / "training.parquet")) == 50
         assert f"train {name}: iteration 50/50" in (tmp_path / f"job/{name}/train.log").read_text()
     assert (tmp_path / "job/evaluation/figures/overview.png").exists()
+
+
+def test_a_process_of_a_pool_ends_with_its_parent(monkeypatch) -> None:
+    ended = threading.Event()
+    monkeypatch.setattr(os, "_exit", lambda code: ended.set())
+    for parent in (None, SimpleNamespace(pid=os.getpid())):  # the parent's pid is another one
+        monkeypatch.setattr(multiprocessing, "parent_process", lambda parent=parent: parent)
+        interrupts.end_with_parent.__wrapped__()
+        assert ended.wait(5.0 if parent else 0.0) is (parent is not None)

@@ -18,7 +18,7 @@ from lcc_rl.commands import training
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError
 from lcc_rl.results.runs import load_config
 from lcc_rl.runs.overview import main, overview_line, states_table
-from lcc_rl.runs.plans import unfinished
+from lcc_rl.runs.plans import SweepPlan, unfinished
 from lcc_rl.runs.progress import ProgressReporter
 from lcc_rl.runs.states import (
     Busy,
@@ -89,13 +89,19 @@ def test_a_failure_is_recorded_and_forgotten_when_tried_again(tmp_path) -> None:
     assert inspect_run(tmp_path).state == "stopped"
 
 
-def test_a_finished_run_stays_finished_and_a_removed_one_removed(tmp_path, trained) -> None:
+def test_a_finished_run_stays_finished_and_a_removed_one_removed(tmp_path, trained, caplog) -> None:
+    caplog.set_level("INFO")
     folder = shutil.copytree(trained, tmp_path / "run")
     record(folder, ConfigError("its data have changed"))
-    assert str(inspect_run(folder)) == "finished: its data have changed"
+    assert str(inspect_run(folder)) == "finished: not repeated: its data have changed"
     assert not unfinished(tmp_path)
-    with pytest.raises(LccError, match=r"^1 of 1 runs failed \(reasons"):  # nothing to repeat
-        conclude(tmp_path)
+    (tmp_path / f"a_{'0' * 8}").mkdir()
+    record(tmp_path / f"a_{'0' * 8}", ConfigError("of another command"))
+    for marks, words in ((["1" * 8], "1 of 1"), ([], "1 of 2 runs failed and 1 of 2")):
+        with pytest.raises(LccError, match=rf"^{words} runs keep earlier rows \(reasons"):
+            conclude(tmp_path, SweepPlan(marks=marks))
+    told = "1 of 1 runs finished", "1 failed runs in the folder are of other commands"
+    assert all(line in caplog.text for line in told)
     training.complete(load_config(folder), folder)
     assert str(inspect_run(folder)) == "finished"
     shutil.rmtree(folder)

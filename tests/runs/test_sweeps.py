@@ -8,6 +8,7 @@ import pty
 import signal
 import subprocess
 import sys
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from pathlib import Path
 
@@ -79,6 +80,17 @@ def test_a_sweep_that_is_interrupted_names_the_way_to_resume(tmp_path, monkeypat
     assert len(list(tmp_path.rglob("train.log"))) == 1  # the second run has not begun
 
 
+def test_a_sweep_whose_process_is_killed_names_the_way_to_resume(tmp_path, monkeypatch) -> None:
+    def killed(*_: object) -> None:
+        raise BrokenProcessPool("a worker was unexpectedly terminated")
+
+    monkeypatch.setattr("lcc_rl.cli.entry.run_job", killed)
+    done = run_command("train", *SWEEP, "seed=0,1", "sweep=mine", cwd=tmp_path)
+    *_, last = done.stderr.splitlines()
+    assert done.returncode == 2
+    assert last.endswith("; the same command resumes the sweep in outputs/train/mine")
+
+
 def test_a_sweep_is_read_as_one_table(tmp_path, capsys) -> None:
     inputs._last.clear()  # what other sweeps of this process have read
     one = [*TINY, "variant=alcc", "training.episodes=16", "evaluation.baselines=[human]"]
@@ -143,6 +155,10 @@ CELLS = {
         "will fail: training.episodes=none: training.episodes"
     ],
     ("seed=0,1",): [],
+    ("reward.terms.safety.weight=1,1.0", "seed=0,1"): [
+        "reward.terms.safety.weight=1.0 is the same run as reward.terms.safety.weight=1"
+    ],
+    ("seed=",): ["will fail: seed"],
     ("seed=0,1", "data=episodes", "data.path=${hydra:runtime.cwd}/pairs.csv"): [],
 }
 
@@ -180,7 +196,8 @@ def test_a_run_of_a_sweep_is_refused_what_has_no_effect(tmp_path) -> None:
 def test_a_sweep_of_nothing_is_one_line(tmp_path) -> None:
     done = run_command("train", *SWEEP, "seed=range(0)", cwd=tmp_path)
     assert done.returncode == 2
-    assert "nothing was swept" in done.stderr
+    assert "nothing is swept: a list of values is empty" in done.stderr
+    assert not [*tmp_path.iterdir()]
 
 
 def on_terminal(cwd: Path, *words: str) -> str:
