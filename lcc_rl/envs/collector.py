@@ -17,9 +17,18 @@ from torchrl.envs.utils import RandomPolicy
 
 from lcc_rl.envs.compiled import Compiled
 from lcc_rl.envs.single import VIEWS, MultiAgent, SingleAgent, group_key
-from lcc_rl.envs.step import DONE, Step, closure, entries_of, leaf_keys, pieces_of, read_before
+from lcc_rl.envs.step import (
+    DONE,
+    Step,
+    check_batch,
+    closure,
+    entries_of,
+    leaf_keys,
+    pieces_of,
+    read_before,
+)
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.pieces.base import NEXT, Key, State, as_key, root_key
+from lcc_rl.pieces.base import NEXT, STEP, Key, State, as_key, root_key
 
 # Plain resets, 2 ms each, before they are compiled, which takes 3 to 7 s.
 PLAIN_RESETS = 2_000
@@ -134,8 +143,12 @@ class StringCollector(BaseCollector):
 
     @torch.no_grad()
     def collect(self) -> TensorDictBase:
-        """Return the next batch, ``[*batch, steps]``."""
-        record = []
+        """Return the next batch, ``[*batch, steps]``.
+
+        Raises:
+            Diverged: naming the first entry of it that is not finite, its step and its episode.
+        """
+        record, begun = [], int(self.state[STEP].max())
         for _ in range(self.steps):
             self.state, entries, over = self.advance(self.state)
             record.append(entries)
@@ -147,6 +160,7 @@ class StringCollector(BaseCollector):
         segment = TensorDict(batch_size=[*batch, self.steps], device=self.env.device)
         for key, values in zip(self.keys, zip(*record, strict=True), strict=True):
             segment.set(key, torch.stack(values, len(batch)))
+        check_batch(segment.reshape(-1, self.steps), begun)
         if isinstance(self.view, MultiAgent):
             self.view(segment)
             self.view(segment.get(NEXT, TensorDict()))

@@ -11,11 +11,13 @@ import torch
 from commands import tiny
 from helpers import ACTION, check_refused, compose, network, play, single_env, small_env
 from platoons import env_of, hcfs, ramps
+from torchrl.collectors import Collector
 
 from lcc_rl.commands import evaluation, training
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.genetic import GeneticSettings
 from lcc_rl.drivers.observed import Selection, observe
+from lcc_rl.envs import StringCollector
 from lcc_rl.errors import DataError, Diverged
 from lcc_rl.pieces import IDM, Controller, Feature, MotorPower, RewardTerm
 
@@ -66,6 +68,7 @@ ENTRY = (
     "+observation.scales.self.broken=0.1",
 )
 FILTER = ("+filter=cbf",)
+ENVIRONMENTS = (single_env, small_env)
 
 
 # -- evaluation ------------------------------------------------------------------------------------
@@ -134,6 +137,26 @@ def test_actions_beyond_the_range_count_as_its_ends() -> None:
         assert (reached[0].exclude(ACTION) == reached[1].exclude(ACTION)).all()
 
 
+def test_every_view_and_collector_names_the_term_that_is_nan() -> None:
+    def rolled(env):
+        return env.rollout(9)
+
+    def torchrls(env):
+        return next(iter(Collector(env, None, frames_per_batch=27, total_frames=27)))
+
+    def ours(env):
+        return StringCollector(env, None, frames_per_batch=27).collect()
+
+    words = "automated.reward_terms.comfort is nan at step 3 of episode 0"
+    cases = [(play, make, words) for play in (rolled, torchrls, ours) for make in ENVIRONMENTS]
+    check_refused(lambda play, make: play(make("alcc", 3, TERM)), cases, Diverged)
+    env = single_env("alcc", 3)
+    td = env.rand_action(env.reset())
+    td["action"][1] = math.nan
+    with pytest.raises(Diverged, match=r"automated\.action is nan at step 1 of episode 1"):
+        env.step(td)
+
+
 # -- training --------------------------------------------------------------------------------------
 
 
@@ -144,7 +167,11 @@ def test_a_training_names_what_it_would_have_learned_from(tmp_path) -> None:
 
     ends = r".* of episode \d+ in iteration 1 of .*; nothing is saved$"
     cases = [
-        ("training.collector=string", *TERM, f"automated.reward is nan at step 3{ends}"),
+        (
+            "training.collector=string",
+            *TERM,
+            f"automated.reward_terms.comfort is nan at step 3{ends}",
+        ),
         ("training.collector=torchrl", *POWER, f"vehicles.power is -?inf at step 1{ends}"),
         ("training.collector=string", *ENTRY, f"automated.observation is nan at step{ends}"),
         ("agent=analytic", *TERM, f"automated.reward_terms.comfort is nan at step 3{ends}"),
