@@ -12,6 +12,7 @@ from commands import DATA
 from helpers import check_refused, compose, play, single_env, small_env, wavy_profiles
 from tensordict import TensorDict
 from torch import nn
+from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
 
 from lcc_rl.config.nodes import Node
 from lcc_rl.drivers.population import bootstrap
@@ -58,6 +59,26 @@ def test_every_way_to_reset_refuses_them(envs) -> None:
         env.reset(TensorDict({SEED: torch.zeros(3, 1).long()}, [3]))
     with pytest.raises(ConfigError, match=r"episode\.seed must be \[2, 1\]"):
         env.reset(options={SEED: torch.zeros(3, 1).long()})
+
+
+def test_what_is_no_argument_of_a_reset_is_refused(envs) -> None:
+    episodes, seeded = r"TensorDict of \[2\] episodes, .* got", r"reset takes no {}; env\.set_seed"
+    cases = [
+        ({"tensordict": 5}, f"{episodes} 5"),
+        ({"tensordict": torch.zeros(3)}, rf"{episodes} tensor\(\[0"),
+        ({"options": 5}, "options must be entries by key, got 5"),
+        ({"seed": 5}, seeded.format("seed")),
+        ({"foo": 3}, seeded.format("foo")),
+    ]
+    around = [
+        SerialEnv(2, lambda: small_env("alcc", 2)),
+        TransformedEnv(envs["group"], StepCounter()),
+    ]
+    for env, refused in [
+        *((env, cases) for env in envs.values()),
+        *((x, cases[2:]) for x in around),
+    ]:
+        check_refused(lambda given, env=env: env.reset(**given), refused)
 
 
 def test_what_torchrl_itself_resets_is_no_option(envs) -> None:
