@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import torch
@@ -13,7 +13,8 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import load
 from lcc_rl.config.nodes import CALLED, Node
-from lcc_rl.config.schemas import AUTO, ScenarioConfig, StudyConfig
+from lcc_rl.config.schemas import AUTO, ScenarioConfig, StudyConfig, TrainingConfig
+from lcc_rl.config.unused import refuse
 from lcc_rl.config.words import with_variant
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
@@ -46,6 +47,14 @@ from lcc_rl.pieces.views import LEADER, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import TARGET, parse, path_of
 
+ARGUMENTS = {"seed": "seed", "device": "device", "training.environments": "batch_size"}
+# Settings of a training that no environment reads, and why they have no effect.
+OF_TRAININGS = {
+    **dict.fromkeys((f"training.{x.name}" for x in fields(TrainingConfig)), "nothing trains"),
+    **dict.fromkeys(("threads", "matmul_precision"), "set it with torch"),
+    **{key: f"use make_env({name}=…)" for key, name in ARGUMENTS.items()},
+}
+del OF_TRAININGS["training.gap_range"]  # of the first states
 MOMENTS = 3  # least states in memory: before and after a step, and intermediate results
 
 
@@ -270,15 +279,19 @@ def make_env(
             there is exactly one, and several as :class:`lcc_rl.envs.MultiAgent`; False: neither.
 
     Raises:
-        ConfigError: if the variant or an override is unknown, or with ``single`` there is not
-            exactly one automated vehicle.
+        ConfigError: if the variant or an override is unknown or has no effect, or with ``single``
+            there is not exactly one automated vehicle.
 
     Examples:
         >>> env = make_env("alcc", batch_size=1024)  # doctest: +SKIP
         >>> env.rollout(300)["next", "reward"].shape  # doctest: +SKIP
         torch.Size([1024, 300, 1])
     """
-    cfg = load("train", with_variant(variant, overrides))
+    for name, flag, kinds in (("held_out", held_out, bool), ("single", single, bool | None)):
+        require(isinstance(flag, kinds), f"{name} must be True or False, got {flag!r}")
+    words = with_variant(variant, overrides)
+    cfg = load("train", words)
+    refuse(words, OF_TRAININGS)
     inputs = shared_inputs(cfg)
     profiles = inputs.evaluation if held_out else inputs.to_learn_from()
     env = build_env(cfg, profiles, inputs.population, batch_size, seed, device, held_out)

@@ -93,12 +93,27 @@ def test_an_impossible_batch_seed_or_device() -> None:
     cases = [
         ({"batch_size": 10**30}, r"batch_size=.* needs about \d+.* of memory"),
         *(({"seed": seed}, "seed must be") for seed in (-1, 2**32, 1.0, True, "1")),
+        ({"held_out": "no"}, "held_out must be True or False, got 'no'"),
+        ({"single": 1}, "single must be True or False, got 1"),
         *(({"device": name}, f"device '{name}' is not available") for name in devices),
     ]
     words = [*DATA, "scenario.horizon=300"]
     check_refused(
         lambda given: make_env("alcc", **{"batch_size": (), **given}, overrides=words), cases
     )
+
+
+def test_settings_of_trainings_have_no_effect_on_an_environment() -> None:
+    cases = [
+        ("seed=7", r"^seed=7 has no effect: use make_env\(seed=…\)"),
+        ("device=cuda", r"use make_env\(device=…\)"),
+        ("threads=2", "with torch"),
+        ("training.environments=3", r"use make_env\(batch_size=…\)"),
+        ("training={segment: 5}", "nothing trains"),
+    ]
+    check_refused(lambda word: make_env("alcc", overrides=[word]), cases)
+    env = make_env("alcc", 2, ["experiment=smoke", "training.gap_range=[0.5,0.6]"])
+    assert env.batch_size == (2,)
 
 
 def test_seeds_that_would_play_the_same_episodes_are_refused(envs) -> None:
