@@ -26,6 +26,7 @@ from lcc_rl.envs.step import (
     leaf_keys,
     pieces_of,
     read_before,
+    transforms_of,
 )
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.pieces.base import NEXT, STEP, Key, State, as_key, root_key
@@ -244,7 +245,7 @@ class StringCollector(BaseCollector):
 
 def _view(env: TransformedEnv) -> Any:
     """Return the view of the automated vehicles, if there is one; refuse other transforms."""
-    foreign = [t for t in env.transform if t not in pieces_of(env)]
+    foreign = [t for t in transforms_of(env) if t not in pieces_of(env)]
     strange = [type(t).__name__ for t in foreign if not isinstance(t, VIEWS)]
     if strange:
         raise ConfigError(

@@ -155,9 +155,14 @@ def leaf_keys(key: NestedKey, known: Iterable[Key]) -> list[Key]:
     return [prefix + entry for entry in known if entry[: len(name)] == name]
 
 
+def transforms_of(env: TransformedEnv) -> list[Any]:
+    """Return the transforms of an environment."""
+    return [*env.transform] if isinstance(env.transform, Compose) else [env.transform]
+
+
 def pieces_of(env: TransformedEnv) -> list[Piece]:
     """Return the pieces of an environment."""
-    return [piece for piece in env.transform if isinstance(piece, Piece)]
+    return [piece for piece in transforms_of(env) if isinstance(piece, Piece)]
 
 
 class Pieces(Compose):
