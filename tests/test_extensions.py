@@ -9,7 +9,7 @@ from typing import Literal
 
 import pytest
 from commands import UNTRAINED, tiny
-from helpers import POPULATION, check_refused, compose, wavy_profiles
+from helpers import POPULATION, check_refused, compose, small_env, wavy_profiles
 
 from lcc_rl.commands import evaluation
 from lcc_rl.config.nodes import Node, as_plain
@@ -118,6 +118,34 @@ def test_settings_of_ones_own_may_be_of_these_types_and_are_stored_and_read_agai
         ({"ends": {1.0, 2.0}}, "which a configuration cannot store"),
     ]
     check_refused(lambda settings: plain.changed(**settings), cases, ConfigError)
+
+
+class Nothing(Comfort):
+    def reward(self, jerk):
+        jerk.abs()
+
+
+class Plain(Comfort):
+    def reward(self, jerk):
+        return jerk.numpy()
+
+
+def test_what_is_no_term_of_the_reward_is_refused() -> None:
+    cases = [
+        ("+scenario.pieces.mine", "Comfort", r"scenario\.pieces\.mine is a .* under reward\.terms"),
+        (
+            "+reward.terms.mine",
+            "Kinetic",
+            "mine: expected a subclass of .*RewardTerm, got .*Kinetic",
+        ),
+        ("+reward.terms.mine", "Nothing", "Nothing does not fit .*it returned None, not a tensor"),
+        ("+reward.terms.mine", "Plain", "Plain does not fit .*it returned array.*, not a tensor"),
+    ]
+
+    def build(key: str, name: str) -> None:
+        small_env("alcc", 2, [f"{key}={{_target_: {__name__}.{name}}}"])
+
+    check_refused(build, cases, ConfigError)
 
 
 def values_of(made: Typed) -> dict[str, object]:

@@ -34,6 +34,7 @@ from lcc_rl.pieces import (
     EnergyClasses,
     Handover,
     Piece,
+    RewardTerm,
     RolePlaces,
     Sensors,
     Slope,
@@ -214,13 +215,19 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
     pieces += [RolePlaces().bind(world), *classes, *drivers, *actuators]
     pieces += [_motion(scenario, world), *slopes, *sensors]
     pieces += _watchers(drivers, world)
-    pieces += [node.made(Piece).bind(world, name) for name, node in named.items()]
+    further = {name: node.made(Piece) for name, node in named.items()}
+    for name in (name for name, piece in further.items() if isinstance(piece, RewardTerm)):
+        raise ConfigError(
+            f"scenario.pieces.{name} is a reward term, which no reward adds: "
+            f"it belongs under reward.terms"
+        )
+    pieces += [piece.bind(world, name) for name, piece in further.items()]
     check_spacing(pieces, world.profiles)
     if not string.count(AUTOMATED):
         return pieces
     pieces.append(cfg.observation.made(Piece).bind(world))
     terms = cfg.reward.terms
-    pieces += [node.made(Piece).bind(world, name) for name, node in terms.items()]
+    pieces += [node.made(RewardTerm).bind(world, name) for name, node in terms.items()]
     check_rewards(pieces)
     # The sum is last, before collisions of the next step.
     return [*pieces, TotalReward(terms=list(terms)).bind(world)]
