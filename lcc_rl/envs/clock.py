@@ -211,6 +211,7 @@ class Traffic(TransformedEnv):
     def compile(self, *, warmup: int | None = None, **given: Any) -> Traffic:
         """Compile ``step_and_maybe_reset``, see TorchRL's ``EnvBase.compile``.
 
+        Compiled steps are not checked for NaN, because they cannot raise.
         Settings of pieces are compared at every step only with a ``mode``, a ``backend`` or
         ``options``; otherwise to change one later is an error.
         """
