@@ -30,8 +30,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 45_050, "code": 29_925},
-    "tests": {"lines": 27_230},
+    "lcc_rl + tools": {"lines": 45_125, "code": 29_985},
+    "tests": {"lines": 27_310},
     "conf": {"yaml": 165},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py

@@ -133,9 +133,7 @@ class Clock(EnvBase):
         seeds = torch.randint(2**31, shape, generator=self.generator, dtype=torch.int64)
         return seeds.to(self.device)
 
-    def _reset(
-        self, tensordict: TensorDictBase | None = None, set_state: bool = False
-    ) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
         options = {} if tensordict is None else tensordict
         seeds, step = options.get(SEED, None), options.get(STEP, None)
         if seeds is None:

@@ -144,11 +144,7 @@ class StringCollector(BaseCollector):
 
     @torch.no_grad()
     def collect(self) -> TensorDictBase:
-        """Return the next batch, ``[*batch, steps]``.
-
-        Raises:
-            Diverged: naming the first entry of it that is not finite, its step and its episode.
-        """
+        """Return the next batch, ``[*batch, steps]``; :class:`Diverged` if it is not finite."""
         record, begun = [], int(self.state[STEP].max())
         for _ in range(self.steps):
             self.state, entries, over = self.advance(self.state)

@@ -48,13 +48,11 @@ from lcc_rl.pieces.views import LEADER, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import TARGET, parse, path_of
 
-ARGUMENTS = {"seed": "seed", "device": "device", "training.environments": "batch_size"}
 # Settings of a training that no environment reads, and why they have no effect.
-OF_TRAININGS = {
-    **dict.fromkeys((f"training.{x.name}" for x in fields(TrainingConfig)), "nothing trains"),
-    **dict.fromkeys(("threads", "matmul_precision"), "set it with torch"),
-    **{key: f"use make_env({name}=…)" for key, name in ARGUMENTS.items()},
-}
+OF_TRAININGS = {f"training.{x.name}": "nothing trains" for x in fields(TrainingConfig)}
+OF_TRAININGS |= dict.fromkeys(("threads", "matmul_precision"), "set it with torch")
+OF_TRAININGS |= {key: f"use make_env({key}=…)" for key in ("seed", "device")}
+OF_TRAININGS["training.environments"] = "use make_env(batch_size=…)"
 del OF_TRAININGS["training.gap_range"]  # of the first states
 MOMENTS = 3  # least states in memory: before and after a step, and intermediate results
 
@@ -215,13 +213,11 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
     pieces += [RolePlaces().bind(world), *classes, *drivers, *actuators]
     pieces += [_motion(scenario, world), *slopes, *sensors]
     pieces += _watchers(drivers, world)
-    further = {name: node.made(Piece) for name, node in named.items()}
-    for name in (name for name, piece in further.items() if isinstance(piece, RewardTerm)):
-        raise ConfigError(
-            f"scenario.pieces.{name} is a reward term, which no reward adds: "
-            f"it belongs under reward.terms"
-        )
-    pieces += [piece.bind(world, name) for name, piece in further.items()]
+    for name, node in named.items():
+        piece = node.made(Piece)
+        misplaced = f"scenario.pieces.{name} is a reward term: it belongs under reward.terms"
+        require(not isinstance(piece, RewardTerm), misplaced)
+        pieces.append(piece.bind(world, name))
     check_spacing(pieces, world.profiles)
     if not string.count(AUTOMATED):
         return pieces

@@ -151,5 +151,4 @@ def group_key(key: Key) -> Key:
 def find(td: TensorDictBase, key: Key) -> Any:
     """Return an entry of the pieces, which a view may show at the root; None if there is none."""
     value = td.get(key, None)
-    shown = value is None and key[0] == AUTOMATED
-    return td.get(key[1:], None) if shown else value
+    return td.get(key[1:], None) if value is None and key[0] == AUTOMATED else value

@@ -173,10 +173,7 @@ def rule(cfg: StudyConfig) -> Strategy:
 
 
 def name_of(cfg: StudyConfig) -> str:
-    """Return the name of what drives after training: the variant, or its class if it is another.
-
-    The variant of an agent, such as ``ddpg``, with another agent has the name of that one.
-    """
+    """Return the name of what drives after training: the variant, or another class or agent."""
     if cfg.deployed is not None:
         cfg.deployed.made(Hybrid)
     elif cfg.learns:

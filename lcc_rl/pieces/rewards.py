@@ -54,8 +54,7 @@ class RewardTerm(RewardPiece):
         cls.name = re.sub("(Reward|Penalty)$", "", cls.__name__).lower()
 
     def compute(self, *entries: Tensor) -> Tensor:
-        term = self.reward(*entries)
-        returned(term)  # an error names what is no tensor
+        (term,) = returned(self.reward(*entries))
         return self.weight * term
 
 

@@ -170,9 +170,7 @@ class Measure:
 
 
 _kj = partial(Measure, unit="kJ", form="{:.1f}")
-_share = partial(  # of the time
-    Measure, unit=SHARE, bound="at most", interval=True, possible=(0.0, 1.0)
-)
+_share = partial(Measure, unit=SHARE, bound="at most", interval=True, possible=(0.0, 1.0))
 _least = partial(Measure, aggregate="min", bound="at least")
 _least_mean = partial(_least, aggregate="mean", interval=True, possible=(0.0, inf))
 _largest = partial(Measure, aggregate="max", bound="at most")

@@ -125,14 +125,11 @@ def test_an_environment_may_be_made_by_a_function_and_its_state_restored() -> No
 
 
 def test_what_cannot_be_collected_is_refused() -> None:
-    sums = RewardSum(), Compose(RewardSum())
+    sums = [TransformedEnv(environment("one"), x) for x in (RewardSum(), Compose(RewardSum()))]
     cases = [
         (small_env("alcc", 4, [string("human*3")]), 40, "no vehicle of the string is automated"),
         (environment("one"), 41, "must be a multiple of the 8 episodes side by side"),
-        *(
-            (TransformedEnv(environment("one"), x), 40, "has the transforms RewardSum")
-            for x in sums
-        ),
+        *((env, 40, "has the transforms RewardSum") for env in sums),
     ]
 
     def collect(env, frames: int) -> None:

@@ -60,9 +60,6 @@ def test_an_error_points_at_the_place(subtests) -> None:
             assert f"{words} at character {place}: " in text
             # The pattern itself, marked where it goes wrong.
             assert text.endswith(f"{pattern[: place - 1]}»{pattern[place - 1 :]}")
-
-
-def test_names_of_views_are_reserved() -> None:
     assert {VEHICLES, LEADER, EPISODE, SELF, AHEAD, BEHIND, NEXT, ROLE, TERM} == RESERVED
 
 

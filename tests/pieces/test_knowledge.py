@@ -31,9 +31,7 @@ def test_preview_is_what_the_leader_will_do() -> None:
 
 
 def test_a_ring_has_no_leader_to_preview() -> None:
-    with pytest.raises(
-        ConfigError, match=r"LeaderPreview reads leader\..*, but a ring road has no"
-    ):
+    with pytest.raises(ConfigError, match=r"LeaderPreview reads leader\..* a ring road has no"):
         small_env("alcc", 2, ["scenario=ring", "+knowledge=preview"])
 
 

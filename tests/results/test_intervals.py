@@ -58,11 +58,10 @@ def test_intervals_of_what_cannot_be_negative_end_at_zero() -> None:
     energies = {f"all_{x}energy_kj": [-1.0, 1, 1, 1] for x in ("", "path_")}
     rows = windows_of(pd.DataFrame(keys | few | energies | {"distance_m": 1e3, "delay_s": -1.0}))
     found = with_bounds(rows, [measure for measure in MEASURES if measure.interval])
-    ends = {key: (x.low, x.high) for key, x in found.items()}
-    assert ends["brakings_below_2_per_100km"][0] == ends["share_ttc_unsafe"][0] == 0.0
-    assert ends["share_ttc_unsafe"][1] == 1.0 < ends["brakings_below_2_per_100km"][1] * 1e3
-    assert ends["kj_per_km"][0] < 0.0 > ends["path_energy_kj_per_km"][0]
-    assert ends["delay_s_per_km"] == pytest.approx((-1e-3, -1e-3))
+    assert found["brakings_below_2_per_100km"].low == found["share_ttc_unsafe"].low == 0.0
+    assert found["share_ttc_unsafe"].high == 1.0
+    assert found["kj_per_km"].low < 0.0 > found["path_energy_kj_per_km"].low
+    assert found["delay_s_per_km"].low == pytest.approx(-1e-3)
 
 
 def test_windows_are_shared_by_both_sides_and_seeds_are_not() -> None:
