@@ -9,7 +9,7 @@ from typing import Literal
 
 import pytest
 from commands import UNTRAINED, tiny
-from helpers import POPULATION, check_refused, compose, wavy_profiles
+from helpers import POPULATION, check_refused, compose, small_env, wavy_profiles
 
 from lcc_rl.commands import evaluation
 from lcc_rl.config.nodes import Node, as_plain
@@ -118,6 +118,21 @@ def test_settings_of_ones_own_may_be_of_these_types_and_are_stored_and_read_agai
         ({"ends": {1.0, 2.0}}, "which a configuration cannot store"),
     ]
     check_refused(lambda settings: plain.changed(**settings), cases, ConfigError)
+
+
+class Nothing(Comfort):
+    def reward(self, jerk):
+        jerk.abs()
+
+
+def test_what_is_no_term_of_the_reward_is_refused() -> None:
+    cases = [
+        ("scenario.pieces", "Comfort", r"scenario\.pieces\.x is a reward .* under reward\.terms"),
+        ("reward.terms", "Kinetic", "x: expected a subclass of .*RewardTerm, got .*Kinetic"),
+        ("reward.terms", "Nothing", "Nothing does not fit .*it returned None, not a tensor"),
+    ]
+    words = f"+{{}}.x={{{{_target_: {__name__}.{{}}}}}}"
+    check_refused(lambda *given: small_env("alcc", 2, [words.format(*given)]), cases, ConfigError)
 
 
 def values_of(made: Typed) -> dict[str, object]:

@@ -22,11 +22,10 @@ from torch import Tensor, nn
 
 from lcc_rl.agents.actor import seeded_mlp
 from lcc_rl.agents.agent import Fraction, Scene, Schedule, anneal, derived_seed
-from lcc_rl.agents.checks import check_batch
 from lcc_rl.agents.loop import REPORTED, TrainingLoop, mean_of
 from lcc_rl.agents.objective import Aiming, Objective
 from lcc_rl.envs.rollout import OBSERVATION, DifferentiableRollout
-from lcc_rl.envs.step import pieces_of
+from lcc_rl.envs.step import check_batch, pieces_of
 from lcc_rl.errors import require
 from lcc_rl.pieces.base import REWARD, next_key
 from lcc_rl.pieces.leader import PROFILE, NGSIMLeader

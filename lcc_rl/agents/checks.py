@@ -1,4 +1,4 @@
-"""Checks during a training that transitions, losses and weights are finite."""
+"""Checks during a training that losses and weights are finite."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from typing import Any, SupportsFloat
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from lcc_rl.errors import Diverged, in_short, require
-from lcc_rl.functional.finite import nonfinite_weight, require_finite
-from lcc_rl.pieces.base import ACTION, NEXT, as_key, root_key
+from lcc_rl.functional.finite import nonfinite_weight
 from lcc_rl.results.runs import flatten
 
 
@@ -58,22 +56,3 @@ def check_learner(
     found = nonfinite_weight(policy.state_dict())
     if found is not None:
         raise Diverged(f"the policy's weight {found} is not finite", advice)
-
-
-def check_batch(batch: TensorDictBase, begun: int = 0, label: str = "") -> None:
-    """Check that transitions are finite, before an update uses them.
-
-    Args:
-        batch: ``[environments, steps]``.
-        begun: steps played before the batch.
-        label: name of the policy in the message.
-
-    Raises:
-        Diverged: naming the first entry that is not finite, its step and its episode.
-    """
-    known = {as_key(key): value.detach() for key, value in batch.items(True, True)}
-    # The state before a step is the result of the previous step.
-    keys = [ACTION, *(key for key in known if key[0] == NEXT and root_key(key) != ACTION)]
-    entries = {root_key(key): known[key].transpose(0, 1) for key in keys if key in known}
-    running = torch.ones((*batch.shape[1::-1], 1), dtype=torch.bool, device=batch.device)
-    require_finite(entries, running, begun + 1, label)

@@ -274,6 +274,10 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
             raise ConfigError(f"{error}; {hint}") from None
         if TARGET not in (content.get("deployed") or (TARGET,)):
             refuse(overrides, {"deployed.": "it belongs to variant=hcfs"})
+        key = re.match(rf"unknown setting of {re.escape(AUTO)} \(\w+\) '(\w+)'", str(error))
+        after = (content.get("deployed") or {}).get(TARGET)  # the controller after training
+        if key and after and key[1] in (settings_of(find_target(after, "deployed")) or ()):
+            raise ConfigError(f"{error} It is deployed.{key[1]}.") from None
         match = re.match(r"unknown setting of (\w+) \(", str(error))
         group = match.group(1) if match else ""
         if not group or not choices(group):

@@ -16,6 +16,7 @@ from lcc_rl.errors import ConfigError, line_of, naming, nearest, replacing, requ
 from lcc_rl.functional.guard import changed, check_forgets, check_independent
 from lcc_rl.pieces import Collision
 from lcc_rl.pieces.base import SEED, STEP, Key, Piece, State, StepTransform, as_key
+from lcc_rl.pieces.views import LEADER
 
 BATCH = 2
 # Options that add pieces, by the entries, or the group of them, that these write.
@@ -163,6 +164,8 @@ def _check_wiring(pieces: Sequence[Piece], actions: Sequence[Key]) -> None:
                     "have an action"
                 )
             name = ".".join(key)
+            ring = key[0] == LEADER and piece.string.ring
+            require(not ring, f"{piece.title} reads {name}, but a ring road has no leader")
             where = f"{piece.title} reads {name}, which no piece of the scenario writes"
             option = ADDED_BY.get(key[0], ADDED_BY.get(name))
             require(option is None, f"{where}; {option} adds one that does")

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from lcc_rl.envs.compiled import compile_settings
 from lcc_rl.envs.single import VIEWS
 from lcc_rl.envs.step import pieces_of, tick, written
-from lcc_rl.errors import LAST_SEED, ConfigError, require
+from lcc_rl.errors import LAST_SEED, ConfigError, in_short, require
 from lcc_rl.pieces.base import SEED, STEP, Entry, Key, Piece, StepTransform, as_key, require_option
 
 
@@ -177,7 +177,7 @@ class Traffic(TransformedEnv):
             **settings: ``options``, reset options by their keys (docs/entries.md).
 
         Raises:
-            ConfigError: naming the entry of the options or the state at fault.
+            ConfigError: naming the argument, or the entry of the options or the state, at fault.
         """
         return super().reset(tensordict, set_state=bool(set_state), **settings)
 
@@ -186,8 +186,10 @@ class Traffic(TransformedEnv):
         tensordict: TensorDictBase | None = None,
         options: Mapping[NestedKey, torch.Tensor] | None = None,
         set_state: bool = False,
-        **settings: Any,
+        **others: Any,
     ) -> TensorDictBase:
+        words = "env.set_seed(…) seeds later episodes, options={('episode', 'seed'): …} those of a"
+        require(not others, f"reset takes no {', '.join(others)}; {words} reset")
         start = TensorDict(batch_size=self.batch_size) if tensordict is None else tensordict
         moving = written(piece for piece in pieces_of(self) if isinstance(piece, StepTransform))
         state = sorted({SEED, STEP, *moving})
@@ -202,11 +204,12 @@ class Traffic(TransformedEnv):
             start = start.exclude(*state)
             for key, value in self._checked({} if options is None else options).items():
                 start.set(key, value)
-        return super()._reset(start, set_state=set_state, **settings)
+        return super()._reset(start, set_state=set_state)
 
     def compile(self, *, warmup: int | None = None, **given: Any) -> Traffic:
         """Compile ``step_and_maybe_reset``, see TorchRL's ``EnvBase.compile``.
 
+        Compiled steps are not checked for NaN, because they cannot raise.
         Settings of pieces are compared at every step only with a ``mode``, a ``backend`` or
         ``options``; otherwise to change one later is an error.
         """
@@ -229,10 +232,11 @@ class Traffic(TransformedEnv):
         return super()._step(tensordict)
 
     def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
-        if tensordict.batch_size != self.batch_size:
+        size = getattr(tensordict, "batch_size", None)
+        if size != self.batch_size:
             raise ConfigError(
                 f"expected a TensorDict of {list(self.batch_size)} episodes, as the environment "
-                f"has, got {list(tensordict.batch_size)}"
+                f"has, got {in_short(tensordict) if size is None else list(size)}"
             )
         for key in self.action_keys:
             # Other shapes may broadcast: one action would drive every vehicle. Other types would
@@ -250,6 +254,8 @@ class Traffic(TransformedEnv):
 
     def _checked(self, options: Any) -> dict[Key, torch.Tensor]:
         """Return reset options by their full keys, after a check of names, shapes and types."""
+        mapping = isinstance(options, Mapping) or is_tensor_collection(options)
+        require(mapping, f"reset: options must be entries by key, got {in_short(options)}")
         leaves = options.items(True, True) if is_tensor_collection(options) else options.items()
         entries, specs = {as_key(key): value for key, value in leaves}, option_specs(self)
         for key, value in entries.items():

@@ -17,9 +17,19 @@ from torchrl.envs.utils import RandomPolicy
 
 from lcc_rl.envs.compiled import Compiled
 from lcc_rl.envs.single import VIEWS, MultiAgent, SingleAgent, group_key
-from lcc_rl.envs.step import DONE, Step, closure, entries_of, leaf_keys, pieces_of, read_before
+from lcc_rl.envs.step import (
+    DONE,
+    Step,
+    check_batch,
+    closure,
+    entries_of,
+    leaf_keys,
+    pieces_of,
+    read_before,
+    transforms_of,
+)
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.pieces.base import NEXT, Key, State, as_key, root_key
+from lcc_rl.pieces.base import NEXT, STEP, Key, State, as_key, root_key
 
 # Plain resets, 2 ms each, before they are compiled, which takes 3 to 7 s.
 PLAIN_RESETS = 2_000
@@ -134,8 +144,8 @@ class StringCollector(BaseCollector):
 
     @torch.no_grad()
     def collect(self) -> TensorDictBase:
-        """Return the next batch, ``[*batch, steps]``."""
-        record = []
+        """Return the next batch, ``[*batch, steps]``; :class:`Diverged` if it is not finite."""
+        record, begun = [], int(self.state[STEP].max())
         for _ in range(self.steps):
             self.state, entries, over = self.advance(self.state)
             record.append(entries)
@@ -147,6 +157,7 @@ class StringCollector(BaseCollector):
         segment = TensorDict(batch_size=[*batch, self.steps], device=self.env.device)
         for key, values in zip(self.keys, zip(*record, strict=True), strict=True):
             segment.set(key, torch.stack(values, len(batch)))
+        check_batch(segment.reshape(-1, self.steps), begun)
         if isinstance(self.view, MultiAgent):
             self.view(segment)
             self.view(segment.get(NEXT, TensorDict()))
@@ -230,7 +241,7 @@ class StringCollector(BaseCollector):
 
 def _view(env: TransformedEnv) -> Any:
     """Return the view of the automated vehicles, if there is one; refuse other transforms."""
-    foreign = [t for t in env.transform if t not in pieces_of(env)]
+    foreign = [t for t in transforms_of(env) if t not in pieces_of(env)]
     strange = [type(t).__name__ for t in foreign if not isinstance(t, VIEWS)]
     if strange:
         raise ConfigError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import torch
@@ -13,7 +13,8 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import load
 from lcc_rl.config.nodes import CALLED, Node
-from lcc_rl.config.schemas import AUTO, ScenarioConfig, StudyConfig
+from lcc_rl.config.schemas import AUTO, ScenarioConfig, StudyConfig, TrainingConfig
+from lcc_rl.config.unused import refuse
 from lcc_rl.config.words import with_variant
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
@@ -33,6 +34,7 @@ from lcc_rl.pieces import (
     EnergyClasses,
     Handover,
     Piece,
+    RewardTerm,
     RolePlaces,
     Sensors,
     Slope,
@@ -46,6 +48,12 @@ from lcc_rl.pieces.views import LEADER, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import TARGET, parse, path_of
 
+# Settings of a training that no environment reads, and why they have no effect.
+OF_TRAININGS = {f"training.{x.name}": "nothing trains" for x in fields(TrainingConfig)}
+OF_TRAININGS |= dict.fromkeys(("threads", "matmul_precision"), "set it with torch")
+OF_TRAININGS |= {key: f"use make_env({key}=…)" for key in ("seed", "device")}
+OF_TRAININGS["training.environments"] = "use make_env(batch_size=…)"
+del OF_TRAININGS["training.gap_range"]  # of the first states
 MOMENTS = 3  # least states in memory: before and after a step, and intermediate results
 
 
@@ -205,13 +213,17 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
     pieces += [RolePlaces().bind(world), *classes, *drivers, *actuators]
     pieces += [_motion(scenario, world), *slopes, *sensors]
     pieces += _watchers(drivers, world)
-    pieces += [node.made(Piece).bind(world, name) for name, node in named.items()]
+    for name, node in named.items():
+        piece = node.made(Piece)
+        misplaced = f"scenario.pieces.{name} is a reward term: it belongs under reward.terms"
+        require(not isinstance(piece, RewardTerm), misplaced)
+        pieces.append(piece.bind(world, name))
     check_spacing(pieces, world.profiles)
     if not string.count(AUTOMATED):
         return pieces
     pieces.append(cfg.observation.made(Piece).bind(world))
     terms = cfg.reward.terms
-    pieces += [node.made(Piece).bind(world, name) for name, node in terms.items()]
+    pieces += [node.made(RewardTerm).bind(world, name) for name, node in terms.items()]
     check_rewards(pieces)
     # The sum is last, before collisions of the next step.
     return [*pieces, TotalReward(terms=list(terms)).bind(world)]
@@ -270,15 +282,19 @@ def make_env(
             there is exactly one, and several as :class:`lcc_rl.envs.MultiAgent`; False: neither.
 
     Raises:
-        ConfigError: if the variant or an override is unknown, or with ``single`` there is not
-            exactly one automated vehicle.
+        ConfigError: if the variant or an override is unknown or has no effect, or with ``single``
+            there is not exactly one automated vehicle.
 
     Examples:
         >>> env = make_env("alcc", batch_size=1024)  # doctest: +SKIP
         >>> env.rollout(300)["next", "reward"].shape  # doctest: +SKIP
         torch.Size([1024, 300, 1])
     """
-    cfg = load("train", with_variant(variant, overrides))
+    for name, flag, kinds in (("held_out", held_out, bool), ("single", single, bool | None)):
+        require(isinstance(flag, kinds), f"{name} must be True or False, got {flag!r}")
+    words = with_variant(variant, overrides)
+    cfg = load("train", words)
+    refuse(words, OF_TRAININGS)
     inputs = shared_inputs(cfg)
     profiles = inputs.evaluation if held_out else inputs.to_learn_from()
     env = build_env(cfg, profiles, inputs.population, batch_size, seed, device, held_out)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from tensordict import TensorDict, TensorDictBase
 from torch import Size
 from torchrl.data import Composite
@@ -144,3 +146,9 @@ def _flat(terms: Composite) -> Composite:
 def group_key(key: Key) -> Key:
     """Return the key in the group for a key at the root."""
     return (AUTOMATED, *key) if key[0] in (*GROUP_ENTRIES, "action") else key
+
+
+def find(td: TensorDictBase, key: Key) -> Any:
+    """Return an entry of the pieces, which a view may show at the root; None if there is none."""
+    value = td.get(key, None)
+    return td.get(key[1:], None) if value is None and key[0] == AUTOMATED else value

@@ -12,15 +12,17 @@ from typing import Any
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Size as BatchSize
-from torch import Tensor, compiler, device, ones_like, zeros_like
+from torch import Tensor, compiler, device, ones, ones_like, zeros_like
 from torchrl.data import Composite
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, FrameSkipTransform, Transform
 
+from lcc_rl.envs.single import find, group_key
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.finite import any_nonfinite, require_finite
 from lcc_rl.pieces.base import (
     ACTION,
+    NEXT,
     OBSERVATION,
     REWARD,
     SEED,
@@ -124,6 +126,28 @@ def entries_of(td: TensorDictBase) -> State:
     return {key: value.clone() for key, value in _read(td).items()}
 
 
+def check_batch(batch: TensorDictBase, begun: int = 0, label: str = "") -> None:
+    """Check that transitions are finite, before an update uses them.
+
+    Args:
+        batch: ``[environments, steps]``.
+        begun: steps of the episodes before the batch.
+        label: name of the policy in the message.
+
+    Raises:
+        Diverged: naming the first entry that is not finite, its step and its episode.
+    """
+    numbers: State = {}
+    for key in map(as_key, batch.keys(True, True)):
+        name = group_key(root_key(key))
+        # The state before a step is the result of the previous step.
+        if (name == ACTION) != (key[0] == NEXT):
+            numbers[name] = batch.get(key).detach().transpose(0, 1)
+    order = sorted(numbers, key=lambda name: (name != ACTION, name == REWARD))  # causes first
+    running = ones((*batch.shape[1::-1], 1), device=batch.device).bool()
+    require_finite({name: numbers[name] for name in order}, running, begun + 1, label)
+
+
 def leaf_keys(key: NestedKey, known: Iterable[Key]) -> list[Key]:
     """Return the keys of an entry, or of all entries below it, among those known."""
     name, path = root_key(key), as_key(key)
@@ -131,9 +155,14 @@ def leaf_keys(key: NestedKey, known: Iterable[Key]) -> list[Key]:
     return [prefix + entry for entry in known if entry[: len(name)] == name]
 
 
+def transforms_of(env: TransformedEnv) -> list[Any]:
+    """Return the transforms of an environment."""
+    return [*env.transform] if isinstance(env.transform, Compose) else [env.transform]
+
+
 def pieces_of(env: TransformedEnv) -> list[Piece]:
     """Return the pieces of an environment."""
-    return [piece for piece in env.transform if isinstance(piece, Piece)]
+    return [piece for piece in transforms_of(env) if isinstance(piece, Piece)]
 
 
 class Pieces(Compose):
@@ -245,12 +274,12 @@ class Pieces(Compose):
 
     def _check_numbers(self, td: TensorDictBase, next_td: TensorDictBase) -> None:
         """Raise Diverged if an entry before or after a step is not finite."""
-        checked = [td.get(ACTION, None), *(next_td.get(key, None) for key in FINITE_CHECKED)]
+        checked = [find(td, ACTION), *(find(next_td, key) for key in FINITE_CHECKED)]
         if not any_nonfinite(value for value in checked if value is not None):
             return
         pieces = [piece for piece in self.transforms if isinstance(piece, Piece)]
         named: dict[Key, Tensor | None] = {ACTION: checked[0]}
-        named |= {key: next_td.get(key, None) for piece in pieces for key in piece.targets}
+        named |= {key: find(next_td, key) for piece in pieces for key in piece.targets}
         done = td.get(DONE, None)
         running = ones_like(next_td.get(DONE)) if done is None else ~done
         batch = running.numel()

@@ -18,10 +18,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from lcc_rl.agents.checks import check_batch
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.envs import DifferentiableRollout, build_env
 from lcc_rl.envs.inputs import Inputs, build_energy
+from lcc_rl.envs.step import check_batch
 from lcc_rl.errors import require
 from lcc_rl.evaluation.episodes import Plan
 from lcc_rl.evaluation.metrics import KILO, LONG_TIME_GAP, UNSAFE_TTC

@@ -79,7 +79,8 @@ class Simulation:
     Args:
         steps: a row per episode, time and vehicle; vehicle 0 is the leader, the others are from
             front to back. ``acceleration_mps2`` and ``power_w`` are those of the step that ends at
-            ``time_s``. An episode ends with its first collision, a gap of 0 m or less.
+            ``time_s``; energies add ``energy.grade`` to the slope's ``grade_rad``. An episode ends
+            with its first collision, a gap of 0 m or less.
         vehicles: a row per episode and vehicle: of a mixture ``energy_class``; ``collided``,
             ``mean_speed_mps`` (of the speeds after each step, as in evaluations), distance and
             energies of :func:`lcc_rl.evaluation.metrics.energy_measures`, and the measures of

@@ -14,6 +14,7 @@ from typing import Any
 import pandas as pd
 
 from lcc_rl.config import load
+from lcc_rl.config.compose import choices
 from lcc_rl.config.nodes import Node
 from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.unused import EXACT
@@ -172,11 +173,11 @@ def rule(cfg: StudyConfig) -> Strategy:
 
 
 def name_of(cfg: StudyConfig) -> str:
-    """Return the name of what drives after training: the variant, or its class if it is another."""
+    """Return the name of what drives after training: the variant, or another class or agent."""
     if cfg.deployed is not None:
         cfg.deployed.made(Hybrid)
     elif cfg.learns:
-        return cfg.variant
+        return str(cfg.agent.name if cfg.variant in choices("agent") else cfg.variant)
     cfg = cfg.after_training()
     try:
         kind = _kind(load("evaluate", [f"variant={cfg.variant}"]).after_training())

@@ -15,6 +15,8 @@ from typing import Any
 from lcc_rl.errors import ConfigError, require
 
 AUTOMATED, HUMAN = "automated", "human"
+# First parts of other entries and views, which no role can have.
+RESERVED = {"vehicles", "leader", "episode", "self", "ahead", "behind", "next", "role", "name"}
 OPEN, RING = "open", "ring"
 MAX_ACCELERATION = 3.0  # of automated vehicles by default, in both directions [m/s²]
 TOKEN = re.compile(r"\s*([A-Za-z_]\w*|\*\s*[0-9]+|[()])")
@@ -131,6 +133,8 @@ class _Parser:
         if depth > 20:
             raise self._error("too many brackets", self.place)
         begun = self.place
+        if token in RESERVED:
+            raise self._error(f"the name {token} is reserved, expected a role", begun)
         self._advance()
         roles = [token]
         if token == "(":

@@ -26,7 +26,7 @@ from lcc_rl.functional.hcfs import PlatoonReward
 from lcc_rl.functional.layout import total
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.safety import time_to_collision
-from lcc_rl.pieces.base import REWARD, AfterStep, Entry, RewardPiece, add_specs
+from lcc_rl.pieces.base import REWARD, AfterStep, Entry, RewardPiece, add_specs, returned
 from lcc_rl.pieces.sections import Sections
 from lcc_rl.pieces.views import VEHICLES
 from lcc_rl.pieces.world import World
@@ -54,7 +54,8 @@ class RewardTerm(RewardPiece):
         cls.name = re.sub("(Reward|Penalty)$", "", cls.__name__).lower()
 
     def compute(self, *entries: Tensor) -> Tensor:
-        return self.weight * self.reward(*entries)
+        (term,) = returned(self.reward(*entries))
+        return self.weight * term
 
 
 class SafetyReward(RewardTerm):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -38,6 +38,11 @@ class Estimate:
     low: float = np.nan
     high: float = np.nan
     more_flow: float = np.nan
+
+    def within(self, least: float, most: float) -> Estimate:
+        """Return it with the bounds of its interval cut at the ends of a range."""
+        low, high = np.clip([self.low, self.high], least, most).tolist()
+        return replace(self, low=low, high=high)
 
     @property
     def percent(self) -> tuple[float, float, float]:

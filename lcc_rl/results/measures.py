@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
-from math import isfinite
+from math import inf, isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -81,6 +81,7 @@ class Measure:
         score: its name as a task's score.
         least: mean of a baseline below which no share of it is given: it is noise.
         interval: whether tables have its 95 % interval; extremes and sums have none.
+        possible: least and largest value, without the factor; intervals are cut there.
 
     Raises:
         ConfigError: if aggregate or bound is unknown.
@@ -102,6 +103,7 @@ class Measure:
     score: str = ""
     least: float = 0.0
     interval: bool = False
+    possible: tuple[float, float] = (-inf, inf)
 
     def __post_init__(self) -> None:
         require_known(f"aggregate of {self.key}", self.aggregate, AGGREGATES)
@@ -168,16 +170,17 @@ class Measure:
 
 
 _kj = partial(Measure, unit="kJ", form="{:.1f}")
-_share = partial(Measure, unit=SHARE, bound="at most", interval=True)  # of the time
+_share = partial(Measure, unit=SHARE, bound="at most", interval=True, possible=(0.0, 1.0))
 _least = partial(Measure, aggregate="min", bound="at least")
-_least_mean = partial(_least, aggregate="mean", interval=True)
+_least_mean = partial(_least, aggregate="mean", interval=True, possible=(0.0, inf))
 _largest = partial(Measure, aggregate="max", bound="at most")
-_average = partial(Measure, interval=True)
+_average = partial(Measure, interval=True, possible=(0.0, inf))
 _varied = partial(_average, unit="m/s")
 _braking = partial(Measure, unit="m/s²", form="{:.1f}", aggregate="max")
 # Ratios of a column of all vehicles and their distance.
-_per = partial(Measure, per=DISTANCE, factor=1e3, interval=True)
-_kj_per_km = partial(_per, unit="kJ", form="{:.1f}")
+_per = partial(Measure, per=DISTANCE, factor=1e3, interval=True, possible=(0.0, inf))
+_signed = partial(_per, possible=(-inf, inf))
+_kj_per_km = partial(_signed, unit="kJ", form="{:.1f}")
 _per_100km = partial(_per, factor=1e5, unit="1/100 km")
 
 MEASURES = [
@@ -207,7 +210,7 @@ MEASURES = [
     _per("fuel_l_per_100km", "fuel", unit="L/100 km", of="all_fuel_l", factor=1e5),
     _per("co2_g_per_km", "carbon dioxide of it", unit="g/km", form="{:.1f}", of="all_co2_g"),
     _per("travel_time_s_per_km", "travel time", unit="s/km", of="vehicle_time_s"),
-    _per("delay_s_per_km", "  delay against v0", unit="s/km", of="delay_s"),
+    _signed("delay_s_per_km", "  delay against v0", unit="s/km", of="delay_s"),
     _least_mean("mean_speed_mps", "mean speed", unit="m/s", limit="mean\nspeed"),
     _varied(SPEED_STD, "deviation of a speed in time", score=SPEED_STD),
     _varied(FINAL_SPREAD, "spread of speeds at the end", score=FINAL_SPREAD, least=CALM),

@@ -242,13 +242,15 @@ def savings(
 
 def with_bounds(rows: pd.DataFrame, measures: Iterable[Measure]) -> dict[str, Estimate]:
     """Return measures of a strategy's rows by key, without factors, with their intervals."""
-    found = {one.key: one.columns for one in measures if {*one.columns} <= set(rows)}
-    table, estimates = _by_window(rows, [name for names in found.values() for name in names]), {}
-    for key, (column, *per) in found.items():
+    found = [one for one in measures if {*one.columns} <= set(rows)]
+    table, estimates = _by_window(rows, [name for one in found for name in one.columns]), {}
+    for one in found:
+        column, *per = one.columns
         total, by, drives = _over(table, column, per)
         side = {"energy": total.to_numpy(), "way": by.to_numpy()}
         if by.size:
-            estimates[key] = estimate(lambda x: per_distance(**x), side, drives=drives)
+            drawn = estimate(lambda x: per_distance(**x), side, drives=drives)
+            estimates[one.key] = drawn.within(*one.possible)
     return estimates
 
 

@@ -227,7 +227,7 @@ def rows_of(share: str, windows: pd.DataFrame) -> Iterator[dict[str, Any]]:
             humans = one.value(groups[HUMAN])
             value = math.nan if crashed else one.value(group)
             interval = Estimate(value, humans * (1.0 - saved.high), humans * (1.0 - saved.low))
-            row |= interval.columns(one.shown.key, one.scale)
+            row |= interval.within(*one.possible).columns(one.shown.key, one.scale)
             if one.key == FUEL:
                 row |= saved.columns("fuel_saved_pct", 100.0)
         yield row | {one.key: one.value(group) for one in MEASURES if one.key in COUNTED}

@@ -12,6 +12,7 @@ from commands import DATA
 from helpers import check_refused, compose, play, single_env, small_env, wavy_profiles
 from tensordict import TensorDict
 from torch import nn
+from torchrl.envs import RewardSum, SerialEnv, TransformedEnv
 
 from lcc_rl.config.nodes import Node
 from lcc_rl.drivers.population import bootstrap
@@ -60,6 +61,17 @@ def test_every_way_to_reset_refuses_them(envs) -> None:
         env.reset(options={SEED: torch.zeros(3, 1).long()})
 
 
+def test_what_is_no_argument_of_a_reset_is_refused(envs) -> None:
+    cases = [
+        ({"tensordict": 5}, r"TensorDict of \[2\] episodes, .* got 5"),
+        ({"options": 5}, "options must be entries by key, got 5"),
+        ({"seed": 5}, r"reset takes no seed; env\.set_seed"),
+    ]
+    check_refused(lambda given: envs["single"].reset(**given), cases)
+    for env in (SerialEnv(2, lambda: small_env()), TransformedEnv(envs["group"], RewardSum())):
+        check_refused(lambda given, env=env: env.reset(**given), cases[1:])
+
+
 def test_what_torchrl_itself_resets_is_no_option(envs) -> None:
     for env in envs.values():
         assert env.rollout(45, break_when_any_done=False).shape == (2, 45)
@@ -72,12 +84,23 @@ def test_an_impossible_batch_seed_or_device() -> None:
     cases = [
         ({"batch_size": 10**30}, r"batch_size=.* needs about \d+.* of memory"),
         *(({"seed": seed}, "seed must be") for seed in (-1, 2**32, 1.0, True, "1")),
+        ({"held_out": "no"}, "held_out must be True or False, got 'no'"),
+        ({"single": 1}, "single must be True or False, got 1"),
         *(({"device": name}, f"device '{name}' is not available") for name in devices),
     ]
     words = [*DATA, "scenario.horizon=300"]
     check_refused(
         lambda given: make_env("alcc", **{"batch_size": (), **given}, overrides=words), cases
     )
+
+
+def test_settings_of_trainings_have_no_effect_on_an_environment() -> None:
+    cases = [
+        ("seed=7", r"^seed=7 has no effect: use make_env\(seed=…\)"),
+        ("training={environments: 3}", r"use make_env\(batch_size=…\)"),
+    ]
+    check_refused(lambda word: make_env("alcc", overrides=[word]), cases)
+    assert make_env("alcc", 2, ["experiment=smoke", "training.gap_range=[0.5,0.6]"])
 
 
 def test_seeds_that_would_play_the_same_episodes_are_refused(envs) -> None:

@@ -11,11 +11,13 @@ import torch
 from commands import tiny
 from helpers import ACTION, check_refused, compose, network, play, single_env, small_env
 from platoons import env_of, hcfs, ramps
+from torchrl.collectors import Collector
 
 from lcc_rl.commands import evaluation, training
 from lcc_rl.drivers.calibrator import Calibrator
 from lcc_rl.drivers.genetic import GeneticSettings
 from lcc_rl.drivers.observed import Selection, observe
+from lcc_rl.envs import StringCollector
 from lcc_rl.errors import DataError, Diverged
 from lcc_rl.pieces import IDM, Controller, Feature, MotorPower, RewardTerm
 
@@ -134,6 +136,16 @@ def test_actions_beyond_the_range_count_as_its_ends() -> None:
         assert (reached[0].exclude(ACTION) == reached[1].exclude(ACTION)).all()
 
 
+def test_every_view_and_collector_names_the_term_that_is_nan() -> None:
+    frames = {"frames_per_batch": 27, "total_frames": 27}
+    kinds = Collector, StringCollector
+    plays = [lambda env, x=x: next(iter(x(env, None, **frames))) for x in kinds]
+    words = "automated.reward_terms.comfort is nan at step 3 of episode 0"
+    plays.append(lambda env: env.rollout(9))
+    cases = [(play, make, words) for play in plays for make in (single_env, small_env)]
+    check_refused(lambda play, make: play(make("alcc", 3, TERM)), cases, Diverged)
+
+
 # -- training --------------------------------------------------------------------------------------
 
 
@@ -144,7 +156,7 @@ def test_a_training_names_what_it_would_have_learned_from(tmp_path) -> None:
 
     ends = r".* of episode \d+ in iteration 1 of .*; nothing is saved$"
     cases = [
-        ("training.collector=string", *TERM, f"automated.reward is nan at step 3{ends}"),
+        ("training.collector=string", *TERM, f"terms.comfort is nan at step 3{ends}"),
         ("training.collector=torchrl", *POWER, f"vehicles.power is -?inf at step 1{ends}"),
         ("training.collector=string", *ENTRY, f"automated.observation is nan at step{ends}"),
         ("agent=analytic", *TERM, f"automated.reward_terms.comfort is nan at step 3{ends}"),

@@ -46,6 +46,7 @@ WRONG = {
     "learning=follow": "choice of learning 'follow'; valid: follow_samples.*, needs --config-dir",
     "agent._partial_=true": "agent._partial_ has no effect",
     "agent.gamma=???": r"^agent\.gamma=\?\?\?: expected a value",
+    f"variant=hcfs {AUTO}.jerk_weight=1": r"It is deployed\.jerk_weight",
     # types
     "seed=abc": "seed must be .* integer",
     "scenario.pieces.ttc=5": "ttc: expected a node",

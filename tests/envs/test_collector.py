@@ -10,6 +10,7 @@ from helpers import TERMS, check_refused, compose, make_agent, single_env, small
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch._dynamo.utils import counters
 from torchrl.collectors import BaseCollector, Collector
+from torchrl.envs import Compose, RewardSum, TransformedEnv
 
 from lcc_rl.agents.actor import GaussianExploration, shared_policy
 from lcc_rl.agents.collecting import LEARNED_FROM
@@ -124,9 +125,11 @@ def test_an_environment_may_be_made_by_a_function_and_its_state_restored() -> No
 
 
 def test_what_cannot_be_collected_is_refused() -> None:
+    sums = [TransformedEnv(environment("one"), x) for x in (RewardSum(), Compose(RewardSum()))]
     cases = [
         (small_env("alcc", 4, [string("human*3")]), 40, "no vehicle of the string is automated"),
         (environment("one"), 41, "must be a multiple of the 8 episodes side by side"),
+        *((env, 40, "has the transforms RewardSum") for env in sums),
     ]
 
     def collect(env, frames: int) -> None:

@@ -22,7 +22,7 @@ from lcc_rl.evaluation.comparison import Comparison
 from lcc_rl.evaluation.entrants import check_distinct, named_apart
 from lcc_rl.evaluation.fit import check_policy, other_traffic
 from lcc_rl.evaluation.named import TUNED
-from lcc_rl.evaluation.strategies import Strategy, baseline, trained
+from lcc_rl.evaluation.strategies import Strategy, baseline, name_of, trained
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import Piece
 from lcc_rl.results.policies import load_policy
@@ -74,6 +74,10 @@ def test_policies_of_one_variant_are_named_by_what_they_learned_with() -> None:
     dated = replace(other, source="runs/2026-11-25_14-26-58-976217_alcc_seed0/policy.pt")
     named = named_apart([replace(ddpg, source="runs/a.pt"), dated])
     assert [one.name for one in named] == ["alcc a", "alcc 14-26-58"]
+
+
+def test_an_agents_variant_with_another_agent_is_named_by_that_one() -> None:
+    assert [name_of(compose(x, "agent=sac")) for x in ("ddpg", "alcc")] == ["sac", "alcc"]
 
 
 def test_rows_are_told_apart_by_whatever_differs_but_the_seed() -> None:

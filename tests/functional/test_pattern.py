@@ -9,7 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lcc_rl.errors import ConfigError
-from lcc_rl.functional.pattern import parse_string
+from lcc_rl.functional.pattern import RESERVED, parse_string
+from lcc_rl.pieces.base import ROLE, TERM
+from lcc_rl.pieces.views import AHEAD, BEHIND, EPISODE, LEADER, NEXT, SELF, VEHICLES
 
 A, H = "automated", "human"
 
@@ -42,6 +44,7 @@ def test_an_error_points_at_the_place(subtests) -> None:
         ("human (automated (human)", "this bracket is never closed", 7),
         ("automated ()", "expected a role", 12),
         ("*3 human", "expected a role before '*'", 1),
+        ("human leader", "the name leader is reserved, expected a role", 7),
         ("human*0", "expected a number that makes 1…10000 vehicles", 6),
         ("human*99999", "expected a number that makes 1…10000 vehicles", 6),
         ("automated human*-2", "expected a number behind '*'", 16),
@@ -57,6 +60,7 @@ def test_an_error_points_at_the_place(subtests) -> None:
             assert f"{words} at character {place}: " in text
             # The pattern itself, marked where it goes wrong.
             assert text.endswith(f"{pattern[: place - 1]}»{pattern[place - 1 :]}")
+    assert {VEHICLES, LEADER, EPISODE, SELF, AHEAD, BEHIND, NEXT, ROLE, TERM} == RESERVED
 
 
 def test_a_share_is_a_number() -> None:

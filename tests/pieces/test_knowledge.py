@@ -9,6 +9,7 @@ import torch
 from helpers import OBSERVATION, small_env, steady, wavy_profiles
 from tensordict import TensorDict
 
+from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import LeaderPreview, TrafficAhead, parse_string
 from lcc_rl.pieces.world import World
 
@@ -28,6 +29,11 @@ def test_preview_is_what_the_leader_will_do() -> None:
     # It is part of the observation: the difference from the present, scaled.
     difference = seen - leader.unsqueeze(-1)
     assert torch.allclose(data[OBSERVATION][0, :, 0, -2:], 0.5 * difference)
+
+
+def test_a_ring_has_no_leader_to_preview() -> None:
+    with pytest.raises(ConfigError, match=r"LeaderPreview reads leader\..* a ring road has no"):
+        small_env("alcc", 2, ["scenario=ring", "+knowledge=preview"])
 
 
 def test_differences_are_taken_in_equal_parts() -> None:
