@@ -102,28 +102,23 @@ def test_filtered_memory_is_an_average_and_the_spread_the_average_distance_from_
     assert torch.allclose(data[OBSERVATION][0, :, 0, -1], 0.5 * spread)
 
 
-@pytest.mark.parametrize(
-    ("pattern", "road"),
-    [
+def test_traffic_ahead_is_the_speed_of_the_vehicles_at_these_places() -> None:
+    speed, leader, drawn = torch.rand(2, 6, 1), torch.rand(2, 1), torch.tensor([[0, 4], [2, 5]])
+    for pattern, road in (
         ("human automated human*2 automated*2", "open"),
         ({"size": 6, "penetration": 0.4}, "open"),
         ("human automated human*3 automated", "ring"),
-    ],
-)
-def test_traffic_ahead_is_the_speed_of_the_vehicles_at_these_places(pattern, road: str) -> None:
-    string = parse_string(pattern, road)
-    piece = TrafficAhead(places=(1, 3)).bind(World(string))
-    own = torch.tensor([[0, 4], [2, 5]]) if string.drawn else None
-    speed, leader = torch.rand(2, 6, 1), torch.rand(2, 1)
-    given = {("vehicles", "speed"): speed, ("leader", "speed"): leader, ("automated", "index"): own}
-    seen = piece(TensorDict({key: given[key] for key in piece.in_keys}, [2]))["traffic", "speed"]
-    for episode in range(2):
-        places = string.places("automated") if own is None else own[episode].tolist()
-        everyone = [*speed[episode].flatten().tolist()]
-        for row, place in zip(seen[episode].tolist(), places, strict=True):
-            beyond = [place < far and road == "open" for far in (1, 3)]
-            there = [everyone[(place - far) % 6] for far in (1, 3)]
-            wanted = [
-                leader[episode].item() if b else x for b, x in zip(beyond, there, strict=True)
-            ]
-            assert row == wanted
+    ):
+        string = parse_string(pattern, road)
+        piece = TrafficAhead(places=(1, 3)).bind(World(string))
+        given = {("vehicles", "speed"): speed, ("leader", "speed"): leader}
+        given["automated", "index"] = drawn
+        state = TensorDict({key: given[key] for key in piece.in_keys}, [2])
+        seen = piece(state)["traffic", "speed"]
+        for episode in range(2):
+            everyone, own = speed[episode].flatten(), string.places("automated")
+            for row, place in enumerate(drawn[episode].tolist() if string.drawn else own):
+                for column, far in enumerate((1, 3)):
+                    beyond = place < far and not string.ring
+                    there = leader[episode, 0] if beyond else everyone[(place - far) % 6]
+                    assert seen[episode, row, column] == there
