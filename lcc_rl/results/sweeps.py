@@ -6,7 +6,7 @@ import hashlib
 import os
 import shlex
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -64,11 +64,10 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
             rows = rows.drop(index=group.index.difference(first.index))
         else:
             names = list(dict.fromkeys(group["run"]))
-            choices = labels([runs[name] for name in names], [root / name for name in names])
             plain, mark, limit = str(strategy).partition(ON_FRONT)
             named = {
-                name: f"{plain} {', '.join(word.values())}".strip() + mark + limit
-                for name, word in zip(names, choices, strict=True)
+                name: f"{plain} {words}".strip() + mark + limit
+                for name, words in zip(names, _told_apart(names, runs, root), strict=True)
             }
             rows.loc[group.index, "strategy"] = group["run"].map(named)
     rows = rows.drop_duplicates([name for name in rows if name != "run"])
@@ -107,7 +106,7 @@ def conditions(rows: pd.DataFrame, runs: Mapping[str, Choices], root: Path) -> d
     return {name: word for word, (_, names) in named if word for name in names}
 
 
-def _told_apart(names: Iterable[str], runs: Mapping[str, Choices], root: Path) -> list[str]:
+def _told_apart(names: Collection[str], runs: Mapping[str, Choices], root: Path) -> list[str]:
     """Return the words by which runs of these names differ, see :func:`labels`."""
     found = labels([runs[name] for name in names], [root / name for name in names])
     return [", ".join(words.values()) for words in found]

@@ -229,7 +229,8 @@ def make_plan(config: DictConfig) -> SweepPlan:
     read = OverridesParser.create().parse_overrides(result_overrides(words_of_sweep(config)))
     swept = {item.get_key_element(): item for item in read if item.is_sweep_override()}
     varied = [key_of(key) for key in swept]
-    values = [list(islice(item.sweep_string_iterator(), MOST_RUNS + 1)) for item in swept.values()]
+    listed = (islice(item.sweep_string_iterator(), MOST_RUNS + 1) for item in swept.values())
+    values = [[*dict.fromkeys(some)] for some in listed]  # a value may be typed twice
     return SweepPlan(math.prod(map(len, values)), varied, values)
 
 
