@@ -31,7 +31,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
     "lcc_rl + tools": {"lines": 45_245, "code": 30_075},
-    "tests": {"lines": 27_435},
+    "tests": {"lines": 27_450},
     "conf": {"yaml": 166},
 }
 CASES = 1_300  # ceiling of all quick tests, see tests/tools/test_size.py
