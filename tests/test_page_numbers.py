@@ -95,7 +95,7 @@ def findings() -> list[str]:
         f"use {1.0 - energy['as calibrated'] / energy['recorded']:.0%} less",
         f"save {1.0 - own['e'] / humans['e']:.1%} (",
         f"at {1.0 - own[FLOW] / humans[FLOW]:.1%} less flow",
-        f"a rule with them {1.0 - own['e'] / at_its_flow:.1%} (",
+        f"less flow, {1.0 - own['e'] / at_its_flow:.1%} (",
         f"driver behind saves {100.0 * least:.1f} to {most:.1%} in windows",
         f"ends {late.count()} of {len(late)} waves",
     ]

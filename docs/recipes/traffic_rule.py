@@ -28,4 +28,5 @@ class Ahead(Controller):
         free = gap - self.standstill_gap
         wanted = flow + self.gain * (free - self.time_gap * speed)
         safe = free - relative.clamp(max=0.0).square() / (2.0 * self.braking)
+        # The safety filter keeps time gaps of at least 1.05 s.
         return (torch.minimum(wanted, safe / 1.05).clamp(min=0.0) - speed) / self.response

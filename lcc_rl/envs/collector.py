@@ -145,8 +145,9 @@ class StringCollector(BaseCollector):
     @torch.no_grad()
     def collect(self) -> TensorDictBase:
         """Return the next batch, ``[*batch, steps]``; :class:`Diverged` if it is not finite."""
-        record, begun = [], int(self.state[STEP].max())
+        record, numbers = [], []
         for _ in range(self.steps):
+            numbers.append(self.state[STEP].reshape(-1) + 1)
             self.state, entries, over = self.advance(self.state)
             record.append(entries)
             if over:
@@ -157,7 +158,7 @@ class StringCollector(BaseCollector):
         segment = TensorDict(batch_size=[*batch, self.steps], device=self.env.device)
         for key, values in zip(self.keys, zip(*record, strict=True), strict=True):
             segment.set(key, torch.stack(values, len(batch)))
-        check_batch(segment.reshape(-1, self.steps), begun)
+        check_batch(segment.reshape(-1, self.steps), torch.stack(numbers))
         if isinstance(self.view, MultiAgent):
             self.view(segment)
             self.view(segment.get(NEXT, TensorDict()))

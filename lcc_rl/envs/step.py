@@ -126,12 +126,12 @@ def entries_of(td: TensorDictBase) -> State:
     return {key: value.clone() for key, value in _read(td).items()}
 
 
-def check_batch(batch: TensorDictBase, begun: int = 0, label: str = "") -> None:
+def check_batch(batch: TensorDictBase, first: int | Tensor = 1, label: str = "") -> None:
     """Check that transitions are finite, before an update uses them.
 
     Args:
         batch: ``[environments, steps]``.
-        begun: steps of the episodes before the batch.
+        first: number of the first step, or of every step of an episode, ``[steps, environments]``.
         label: name of the policy in the message.
 
     Raises:
@@ -145,7 +145,7 @@ def check_batch(batch: TensorDictBase, begun: int = 0, label: str = "") -> None:
             numbers[name] = batch.get(key).detach().transpose(0, 1)
     order = sorted(numbers, key=lambda name: (name != ACTION, name == REWARD))  # causes first
     running = ones((*batch.shape[1::-1], 1), device=batch.device).bool()
-    require_finite({name: numbers[name] for name in order}, running, begun + 1, label)
+    require_finite({name: numbers[name] for name in order}, running, first, label)
 
 
 def leaf_keys(key: NestedKey, known: Iterable[Key]) -> list[Key]:

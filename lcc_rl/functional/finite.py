@@ -26,7 +26,7 @@ def nonfinite_weight(weights: Mapping[str, Tensor]) -> str | None:
 def require_finite(
     entries: Mapping[tuple[str, ...], Tensor],
     running: Tensor,
-    first: int = 1,
+    first: int | Tensor = 1,
     label: str = "",
     named: Callable[[int], str] = str,
     writers: Mapping[tuple[str, ...], str] | None = None,
@@ -36,7 +36,7 @@ def require_finite(
     Args:
         entries: entries ``[steps, batch, …]`` by key, causes before effects.
         running: whether each episode runs, ``[steps, batch, 1]``; later steps are not checked.
-        first: number of the first step.
+        first: number of the first step, or of every step, ``[steps, batch]``.
         label: name of the policy in the message.
         named: returns the name of an episode in the message from its index.
         writers: what computes entries, by key.
@@ -62,4 +62,5 @@ def require_finite(
     number = values[~values.isfinite()][0].item()
     where = f"{label}: {'.'.join(key)}" if label else ".".join(key)
     where += f" of {writers[key]}" if writers and key in writers else ""
-    raise Diverged(f"{where} is {number} at step {first + step} of episode {named(episode)}")
+    at = int(first[step, episode]) if isinstance(first, Tensor) else first + step
+    raise Diverged(f"{where} is {number} at step {at} of episode {named(episode)}")

@@ -78,7 +78,7 @@ class TrafficAhead(Feature):
     """Speeds of vehicles further ahead, as they or sensors at the road report them by radio.
 
     Writes ``("traffic", "speed")`` [m/s], ``[*batch, A, places]``. Ahead of the string no vehicle
-    is known but the leader, whose present speed stands for theirs. A ring has no first vehicle.
+    is known but the leader, whose present speed stands for theirs. On a ring the count continues.
     """
 
     places: Annotated[tuple[Count, ...], Field(min_length=1)] = (5, 10, 20, 40)  # 1: the next one

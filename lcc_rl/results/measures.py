@@ -179,7 +179,7 @@ _varied = partial(_average, unit="m/s")
 _braking = partial(Measure, unit="m/s²", form="{:.1f}", aggregate="max")
 # Ratios of a column of all vehicles and their distance.
 _per = partial(Measure, per=DISTANCE, factor=1e3, interval=True, possible=(0.0, inf))
-_signed = partial(_per, possible=(-inf, inf))
+_signed = partial(_per, possible=(-inf, inf))  # of net energies, too, and of their fuel
 _kj_per_km = partial(_signed, unit="kJ", form="{:.1f}")
 _per_100km = partial(_per, factor=1e5, unit="1/100 km")
 
@@ -207,8 +207,8 @@ MEASURES = [
     _kj_per_km(
         f"{SECOND}_per_km", "path energy, second model, per vehicle and km", of=f"all_{SECOND}"
     ),
-    _per("fuel_l_per_100km", "fuel", unit="L/100 km", of="all_fuel_l", factor=1e5),
-    _per("co2_g_per_km", "carbon dioxide of it", unit="g/km", form="{:.1f}", of="all_co2_g"),
+    _signed("fuel_l_per_100km", "fuel", unit="L/100 km", of="all_fuel_l", factor=1e5),
+    _signed("co2_g_per_km", "carbon dioxide of it", unit="g/km", form="{:.1f}", of="all_co2_g"),
     _per("travel_time_s_per_km", "travel time", unit="s/km", of="vehicle_time_s"),
     _signed("delay_s_per_km", "  delay against v0", unit="s/km", of="delay_s"),
     _least_mean("mean_speed_mps", "mean speed", unit="m/s", limit="mean\nspeed"),

@@ -6,7 +6,7 @@ import hashlib
 import os
 import shlex
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import pandas as pd
 
 from lcc_rl.arrays import Floats
 from lcc_rl.config.compose import NOT_IDENTITY
-from lcc_rl.errors import ConfigError, ResultsError, require
+from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.io.files import as_rows
 from lcc_rl.io.tensors import checksums
 from lcc_rl.results.loading import SHARD, listed, load
@@ -64,11 +64,10 @@ def load_sweep(root: str | Path) -> pd.DataFrame:
             rows = rows.drop(index=group.index.difference(first.index))
         else:
             names = list(dict.fromkeys(group["run"]))
-            choices = labels([runs[name] for name in names], [root / name for name in names])
             plain, mark, limit = str(strategy).partition(ON_FRONT)
             named = {
-                name: f"{plain} {', '.join(word.values())}".strip() + mark + limit
-                for name, word in zip(names, choices, strict=True)
+                name: f"{plain} {words}".strip() + mark + limit
+                for name, words in zip(names, _told_apart(names, runs, root), strict=True)
             }
             rows.loc[group.index, "strategy"] = group["run"].map(named)
     rows = rows.drop_duplicates([name for name in rows if name != "run"])
@@ -107,7 +106,7 @@ def conditions(rows: pd.DataFrame, runs: Mapping[str, Choices], root: Path) -> d
     return {name: word for word, (_, names) in named if word for name in names}
 
 
-def _told_apart(names: Iterable[str], runs: Mapping[str, Choices], root: Path) -> list[str]:
+def _told_apart(names: Collection[str], runs: Mapping[str, Choices], root: Path) -> list[str]:
     """Return the words by which runs of these names differ, see :func:`labels`."""
     found = labels([runs[name] for name in names], [root / name for name in names])
     return [", ".join(words.values()) for words in found]
@@ -118,9 +117,10 @@ def _of_vehicles(runs: Mapping[str, Choices], root: Path) -> list[str]:
     first: dict[str, str] = {}
     for name, own in runs.items():
         first.setdefault(str({k: x for k, x in own.items() if f"{k}.".startswith(OF_ENERGY)}), name)
-    words = " and ".join(_told_apart([*first.values()], runs, root))
-    why = f"because energy models or vehicles differ: {words}"
-    return [f"Energies are not comparable, {why}."] * (len(first) > 1)
+    if len(first) == 1:
+        return []
+    words = " and ".join(_told_apart(first.values(), runs, root))
+    return [f"Energies are not comparable, because energy models or vehicles differ: {words}."]
 
 
 def labels(stored: Sequence[Choices], folders: Sequence[Path]) -> list[dict[str, str]]:
@@ -205,15 +205,15 @@ def _equal(folders: Sequence[Path], what: str, digest: Callable[[Path], Any]) ->
 def _check_one_study(root: Path, rows: pd.DataFrame, runs: Mapping[str, Choices]) -> None:
     if "leader_speed_mps" in rows:
         leaders = rows.groupby("profile_id")["leader_speed_mps"].nunique()
-        window = leaders.idxmax()
-        own = rows[rows["profile_id"] == window].drop_duplicates("leader_speed_mps")["run"]
-        words = " and ".join(filter(None, _told_apart(own, runs, root)))
-        first = shlex.quote(str(root / own.iloc[0]))
-        require(
-            leaders.max() == 1,
-            f"{root}: its runs have different leaders ({words or f'profile_id {window}'}): "
-            f"each has a table, lcc-rl table {first}; lcc_rl.results.load({str(root)!r}) reads all",
-        )
+        if leaders.max() > 1:
+            window = leaders.idxmax()
+            own = rows[rows["profile_id"] == window].drop_duplicates("leader_speed_mps")["run"]
+            words = " and ".join(filter(None, _told_apart([*own], runs, root)))
+            raise ConfigError(
+                f"{root}: its runs have different leaders ({words or f'profile_id {window}'}): "
+                f"each has a table, lcc-rl table {shlex.quote(str(root / own.iloc[0]))}; "
+                f"lcc_rl.results.load({str(root)!r}) reads all"
+            )
     twice = rows[rows.duplicated([key for key in EPISODE if key in rows], keep=False)]
     for (strategy, seed), group in twice.groupby([STRATEGY, TRAINED], dropna=False, observed=True):
         where = " and ".join(group["run"].unique()[:2])

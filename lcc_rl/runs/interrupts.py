@@ -23,6 +23,7 @@ ENDING_SIGNALS = (
     *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []),
 )
 TOGETHER = 1.0  # signals of scheduler, terminal and parent within this time count as one [s]
+BETWEEN_LOOKS = 1.0  # time after which a process looks again whether its parent lives [s]
 Restore = Callable[[], None]
 
 
@@ -48,7 +49,7 @@ def end_with_parent() -> None:
 
     def wait_for_end() -> None:
         while parent is not None and os.getppid() == parent.pid:
-            time.sleep(TOGETHER)
+            time.sleep(BETWEEN_LOOKS)
         os._exit(INTERRUPTED)
 
     if parent is not None:

@@ -229,7 +229,8 @@ def make_plan(config: DictConfig) -> SweepPlan:
     read = OverridesParser.create().parse_overrides(result_overrides(words_of_sweep(config)))
     swept = {item.get_key_element(): item for item in read if item.is_sweep_override()}
     varied = [key_of(key) for key in swept]
-    values = [list(islice(item.sweep_string_iterator(), MOST_RUNS + 1)) for item in swept.values()]
+    listed = (islice(item.sweep_string_iterator(), MOST_RUNS + 1) for item in swept.values())
+    values = [[*dict.fromkeys(some)] for some in listed]  # a value may be typed twice
     return SweepPlan(math.prod(map(len, values)), varied, values)
 
 
@@ -245,7 +246,8 @@ def warn_of_rounding(plan: SweepPlan) -> None:
 def check_cells(config: DictConfig, varied: Collection[str]) -> list[str]:
     """Log which cells of a sweep will fail, and why, and which are one run; return their hashes.
 
-    Keys ``varied`` name a cell. There are no hashes if they are known in a run only.
+    The hashes have the order of the cells of the plan, whose keys are ``varied``. There are none if
+    a setting such as ``${hydra:…}`` has its value in a run only.
 
     Raises:
         SystemExit: for a choice that no file has, with which Hydra does not start a sweep.
@@ -313,8 +315,10 @@ def conclude(folder: Path, plan: SweepPlan) -> None:
         log.info("side by side: lcc-rl table %s --figure sweep.png", shlex.quote(str(folder)))
     if others := sum(state.state == "failed" for state in every) - len(failed):
         log.warning("%d failed runs in the folder are of other commands", others)
-    for state in (*failed, *refused):
+    for state in failed:
         log.error("failed: %s: %s", state.name, state.error)
+    for state in refused:
+        log.error("%s: %s", state.name, state.error)  # "not repeated: …"
     if failed or refused:
         begun = any((folder / x.name / CONFIG).is_file() for x in failed)
         again = "; the same command repeats those that had begun" * begun

@@ -146,6 +146,21 @@ def test_every_view_and_collector_names_the_term_that_is_nan() -> None:
     check_refused(lambda play, make: play(make("alcc", 3, TERM)), cases, Diverged)
 
 
+class LaterNan(NanReward):
+    calls = 0
+
+    def reward(self, jerk, step):
+        type(self).calls += 1
+        return nan_at(step, -jerk.abs(), 3 if self.calls > 60 else -1)
+
+
+def test_a_collector_counts_the_steps_of_an_episode_that_begins_within_a_batch() -> None:
+    later = f"+reward.terms.comfort={{_target_: {__name__}.LaterNan, weight: 0.1}}"
+    env = small_env("alcc", 3, [later, "scenario.horizon=40"])
+    with pytest.raises(Diverged, match="comfort is nan at step 3 of"):
+        list(StringCollector(env, None, frames_per_batch=27, total_frames=540))
+
+
 # -- training --------------------------------------------------------------------------------------
 
 

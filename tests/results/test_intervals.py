@@ -55,12 +55,14 @@ def test_episodes_without_a_value_have_no_weight() -> None:
 def test_intervals_of_what_cannot_be_negative_end_at_zero() -> None:
     keys = {"strategy": "alcc", "training_seed": np.nan, "profile_id": [*range(4)]}
     few = {"brakings_below_2": [0.0, 0, 0, 9], "share_ttc_unsafe": [0.0, 0, 0, 1]}
-    energies = {f"all_{x}energy_kj": [-1.0, 1, 1, 1] for x in ("", "path_")}
+    signed = ("energy_kj", "path_energy_kj", "fuel_l", "co2_g")  # fuel is that of path energy
+    energies = {f"all_{name}": [-1.0, 1, 1, 1] for name in signed}
     rows = windows_of(pd.DataFrame(keys | few | energies | {"distance_m": 1e3, "delay_s": -1.0}))
     found = with_bounds(rows, [measure for measure in MEASURES if measure.interval])
     assert found["brakings_below_2_per_100km"].low == found["share_ttc_unsafe"].low == 0.0
     assert found["share_ttc_unsafe"].high == 1.0
-    assert found["kj_per_km"].low < 0.0 > found["path_energy_kj_per_km"].low
+    for key in ("kj_per_km", "path_energy_kj_per_km", "fuel_l_per_100km", "co2_g_per_km"):
+        assert found[key].low < 0.0, key
     assert found["delay_s_per_km"].low == pytest.approx(-1e-3)
 
 

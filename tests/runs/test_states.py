@@ -102,6 +102,7 @@ def test_a_finished_run_stays_finished_and_a_removed_one_removed(tmp_path, train
             conclude(tmp_path, SweepPlan(marks=marks))
     told = "1 of 1 runs finished", "1 failed runs in the folder are of other commands"
     assert all(line in caplog.text for line in told)
+    assert "run: not repeated: its data have changed" in caplog.messages
     training.complete(load_config(folder), folder)
     assert str(inspect_run(folder)) == "finished"
     shutil.rmtree(folder)

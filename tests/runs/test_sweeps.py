@@ -136,6 +136,16 @@ def test_what_was_typed_may_refer_to_settings() -> None:
     assert sweeps.make_plan(config) == sweeps.SweepPlan(2, ["seed"], values)
 
 
+def test_a_value_that_is_typed_twice_is_one() -> None:
+    typed = {"task": ["variant=alcc", "experiment=smoke", "seed=0,1", "agent.gamma=0.9,0.9"]}
+    hydra = {"overrides": typed, "sweeper": {}, "job": {"config_name": "train"}}
+    config = OmegaConf.create({"hydra": hydra})
+    plan = sweeps.make_plan(config)
+    assert plan.values == [["0", "1"], ["0.9"]]
+    # The hashes belong to the cells of the plan, in their order.
+    assert len(set(sweeps.check_cells(config, plan.varied))) == plan.runs == 2
+
+
 def test_a_range_of_decimals_is_told_to_be_listed(caplog) -> None:
     typed = {"task": ["agent.tau=range(0,0.9,0.3)", "seed=range(3)", "agent.gamma=0.25,1e-3"]}
     plan = sweeps.make_plan(OmegaConf.create({"hydra": {"overrides": typed, "sweeper": {}}}))
