@@ -1,7 +1,8 @@
 """A rule that drives at the speed of the traffic further ahead, rival of a network that knows it.
 
 export PYTHONPATH=docs/recipes
-lcc-rl evaluate task=i24-fleet 'knowledge=[memory,traffic]' trust=[traffic_rule] \
+lcc-rl evaluate task=i24-fleet leader=i24 leader.path=i24_leaders.parquet leader.fastest=null \
+    evaluation.warm_up=0 'knowledge=[memory,traffic]' trust=[traffic_rule] \
     'compare={ahead_filtered: {_target_: traffic_rule.Ahead, time_gap: 2.0}}'
 """
 

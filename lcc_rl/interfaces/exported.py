@@ -267,14 +267,20 @@ class DrivingProgram(nn.Module):
 
 
 def described_input(name: str) -> Input:
-    """Return name, unit and meaning of a measurement such as ``"ahead.speed"``."""
-    view, entry = name.split(".")[:2]
+    """Return name, unit and meaning of a measurement such as ``"ahead.speed"``.
+
+    Columns of a wide entry have a number, ``"traffic.speed.0"``.
+    """
+    view, entry, *column = name.split(".")
     owners = {"self": "own", "ahead": "of the vehicle ahead", "behind": "of the vehicle behind"}
+    whose = owners.get(view, view)
+    if column:
+        whose += f", value {int(column[0]) + 1}"
     shown = declared(Piece)
-    for key in ((VEHICLES, entry), (view, entry), (ROLE, entry)):
+    for key in ((view, entry), (VEHICLES, entry), (ROLE, entry)):
         if key in shown:
-            return Input(name, shown[key].unit, f"{shown[key].meaning} ({owners.get(view, view)})")
-    return Input(name, "–", f"{entry} ({owners.get(view, view)})")
+            return Input(name, shown[key].unit, f"{shown[key].meaning} ({whose})")
+    return Input(name, "–", f"{entry} ({whose})")
 
 
 def measuring(time_step: float, behind: bool = True, population: Population | None = None) -> World:

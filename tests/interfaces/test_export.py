@@ -25,7 +25,7 @@ from lcc_rl.cli.export import main
 from lcc_rl.config import load
 from lcc_rl.errors import ConfigError, ResultsError
 from lcc_rl.interfaces.driver import Driver
-from lcc_rl.interfaces.exported import DrivingProgram, program
+from lcc_rl.interfaces.exported import DrivingProgram, described_input, program
 from lcc_rl.pieces import Controller
 from lcc_rl.results.policies import load_policy
 from lcc_rl.settings import Positive
@@ -107,6 +107,7 @@ def test_a_pytorch_program_computes_the_same_and_says_what_it_reads(module, expo
     given = (states(module), memories(module))
     torch.testing.assert_close(loaded(*given), module(*given))
     assert [item["name"] for item in json.loads(about["lcc_rl"])["inputs"]] == module.names
+    assert "places ahead (traffic, value 2)" in described_input("traffic.speed.1").meaning
     with pytest.raises(ResultsError, match="exists already"):
         lcc_rl.export("pretrained/i80-follow", path)
 
