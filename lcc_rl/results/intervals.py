@@ -39,7 +39,7 @@ class Estimate:
     high: float = np.nan
     more_flow: float = np.nan
 
-    def within(self, least: float, most: float) -> Estimate:
+    def within(self, least: float = -np.inf, most: float = np.inf) -> Estimate:
         """Return it with the bounds of its interval cut at the ends of a range."""
         low, high = np.clip([self.low, self.high], least, most).tolist()
         return replace(self, low=low, high=high)

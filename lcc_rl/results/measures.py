@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
-from math import inf, isfinite
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -81,7 +81,7 @@ class Measure:
         score: its name as a task's score.
         least: mean of a baseline below which no share of it is given: it is noise.
         interval: whether tables have its 95 % interval; extremes and sums have none.
-        possible: least and largest value, without the factor; intervals are cut there.
+        possible: least value, and largest, without the factor; intervals are cut there.
 
     Raises:
         ConfigError: if aggregate or bound is unknown.
@@ -103,7 +103,7 @@ class Measure:
     score: str = ""
     least: float = 0.0
     interval: bool = False
-    possible: tuple[float, float] = (-inf, inf)
+    possible: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         require_known(f"aggregate of {self.key}", self.aggregate, AGGREGATES)
@@ -172,14 +172,14 @@ class Measure:
 _kj = partial(Measure, unit="kJ", form="{:.1f}")
 _share = partial(Measure, unit=SHARE, bound="at most", interval=True, possible=(0.0, 1.0))
 _least = partial(Measure, aggregate="min", bound="at least")
-_least_mean = partial(_least, aggregate="mean", interval=True, possible=(0.0, inf))
+_least_mean = partial(_least, aggregate="mean", interval=True, possible=(0.0,))
 _largest = partial(Measure, aggregate="max", bound="at most")
-_average = partial(Measure, interval=True, possible=(0.0, inf))
+_average = partial(Measure, interval=True, possible=(0.0,))
 _varied = partial(_average, unit="m/s")
 _braking = partial(Measure, unit="m/s²", form="{:.1f}", aggregate="max")
 # Ratios of a column of all vehicles and their distance.
-_per = partial(Measure, per=DISTANCE, factor=1e3, interval=True, possible=(0.0, inf))
-_signed = partial(_per, possible=(-inf, inf))  # of net energies, too, and of their fuel
+_per = partial(Measure, per=DISTANCE, factor=1e3, interval=True, possible=(0.0,))
+_signed = partial(_per, possible=())  # of net energies, too, and of their fuel
 _kj_per_km = partial(_signed, unit="kJ", form="{:.1f}")
 _per_100km = partial(_per, factor=1e5, unit="1/100 km")
 

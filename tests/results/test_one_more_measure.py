@@ -43,8 +43,6 @@ MINE = Measure(
     short="most\njerk",
 )
 MODULE = """
-from math import inf
-
 from lcc_rl.evaluation.metrics import register
 from lcc_rl.results.measures import Measure
 
