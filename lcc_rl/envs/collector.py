@@ -145,9 +145,9 @@ class StringCollector(BaseCollector):
     @torch.no_grad()
     def collect(self) -> TensorDictBase:
         """Return the next batch, ``[*batch, steps]``; :class:`Diverged` if it is not finite."""
-        record, numbers = [], []
+        record, begun = [], []
         for _ in range(self.steps):
-            numbers.append(self.state[STEP].reshape(-1) + 1)
+            begun.append(self.state[STEP])
             self.state, entries, over = self.advance(self.state)
             record.append(entries)
             if over:
@@ -158,7 +158,7 @@ class StringCollector(BaseCollector):
         segment = TensorDict(batch_size=[*batch, self.steps], device=self.env.device)
         for key, values in zip(self.keys, zip(*record, strict=True), strict=True):
             segment.set(key, torch.stack(values, len(batch)))
-        check_batch(segment.reshape(-1, self.steps), torch.stack(numbers))
+        check_batch(segment.reshape(-1, self.steps), torch.stack(begun).flatten(1) + 1)
         if isinstance(self.view, MultiAgent):
             self.view(segment)
             self.view(segment.get(NEXT, TensorDict()))

@@ -11,10 +11,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.functional.layout import batch_innermost, join
+from lcc_rl.functional.layout import batch_innermost
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
-from lcc_rl.functional.string import gather
+from lcc_rl.functional.string import entries_ahead, gather
 from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP, Entry, Feature, Piece, StepTransform
 from lcc_rl.pieces.cbf import CBFFilter
 from lcc_rl.pieces.connected import Communication
@@ -98,13 +98,10 @@ class TrafficAhead(Feature):
 
     def compute(self, speed: Tensor, *more: Tensor) -> Tensor:
         own = more[-1] if self.string.drawn else self.own.expand(*speed.shape[:-2], -1)
-        place = own.unsqueeze(-1) - self.far  # -1: the leader's
-        if self.string.ring:
-            place = place % speed.shape[-2]
-        else:
-            speed = join([more[0].unsqueeze(-2), speed], -2)
-            place = (place + 1).clamp(min=0)
-        return gather(speed, place.flatten(-2)).view(*place.shape)
+        ahead = entries_ahead(None if self.string.ring else more[0], speed)
+        place = own.unsqueeze(-1) - self.far + 1  # of the vehicle behind
+        place = place % ahead.shape[-2] if self.string.ring else place.clamp(min=0)
+        return gather(ahead, place.flatten(-2)).view(*place.shape)
 
 
 def driving_reads(pieces: Sequence[Piece]) -> set[Key]:

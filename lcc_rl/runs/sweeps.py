@@ -257,6 +257,7 @@ def check_cells(config: DictConfig, varied: Collection[str]) -> list[str]:
     marks: dict[tuple[str, ...], str] = {}  # by the values of a cell
     first: dict[str, list[str]] = {}
     same: dict[str, None] = {}
+    known = True  # whether all hashes are those of the runs
     for words in BasicSweeper.split_arguments(read, None)[0]:
         try:
             mark, error = _hashed(composed(entry, words), entry, words)
@@ -264,7 +265,7 @@ def check_cells(config: DictConfig, varied: Collection[str]) -> list[str]:
             refuse(refused)
         own = [item.lstrip("+") for item in words if key_of(item) in varied]
         if "HydraConfig was not set" in str(error):  # ${hydra:…} has its value in a run only
-            marks[()] = ""
+            known = False
         elif error:
             log.error("will fail: %s%s", f"{' '.join(own)}: " * bool(own), error)
         pairs = zip(own, first.setdefault(mark, own), strict=True)
@@ -274,7 +275,7 @@ def check_cells(config: DictConfig, varied: Collection[str]) -> list[str]:
         marks[tuple(item.partition("=")[2] for item in own)] = mark
     for line in same:
         log.warning(line)
-    return [] if "" in marks.values() else [*marks.values()]
+    return [*marks.values()] if known else []
 
 
 def run_job(function: Callable[[DictConfig], Any], cfg: DictConfig, folder: Path) -> Any:
