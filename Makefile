@@ -49,7 +49,7 @@ ROWS := outputs/benchmarks
 benchmarks: $(STAMP)
 	mkdir -p $(ROWS)
 	$(BENCHMARK) env collect string start gym evaluate analytic --repeats 3 --out $(ROWS)/1.parquet $(ARGS) & \
-	$(BENCHMARK) update train calibrate read loading simulate --repeats 3 --out $(ROWS)/2.parquet $(ARGS) & wait
+	$(BENCHMARK) update train calibrate read simulate --repeats 3 --out $(ROWS)/2.parquet $(ARGS) & wait
 	$(BENCHMARK) --page $(ROWS)/1.parquet $(ROWS)/2.parquet | tee $(ROWS)/page.md
 
 # Surprises of other libraries, each in an environment of its own; 20 minutes, not part of tests.

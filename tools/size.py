@@ -30,7 +30,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 45_250, "code": 30_080},
+    "lcc_rl + tools": {"lines": 45_175, "code": 30_020},
     "tests": {"lines": 27_450},
     "conf": {"yaml": 166},
 }

@@ -21,7 +21,7 @@ from benchmarks.calibrate import calibrate
 from benchmarks.env import collect, env, gym
 from benchmarks.harness import EXTRA, Row, installed, page, table
 from benchmarks.jobs import analytic, evaluate, train, update
-from benchmarks.read import loading, read, start
+from benchmarks.read import read, start
 from benchmarks.string import simulate, string
 from lcc_rl.data.tables import TableFile
 from lcc_rl.errors import how_to_install, require_known
@@ -31,7 +31,7 @@ from lcc_rl.runs.arguments import Arguments, typed
 from lcc_rl.settings import Million
 
 LISTED = (
-    *(read, loading, start, env, string, simulate, gym, collect, update, train, analytic),
+    *(read, start, env, string, simulate, gym, collect, update, train, analytic),
     *(calibrate, evaluate),
 )
 BENCHMARKS: dict[str, Callable[[Namespace], list[Row]]] = {

@@ -1,4 +1,4 @@
-"""Benchmarks of reading recordings and results, and of starting a command."""
+"""Benchmarks of reading recordings and of starting a command."""
 
 from __future__ import annotations
 
@@ -6,26 +6,17 @@ import resource
 import subprocess
 import sys
 from argparse import Namespace
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TextIO
 
 import numpy as np
 import pandas as pd
-import pyarrow.parquet as pq
 
 from benchmarks.harness import Row, rates, rows_of, stream
-from lcc_rl import results
-from lcc_rl.config import load
-from lcc_rl.config.schemas import as_text
 from lcc_rl.data.ngsim import OFFICIAL, read_ngsim
 from lcc_rl.data.trajectories import FOOT
-from lcc_rl.io.files import write_parquet
 
-NUMBERS, BLOCK = 40, 50_000  # columns of a row besides its names; rows of a group
-ARROW = "pyarrow, to pandas"
 STARTS = {
     "import torchrl": ("-c", "import torchrl.envs, torchrl.collectors, torchrl.objectives"),
     "evaluate smoke": (
@@ -60,27 +51,6 @@ def write_ngsim(samples: pd.DataFrame, path: Path | TextIO) -> None:
     table.to_csv(path, index=False, float_format="%.3f")
 
 
-def loading(options: Namespace) -> list[Row]:
-    """Return rows/s of ``results.load``: of one run of many rows, and of many runs of few."""
-    rows: list[Row] = []
-    shapes = ((1, 1000), (3, 100)) if options.quick else ((1, 1_000_000), (200, 1000))
-    for runs, size in shapes:
-        with TemporaryDirectory(prefix="lcc_rl_benchmark_") as name:
-            folder = Path(name)
-            _write(folder, runs, size)
-            read: dict[str, Callable[[], object]] = {
-                "results.load": partial(results.load, folder),
-                ARROW: partial(_plain, folder),
-            }
-            unit, against = f"rows/s, {runs} runs", {"results.load": [ARROW]}
-            rows += rates(options, read, unit, runs * size, against)
-    return rows
-
-
-def _plain(folder: Path) -> list[pd.DataFrame]:
-    return [pq.read_table(path).to_pandas() for path in folder.glob("*/*.parquet")]
-
-
 def start(options: Namespace) -> list[Row]:
     """Return the seconds of the processor that small commands take, loading included."""
     chosen = list(STARTS)[: 1 if options.quick else None]
@@ -100,28 +70,3 @@ def _processor(words: tuple[str, ...], folder: str) -> float:
     before = used()
     subprocess.run([sys.executable, *words], check=True, cwd=folder, stdout=subprocess.DEVNULL)
     return used() - before
-
-
-def _write(folder: Path, runs: int, size: int) -> None:
-    """Write runs that differ by their seeds."""
-    text, draw = as_text(load("evaluate", ["variant=idm"])), np.random.default_rng(0)
-    for run in range(runs):
-        place = folder / f"{run:03d}"
-        place.mkdir()
-        (place / "config.yaml").write_text(
-            text.replace("\nseed: 0\n", f"\nseed: {run}\n"), encoding="utf-8"
-        )
-        parts = range(0, size, BLOCK)
-        table = (_episodes(min(BLOCK, size - first), draw) for first in parts)
-        write_parquet(table, place / "episodes.parquet")
-
-
-def _episodes(size: int, draw: np.random.Generator) -> pd.DataFrame:
-    names = {
-        "strategy": ["direct", "idm", "alcc"],
-        "profile": [f"rec0/{x}@0.0s" for x in range(40)],
-    }
-    columns: dict[str, object] = {key: draw.choice(some, size) for key, some in names.items()}
-    columns["training_seed"] = pd.array([None] * size, dtype="Int64")
-    columns |= {f"x{x}": draw.random(size, dtype=np.float32) for x in range(NUMBERS)}
-    return pd.DataFrame(columns)
