@@ -60,8 +60,8 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
         (compared), leader, follower, slope (of the gap over the relative distance), fit (share of
         the variance explained), motion, change (root mean squares of relative distance and change
         of the gap [m]), late [s], signal (the late one), ahead, own, grown (distances of leader and
-        follower, growth of the gap [m]), constant, rate (growth of the gap beyond that by both
-        speeds, fitted with and without the coefficients [m/s]).
+        follower, growth of the gap [m]), rate (growth of the gap beyond that by both speeds
+        [m/s]).
     """
     pair = numbers_of_pairs(episodes)
     starts = starts_of(pair)
@@ -83,7 +83,7 @@ def agreement(episodes: pd.DataFrame) -> pd.DataFrame:
     best[-1] = 0
     index, count = np.arange(pairs + 1), sums[2, 2]
     ahead, own, grown = sums[[0, 1, 3], 2] * [[1], [-1], [1]] * EVERY_S / CHANGE_S
-    names = ["leader", "follower", "constant", "slope"]
+    names = ["leader", "follower", "slope"]
     return pd.DataFrame(coefs[best, :, index], columns=names).assign(
         row=np.append(starts[np.unique(pair[starts], return_index=True)[1]], 0),
         seconds=EVERY_S * count,
@@ -115,7 +115,7 @@ def _fits(
     rows: NDArray[np.intp],
     lags: Iterable[tuple[int, int]],
 ) -> Iterator[tuple[Floats, Floats, Floats]]:
-    """Yield coefficients, constant, slope of each pair and of all, residuals and products.
+    """Yield coefficients and slope of each pair and of all, residuals and products.
 
     ``series`` are the gap and the distances of leader and follower; a lag is the place of the one
     that is late, and its samples. Changes over ``width`` samples begin at ``rows``; ``pair`` is the
@@ -146,13 +146,13 @@ def _fits(
 
 
 def _solved(sums: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return coefficients, constant and slope of sums of products, the residuals, and the sums."""
+    """Return coefficients and slope of sums of products, the residuals, and the sums."""
     matrix = np.moveaxis(sums[:3, :3], -1, 0) + RIDGE
     coefs = np.linalg.solve(matrix, sums[:3, 3].T[..., None]).astype(np.float64)[..., 0].T
     rest = sums[3, 3] - (coefs * sums[:3, 3]).sum(axis=0)
     rest /= sums[3, 3] - sums[2, 3] ** 2 / sums[2, 2]
     slope = sums[:2, 3].sum(axis=0) / sums[:2, :2].sum(axis=(0, 1))
-    coefs = np.vstack([coefs[:2], coefs[2:] / CHANGE_S, slope])
+    coefs = np.vstack([coefs[:2], slope])
     return coefs, np.nan_to_num(rest, nan=9.0).clip(FLOOR, 9.0), sums
 
 
@@ -249,7 +249,8 @@ def check_pairs(
         raise DataError(line)
     odd = pairs[clear & ~right & ~pairs["slope"].between(*span)].to_dict("records")
     sure = right & (pairs["fit"] >= SURE_FIT)  # noise lowers the coefficients
-    biased = [x for pair in pairs[sure].to_dict("records") for x in _biased(pair)]
+    moving = pairs.assign(sure=sure)[moves[:-1] & (pairs["seconds"] >= LEAST_S)]
+    biased = [x for pair in moving.to_dict("records") for x in _biased(pair)]
     text = "the gap changes by {:.2f} m where both speeds give 1 m, and no unit fits"
     strange = [(pair["row"], "gap", text.format(pair["slope"])) for pair in odd]
     enough = every["seconds"] >= LEAST_ALL_S and moves.iloc[-1]
@@ -346,15 +347,14 @@ def _own_speed(episodes: pd.DataFrame, units: Units, max_mismatch: float) -> Ite
 def _biased(pair: Mapping[Any, Any]) -> list[tuple[int, str, str]]:
     """Return row, signal and words on a clock or a speed that is slightly off; else nothing."""
     row, a, b, rate = (pair[name] for name in ("row", "leader", "follower", "rate"))
-    if min(a, b) > LOUD_FACTOR or max(a, b) < 1 / LOUD_FACTOR:
+    if pair["sure"] and (min(a, b) > LOUD_FACTOR or max(a, b) < 1 / LOUD_FACTOR):
         message = f"the gap changes by {(a * b) ** 0.5:.2f} m where both speeds give 1 m"
         return [(row, "gap", f"{message}; is a clock too fast or slow by this factor?")]
     if abs(rate) < LOUD_RATE:
         return []
     message = (
-        f"the gap changes by {rate:+.1f} m/s against both speeds, fitted by {a:.2f} of the "
-        f"leader's, {b:.2f} of the follower's and {pair['constant']:+.1f} m/s; is a speed biased? "
-        f"Add {rate:.1f} m/s to the leader's, or multiply the follower's by "
+        f"the gap changes by {rate:+.1f} m/s against both speeds; is a speed biased? Add "
+        f"{rate:.1f} m/s to the leader's, or multiply the follower's by "
         f"{1 - rate * pair['seconds'] / max(pair['own'], 1.0):.3f}"
     )
     return [(row, "leader", message)]

@@ -453,6 +453,12 @@ BIASES = [
         scaled(BOTH, 1.3).where(irregular()["episode"] == 1, irregular()),
         r"row 600, gap_m: the gap .* 0\.77 m where .* is a clock .*1 of 3 pairs",
     ),
+    (
+        scaled(LEADER, more=-1.5)
+        .assign(gap_m=noisy(1.0)["gap_m"])
+        .where(irregular()["episode"] == 1, irregular()),
+        r"row 600, leader_speed_mps: .* by \+1\.5 m/s .*; 1 of 3 pairs",
+    ),
 ]
 
 
