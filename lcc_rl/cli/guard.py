@@ -20,6 +20,9 @@ from lcc_rl.errors import (
 from lcc_rl.runs.interrupts import BAD_INPUT, INTERRUPTED, interruptible
 from lcc_rl.runs.output import unbroken_output
 
+# Settings of trainings and evaluations on which the memory depends.
+SMALLER = "training.environments, agent.buffer_size, agent.batch_size or evaluation.batch_size"
+
 
 def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
     """Decorate a function as a command with streams, signals and exit codes.
@@ -47,7 +50,7 @@ def main_guard(function: Callable[..., Any]) -> Callable[..., Any]:
                 stop(str(cause), INTERRUPTED)
             if cause is None and out_of_memory(error):
                 first = str(error).strip().partition("\n")[0]
-                stop(f"error: too little memory: {first}", BAD_INPUT)
+                stop(f"error: too little memory: {first}; lower {SMALLER}", BAD_INPUT)
             if not (cause or isinstance(error, OSError) or of_hydra(error) or place_of(error)):
                 raise
             stop(f"error: {cause or line_of(error) or type(error).__name__}", BAD_INPUT)

@@ -85,6 +85,13 @@ def test_errors_of_a_users_code_name_type_and_line(capsys) -> None:
         main_guard(eval)("1 / 0")
 
 
+def test_a_failed_allocation_names_the_settings_that_need_less(capsys) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main_guard(torch.zeros)(10**15)
+    said = capsys.readouterr().err
+    assert re.fullmatch("lcc_rl: error: too little memory: .*; lower training.env.*_size\n", said)
+
+
 def test_code_of_tools_and_of_compilers_is_no_users(tmp_path) -> None:
     tool, stored = Path(__file__).parents[2] / "tools" / "size.py", tmp_path / "c4.py"
     assert not is_users("__main__", tool)
