@@ -30,8 +30,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 45_250, "code": 30_080},
-    "tests": {"lines": 27_450},
+    "lcc_rl + tools": {"lines": 45_500, "code": 30_270},
+    "tests": {"lines": 27_560},
     "conf": {"yaml": 166},
 }
 CASES = 1_310  # ceiling of all quick tests, see tests/tools/test_size.py
