@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from os import PathLike, fspath
 from typing import Any
@@ -16,10 +17,13 @@ from lcc_rl.config.words import key_of, quoted, top_key
 from lcc_rl.data.leaders import DriveLeaders
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.inputs import build_energy
-from lcc_rl.errors import require
+from lcc_rl.errors import DataError, require
 from lcc_rl.evaluation.metrics import KILO
+from lcc_rl.results.remarks import MUCH
 from lcc_rl.runs.output import log_report
 from lcc_rl.settings import checked
+
+log = logging.getLogger("lcc_rl")
 
 BLOCK = 10  # records whose energies are computed together; more exceed the processor's cache
 KWH = 3600.0  # [kJ]
@@ -41,8 +45,12 @@ def trip_energies(
     Returns:
         A row per trip, by name: ``trip``, ``parts`` (records that holes divide it into),
         ``duration_s``, ``distance_km``, ``energy_kj`` as drawn, ``net_energy_kj``, less the gain of
-        kinetic energy and height; and of the energy drawn ``energy_kwh``, ``kwh_per_100km``, fuel
-        and carbon dioxide.
+        kinetic energy and height; of the energy drawn ``energy_kwh``, ``kwh_per_100km``, fuel and
+        carbon dioxide; and ``share_infeasible``, the share of the time with motion beyond the
+        model's power, which counts as the most that it can do.
+
+    Raises:
+        LccError: if a setting has no effect, the data are unusable, or a power is not finite.
     """
     for word in overrides:
         valid = top_key(word) in ("energy", "trust") or f"{key_of(word)}.".startswith(OF_TRIPS)
@@ -69,6 +77,11 @@ def trip_energies(
         trips["fuel_l"], trips["co2_g"] = (x.numpy() for x in model.burnt(drawn))
         trips["l_per_100km"] = 100.0 * trips["fuel_l"] / km
         trips["co2_g_per_km"] = trips["co2_g"] / km
+    trips["share_infeasible"] = trips.pop("infeasible_s") / trips["duration_s"]
+    for trip, share in zip(trips["trip"], trips["share_infeasible"], strict=True):
+        if share > MUCH:
+            text = "%s drives beyond the model's power for %.0f %% of the time: its energy is a "
+            log.warning(text + "lower bound", trip, 100.0 * share)
     return trips
 
 
@@ -80,9 +93,24 @@ def _energies(records: Profiles, block: slice, model: Any) -> pd.DataFrame:
     speed = records.speeds[rows]
     if records.grades is not None:
         model = model.at(records.grades[rows][:-1])
-    rates = np.stack([model.power(speed[:-1], speed.diff() / step), model.climbing(speed[:-1])])
+    motion = speed[:-1], speed.diff() / step
+    unpaid, beyond = (
+        torch.zeros_like(motion[0]) if x is None else x.float()
+        for x in (model.unpaid(*motion), model.infeasible(*motion))
+    )
+    rates = np.stack([model.power(*motion), model.climbing(speed[:-1]) - unpaid, beyond])
     rates[:, last[:-1]] = 0.0  # from one record to the next
-    drawn, climbed = KILO * step * np.add.reduceat(rates, first, axis=1, dtype=np.float64)
+    lost = np.flatnonzero(~np.isfinite(rates[0]))
+    if len(lost):
+        part = int(np.searchsorted(first, lost[0], side="right")) - 1
+        at, risen = (float(x[lost[0]]) for x in motion)
+        raise DataError(
+            f"{records.recordings[block][part]}: {type(model).__name__}.power is "
+            f"{rates[0, lost[0]]} at {at:.4g} m/s and {risen:.4g} m/s², "
+            f"{times(lost[0] - first[part], step):g} s after the start of the trip or of its part"
+        )
+    drawn, climbed, spent = step * np.add.reduceat(rates, first, axis=1, dtype=np.float64)
+    drawn, climbed = KILO * drawn, KILO * climbed
     edges = speed[np.stack([first, last])].double()
     stored = climbed + KILO * model.stored_energy(edges).diff(dim=0)[0].numpy()
     total = np.add.reduceat(speed.numpy(), first, dtype=np.float64) - 0.5 * edges.sum(0).numpy()
@@ -94,5 +122,6 @@ def _energies(records: Profiles, block: slice, model: Any) -> pd.DataFrame:
             "distance_km": KILO * step * total,
             "energy_kj": drawn,
             "net_energy_kj": drawn - stored,
+            "infeasible_s": spent,
         }
     )

@@ -57,6 +57,7 @@ class Column:
         whole: whether its numbers are whole.
         blank: whether cells may be blank: NaN, or ``""`` of text.
         required: whether a table must have it.
+        used: what alone uses it, for messages; empty for all.
     """
 
     key: str
@@ -67,6 +68,7 @@ class Column:
     whole: bool = False
     blank: bool = False
     required: bool = True
+    used: str = ""
 
     @property
     def expected(self) -> str:

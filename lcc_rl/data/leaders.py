@@ -293,7 +293,10 @@ class DriveLeaders(Settings):
         """Read all records; see :meth:`RecordLeaders.load`."""
         single = self.columns["drive"] is None
         profiles, report = self.profiles(time_step)
-        require(profiles.grades is None, "leader.columns.grade: only lcc-rl energy uses grades")
+        message = (
+            "leader.columns.grade: only lcc-rl energy uses it; +slope=hills gives roads grades"
+        )
+        require(profiles.grades is None, message)
         drives = {*profiles.recordings}
         per_file = 1 < len(drives) == len(find_files(self.path))  # a file is a drive
         if per_file and self.together and len({*map(self._family, drives)}) == 1:

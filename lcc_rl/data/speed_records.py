@@ -23,7 +23,7 @@ from lcc_rl.data.sources import SHIPPED_FILES, copies, find_files, units_of
 from lcc_rl.data.tables import TableFile, same_text, tables_of
 from lcc_rl.data.text import alike
 from lcc_rl.data.trajectories import ReadReport
-from lcc_rl.errors import Concern, DataError
+from lcc_rl.errors import DataError
 
 log = logging.getLogger("lcc_rl")
 
@@ -33,7 +33,7 @@ DRIVE_FIELDS = (
     Column("drive", "text", "drive", required=False),
     Column("time", "time", TIME_COLUMN, blank=True),
     Column("speed", "speed", SPEED_COLUMN, blank=True),
-    Column("grade", "grade", least=-0.3, most=0.3, required=False),  # of lcc-rl energy
+    Column("grade", "grade", least=-0.3, most=0.3, required=False, used=" for lcc-rl energy"),
 )
 DRIVE_COLUMNS = {column.key: column.name for column in DRIVE_FIELDS if column.name}
 
@@ -63,7 +63,7 @@ def read_speed_record(
         raise DataError(f"{path}: no such file, and none of the package ({known})")
     names = {**DRIVE_COLUMNS, "drive": None}
     samples, lines = _read(TableFile(file), names, plausible, {}, BRIDGE_S)
-    for line in (line for line in lines if isinstance(line, Concern)):
+    for line in lines[1:]:  # the first one is on the number of rows
         log.warning(line)
     time = samples[TIME_COLUMN].to_numpy()
     if len(holes := np.flatnonzero(np.diff(samples["episode"]))):

@@ -137,10 +137,10 @@ class TableFile:
             if column.key not in self.names and unit != SI.get(column.quantity):
                 at = f"{option.removesuffix('columns')}units.{column.key}={unit}"
                 raise DataError(f"{self.path}: {at} has no effect: no column is {column.key}")
-        for key in (c.key for c in columns if c.key in self.header and c.key not in names):
-            if key not in self.names.values():
+        for key, used in ((c.key, c.used) for c in columns if c.key in self.header):
+            if key not in names and key not in self.names.values():
                 message = f"column {key!r} is not read"
-                message += f" unless {option}.{key} names it" if option else ""
+                message += f" unless {option}.{key} names it{used}" * bool(option)
                 self.notes.append(Concern(f"{self.path}: {message}"))
         scales = {
             column: self._scale(column, units or {}, option)

@@ -71,8 +71,12 @@ class EnergyModel(Settings, ABC):
         require(
             hasattr(self, "grade"), f"{kind} has no grade; choose another, such as energy=electric"
         )
+        return self.on(self.grade + grade)  # type: ignore[attr-defined]
+
+    def on(self, grade: Tensor | float) -> Self:
+        """Return the model on a road of this grade [rad], in place of its own."""
         model = copy(self)
-        model.grade = self.grade + grade  # type: ignore[attr-defined]
+        model.grade = grade  # type: ignore[attr-defined]
         model.validate()
         return model
 
@@ -92,6 +96,8 @@ class EnergyModel(Settings, ABC):
     def path_power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the smooth power [W] minus the change of kinetic energy and of height."""
         stored = self.inertia / self.efficiency * speed * acceleration
+        unpaid = self.unpaid(speed, acceleration)
+        stored = stored if unpaid is None else stored - unpaid
         net = self.smooth_power(speed, acceleration) - stored
         return net if self.level else net - self.climbing(speed)
 
@@ -113,6 +119,13 @@ class EnergyModel(Settings, ABC):
 
     def acceleration_loss(self, speed: Tensor, acceleration: Tensor) -> Tensor | None:
         """Return the power dissipated by accelerating [W]; None if the model has no such part."""
+        return None
+
+    def unpaid(self, speed: Tensor, acceleration: Tensor) -> Tensor | None:
+        """Return the power that becomes kinetic energy, over efficiency, but is not drawn [W].
+
+        None if :meth:`power` draws what every acceleration takes.
+        """
         return None
 
     def strongest(self, speed: Tensor) -> Tensor | None:

@@ -15,13 +15,15 @@ from lcc_rl.functional.power import acceleration_loss, motor_power, path_power
 from lcc_rl.settings import NonNegative, Positive
 
 AIR = 1.2  # [kg/m³]
+MOST_POWER = 2e6  # of a vehicle [W]
 
 
 def _in_watts(least: float) -> AfterValidator:
-    """Return a check of a power that is 0, or at least that of any car: kW for W are refused."""
+    """Return a check of a power that is 0 or that of a vehicle: kW for W are refused."""
 
     def check(power: float) -> float:
-        require(power == 0.0 or power >= least, f"must be 0 or at least {least:g} W, got {power:g}")
+        fits = power == 0.0 or least <= power <= MOST_POWER
+        require(fits, f"must be 0 or {least:g} to {MOST_POWER:g} W, got {power:g}")
         return power
 
     return AfterValidator(check)
@@ -40,12 +42,14 @@ class ElectricCar(EnergyModel):
 
     # Mass of the car and its passengers [kg].
     mass: Annotated[float, Field(ge=100.0, le=100_000.0)] = 1636.0
-    rotating_mass: Positive = 1.03  # factor on the mass for rotating parts
-    drag: Positive = 0.315  # drag coefficient
-    area: Positive = 2.755  # frontal area [m²]
-    rolling: NonNegative = 0.008  # rolling resistance coefficient
-    efficiency: Annotated[float, Field(gt=0.0, le=1.0)] = 0.87  # of the drivetrain, either way
-    auxiliary: Annotated[NonNegative, _in_watts(1.0)] = 250.0  # power of auxiliary consumers [W]
+    # Factor on the mass for rotating parts.
+    rotating_mass: Annotated[float, Field(ge=1.0, le=2.0)] = 1.03
+    drag: Annotated[float, Field(gt=0.0, le=3.0)] = 0.315  # drag coefficient
+    area: Annotated[float, Field(gt=0.0, le=20.0)] = 2.755  # frontal area [m²]
+    rolling: Annotated[float, Field(ge=0.0, le=0.1)] = 0.008  # rolling resistance coefficient
+    efficiency: Annotated[float, Field(ge=0.1, le=1.0)] = 0.87  # of the drivetrain, either way
+    # Power of auxiliary consumers [W].
+    auxiliary: Annotated[float, Field(ge=0.0, le=1e5), _in_watts(1.0)] = 250.0
     # Largest braking power of the motor [W].
     regeneration_limit: Annotated[NonNegative, _in_watts(1000.0)] = 50_000.0
     fade_speed: Positive = 5.0  # below this speed recuperation is proportional to speed [m/s]

@@ -11,7 +11,7 @@ import torch
 from pydantic import Field, InstanceOf
 from torch import Tensor
 
-from lcc_rl.energy.base import BURNT, STEEPEST, EnergyModel
+from lcc_rl.energy.base import BURNT, GRAVITY, STEEPEST, EnergyModel
 from lcc_rl.energy.electric import PaperMotor
 from lcc_rl.errors import ConfigError, raised_as, require, require_known
 from lcc_rl.functional.guard import check_independent, unchanged
@@ -25,6 +25,8 @@ MASSES = (50.0, 200_000.0)  # of vehicles [kg]
 # Speed [m/s] at which power and kinetic energy are compared, and their largest factor: the motor of
 # the ALCC paper has 2.6, other shipped models 0.6 to 1.1; km/h for m/s have 3.6.
 PROBE, MOST_OFF = 10.0, 3.0
+UPHILL = 0.01  # grade at which power and height are compared [rad]
+HEATS, DENSITIES = (5e3, 150e3), (0.05, 1.5)  # of fuels, alcohols to hydrogen [J/g], [kg/L]
 
 
 class VehicleClass(Settings):
@@ -52,24 +54,52 @@ class VehicleClass(Settings):
                 abs(grade) <= STEEPEST, f"{kind}: grade must be at most {STEEPEST} rad, got {grade}"
             )
         require(0.0 < share <= 1.0, f"{kind}: efficiency must lie from 0 to 1, got {share!r}")
+        fuel, density = self.energy.heating_value, self.energy.density
+        for name, number, (least, most), unit in (
+            ("heating_value", fuel, HEATS, "J/g"),
+            ("density", density, DENSITIES, "kg/L"),
+        ):
+            text = f"{kind}: {name} must lie from {least:g} to {most:g} {unit}, got {number!r}"
+            require(not fuel or least <= number <= most, text)
         self._check_power(kind)
 
     def _check_power(self, kind: str) -> None:
-        """Refuse a power that depends on more than its motion, or is not in W for m/s and kg."""
-        mass, share = self.energy.mass, self.energy.efficiency
+        """Refuse a power that depends on more than its motion, or is not in W for m/s, kg, rad."""
+        model, graded = self.energy, hasattr(self.energy, "grade")
+        level = model.on(0.0) if graded else model  # uphill the engine may be at its limit
         motion = torch.full((2,), PROBE), torch.tensor([0.0, 0.1])
         with raised_as(ConfigError, f"{kind}.power", Exception):
-            power = unchanged(self.energy.power, motion, kind, ("speed", "acceleration"))
+            power = unchanged(level.power, motion, kind, ("speed", "acceleration"))
             shape = [*power.shape]
             require(shape == [2], f"its shape is {shape} for speeds of shape [2]")
-            alone, again = (self.energy.power(*(x[1:] for x in motion)) for _ in range(2))
+            alone, again = (level.power(*(x[1:] for x in motion)) for _ in range(2))
             check_independent(kind, "power", power[1:], alone, again)
-            risen, stored = float(power[1] - power[0]) / 0.1, PROBE * self.energy.inertia / share
-        require(
-            stored / MOST_OFF <= risen <= stored * MOST_OFF,
-            f"{kind}.power at {PROBE:g} m/s rises by {risen:.4g} W per m/s², its kinetic energy by "
-            f"{stored:.4g} W (mass {mass:g} kg, efficiency {share:g}): are these in W, m/s and kg?",
-        )
+            steady, faster = power.tolist()
+            uphill = float(model.on(UPHILL).power(*motion)[0]) if graded else steady
+        sizes = f"(mass {model.mass:g} kg, efficiency {model.efficiency:g})"
+        stored = PROBE * model.inertia / model.efficiency
+        lifted = PROBE * model.mass / model.efficiency * GRAVITY * UPHILL
+        for risen, expected, what, of, ask in (
+            (
+                (faster - steady) / 0.1,
+                stored,
+                "W per m/s²",
+                "kinetic energy",
+                "are these in W, m/s and kg",
+            ),
+            (
+                uphill - steady,
+                lifted * graded,
+                f"W for a grade of {UPHILL:g} rad",
+                "height",
+                "does it use the grade, in rad",
+            ),
+        ):
+            require(
+                expected / MOST_OFF <= risen <= expected * MOST_OFF,
+                f"{kind}.power at {PROBE:g} m/s rises by {risen:.4g} {what}, its {of} by "
+                f"{expected:.4g} W {sizes}: {ask}?",
+            )
 
     def at(self, grade: Tensor) -> Self:
         """Return the class on a road with a grade at each sample [rad]."""
@@ -242,6 +272,12 @@ class Fleet:
         """Return the power dissipated by accelerating [W]; None unless all models define it."""
         return self._known("acceleration_loss", all, speed, acceleration, kind)
 
+    def unpaid(
+        self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None
+    ) -> Tensor | None:
+        """Return kinetic power that no model draws [W], see :meth:`EnergyModel.unpaid`."""
+        return self._known("unpaid", any, speed, acceleration, kind)
+
     def infeasible(
         self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None
     ) -> Tensor | None:
@@ -269,7 +305,7 @@ class Fleet:
 
         def of(model: EnergyModel, speed: Tensor, acceleration: Tensor) -> Tensor:
             found = getattr(model, name)(speed, acceleration)
-            return torch.zeros_like(speed, dtype=torch.bool) if found is None else found
+            return torch.zeros_like(speed) if found is None else found
 
         return self._of(of, *motion)
 

@@ -201,7 +201,8 @@ class Goal:
         power = fleet.power(*motion, kind) if self.exact else fleet.path_power(*motion, kind)
         if self.exact:
             stored = fleet.stored_energy(then, kind) - fleet.stored_energy(now, kind)
-            power = power - stored / self.time_step
+            unpaid = fleet.unpaid(*motion, kind)
+            power = power - stored / self.time_step + (0.0 if unpaid is None else unpaid)
         return power.flatten(1).sum(1) * self.time_step * KILO
 
 

@@ -18,7 +18,14 @@ from lcc_rl.config.unused import FIXED, drawn_in_training, of_package, refuse
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.evaluation.fit import check_policy, check_variant, other_traffic, task_of
+from lcc_rl.evaluation.fit import (
+    check_policy,
+    check_variant,
+    conditions_of,
+    of_observation,
+    other_traffic,
+    task_of,
+)
 from lcc_rl.evaluation.foreign import GivenPolicy
 from lcc_rl.evaluation.named import DIRECT, PEOPLE, controller_of, is_policy, label_of
 from lcc_rl.evaluation.strategies import (
@@ -75,6 +82,7 @@ class Entrants:
         self.rivals, self.paths = self._compared()
         self._check_used(typed)
         self.policy, self.policies = self._read_policies()
+        self._warn_of_kept(typed)
         read = [self.policy] if self.policy else self.policies
         agents = sorted({training.agent.name for _, training in read})
         unread = self.policy or not (self.own or self.further)
@@ -170,6 +178,16 @@ class Entrants:
         for (name, path), (_, training) in zip(self.paths, policies, strict=True):
             _check_label(name, path, training.variant)
         return policy, policies
+
+    def _warn_of_kept(self, typed: Sequence[str]) -> None:
+        """Warn of typed settings of what a compared policy observes, which it keeps."""
+        for (_, path), (_, training) in zip(self.paths, self.policies, strict=True):
+            for piece in of_observation(training):
+                free = conditions_of(training.scenario.pieces[piece])
+                at = f"scenario.pieces.{piece}."
+                kept = [x for x in typed if at in x and x.split("=")[0].split(at)[1] not in free]
+                if kept:
+                    log.warning("%s observes as in its training, without %s", path, ", ".join(kept))
 
     def strategies(self, inputs: Inputs) -> list[Strategy]:
         """Build the strategies in the order of their rows: baselines and rules, then policies.

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule
 
 from lcc_rl.config import load
 from lcc_rl.config.compose import config_hash
-from lcc_rl.config.nodes import as_plain
+from lcc_rl.config.nodes import Node, as_plain
 from lcc_rl.config.schemas import AUTO, StudyConfig
 from lcc_rl.energy import VehicleClass
 from lcc_rl.envs.inputs import MADE, build_energy, origin_of
@@ -126,8 +126,20 @@ def _observed(cfg: StudyConfig, names: Iterable[str]) -> dict[str, Any]:
     """Return the settings of an observation, the order of its entries and the named pieces."""
     node = as_plain(cfg.observation)
     order = [key for key, _ in flatten(node) if key.startswith("scales.")]
-    pieces = {f"scenario.pieces.{name}": as_plain(cfg.scenario.pieces.get(name)) for name in names}
-    return {"observation": {**node, "order of scales": order}, **pieces}
+    pieces = {name: cfg.scenario.pieces.get(name) for name in names}
+    settled = {f"scenario.pieces.{x}": _settled(piece) for x, piece in pieces.items()}
+    return {"observation": {**node, "order of scales": order}, **settled}
+
+
+def _settled(piece: Node | None) -> Any:
+    """Return the settings of a piece without its conditions, which an evaluation may change."""
+    free = conditions_of(piece)
+    return piece and {key: x for key, x in as_plain(piece).items() if key not in free}
+
+
+def conditions_of(piece: Node | None) -> tuple[str, ...]:
+    """Return the names of a piece's conditions."""
+    return getattr(piece.kind, "conditions", ()) if piece else ()
 
 
 def check_scenario(path: str, own: StudyConfig, cfg: StudyConfig) -> None:

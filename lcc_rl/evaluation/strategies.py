@@ -7,7 +7,7 @@ and pieces. They differ in the controller of the automated vehicles and in its o
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +20,13 @@ from lcc_rl.config.schemas import StudyConfig
 from lcc_rl.config.unused import EXACT
 from lcc_rl.config.words import FILTERED, RECORDED
 from lcc_rl.errors import ConfigError, ResultsError, raised_as, require
-from lcc_rl.evaluation.fit import check_action, check_scenario, check_width, of_observation
+from lcc_rl.evaluation.fit import (
+    check_action,
+    check_scenario,
+    check_width,
+    conditions_of,
+    of_observation,
+)
 from lcc_rl.evaluation.named import DIRECT, PEOPLE, controller_of, label_of
 from lcc_rl.evaluation.rollout import Policy
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, RING
@@ -233,12 +239,21 @@ def _of_training(cfg: StudyConfig, own: StudyConfig, path: str) -> StudyConfig:
         log.info("the policy of variant %s keeps the filter of its training", own.variant)
         changes["scenario"] = {"filters": {AUTOMATED: trained}}
     elif given is not None and trained is not None:
-        pairs = [(key, x, given.settings.get(key)) for key, x in trained.settings.items()]
-        other = [f"{key}={mine} in place of {x}" for key, x, mine in pairs if x != mine]
-        text = "%s: the filter of this command replaces that of the policy's training: %s"
-        if other:
-            log.warning(text, path, ", ".join(other))
+        _replaced(path, "filter", trained, given, trained.settings)
     return cfg.with_(**changes)
+
+
+def _replaced(
+    path: str, what: str, trained: Node, given: Node, names: Iterable[str]
+) -> dict[str, Any]:
+    """Return the settings of a command that replace a policy's own, and warn of them."""
+    new = {key: given.settings.get(key) for key in names}
+    changed = {key: x for key, x in new.items() if x != trained.settings.get(key)}
+    other = [f"{key}={x} in place of {trained.settings.get(key)}" for key, x in changed.items()]
+    text = "%s: the %s of this command replaces that of the policy's training: %s"
+    if other:
+        log.warning(text, path, what, ", ".join(other))
+    return changed
 
 
 def hybrids(strategy: Strategy) -> list[Strategy]:
@@ -267,7 +282,12 @@ def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Popu
     check_scenario(path, training, cfg)
     other = _of_training(cfg.with_(observation=training.observation), training, path)
     own, kept = training.scenario.pieces, of_observation(training)
-    pieces = {x: own[x] for x in own if x in kept or x not in other.scenario.pieces}
+    given = other.scenario.pieces
+    pieces = {x: own[x] for x in own if x in kept or x not in given}
+    for name, piece in pieces.items():  # observed as in training, under the command's conditions
+        if piece and (asked := given.get(name)) and asked.kind is piece.kind:
+            changed = _replaced(path, name, piece, asked, conditions_of(piece))
+            pieces[name] = piece.changed(**changed)
     driver = {AUTOMATED: training.scenario.controllers[AUTOMATED]}
     other = other.with_(
         variant=training.variant,

@@ -115,6 +115,8 @@ def require_option(key: Key, values: Tensor, count: Tensor | int) -> None:
 class Piece(Part, TensorDictModuleBase, Transform):
     """Base of all pieces; see the module's description."""
 
+    # Settings that an evaluation may change for a policy, as it does drivers and faults.
+    conditions: ClassVar[tuple[str, ...]] = ()
     # Rows of the written entries: one per vehicle of a role, one per vehicle ("vehicles"), or one
     # per episode ("episode").
     role = AUTOMATED

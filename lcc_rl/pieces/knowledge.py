@@ -11,11 +11,22 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.functional.layout import batch_innermost
+from lcc_rl.functional.layout import batch_innermost, join
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import normal, stream_id
 from lcc_rl.functional.string import entries_ahead, gather
-from lcc_rl.pieces.base import ACTION, OBSERVATION, SEED, STEP, Entry, Feature, Piece, StepTransform
+from lcc_rl.pieces.base import (
+    ACTION,
+    OBSERVATION,
+    SEED,
+    STEP,
+    Entry,
+    Feature,
+    Piece,
+    StepTransform,
+    as_key,
+    next_key,
+)
 from lcc_rl.pieces.cbf import CBFFilter
 from lcc_rl.pieces.connected import Communication
 from lcc_rl.pieces.controllers import Controller
@@ -41,6 +52,7 @@ class LeaderPreview(Feature):
     noise: NonNegative = 0.0  # standard deviation of an error drawn anew for each speed [m/s]
     delay: Seconds = 0.0  # age of the message, by which the horizons are shorter [s]
 
+    conditions = ("noise", "delay")
     role = EPISODE
     reads = (PROFILE, PROFILE_START, SEED, STEP)
     known = Entry("preview.speed", "m/s", "speed of the leader at each horizon ahead")
@@ -74,34 +86,74 @@ class LeaderPreview(Feature):
         return speed.unsqueeze(-2)
 
 
-class TrafficAhead(Feature):
+class TrafficAhead(StepTransform):
     """Speeds of vehicles further ahead, as they or sensors at the road report them by radio.
 
-    Writes ``("traffic", "speed")`` [m/s], ``[*batch, A, places]``. Ahead of the string no vehicle
-    is known but the leader, whose present speed stands for theirs. On a ring the count continues.
+    Writes ``("traffic", "speed")`` [m/s], ``[*batch, A, places]``; reports of the last steps, if
+    they are late, as ``("traffic", "reports")``. Ahead of the string no vehicle is known but the
+    leader, whose speed stands for theirs. On a ring the count continues. Before the episode speeds
+    are those of its start.
     """
 
     places: Annotated[tuple[Count, ...], Field(min_length=1)] = (5, 10, 20, 40)  # 1: the next one
+    noise: NonNegative = 0.0  # standard deviation of an error drawn anew for each speed [m/s]
+    delay: Seconds = 0.0  # age of the reports [s]
 
+    conditions = ("noise", "delay")
     reported = Entry("traffic.speed", "m/s", "speed of the vehicle at each number of places ahead")
+    kept = Entry("traffic.reports", "m/s", "reports of the last steps, latest first")
     own: ClassVar[Tensor]
     far: ClassVar[Tensor]
 
     def setup(self, world: World) -> None:
-        string = world.string
-        reads: list[Key] = [(VEHICLES, "speed")]
-        reads += [] if string.ring else [(LEADER, "speed")]
-        reads += [(AUTOMATED, "index")] if string.drawn else []
-        self.declare(world, reads, [self.reported.wide(len(self.places))])
-        self.register_buffer("own", torch.tensor(string.places(AUTOMATED)))
+        string, count = world.string, len(self.places)
+        self.late = world.late(self.delay, f"scenario.pieces.{self.name}.delay")
+        self.now: list[Key] = [(VEHICLES, "speed")]  # read at reset and after every step
+        self.now += [] if string.ring else [(LEADER, "speed")]
+        self.now += [(AUTOMATED, "index")] if string.drawn else []
+        self.now += [SEED, STEP] if self.noise else []
+        kept = [self.kept.wide(count * (self.late + 1))] if self.late else []
+        reads = [*(as_key(entry.key) for entry in kept), *map(next_key, self.now)]
+        self.declare(world, reads, [self.reported.wide(count), *kept])
+        own = torch.tensor(string.places(AUTOMATED))
+        self.register_buffer("own", own)
         self.register_buffer("far", torch.tensor(self.places))
+        streams = stream_id("traffic.noise") + torch.arange(len(own) * count)
+        self.register_buffer("streams", streams.view(-1, count))
 
-    def compute(self, speed: Tensor, *more: Tensor) -> Tensor:
-        own = more[-1] if self.string.drawn else self.own.expand(*speed.shape[:-2], -1)
-        ahead = entries_ahead(None if self.string.ring else more[0], speed)
+    def compute(self, *read: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+        """Return the reports received, and those of the last steps if they are late."""
+        reports = self._sent(read[1:] if self.late else read)
+        if not self.late:
+            return self._received(reports, read)
+        kept = join([reports, read[0][..., : -len(self.places)]], -1)
+        return self._received(kept[..., -len(self.places) :], read), kept
+
+    def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
+        read = [start.get(key) for key in self.now]
+        reports = self._sent(read)
+        start.set(self.targets[0], self._received(reports, read))
+        for key in self.targets[1:]:
+            start.set(key, join([reports] * (self.late + 1), -1))
+
+    def _sent(self, now: Sequence[Tensor]) -> Tensor:
+        """Return the present speeds at the places."""
+        speed, *more = now
+        ring = self.string.ring
+        ahead = entries_ahead(None if ring else more[0], speed)
+        own = (
+            more[0 if ring else 1] if self.string.drawn else self.own.expand(*speed.shape[:-2], -1)
+        )
         place = own.unsqueeze(-1) - self.far + 1  # of the vehicle behind
-        place = place % ahead.shape[-2] if self.string.ring else place.clamp(min=0)
+        place = place % ahead.shape[-2] if ring else place.clamp(min=0)
         return gather(ahead, place.flatten(-2)).view(*place.shape)
+
+    def _received(self, reports: Tensor, read: Sequence[Tensor]) -> Tensor:
+        """Return reports with their errors; seed and step are the last entries read."""
+        if not self.noise:
+            return reports
+        seed, step = (entry.unsqueeze(-1) for entry in read[-2:])
+        return (reports + self.noise * normal(seed, step, self.streams)).clamp(min=0.0)
 
 
 def driving_reads(pieces: Sequence[Piece]) -> set[Key]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -69,13 +69,18 @@ def flow_note(table: pd.DataFrame) -> str:
     return f"{MARK.strip()}: flow lost against {against}: {'; '.join(losses)}." if len(lost) else ""
 
 
-def front_note(table: pd.DataFrame) -> str:
-    """Return sentences on fronts with more, or less, flow than the recorded drivers have."""
+def flow_reference(names: Iterable[str], against: str) -> str:
+    """Return whose flow is that of comparisons at equal flow: the recorded drivers, if present."""
+    return RECORDED if RECORDED in {*names} else against
+
+
+def front_note(table: pd.DataFrame, reference: str) -> str:
+    """Return sentences on fronts with more, or less, flow than the reference has."""
     rows = table[table[MORE_FLOW] > MORE_NAMED]
     named = zip(rows["strategy"], rows[MORE_FLOW], strict=True)
     names = ", ".join(f"{in_words(str(name))} {share:.1%}" for name, share in named)
     more = "Saved at their flow: not at equal flow, but at the least flow on the strategy's front, "
-    lines = [f"{more}which exceeds that of the recorded drivers by: {names}."] * bool(names)
+    lines = [f"{more}which exceeds that of {reference} by: {names}."] * bool(names)
     less = table[table["flow_saving"].isna() & table[MORE_FLOW].notna() & ~crashed(table)]
     names = ", ".join(map(in_words, less["strategy"]))
     fewer = "No saving at their flow: less flow at all points of the front: "

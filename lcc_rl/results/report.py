@@ -40,6 +40,7 @@ from lcc_rl.results.remarks import (
     crashed,
     crashes,
     flow_note,
+    flow_reference,
     front_note,
     remarks,
     seeds_note,
@@ -179,11 +180,12 @@ def summary(
     Returns:
         One row per strategy: :data:`lcc_rl.results.measures.MEASURES`; ``saving``, the share of the
         score saved ``against`` the baseline, ``second_saving``, that of the second energy model,
-        ``flow_saving`` and ``second_flow_saving``, those against the recorded drivers at their
-        flow, ``more_flow``, see :class:`lcc_rl.results.intervals.Estimate`, ``rule_saving``, that
-        against the rule at this flow, and ``drawn_saving``, that of the energy drawn in an episode,
-        and the share of the flow lost, with their intervals; ``end_saving``, the difference of the
-        drawn and the first saving; the share of the distance lost; numbers of windows, drives,
+        ``flow_saving`` and ``second_flow_saving``, those against the recorded drivers, or the
+        baseline without them, at their flow, ``more_flow``, see
+        :class:`lcc_rl.results.intervals.Estimate`, ``rule_saving``, that against the rule at this
+        flow, and ``drawn_saving``, that of the energy drawn in an episode, and the share of the
+        flow lost, with their intervals; ``end_saving``, the difference of the drawn and the first
+        saving; the share of the distance lost; numbers of windows, drives,
         drivers behind each window and training seeds; ``left_out``, the seeds that the first saving
         leaves out, and ``single``, whether it has one training beside others of several; and for a
         task score, limits and whether they are kept without a collision. Missing values are NaN, as
@@ -253,15 +255,16 @@ def _savings(
         row |= share.columns(key)
     row["end_saving"] = row["drawn_saving"] - row["saving"]
     names = windows["strategy"].unique()
+    reference = flow_reference(names, str(against))
     fronts = {x: [y for y in names if y.partition(ON_FRONT)[0] == x] for x in (*RULE_ROWS, name)}
     rule = next((x for x in RULE_ROWS if len(fronts[x]) > 1), "")
     for key, other, energy in (
-        ("flow_saving", [RECORDED], of[0]),
-        ("second_flow_saving", [RECORDED], second),
+        ("flow_saving", [reference], of[0]),
+        ("second_flow_saving", [reference], second),
         ("rule_saving", fronts.get(rule, []) if name != rule else [], of[0]),
     ):
         front = fronts[name] if len(fronts[name]) > 1 and against is not None else []
-        share = at_equal_flow(windows, front, other, energy, RECORDED)
+        share = at_equal_flow(windows, front, other, energy, reference)
         row |= share.columns(key) | ({MORE_FLOW: share.more_flow} if key == "flow_saving" else {})
     return row
 
@@ -306,11 +309,15 @@ def report(
     every = with_drivers(pd.concat([table, pd.DataFrame(percent)], axis=1))
     fields = _of_task(every, task) if task else _of_energy(every, units, second)
     short, shown = fields.pop("short")
-    rows = _rows(task, table["against"].iloc[0], shown[1] if task or unit else None)
+    baseline = str(table["against"].iloc[0])
+    reference = in_words(flow_reference(table["strategy"], baseline))
+    rows = _rows(task, baseline, reference, shown[1] if task or unit else None)
     text = "" if task else verdict(windows, table, few)
     seen, shown_windows = (x[x["strategy"].isin(short["strategy"])] for x in (table, windows))
     notes = [*remarks(shown_windows), *crashes(seen)]
-    notes += filter(None, [flow_note(seen), front_note(seen), by_ends(seen), seeds_note(seen)])
+    notes += filter(
+        None, [flow_note(seen), front_note(seen, reference), by_ends(seen), seeds_note(seen)]
+    )
     fields |= {"full_caption": FULL, "verdict": text, "remarks": notes}
     ends = {"_low": "_high", "_high": "_low"}
     bounds = {f"{FLOW_SHARE.key}{x}": -100.0 * table[f"{FLOW_LOST}{y}"] for x, y in ends.items()}
@@ -320,8 +327,13 @@ def report(
     return Report(of, every, short, shown, rows, **fields)
 
 
-def _rows(task: Task | None, against: str | None, score: Shown | None) -> list[Measure]:
-    """Return the rows of the full table; ``score``: the first number of the short one, if any."""
+def _rows(task: Task | None, against: str, reference: str, score: Shown | None) -> list[Measure]:
+    """Return the rows of the full table.
+
+    Args:
+        reference: whose flow is that of comparisons at equal flow, in words.
+        score: the first number of the short table, if any.
+    """
     bounds = task.bounds if task else {}
     limits = [
         replace(x, label=f"limit: {' '.join(x.bounded(bounds[x]).split())}", unit="", form=x.number)
@@ -330,9 +342,9 @@ def _rows(task: Task | None, against: str | None, score: Shown | None) -> list[M
     kept = [Measure("kept", "keeps the limits (1: yes)", form="{:d}")] if task else []
     return [
         *([Measure(score.key, score.words)] if score else ()),
-        Measure("saving", f"saved against {in_words(str(against))}", form="{:+.2%}"),
+        Measure("saving", f"saved against {in_words(against)}", form="{:+.2%}"),
         Measure("second_saving", "  second energy model", form="{:+.2%}"),
-        Measure("flow_saving", "  at the recorded drivers' flow, against them", form="{:+.2%}"),
+        Measure("flow_saving", f"  against {reference} at their flow", form="{:+.2%}"),
         Measure("rule_saving", "    against the rule", form="{:+.2%}"),
         Measure(MORE_FLOW, "    at more flow than theirs, by", form="{:+.2%}"),
         Measure("drawn_saving", "  as drawn, per episode", form="{:+.1%}"),
@@ -368,8 +380,9 @@ def _of_energy(table: pd.DataFrame, units: Sequence[str], second: Fleet | None) 
     of = "fuel" if second is not None and burns_one_fuel(second) else "second model"
     shown = [Shown(key, heading.format(of)) for key, heading in [*shown, COLLISIONS]]
     note += SHARES * (not fronts)
-    if AT_FLOW[0] in fronts and against != RECORDED:
-        note += f"saved at their flow: against {in_words(RECORDED)}, at the flow of these; "
+    reference = flow_reference(table["strategy"], str(against))
+    if AT_FLOW[0] in fronts and against != reference:
+        note += f"saved at their flow: against {in_words(reference)}, at the flow of these; "
     return {
         "short": shortened(cars.assign(**columns), shown, spread),
         "caption": CAPTION.format(note + behind_filter(cars)),

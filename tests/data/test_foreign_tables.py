@@ -76,7 +76,7 @@ def test_a_known_column_that_nothing_reads_is_loud(tmp_path) -> None:
         found = [x for x in report if isinstance(x, Concern)]
         assert found == ([] if read else [f"{path}: {words}"]), read
     report = DriveLeaders(path=other, evaluation_share=1.0).load(0.1, 300).report
-    words = "column 'grade' is not read unless leader.columns.grade names it"
+    words = "column 'grade' is not read unless leader.columns.grade names it for lcc-rl energy"
     assert [x for x in report if isinstance(x, Concern)] == [f"{other}: {words}"]
 
 

@@ -104,9 +104,13 @@ class Rolling(EnergyModel):
     summed: bool = False
     warming: bool = False
     grade: Number = 0.0
+    slope: Number = 1.0
+    heating_value: Number = 0.0
+    density: Number = 0.0
 
     def power(self, speed, acceleration):
-        power = (1500.0 * acceleration + 200.0) * speed * self.unit
+        force = 1500.0 * (acceleration + 9.81 * self.slope * torch.as_tensor(self.grade).sin())
+        power = (force + 200.0) * speed * self.unit
         if self.warming:
             self.unit *= 1.1
         return power.sum() if self.summed else power
@@ -125,6 +129,13 @@ def test_mistakes_are_named() -> None:
         ({"x": Rolling(unit=-1.0)}, "Rolling.power"),
         ({"x": Rolling(mass=1.5, unit=1e-3)}, "Rolling: .* its mass, 50 to 200000 kg, got 1.5"),
         ({"x": Rolling(grade=2.0)}, "Rolling: grade must be at most 0.3 rad, got 2"),
+        (
+            {"x": Rolling(slope=0.0)},
+            r"by 0 W for a grade of 0.01 rad, its height .* the grade, in r",
+        ),
+        ({"x": Rolling(slope=57.3)}, r"its height by 1472 W .* the grade, in rad"),
+        ({"x": Rolling(heating_value=42.4)}, "Rolling: heating_value must .* J/g, got 42.4"),
+        ({"x": Rolling(heating_value=42e3)}, "Rolling: density must .* 0.05 to 1.5 kg/L, got 0.0"),
         ({"x": Rolling(warming=True)}, "Rolling gives an episode other power .* again"),
         ({"x": Rolling(summed=True)}, r"Rolling.power: its shape is \[\] for"),
     ]

@@ -19,7 +19,7 @@ from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation import strategies
 from lcc_rl.evaluation.comparison import Comparison
-from lcc_rl.evaluation.entrants import check_distinct, named_apart
+from lcc_rl.evaluation.entrants import Entrants, check_distinct, named_apart
 from lcc_rl.evaluation.fit import check_policy, other_traffic
 from lcc_rl.evaluation.named import TUNED
 from lcc_rl.evaluation.strategies import Strategy, baseline, name_of, trained
@@ -162,6 +162,30 @@ def test_a_policy_keeps_the_pieces_that_it_observes(monkeypatch) -> None:
             check_policy(cfg, policy)
         kept = trained(cfg, "p.pt", ({}, policy), POPULATION).cfg.scenario.pieces
         assert kept == policy.scenario.pieces
+
+
+def test_a_policy_meets_the_conditions_of_the_command(monkeypatch, caplog) -> None:
+    monkeypatch.setattr(strategies, "with_weights", lambda cfg, *_: Strategy("alcc", cfg))
+    at = "scenario.pieces.traffic"
+    policy, late = (
+        compose("alcc", "+knowledge=traffic", *words).with_(policy="p.pt")
+        for words in ([], [f"{at}.delay=2.0"])
+    )
+    check_policy(late, policy)
+    other = compose("alcc", "+knowledge=traffic", f"{at}.delay=2.0", f"{at}.places=[7]")
+    for cfg in (late, other):
+        piece = trained(cfg, "p.pt", ({}, policy), POPULATION).cfg.scenario.pieces["traffic"]
+        assert piece == policy.scenario.pieces["traffic"].changed(delay=2.0)
+    assert "p.pt: the traffic of this command replaces" in caplog.text
+    assert "delay=2.0 in place of 0.0" in caplog.text
+    # What it keeps is said if it was typed.
+    words = ["task=i24-fleet", "compare=[pretrained/i24-traffic]", "knowledge=[spread,traffic]"]
+    for change, kept in (("traffic.delay=2.0", False), ("spread.seconds=[9.0,30.0]", True)):
+        typed = f"scenario.pieces.{change}"
+        caplog.clear()
+        Entrants(load("evaluate", [*words, typed]), typed=[typed])
+        text = f"pretrained/i24-traffic observes as in its training, without {typed}"
+        assert (text in caplog.text) == kept
 
 
 def test_a_policy_of_a_task_is_refused_without_a_task_and_in_another_scenario() -> None:

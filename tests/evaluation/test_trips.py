@@ -15,8 +15,10 @@ from page_blocks import blocks
 import lcc_rl
 from lcc_rl.cli.energy import main
 from lcc_rl.config import load
+from lcc_rl.energy import EnergyModel
 from lcc_rl.envs import load_inputs
 from lcc_rl.envs.inputs import build_energy
+from lcc_rl.errors import DataError
 from lcc_rl.evaluation.metrics import energy_measures
 from lcc_rl.runs.arguments import files_and_settings
 
@@ -24,6 +26,15 @@ COLUMNS = "leader.columns={drive: trip, time: t, speed: v}"
 GRADED = ["leader.columns={drive: trip, time: t, speed: v, grade: slope}", "leader.units.grade=%"]
 KMH = "leader.units.speed=km/h"
 SECONDS = 60
+
+
+class OfMap(EnergyModel):
+    """A map that ends at 16 m/s."""
+
+    mass = 1500.0
+
+    def power(self, speed, acceleration):
+        return torch.where(speed > 16.0, torch.nan, 1500.0 * acceleration * speed)
 
 
 def made(step: float = 1.0) -> pd.DataFrame:
@@ -78,7 +89,40 @@ def test_a_grade_by_sample_is_that_of_the_model(path, subtests) -> None:
             drawn, net = (steep[x] - flat[x] for x in ("energy_kj", "net_energy_kj"))
             height = 1e3 * flat["distance_km"] * np.sin(np.arctan(0.03))
             work = model.mass * 9.81 * height / model.efficiency / 1e3
-            np.testing.assert_allclose(drawn - net, work, rtol=5e-3)  # speeds at the steps' starts
+            if energy == "electric":  # speeds at the steps' starts
+                np.testing.assert_allclose(drawn - net, work, rtol=5e-3)
+            else:  # the model's own fuel for the grade, which is less at these speeds
+                assert ((drawn - net) / work).between(0.9, 0.99).all()
+
+
+def test_a_truck_uphill_has_the_net_energy_of_a_level_road() -> None:
+    speed, still = torch.tensor([10.0, 15.0, 20.0]), torch.zeros(3)
+    for vehicle in ("Class8Tractor", "Pickup", "Compact"):
+        words = ["variant=direct", "energy=fuel", f"energy.vehicle={vehicle}"]
+        (level,) = build_energy(load("evaluate", words)).models
+        for grade in (0.02, 0.04, 0.06):
+            uphill = level.at(torch.full((3,), grade))
+            can = ~uphill.infeasible(speed, still)
+            assert bool(can[0])
+            net = uphill.path_power(speed, still)
+            torch.testing.assert_close(
+                net[can], level.path_power(speed, still)[can], rtol=0.05, atol=0
+            )
+            assert float(level.on(grade).climbing(torch.zeros(1))) == 0.0
+    for words in (["energy=fuel"], ["energy=electric", "energy.regeneration_limit=0"]):
+        build_energy(load("evaluate", ["variant=direct", "energy.grade=-0.05", *words]))
+
+
+def test_motion_beyond_a_model_is_said_and_a_power_without_number_is_refused(path, caplog) -> None:
+    truck = ["energy=fuel", "energy.vehicle=Class8Tractor", COLUMNS]
+    found = lcc_rl.trip_energies(path, truck)
+    assert (found["share_infeasible"] > 0.1).all()
+    assert "a drives beyond the model's power for" in caplog.text
+    assert (lcc_rl.trip_energies(path, ["energy=bolt", COLUMNS])["share_infeasible"] == 0.0).all()
+    own = [f"energy._target_={__name__}.OfMap", "trust=[test_trips]", COLUMNS]
+    message = r"a: OfMap.power is nan at 16\.\d+ m/s and 0\.\d+ m/s², 5\.\d s after the start"
+    with pytest.raises(DataError, match=message):
+        lcc_rl.trip_energies(path, own)
 
 
 def test_trips_of_files_rates_and_with_holes(tmp_path, path, subtests) -> None:

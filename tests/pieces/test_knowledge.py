@@ -11,6 +11,7 @@ from tensordict import TensorDict
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.pieces import LeaderPreview, TrafficAhead, parse_string
+from lcc_rl.pieces.base import root_key
 from lcc_rl.pieces.world import World
 
 FIRST = ("scenario.pieces.leader.start=first", "scenario.pieces.leader.profile=2")
@@ -113,8 +114,8 @@ def test_traffic_ahead_is_the_speed_of_the_vehicles_at_these_places() -> None:
         piece = TrafficAhead(places=(1, 3)).bind(World(string))
         given = {("vehicles", "speed"): speed, ("leader", "speed"): leader}
         given["automated", "index"] = drawn
-        state = TensorDict({key: given[key] for key in piece.in_keys}, [2])
-        seen = piece(state)["traffic", "speed"]
+        state = TensorDict({key: given[root_key(key)] for key in piece.in_keys}, [2])
+        seen = piece(state)["next", "traffic", "speed"]
         for episode in range(2):
             everyone, own = speed[episode].flatten(), string.places("automated")
             for row, place in enumerate(drawn[episode].tolist() if string.drawn else own):
@@ -122,3 +123,29 @@ def test_traffic_ahead_is_the_speed_of_the_vehicles_at_these_places() -> None:
                     beyond = place < far and not string.ring
                     there = leader[episode, 0] if beyond else everyone[(place - far) % 6]
                     assert seen[episode, row, column] == there
+
+
+def test_late_reports_are_the_past_speeds_and_their_errors_are_as_large_as_stated() -> None:
+    mixed = "scenario.string='human*2 automated human automated'"
+    places = "scenario.pieces.traffic.places=[2,3]"
+    words = ("+knowledge=traffic", mixed, places)
+    data = played(*words, "scenario.pieces.traffic.delay=0.5")
+    seen, speed = data["traffic", "speed"], data["vehicles", "speed"][..., 0]
+    everyone = torch.cat([data["leader", "speed"], speed], -1)  # the leader is place 0
+    for row, place in enumerate((3, 5)):
+        for column, far in enumerate((2, 3)):
+            true = everyone[:, :, place - far]
+            assert torch.equal(seen[:, 5:, row, column], true[:, :-5])
+            assert (seen[:, :5, row, column] == true[:, :1]).all()
+    assert torch.allclose(
+        data[OBSERVATION][0, 1:, 0, -3:-1], 0.5 * (seen - ahead_of(data))[0, 1:, 0]
+    )
+    noisy = played(*words, "scenario.pieces.traffic.noise=0.3")["traffic", "speed"]
+    error = noisy - played(*words)["traffic", "speed"]
+    assert error.std().item() == pytest.approx(0.3, rel=0.2)
+    assert error.unique().numel() == error.numel()
+
+
+def ahead_of(data: TensorDict) -> torch.Tensor:
+    """Return the speed of the vehicle ahead of the two automated ones."""
+    return data["vehicles", "speed"][..., [1, 3], :]

@@ -102,6 +102,16 @@ def test_a_table_marks_savings_at_more_flow_than_the_recorded_drivers_have() -> 
     assert less in report(windows_for(slower)).remarks
 
 
+def test_without_recorded_drivers_the_flow_is_that_of_the_baseline() -> None:
+    windows = windows_for(rows().replace({"strategy": {"recorded": "human"}}))
+    found = report(windows)
+    row = found.table.set_index("strategy").loc["alcc"]
+    assert row["flow_saving"] == pytest.approx(1.0 - 100.0 / 120.0)
+    assert row["rule_saving"] == pytest.approx(1.0 - 100.0 / 104.0)
+    label = next(x.label for x in found.rows if x.key == "flow_saving")
+    assert label.strip() == "against simulated drivers at their flow"
+
+
 def test_fronts_are_compared_by_equal_seeds() -> None:
     whole, energy = rows(), "total_path_energy_kj"
     parts = [whole[whole["strategy"] == "recorded"].assign(training_seed=np.nan)]
