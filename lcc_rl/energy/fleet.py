@@ -76,30 +76,21 @@ class VehicleClass(Settings):
             check_independent(kind, "power", power[1:], alone, again)
             steady, faster = power.tolist()
             uphill = float(model.on(UPHILL).power(*motion)[0]) if graded else steady
-        sizes = f"(mass {model.mass:g} kg, efficiency {model.efficiency:g})"
         stored = PROBE * model.inertia / model.efficiency
         lifted = PROBE * model.mass / model.efficiency * GRAVITY * UPHILL
-        for risen, expected, what, of, ask in (
-            (
-                (faster - steady) / 0.1,
-                stored,
-                "W per m/s²",
-                "kinetic energy",
-                "are these in W, m/s and kg",
-            ),
-            (
-                uphill - steady,
-                lifted * graded,
-                f"W for a grade of {UPHILL:g} rad",
-                "height",
-                "does it use the grade, in rad",
-            ),
-        ):
-            require(
-                expected / MOST_OFF <= risen <= expected * MOST_OFF,
-                f"{kind}.power at {PROBE:g} m/s rises by {risen:.4g} {what}, its {of} by "
-                f"{expected:.4g} W {sizes}: {ask}?",
-            )
+        of = "W per m/s², its kinetic energy"
+        self._check_rise(kind, (faster - steady) / 0.1, of, stored, "are these in W, m/s and kg")
+        if graded:
+            of = f"W for a grade of {UPHILL:g} rad, its height"
+            self._check_rise(kind, uphill - steady, of, lifted, "does it use the grade, in rad")
+
+    def _check_rise(self, kind: str, risen: float, of: str, stored: float, ask: str) -> None:
+        """Refuse a rise of power that differs much from that of the energy stored."""
+        require(
+            stored / MOST_OFF <= risen <= stored * MOST_OFF,
+            f"{kind}.power at {PROBE:g} m/s rises by {risen:.4g} {of} by {stored:.4g} W (mass "
+            f"{self.energy.mass:g} kg, efficiency {self.energy.efficiency:g}): {ask}?",
+        )
 
     def at(self, grade: Tensor) -> Self:
         """Return the class on a road with a grade at each sample [rad]."""

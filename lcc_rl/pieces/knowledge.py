@@ -141,9 +141,8 @@ class TrafficAhead(StepTransform):
         speed, *more = now
         ring = self.string.ring
         ahead = entries_ahead(None if ring else more[0], speed)
-        own = (
-            more[0 if ring else 1] if self.string.drawn else self.own.expand(*speed.shape[:-2], -1)
-        )
+        drawn = more[0 if ring else 1] if self.string.drawn else None
+        own = self.own.expand(*speed.shape[:-2], -1) if drawn is None else drawn
         place = own.unsqueeze(-1) - self.far + 1  # of the vehicle behind
         place = place % ahead.shape[-2] if ring else place.clamp(min=0)
         return gather(ahead, place.flatten(-2)).view(*place.shape)
