@@ -47,7 +47,7 @@ def trip_energies(
         ``duration_s``, ``distance_km``, ``energy_kj`` as drawn, ``net_energy_kj``, less the gain of
         kinetic energy and height; of the energy drawn ``energy_kwh``, ``kwh_per_100km``, fuel and
         carbon dioxide; and ``share_infeasible``, the share of the time with motion beyond the
-        model's power, which counts as the most that it can do.
+        model's power.
 
     Raises:
         LccError: if a setting has no effect, the data are unusable, or a power is not finite.
@@ -80,8 +80,8 @@ def trip_energies(
     trips["share_infeasible"] = trips.pop("infeasible_s") / trips["duration_s"]
     for trip, share in zip(trips["trip"], trips["share_infeasible"], strict=True):
         if share > MUCH:
-            text = "%s drives beyond the model's power for %.0f %% of the time: its energy is a "
-            log.warning(text + "lower bound", trip, 100.0 * share)
+            text = "%s drives beyond the model's power for %.0f %% of the time"
+            log.warning(f"{text}: such a vehicle would be slower", trip, 100.0 * share)
     return trips
 
 

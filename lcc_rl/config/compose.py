@@ -66,7 +66,7 @@ OPTIONAL = ("learning", "surrogates")  # groups that Hydra lets choose a missing
 # Groups that no file of the package chooses.
 ADDED = ("event", "faults", "filter", "fleet", "knowledge", "slope")
 OF_NODE = re.compile(r"([\w.: ]+): expected a node with .*, got (?:'(\w+)'|{.*)$")
-WITHOUT_TARGET = re.compile(r"unknown name '(\w+)', which has no ")
+WITHOUT_TARGET = re.compile(r"scenario\.pieces: unknown name '(\w+)', which has no ")
 OWN_FILES = re.compile(r"path=(?!pkg://|structured://)")  # in Hydra's search path
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException)
 
@@ -273,8 +273,9 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     except ConfigError as error:  # another choice of the group may have the setting
         if (found := OF_NODE.match(str(error))) and (hint := _file_of(*found.groups())):
             raise ConfigError(f"{error}; {hint}") from None
-        if (found := WITHOUT_TARGET.search(str(error))) and (group := _group_of(name := found[1])):
-            raise ConfigError(f"{error}; {group}={name} adds it, [{name},…] with others") from None
+        if (found := WITHOUT_TARGET.match(str(error))) and found[1] in choices("knowledge"):
+            text = f"+knowledge={found[1]} adds it, knowledge=[…,{found[1]}] beside a task's"
+            raise ConfigError(f"{error}; {text}") from None
         if TARGET not in (content.get("deployed") or (TARGET,)):
             refuse(overrides, {"deployed.": "it belongs to variant=hcfs"})
         key = re.match(rf"unknown setting of {re.escape(AUTO)} \(\w+\) '(\w+)'", str(error))
@@ -419,15 +420,10 @@ def _file_of(key: str, name: str | None) -> str:
     """Return how a file of a group is chosen for a node, if there is one of this name."""
     if name is None:  # settings without a choice
         return f"choose one, too: {key}={'|'.join(choices(key))}" if choices(key) else ""
-    group = _group_of(name)
+    group = next((group for group in sorted(_groups()) if name in choices(group)), "")
     choice = f"{group}@{key.replace(': ', '.')}={name}"
     choice = f"+{group}={name}" if group in ADDED else f"{choice}, or +{choice}"
     return f"the file of {group} is chosen by {choice}" if group else ""
-
-
-def _group_of(name: str) -> str:
-    """Return the first group with a file of this name, or nothing."""
-    return next((group for group in sorted(_groups()) if name in choices(group)), "")
 
 
 def _unknown_option(name: str) -> ConfigError:

@@ -66,9 +66,9 @@ class VehicleClass(Settings):
     def _check_power(self, kind: str) -> None:
         """Refuse a power that depends on more than its motion, or is not in W for m/s, kg, rad."""
         model, graded = self.energy, hasattr(self.energy, "grade")
-        level = model.on(0.0) if graded else model  # uphill the engine may be at its limit
         motion = torch.full((2,), PROBE), torch.tensor([0.0, 0.1])
         with raised_as(ConfigError, f"{kind}.power", Exception):
+            level = model.on(0.0) if graded else model  # uphill the engine may be at its limit
             power = unchanged(level.power, motion, kind, ("speed", "acceleration"))
             shape = [*power.shape]
             require(shape == [2], f"its shape is {shape} for speeds of shape [2]")

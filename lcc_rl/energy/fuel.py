@@ -44,7 +44,7 @@ class CirclesFuel(EnergyModel):
     count as the largest feasible one (:meth:`infeasible` returns where). At speeds that the engine
     cannot hold, this would be a deceleration, as in the published model. Here it is zero, so that
     the driven speed is paid for. Height counts as the fuel that the polynomial has for the grade,
-    0.33 to 0.44 of whose heat becomes height above 10 m/s.
+    0.33 to 0.44 of whose heat becomes height from 10 to 30 m/s.
     """
 
     vehicle: str = "midBase"  # Compact, midBase, midSUV, Pickup, Class4PND or Class8Tractor

@@ -15,7 +15,7 @@ from lcc_rl.config.compose import NOT_IDENTITY
 from lcc_rl.config.nodes import Node, as_plain, nodes_in
 from lcc_rl.config.schemas import AUTO, EvaluateConfig, StudyConfig
 from lcc_rl.config.unused import FIXED, drawn_in_training, of_package, refuse
-from lcc_rl.config.words import FILTERED, RECORDED
+from lcc_rl.config.words import FILTERED, RECORDED, typed_keys
 from lcc_rl.envs import Inputs, build_env
 from lcc_rl.errors import ConfigError, require
 from lcc_rl.evaluation.fit import (
@@ -180,14 +180,17 @@ class Entrants:
         return policy, policies
 
     def _warn_of_kept(self, typed: Sequence[str]) -> None:
-        """Warn of typed settings of what a compared policy observes, which it keeps."""
+        """Warn of typed settings of what a compared policy observes, if it keeps others."""
         for (_, path), (_, training) in zip(self.paths, self.policies, strict=True):
-            for piece in of_observation(training):
-                free = conditions_of(training.scenario.pieces[piece])
-                at = f"scenario.pieces.{piece}."
-                kept = [x for x in typed if at in x and x.split("=")[0].split(at)[1] not in free]
+            for name in sorted(of_observation(training)):
+                own, given = training.scenario.pieces[name], self.cfg.scenario.pieces.get(name)
+                asked = given.settings if given else {}
+                other = {x for x, mine in own.settings.items() if mine != asked.get(x)}
+                keys = tuple(f"scenario.pieces.{name}.{x}." for x in other - {*conditions_of(own)})
+                kept = [x for x in typed if any(f"{y}.".startswith(keys) for y in typed_keys(x))]
+                words = ", ".join(x.lstrip("+") for x in kept)
                 if kept:
-                    log.warning("%s observes as in its training, without %s", path, ", ".join(kept))
+                    log.warning("%s observes as in its training, without %s", path, words)
 
     def strategies(self, inputs: Inputs) -> list[Strategy]:
         """Build the strategies in the order of their rows: baselines and rules, then policies.

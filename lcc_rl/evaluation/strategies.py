@@ -219,6 +219,7 @@ def studied(
         return [] if repeats or named else [strategy]
     weights, own_cfg = policy
     cfg = _of_training(cfg, own_cfg, f"policy={cfg.policy}")
+    _observed(f"policy={cfg.policy}", own_cfg, cfg)  # its conditions differ at most
     strategy = with_weights(cfg, weights, own_cfg.seed, str(cfg.policy), population)
     strategy = replace(strategy, own=own_cfg)
     return [strategy] if cfg.deployed is None else hybrids(strategy)
@@ -256,6 +257,17 @@ def _replaced(
     return changed
 
 
+def _observed(path: str, own: StudyConfig, cfg: StudyConfig) -> dict[str, Node]:
+    """Return the pieces that a policy observes, under the conditions of a command."""
+    pieces = {}
+    for name in sorted(of_observation(own)):
+        piece, given = own.scenario.pieces[name], cfg.scenario.pieces.get(name)
+        if given and given.kind is piece.kind:
+            piece = piece.changed(**_replaced(path, name, piece, given, conditions_of(piece)))
+        pieces[name] = piece
+    return pieces
+
+
 def hybrids(strategy: Strategy) -> list[Strategy]:
     """Build a hybrid strategy and its parents; for HCFS, its oracle, too."""
     cfg = strategy.cfg
@@ -282,12 +294,8 @@ def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Popu
     check_scenario(path, training, cfg)
     other = _of_training(cfg.with_(observation=training.observation), training, path)
     own, kept = training.scenario.pieces, of_observation(training)
-    given = other.scenario.pieces
-    pieces = {x: own[x] for x in own if x in kept or x not in given}
-    for name, piece in pieces.items():  # observed as in training, under the command's conditions
-        if piece and (asked := given.get(name)) and asked.kind is piece.kind:
-            changed = _replaced(path, name, piece, asked, conditions_of(piece))
-            pieces[name] = piece.changed(**changed)
+    pieces = {x: own[x] for x in own if x in kept or x not in other.scenario.pieces}
+    pieces |= _observed(path, training, other)
     driver = {AUTOMATED: training.scenario.controllers[AUTOMATED]}
     other = other.with_(
         variant=training.variant,

@@ -50,7 +50,7 @@ def remarks(windows: pd.DataFrame) -> list[str]:
     if names := named(means[list(REACH)].max(axis=1), MUCH):
         sentences.append(
             "Vehicles accelerate harder, or hold a higher speed, than their energy model allows "
-            f"for more than {MUCH:.0%} of the time ({names}): their energies are lower bounds."
+            f"for more than {MUCH:.0%} of the time ({names}): such vehicles would fall behind."
         )
     if names := named(means[BROKEN], 0.0):
         sentences.append(

@@ -256,11 +256,12 @@ def _savings(
     row["end_saving"] = row["drawn_saving"] - row["saving"]
     names = windows["strategy"].unique()
     reference = flow_reference(names, str(against))
+    theirs = [reference] if name != reference else []
     fronts = {x: [y for y in names if y.partition(ON_FRONT)[0] == x] for x in (*RULE_ROWS, name)}
     rule = next((x for x in RULE_ROWS if len(fronts[x]) > 1), "")
     for key, other, energy in (
-        ("flow_saving", [reference], of[0]),
-        ("second_flow_saving", [reference], second),
+        ("flow_saving", theirs, of[0]),
+        ("second_flow_saving", theirs, second),
         ("rule_saving", fronts.get(rule, []) if name != rule else [], of[0]),
     ):
         front = fronts[name] if len(fronts[name]) > 1 and against is not None else []
@@ -344,9 +345,9 @@ def _rows(task: Task | None, against: str, reference: str, score: Shown | None) 
         *([Measure(score.key, score.words)] if score else ()),
         Measure("saving", f"saved against {in_words(against)}", form="{:+.2%}"),
         Measure("second_saving", "  second energy model", form="{:+.2%}"),
-        Measure("flow_saving", f"  against {reference} at their flow", form="{:+.2%}"),
+        Measure("flow_saving", f"  at equal flow, against {reference}", form="{:+.2%}"),
         Measure("rule_saving", "    against the rule", form="{:+.2%}"),
-        Measure(MORE_FLOW, "    at more flow than theirs, by", form="{:+.2%}"),
+        Measure(MORE_FLOW, "    at more flow, by", form="{:+.2%}"),
         Measure("drawn_saving", "  as drawn, per episode", form="{:+.1%}"),
         Measure("end_saving", "    of it by start and end of episodes", form="{:+.1%}"),
         Measure(WAY.key, "distance against the baseline", form="{:+.2f}%"),

@@ -38,6 +38,8 @@ WRONG = {
     "+scenario.filters.automated.margin=1": "'automated'.*valid: none; .filter=cbf or a task adds",
     "+scenario.actuators.automated.lag=0.4": "'automated'.* .faults=all actuators and sensors",
     "agent.regularizers.nosuch.weight=1": "'nosuch', which has no _target_; valid: none; <name>={",
+    "scenario.pieces.traffic.delay=1": r"; \+knowledge=traffic adds it, knowledge=\[…,traffic\] b",
+    "scenario.pieces.fuel.x=1": "'fuel', which has no _target_; valid: [^;]*$",
     "agent.surrogates.nosuch.weight=1": "'nosuch', which has no _target_; valid:",
     "+scenario.fleet.t={_target_: builtins.dict}": "scenario.fleet.t: expected a .*VehicleClass",
     "scenario.string='automated human*٢٥'": "expected .* at character 16",

@@ -116,6 +116,11 @@ class Rolling(EnergyModel):
         return power.sum() if self.summed else power
 
 
+class Uphill(Weightless):
+    mass = 1500.0
+    grade = property(lambda self: 0.01)  # cannot be set
+
+
 def test_mistakes_are_named() -> None:
     cases = [
         ({}, "energy.models is empty"),
@@ -136,6 +141,7 @@ def test_mistakes_are_named() -> None:
         ({"x": Rolling(slope=57.3)}, r"its height by 1472 W .* the grade, in rad"),
         ({"x": Rolling(heating_value=42.4)}, "Rolling: heating_value must .* J/g, got 42.4"),
         ({"x": Rolling(heating_value=42e3)}, "Rolling: density must .* 0.05 to 1.5 kg/L, got 0.0"),
+        ({"x": Uphill()}, "Uphill.power: .*'grade'"),
         ({"x": Rolling(warming=True)}, "Rolling gives an episode other power .* again"),
         ({"x": Rolling(summed=True)}, r"Rolling.power: its shape is \[\] for"),
     ]

@@ -178,12 +178,19 @@ def test_a_policy_meets_the_conditions_of_the_command(monkeypatch, caplog) -> No
         assert piece == policy.scenario.pieces["traffic"].changed(delay=2.0)
     assert "p.pt: the traffic of this command replaces" in caplog.text
     assert "delay=2.0 in place of 0.0" in caplog.text
-    # What it keeps is said if it was typed.
+    caplog.clear()
+    strategies.studied(late, ({}, policy), POPULATION)
+    assert "policy=p.pt: the traffic of this command replaces" in caplog.text
+    # What it keeps is said if another value was typed.
     words = ["task=i24-fleet", "compare=[pretrained/i24-traffic]", "knowledge=[spread,traffic]"]
-    for change, kept in (("traffic.delay=2.0", False), ("spread.seconds=[9.0,30.0]", True)):
+    for change, kept in (
+        ("traffic.delay=2.0", False),
+        ("traffic.places=[5,10,20,40]", False),
+        ("spread.seconds=[9.0,30.0]", True),
+    ):
         typed = f"scenario.pieces.{change}"
         caplog.clear()
-        Entrants(load("evaluate", [*words, typed]), typed=[typed])
+        Entrants(load("evaluate", [*words, typed]), typed=[f"++{typed}"])
         text = f"pretrained/i24-traffic observes as in its training, without {typed}"
         assert (text in caplog.text) == kept
 

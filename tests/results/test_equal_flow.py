@@ -109,7 +109,11 @@ def test_without_recorded_drivers_the_flow_is_that_of_the_baseline() -> None:
     assert row["flow_saving"] == pytest.approx(1.0 - 100.0 / 120.0)
     assert row["rule_saving"] == pytest.approx(1.0 - 100.0 / 104.0)
     label = next(x.label for x in found.rows if x.key == "flow_saving")
-    assert label.strip() == "against simulated drivers at their flow"
+    assert label.strip() == "at equal flow, against simulated drivers"
+    # A baseline saves nothing against itself, with a front, too.
+    table = report(windows_for(rows()[lambda x: x["strategy"] != "recorded"])).table
+    missing = table["flow_saving"].isna()
+    assert dict(zip(table["strategy"], missing, strict=True)) == {"rule": True, "alcc": False}
 
 
 def test_fronts_are_compared_by_equal_seeds() -> None:
