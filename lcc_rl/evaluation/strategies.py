@@ -219,7 +219,8 @@ def studied(
         return [] if repeats or named else [strategy]
     weights, own_cfg = policy
     cfg = _of_training(cfg, own_cfg, f"policy={cfg.policy}")
-    _observed(f"policy={cfg.policy}", own_cfg, cfg)  # its conditions differ at most
+    kept = {x: own_cfg.scenario.pieces[x] for x in sorted(of_observation(own_cfg))}
+    _observed(f"policy={cfg.policy}", kept, cfg.scenario.pieces)  # differ in conditions at most
     strategy = with_weights(cfg, weights, own_cfg.seed, str(cfg.policy), population)
     strategy = replace(strategy, own=own_cfg)
     return [strategy] if cfg.deployed is None else hybrids(strategy)
@@ -257,14 +258,15 @@ def _replaced(
     return changed
 
 
-def _observed(path: str, own: StudyConfig, cfg: StudyConfig) -> dict[str, Node]:
+def _observed(
+    path: str, own: Mapping[str, Node], given: Mapping[str, Node | None]
+) -> dict[str, Node]:
     """Return the pieces that a policy observes, under the conditions of a command."""
-    pieces = {}
-    for name in sorted(of_observation(own)):
-        piece, given = own.scenario.pieces[name], cfg.scenario.pieces.get(name)
-        if given and given.kind is piece.kind:
-            piece = piece.changed(**_replaced(path, name, piece, given, conditions_of(piece)))
-        pieces[name] = piece
+    pieces = dict(own)
+    for name, piece in own.items():
+        if (asked := given.get(name)) and asked.kind is piece.kind:
+            changed = _replaced(path, name, piece, asked, conditions_of(piece))
+            pieces[name] = piece.changed(**changed)
     return pieces
 
 
@@ -293,9 +295,10 @@ def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Popu
     weights, training = policy
     check_scenario(path, training, cfg)
     other = _of_training(cfg.with_(observation=training.observation), training, path)
-    own, kept = training.scenario.pieces, of_observation(training)
-    pieces = {x: own[x] for x in own if x in kept or x not in other.scenario.pieces}
-    pieces |= _observed(path, training, other)
+    own, given = training.scenario.pieces, other.scenario.pieces
+    kept = {x: own[x] for x in sorted(of_observation(training))}
+    pieces = {x: own[x] for x in own if x in kept or x not in given}
+    pieces |= _observed(path, kept, given)
     driver = {AUTOMATED: training.scenario.controllers[AUTOMATED]}
     other = other.with_(
         variant=training.variant,
