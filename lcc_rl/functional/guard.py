@@ -21,7 +21,7 @@ AS_ENTRY = (
     "docs/controllers.md"
 )
 BY_SEED = "remember, or draw random numbers but by the episode's seed"
-DRAWN, ALONE = 64, 6  # episodes with drawn inputs, and how many of them are repeated alone
+TRIED, ALONE = 64, 6  # episodes with drawn inputs, and how many of them are repeated alone
 
 
 def unchanged(
@@ -115,15 +115,15 @@ def _agree(beside: Tensor, alone: list[Tensor], near: float) -> bool:
 
 
 def _drawn(inputs: Sequence[Tensor]) -> Iterator[list[Tensor]]:
-    """Yield inputs of :data:`DRAWN` episodes: numbers scaled by 0 or 0.02 to 12, then shifted, too.
+    """Yield inputs of :data:`TRIED` episodes: numbers scaled by 0 or 0.02 to 12, then shifted, too.
 
     All numbers of an episode share a part of the scale. Whole numbers are kept.
     """
     generator = torch.Generator().manual_seed(0)
     for shift in (0.0, 3.0):
-        found, shared = [], 3.0 * torch.rand(DRAWN, generator=generator) - 2.0
+        found, shared = [], 3.0 * torch.rand(TRIED, generator=generator) - 2.0
         for given in inputs:
-            x = given.detach()[torch.arange(DRAWN) % len(given)]
+            x = given.detach()[torch.arange(TRIED) % len(given)]
             chance, scale = torch.rand((2, *x.shape), generator=generator)
             moved = shift * torch.randn(x.shape, generator=generator)
             scale = (shared.reshape(-1, *[1] * (x.ndim - 1)) + 3.5 * scale - 2.0).exp()
