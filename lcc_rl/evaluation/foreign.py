@@ -123,9 +123,8 @@ class GivenPolicy(TensorDictModuleBase):
             return [self._action(*one) for one in zip(steps, firsts, strict=True)]
 
         message = f"{self.name} fails for observations of {seen.shape[-1]} numbers"
-        names = "first action", "second action"
-        # Any error of the user's module.
         with replacing(lambda error: ConfigError(f"{message}: {line_of(error)}")):
+            names = "first action", "second action"
             check_independent(self.name, names, play, [seen, seen], BY_NEXT, 1e-2)
 
 

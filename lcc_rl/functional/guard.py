@@ -21,7 +21,7 @@ AS_ENTRY = (
     "docs/controllers.md"
 )
 BY_SEED = "remember, or draw random numbers but by the episode's seed"
-TRIED, ALONE = 64, 6  # episodes with drawn inputs, and how many of them are repeated alone
+BESIDE, ALONE = 64, 6  # episodes with drawn inputs, and how many of them play alone
 
 
 def unchanged(
@@ -81,49 +81,40 @@ def check_independent(
     Raises:
         ConfigError: naming the title and the numbers.
     """
-    for given in (inputs, *_drawn(inputs)):
-        rows = range(min(len(given[0]), ALONE))
-        each = [[x[row : row + 1].clone() for x in given] for row in (*rows, 0)]
+    for given in (inputs, *_examples(inputs)):
+        rows = (*range(min(len(given[0]), ALONE)), 0)
         try:
             with torch.random.fork_rng(devices=[]), warnings.catch_warnings():
                 warnings.simplefilter("ignore", RuntimeWarning)  # of numbers that no car has
-                alone = [function(*one) for one in each]
+                alone = [function(*(x[row : row + 1].clone() for x in given)) for row in rows]
                 beside = function(*(x.clone() for x in given))
-            several = zip(beside, zip(*alone, strict=True), strict=True)
-            agree = [_agree(first, list(others), near) for first, others in several]
+            several = zip(names, beside, zip(*alone, strict=True), strict=True)
+            wrong = [name for name, found, each in several if not _same(found, each, near)]
         except Exception:
             if given is inputs:
                 raise
             continue
-        wrong = [name for name, equal in zip(names, agree, strict=True) if not equal]
-        require(
-            not wrong,
-            f"{title} gives an episode other {', '.join(wrong)} alone, or in the same step again: "
-            "it must not mix episodes (mean() of a batch; if with any(): use torch.where), "
-            f"{remedy}",
-        )
+        text = f"{title} gives an episode other {', '.join(wrong)} alone, or in the same step again"
+        mixing = "mix episodes (mean() of a batch; if with any(): use torch.where)"
+        require(not wrong, f"{text}: it must not {mixing}, {remedy}")
 
 
-def _agree(beside: Tensor, alone: list[Tensor], near: float) -> bool:
+def _same(beside: Tensor, alone: Sequence[Tensor], near: float) -> bool:
     """Whether rows alone, and the first of them a second time, are the first ones of all rows."""
     *rows, again = (x.nan_to_num().double() for x in alone)
-    first = beside[: len(rows)].nan_to_num().double()
-    both = torch.cat(rows)
-    return torch.equal(rows[0], again) and (
-        first.shape == both.shape and torch.allclose(first, both, rtol=1e-3, atol=near)
-    )
+    first, both = beside[: len(rows)].nan_to_num().double(), torch.cat(rows)
+    same = torch.equal(rows[0], again) and first.shape == both.shape
+    return same and torch.allclose(first, both, rtol=1e-3, atol=near)
 
 
-def _drawn(inputs: Sequence[Tensor]) -> Iterator[list[Tensor]]:
-    """Yield inputs of :data:`TRIED` episodes: numbers scaled by 0 or 0.02 to 12, then shifted, too.
-
-    All numbers of an episode share a part of the scale. Whole numbers are kept.
-    """
+def _examples(inputs: Sequence[Tensor]) -> Iterator[list[Tensor]]:
+    """Yield inputs of drawn episodes: numbers are scaled by 0 or 0.02 to 12, then shifted, too."""
     generator = torch.Generator().manual_seed(0)
     for shift in (0.0, 3.0):
-        found, shared = [], 3.0 * torch.rand(TRIED, generator=generator) - 2.0
+        # All numbers of an episode share a part of the scale.
+        found, shared = [], 3.0 * torch.rand(BESIDE, generator=generator) - 2.0
         for given in inputs:
-            x = given.detach()[torch.arange(TRIED) % len(given)]
+            x = given.detach()[torch.arange(BESIDE) % len(given)]
             chance, scale = torch.rand((2, *x.shape), generator=generator)
             moved = shift * torch.randn(x.shape, generator=generator)
             scale = (shared.reshape(-1, *[1] * (x.ndim - 1)) + 3.5 * scale - 2.0).exp()

@@ -70,8 +70,7 @@ class Hybrid(Controller):
         """Read the action, the entries of the choice and those of the rule."""
         self.rule = self.rule.bind(world, self.name)
         kept = ", ".join(".".join(key) for key in self.rule.targets[1:])
-        text = f"{self.title}.rule: {self.rule.title} remembers {kept}; a hybrid's rule must not"
-        require(not kept, text)
+        require(not kept, f"{self.title}.rule: {self.rule.title} remembers {kept}; it must not")
         own = self.reads if reads is None else reads
         self.weighed = len(own)
         super().declare(world, [f"{self.name}.action", *own, *self.rule.names], *others, **named)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
+from itertools import count
 
 import numpy as np
 import pytest
@@ -43,27 +44,6 @@ class Lagged(nn.Module):
         before = observation if before is None else before
         assert begins.shape == (*observation.shape[:-1], 1)
         return self.network(before), observation
-
-
-class Built(nn.Module):
-    """A network, and a function of it and of observations."""
-
-    def __init__(self, act: Callable[[Built, Tensor], Tensor]) -> None:
-        super().__init__()
-        self.network, self.act, self.calls, self.kept = networks()[0], act, 0, torch.zeros(0, 1)
-
-    def forward(self, observation: Tensor) -> Tensor:
-        return self.act(self, observation)
-
-    def counted(self, observation: Tensor) -> Tensor:
-        self.calls += 1
-        return self.network(observation) + 0.001 * self.calls
-
-    def recurrent(self, observation: Tensor) -> Tensor:
-        action = self.network(observation)
-        kept = self.kept if len(self.kept) == len(action) else 0.0 * action
-        self.kept = 0.9 * kept + 0.1 * action
-        return self.kept
 
 
 def networks() -> tuple[nn.Sequential, dict[str, nn.Module]]:
@@ -167,39 +147,35 @@ def test_actions_beyond_their_range_are_named(caplog) -> None:
     assert "share of the largest acceleration" in line
 
 
-MIXING = {
-    "mean": lambda own, seen: own.network(seen - seen.mean(0)),
-    "first row": lambda own, seen: own.network(seen[:1]).expand(len(seen), 1),
-    "branch": lambda own, seen: own.network(seen) * (0.5 if (seen > 2.0).any() else 1.0),
-    "drawn": lambda own, seen: torch.rand(len(seen), 1),
-    "dropout": lambda own, seen: own.network(nn.functional.dropout(seen)),
-    "counted": Built.counted,
-    "recurrent": Built.recurrent,
-}
+CALLS = count()
+MIXING = [
+    lambda net, seen: net(seen - seen.mean(0)),
+    lambda net, seen: net(seen) * (0.5 if (seen > 2.0).any() else 1.0),
+    lambda net, seen: net(nn.functional.dropout(seen)),
+    lambda net, seen: net(seen) + 0.001 * next(CALLS),
+]
 
 
 def test_a_policy_acts_by_the_observations_of_a_row_alone() -> None:
     moment = lcc_rl.make_env("alcc", 1, [*NO_AGENT], seed=0, single=False).reset()
     words = r"x gives an episode other .*second action alone, or in the same .* \('next', key\)"
-    check_refused(
-        lambda act: as_given(Built(act), "x").tried(moment),
-        [(act, words) for act in MIXING.values()],
-        ConfigError,
-    )
+    cases = [(TensorDictModule(partial(act, networks()[0]), *ROOT), words) for act in MIXING]
+    check_refused(lambda policy: as_given(policy, "x").tried(moment), cases, ConfigError)
     normed = nn.Sequential(nn.BatchNorm1d(WIDTH), nn.Dropout(), networks()[0])
-    policies = [as_given(right, "x") for right in (normed, *networks()[1].values())]
-    state = torch.get_rng_state()
-    for given in policies:
-        given.tried(moment)
+    for right in (normed, *networks()[1].values()):
+        (given := as_given(right, "x")).tried(moment)
         assert not given.clipped()
-    assert torch.equal(state, torch.get_rng_state())
 
 
-def test_actions_may_have_another_type() -> None:
-    double = Built(lambda own, seen: own.network(seen).double())
-    half = Built(lambda own, seen: own.network(seen.bfloat16()))
-    half.bfloat16()
-    found = lcc_rl.compare({"a": networks()[0], "b": double, "c": half}, overrides=SMALL).rows
+def test_actions_and_weights_may_have_another_type() -> None:
+    network, half = networks()[0], networks()[0].bfloat16()
+    rounded = TensorDictModule(lambda seen: seen.bfloat16(), ["observation"], ["seen"])
+    policies = {
+        "a": network,
+        "b": TensorDictModule(lambda seen: network(seen).double(), *ROOT),
+        "c": TensorDictSequential(rounded, TensorDictModule(half, ["seen"], ["action"])),
+    }
+    found = lcc_rl.compare(policies, overrides=SMALL).rows
     plain, same, near = (x for _, x in found.groupby("strategy")["total_path_energy_kj"])
     np.testing.assert_array_equal(plain, same)
     np.testing.assert_allclose(plain, near, rtol=0.05)
