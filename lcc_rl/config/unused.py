@@ -25,6 +25,7 @@ OBSERVATION = "lcc_rl.pieces.Observation"
 # Options that add the pieces of a role; an event also replaces leaders.
 OPTIONS_OF = {"filters": ("filter",), "actuators": ("faults",), "sensors": ("faults", "event")}
 EXACT = "actuators and sensors are exact; +faults=all adds others"
+OF_TRAINING = "only episodes of a training draw it"
 FIXED = "no vehicle of this platoon depends on drivers or noise"
 
 
@@ -81,7 +82,7 @@ def drawn_in_training(scenario: Any) -> dict[str, str]:
     keys = ["scenario.circumference_range"]
     for node in nodes_in(scenario):
         keys += [f"{node.where}.{name}" for name in getattr(node.kind, "of_training", ())]
-    return dict.fromkeys(keys, "only episodes of a training draw it")
+    return dict.fromkeys(keys, OF_TRAINING)
 
 
 def of_package(part: Any) -> bool:

@@ -13,8 +13,14 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import load
 from lcc_rl.config.nodes import CALLED, Node
-from lcc_rl.config.schemas import AUTO, ScenarioConfig, StudyConfig, TrainingConfig
-from lcc_rl.config.unused import refuse
+from lcc_rl.config.schemas import (
+    AUTO,
+    EvaluationConfig,
+    ScenarioConfig,
+    StudyConfig,
+    TrainingConfig,
+)
+from lcc_rl.config.unused import OF_TRAINING, drawn_in_training, refuse
 from lcc_rl.config.words import with_variant
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
@@ -48,12 +54,17 @@ from lcc_rl.pieces.views import LEADER, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import TARGET, parse, path_of
 
-# Settings of a training that no environment reads, and why they have no effect.
-OF_TRAININGS = {f"training.{x.name}": "nothing trains" for x in fields(TrainingConfig)}
-OF_TRAININGS |= dict.fromkeys(("threads", "matmul_precision"), "set it with torch")
-OF_TRAININGS |= {key: f"use make_env({key}=…)" for key in ("seed", "device")}
-OF_TRAININGS["training.environments"] = "use make_env(batch_size=…)"
-del OF_TRAININGS["training.gap_range"]  # of the first states
+# Settings that no environment reads, and why they have no effect.
+UNREAD = {
+    "seed": "use make_env(seed=…), or reset(seed=…) in Gymnasium",
+    "device": "use make_env(device=…)",
+    "training.environments": "use make_env(batch_size=…), or num_envs in Gymnasium",
+    **dict.fromkeys(("threads", "matmul_precision"), "set it with torch"),
+    "agent.": "it is of the learners of lcc-rl train; an environment takes an action every step",
+}
+UNREAD |= {f"training.{x.name}": "nothing trains" for x in fields(TrainingConfig)} | UNREAD
+UNREAD |= {f"evaluation.{x.name}": "nothing is evaluated" for x in fields(EvaluationConfig)}
+WINDOWS, STARTS = "evaluation.profiles", "training.gap_range"  # read with and without held_out
 MOMENTS = 3  # least states in memory: before and after a step, and intermediate results
 
 
@@ -259,6 +270,14 @@ def _motion(scenario: ScenarioConfig, world: World) -> StringMotion:
     return parse(StringMotion, {"start": start, **of_ring}, "scenario").bind(world)
 
 
+def _unread(cfg: StudyConfig, held_out: bool) -> dict[str, str]:
+    """Return settings without effect on an environment of a configuration, and why."""
+    if not held_out:
+        return {key: reason for key, reason in UNREAD.items() if key != STARTS}
+    unread = UNREAD | {STARTS: OF_TRAINING} | drawn_in_training(cfg.scenario)
+    return {key: x for key, x in unread.items() if key != WINDOWS or cfg.scenario.road == RING}
+
+
 def make_env(
     variant: str = "alcc",
     batch_size: Sequence[int] | int = (),
@@ -294,7 +313,7 @@ def make_env(
         require(isinstance(flag, kinds), f"{name} must be True or False, got {flag!r}")
     words = with_variant(variant, overrides)
     cfg = load("train", words)
-    refuse(words, OF_TRAININGS)
+    refuse(words, _unread(cfg, held_out))
     inputs = shared_inputs(cfg)
     profiles = inputs.evaluation if held_out else inputs.to_learn_from()
     env = build_env(cfg, profiles, inputs.population, batch_size, seed, device, held_out)

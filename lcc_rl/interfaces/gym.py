@@ -135,7 +135,7 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         """Play one step."""
         if not self.running:
             raise ResetNeeded("call reset before the first step, and after the last of an episode")
-        results = self.episodes.step([action])
+        results = self.episodes.step([action], alone=True)
         reward, terminated, truncated, *terms = results[0].tolist()
         self.running = not (terminated or truncated)
         info = {TERMS_INFO: dict(zip(self.episodes.terms, terms, strict=True))}

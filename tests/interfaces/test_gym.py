@@ -182,9 +182,10 @@ def test_what_cannot_take_effect_is_refused_and_changes_nothing(env, many) -> No
 def test_an_action_that_is_none_is_refused_and_changes_nothing(env, many) -> None:
     real = "actions must be real numbers"
     no_array = (STILL + 0j, STILL > 0, STILL.astype(object), STILL.astype(str), None, {})
-    no_number = (0j, [1j], True, [True], {"action": 0.0}, [None], "0", [0.1, 0.2], 0.1)
+    no_number = (0j, [1j], True, [True], {"action": 0.0}, [None], "0", 0.1)
     given = [
         (many, np.zeros((2, 1)), r"numbers \[3, 1\], got \[2, 1\]"),
+        (env, [0.1, 0.2], r"numbers \[1\], got \[2\] float64"),
         (many, STILL + np.nan, "automated.action is nan at step 1"),
         *((many, action, real) for action in (*no_array, [[0.1], [0.2, 0.3], [0.4]])),
         *((env, action, real) for action in no_number),
