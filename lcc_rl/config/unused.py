@@ -25,7 +25,6 @@ OBSERVATION = "lcc_rl.pieces.Observation"
 # Options that add the pieces of a role; an event also replaces leaders.
 OPTIONS_OF = {"filters": ("filter",), "actuators": ("faults",), "sensors": ("faults", "event")}
 EXACT = "actuators and sensors are exact; +faults=all adds others"
-OF_TRAINING = "only episodes of a training draw it"
 FIXED = "no vehicle of this platoon depends on drivers or noise"
 
 
@@ -79,10 +78,10 @@ def refuse(overrides: Iterable[str], reasons: Mapping[str, str]) -> None:
 
 def drawn_in_training(scenario: Any) -> dict[str, str]:
     """Return the settings of a scenario that an evaluation does not use, and why."""
-    keys = ["scenario.circumference_range"]
+    keys = ["scenario.circumference_range", "training.gap_range"]
     for node in nodes_in(scenario):
         keys += [f"{node.where}.{name}" for name in getattr(node.kind, "of_training", ())]
-    return dict.fromkeys(keys, OF_TRAINING)
+    return dict.fromkeys(keys, "only episodes of a training draw it")
 
 
 def of_package(part: Any) -> bool:

@@ -20,7 +20,7 @@ from lcc_rl.config.schemas import (
     StudyConfig,
     TrainingConfig,
 )
-from lcc_rl.config.unused import OF_TRAINING, drawn_in_training, refuse
+from lcc_rl.config.unused import drawn_in_training, refuse
 from lcc_rl.config.words import with_variant
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
@@ -55,16 +55,18 @@ from lcc_rl.pieces.world import World
 from lcc_rl.settings import TARGET, parse, path_of
 
 # Settings that no environment reads, and why they have no effect.
-UNREAD = {
+OF_COMMANDS = {
     "seed": "use make_env(seed=…), or reset(seed=…) in Gymnasium",
     "device": "use make_env(device=…)",
     "training.environments": "use make_env(batch_size=…), or num_envs in Gymnasium",
     **dict.fromkeys(("threads", "matmul_precision"), "set it with torch"),
     "agent.": "it is of the learners of lcc-rl train; an environment takes an action every step",
 }
-UNREAD |= {f"training.{x.name}": "nothing trains" for x in fields(TrainingConfig)} | UNREAD
-UNREAD |= {f"evaluation.{x.name}": "nothing is evaluated" for x in fields(EvaluationConfig)}
-WINDOWS, STARTS = "evaluation.profiles", "training.gap_range"  # read with and without held_out
+OF_COMMANDS |= {
+    f"training.{x.name}": "nothing trains" for x in fields(TrainingConfig)
+} | OF_COMMANDS
+OF_COMMANDS |= {f"evaluation.{x.name}": "nothing is evaluated" for x in fields(EvaluationConfig)}
+del OF_COMMANDS["training.gap_range"]  # of the first states
 MOMENTS = 3  # least states in memory: before and after a step, and intermediate results
 
 
@@ -270,14 +272,6 @@ def _motion(scenario: ScenarioConfig, world: World) -> StringMotion:
     return parse(StringMotion, {"start": start, **of_ring}, "scenario").bind(world)
 
 
-def _unread(cfg: StudyConfig, held_out: bool) -> dict[str, str]:
-    """Return settings without effect on an environment of a configuration, and why."""
-    if not held_out:
-        return {key: reason for key, reason in UNREAD.items() if key != STARTS}
-    unread = UNREAD | {STARTS: OF_TRAINING} | drawn_in_training(cfg.scenario)
-    return {key: x for key, x in unread.items() if key != WINDOWS or cfg.scenario.road == RING}
-
-
 def make_env(
     variant: str = "alcc",
     batch_size: Sequence[int] | int = (),
@@ -313,7 +307,10 @@ def make_env(
         require(isinstance(flag, kinds), f"{name} must be True or False, got {flag!r}")
     words = with_variant(variant, overrides)
     cfg = load("train", words)
-    refuse(words, _unread(cfg, held_out))
+    unused = OF_COMMANDS | (drawn_in_training(cfg.scenario) if held_out else {})
+    if held_out and cfg.scenario.road != RING:
+        del unused["evaluation.profiles"]
+    refuse(words, unused)
     inputs = shared_inputs(cfg)
     profiles = inputs.evaluation if held_out else inputs.to_learn_from()
     env = build_env(cfg, profiles, inputs.population, batch_size, seed, device, held_out)

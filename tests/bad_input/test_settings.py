@@ -116,7 +116,8 @@ IGNORED = {
 # Settings of an evaluation of a policy without effect, by variant, and why.
 OF_TRAINING = "has the (settings|agent) of its training"
 EVALUATED = {
-    "alcc training.gap_range=[0.2,0.3]": OF_TRAINING,
+    "alcc training.segment=20": OF_TRAINING,
+    "alcc training.gap_range=[0.2,0.3]": "only episodes of a training draw it",
     "alcc agent.hold=5": OF_TRAINING,
     "alcc scenario.controllers.human.time_gap_range=[1,2]": "only episodes of a training draw it",
     "alcc agent=ppo": f"{OF_TRAINING}, analytic",
