@@ -95,6 +95,8 @@ def _of_road(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
     if cfg.scenario.road == RING:
         for key in ("data", "split", "leader"):
             yield key, "a ring road has no leader"
+        for key in ("scenario.start", "training.gap_range"):
+            yield key, "vehicles of a ring start evenly spaced, at scenario.initial_speed"
         return
     for key in ("circumference", "circumference_range", "initial_speed"):
         yield f"scenario.{key}", "it belongs to scenario.road=ring"
