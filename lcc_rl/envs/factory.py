@@ -60,7 +60,8 @@ OF_COMMANDS = {
     "device": "use make_env(device=…)",
     "training.environments": "use make_env(batch_size=…), or num_envs in Gymnasium",
     **dict.fromkeys(("threads", "matmul_precision"), "set it with torch"),
-    "agent.": "it is of the learners of lcc-rl train; an environment takes an action every step",
+    "agent.hold": "use scenario.controllers.automated.hold=…",
+    "agent.": "it belongs to the learners of lcc-rl train",
 }
 OF_COMMANDS |= {
     f"training.{x.name}": "nothing trains" for x in fields(TrainingConfig)

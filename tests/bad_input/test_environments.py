@@ -101,10 +101,8 @@ def test_settings_of_trainings_have_no_effect_on_an_environment() -> None:
             r"^seed=7 has no effect: use make_env\(seed=…\), or reset\(seed=…\) in Gymnasium",
         ),
         ("training={environments: 3}", r"use make_env\(batch_size=…\)"),
-        *(
-            (f"agent.{x}=5", rf"agent\.{x}=5 has .*: .* every step")
-            for x in ("hold", "humans_first")
-        ),
+        ("agent.hold=5", r"^agent\.hold=5 .*: use scenario\.controllers\.automated\.hold=…"),
+        ("agent.humans_first=5", "has no effect: it belongs to the learners of lcc-rl train"),
         *((f"evaluation.{x}=3", "has no effect: nothing is eval") for x in ("drivers", "profiles")),
         ("evaluation={seed: 3}", "nothing is evaluated"),
     ]
