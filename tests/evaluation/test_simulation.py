@@ -29,6 +29,7 @@ from lcc_rl.pieces import Controller
 STEPS = 200
 MARGIN = "scenario.filters.automated.margin"
 WAVE = 8.0 + 3.0 * np.sin(0.1 * np.arange(STEPS + 1) / 4.0)
+EPOCH = pd.DataFrame({"time_s": 1.7e12 + 100.0 * np.arange(9), "speed_mps": 9.0})
 BEHIND = {"leader": WAVE, "string": "automated"}
 QUICK = ["scenario.horizon=200", "evaluation.baselines=[]", "evaluation.warm_up=0"]
 
@@ -191,6 +192,7 @@ def test_wrong_arguments_are_named(tmp_path) -> None:
         ({"leader": [3.0, np.inf], "time_step": 0.2}, "speed 1, at 0.2 s, is inf, not from 0"),
         ({"leader": np.ones((2, 3))}, r"speeds .*shape \[2, 3\]; give a column"),
         ({"leader": pd.DataFrame({"v": WAVE})}, "^the data frame: lacks .*time_s"),
+        ({"leader": EPOCH}, r"expected a number .* s; is it in ms, us or ns \(convert it\)\?$"),
         ({"leader": pd.DataFrame({"v": [1, "x"]})}, "^the data frame: .*Could not convert 'x'"),
         ({"leader": 12.0 * WAVE}, r"leader must be speeds .*is 96, not .*in km/h"),
         ({"leader": np.ma.masked_greater(WAVE, 9.0)}, "speed 14, at 1.4 s, is nan, not from 0"),
