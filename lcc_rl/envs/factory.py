@@ -13,13 +13,7 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import load
 from lcc_rl.config.nodes import CALLED, Node
-from lcc_rl.config.schemas import (
-    AUTO,
-    EvaluationConfig,
-    ScenarioConfig,
-    StudyConfig,
-    TrainingConfig,
-)
+from lcc_rl.config.schemas import AUTO, SECTIONS, ScenarioConfig, StudyConfig
 from lcc_rl.config.unused import drawn_in_training, refuse
 from lcc_rl.config.words import with_variant
 from lcc_rl.data.profiles import Profiles
@@ -63,10 +57,8 @@ OF_COMMANDS = {
     "agent.hold": "use scenario.controllers.automated.hold=…",
     "agent.": "it belongs to the learners of lcc-rl train",
 }
-OF_COMMANDS |= {
-    f"training.{x.name}": "nothing trains" for x in fields(TrainingConfig)
-} | OF_COMMANDS
-OF_COMMANDS |= {f"evaluation.{x.name}": "nothing is evaluated" for x in fields(EvaluationConfig)}
+for _part, _why in (("training", "nothing trains"), ("evaluation", "nothing is evaluated")):
+    OF_COMMANDS = {f"{_part}.{x.name}": _why for x in fields(SECTIONS[_part])} | OF_COMMANDS
 del OF_COMMANDS["training.gap_range"]  # of the first states
 MOMENTS = 3  # least states in memory: before and after a step, and intermediate results
 
