@@ -16,15 +16,18 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
+from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import CatFrames, ObservationNorm, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lcc_rl.envs.arrays import LARGEST_SCALED
+from lcc_rl.envs.step import observation_settings
 from lcc_rl.errors import ConfigError, line_of, raised_as, replacing, require
 from lcc_rl.functional.guard import check_independent
 from lcc_rl.pieces.base import ACTION, OBSERVATION, STEP, StepTransform
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import NEXT
+from lcc_rl.results.runs import differing, flatten
 
 BY_NEXT = "draw random numbers, or remember but by ('next', key) of a TensorDictModule"
 INITIAL = "is_init"  # key from which recurrent modules of TorchRL read that an episode begins
@@ -171,6 +174,20 @@ def as_given(policy: Any, name: str) -> GivenPolicy | None:
     return GivenPolicy(TensorDictModule(network, [OBSERVATION[-1]], [ACTION[-1]]), name)
 
 
+def check_observed(policy: GivenPolicy, env: TransformedEnv) -> None:
+    """Check that a model of stable-baselines3 observes as in its environment, if it has one.
+
+    Raises:
+        ConfigError: naming the settings of the observation that differ.
+    """
+    here = dict(flatten(observation_settings(env)))
+    for module in policy.modules():
+        there = dict(flatten(getattr(module, "observes", None) or here))
+        other = [f"observation.{key}={there.get(key)}" for key in differing(here, there)]
+        text = f"{policy.name} was trained with {', '.join(other)}, which are other here: "
+        require(not other, f"{text}give the variant and overrides of its environment")
+
+
 def network_of(policy: Any, normalize: Any = None) -> nn.Module | None:
     """Return a policy as a module from observations ``[rows, n]`` to actions ``[rows, 1]``.
 
@@ -221,6 +238,7 @@ class StableBaselinesPolicy(nn.Module):
         super().__init__()
         self.title, policy = type(model).__name__, model.policy
         vectors, names = self._wrappers(model.get_env() if normalize is None else normalize)
+        self.observes = vectors[-1].get_attr("observes", 0)[0] if vectors else None
         # Only models trained with VecNormalize have it; those with a replay buffer always do.
         raw = getattr(model, "_last_original_obs", None) is not None
         normalized = NORMALIZED in names or (vectors and hasattr(model, "replay_buffer"))

@@ -96,11 +96,27 @@ def test_an_impossible_batch_seed_or_device() -> None:
 
 def test_settings_of_trainings_have_no_effect_on_an_environment() -> None:
     cases = [
-        ("seed=7", r"^seed=7 has no effect: use make_env\(seed=…\)"),
+        (
+            "seed=7",
+            r"^seed=7 has no effect: use make_env\(seed=…\), or reset\(seed=…\) in Gymnasium",
+        ),
         ("training={environments: 3}", r"use make_env\(batch_size=…\)"),
+        ("agent.hold=5", r"^agent\.hold=5 .*: use scenario\.controllers\.automated\.hold=…"),
+        ("agent.humans_first=5", "has no effect: it belongs to the learners of lcc-rl train"),
+        *((f"evaluation.{x}=3", "has no effect: nothing is eval") for x in ("drivers", "profiles")),
+        ("evaluation={seed: 3}", "nothing is evaluated"),
     ]
     check_refused(lambda word: make_env("alcc", overrides=[word]), cases)
+    cases = [
+        ("training.gap_range=[1,1]", "only episodes of a training draw it"),
+        ("scenario.controllers.human.time_gap_range=[1,2]", "only episodes of a training draw it"),
+        ("agent.hold=5", "has no effect"),
+        ("evaluation.batch_size=3", "nothing is evaluated"),
+    ]
+    check_refused(lambda word: make_env("alcc", overrides=[word], held_out=True), cases)
     assert make_env("alcc", 2, ["experiment=smoke", "training.gap_range=[0.5,0.6]"])
+    given = ["experiment=smoke", "evaluation.profiles=1", "agent=ppo"]
+    assert make_env("alcc", 2, given, held_out=True)
 
 
 def test_seeds_that_would_play_the_same_episodes_are_refused(envs) -> None:
