@@ -30,8 +30,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 45_175, "code": 30_020},
-    "tests": {"lines": 27_460},
+    "lcc_rl + tools": {"lines": 45_195, "code": 30_030},
+    "tests": {"lines": 27_480},
     "conf": {"yaml": 166},
 }
 CASES = 1_310  # ceiling of all quick tests, see tests/tools/test_size.py
