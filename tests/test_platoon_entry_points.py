@@ -15,7 +15,7 @@ from lcc_rl.commands import evaluation, training
 from lcc_rl.config import load
 from lcc_rl.config.nodes import Node
 from lcc_rl.io.files import read_parquet
-from lcc_rl.pieces import Action, Hybrid
+from lcc_rl.pieces import Action, Hybrid, PISaturation
 from lcc_rl.results.policies import load_policy
 from lcc_rl.settings import TARGET, path_of
 
@@ -123,6 +123,8 @@ def test_an_own_choice_is_named_and_has_no_oracle(tmp_path) -> None:
     cacc = cfg.deployed.settings["rule"]
     refused = [(Action, {}, "deployed: expected a subclass of .*Hybrid, got .*Action")]
     refused += [(Number, {"rule": cacc}, "Number.choose must return a tensor of bool, got 1.0")]
+    memory = {"rule": {TARGET: path_of(PISaturation)}}
+    refused += [(Gentler, memory, r"Gentler.rule: PISaturation remembers .*; it must not")]
     check_refused(lambda kind, settings: evaluated(kind, **settings), refused)
     rows = evaluated(Gentler, rule=cacc).set_index("strategy")
     assert [*rows.index.unique()] == ["cacc", "ddpg", "Gentler"]

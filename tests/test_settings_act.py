@@ -50,7 +50,6 @@ REASONS: Mapping[str, str] = {
     "scenario.max_braking": "no command is as unsafe",
     "scenario.max_acceleration": "no command is as large",
     "scenario.vehicle_length": "enters flow and the excess of spacing only",
-    "scenario.start.automated.standstill_gap": "episodes begin with the recorded gap",
     "scenario.start.human.cap_time_gap": "no gap at the start is as long",
     f"{FILTER}.robust": "actuators and sensors are ideal",
     f"{FILTER}.full_speed": "acts at lower speeds",

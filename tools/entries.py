@@ -79,7 +79,8 @@ def configurations() -> Iterator[StudyConfig]:
         yield cfg
         if cfg.deployed is not None:
             yield cfg.after_training()
-    knowledge = ["+knowledge=[spread,preview,traffic]", "scenario.pieces.memory.kind=stacked"]
+    knowledge = ["+knowledge=[spread,preview,traffic]", "scenario.pieces.traffic.delay=1.0"]
+    knowledge += ["scenario.pieces.memory.kind=stacked"]
     cfg = load("train", ["variant=alcc", SIZES, "+filter=cbf", "+faults=all", *knowledge])
     yield cfg
     held = "scenario.controllers.automated.hold=0.5"

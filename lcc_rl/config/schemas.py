@@ -172,6 +172,12 @@ class ScenarioConfig(Section):
         return leader is not None and getattr(leader.kind, "replaces", False)
 
     @property
+    def perturbation(self) -> float:
+        """The perturbation of the leader's speed in training."""
+        leader = self.pieces.get("leader")
+        return 0.0 if leader is None else float(leader.settings.get("perturbation", 0.0))
+
+    @property
     def slope(self) -> Node | None:
         """The node of the road's grade; None: the road is level."""
         return self.pieces.get("slope")

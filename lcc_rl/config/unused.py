@@ -78,7 +78,7 @@ def refuse(overrides: Iterable[str], reasons: Mapping[str, str]) -> None:
 
 def drawn_in_training(scenario: Any) -> dict[str, str]:
     """Return the settings of a scenario that an evaluation does not use, and why."""
-    keys = ["scenario.circumference_range"]
+    keys = ["scenario.circumference_range", "training.gap_range"]
     for node in nodes_in(scenario):
         keys += [f"{node.where}.{name}" for name in getattr(node.kind, "of_training", ())]
     return dict.fromkeys(keys, "only episodes of a training draw it")
@@ -95,6 +95,8 @@ def _of_road(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
     if cfg.scenario.road == RING:
         for key in ("data", "split", "leader"):
             yield key, "a ring road has no leader"
+        for key in ("scenario.start", "training.gap_range"):
+            yield key, "vehicles of a ring start evenly spaced, at scenario.initial_speed"
         return
     for key in ("circumference", "circumference_range", "initial_speed"):
         yield f"scenario.{key}", "it belongs to scenario.road=ring"

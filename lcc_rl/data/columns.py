@@ -24,8 +24,8 @@ UNITS: dict[str, dict[str, float]] = {
 }
 SLOPES = ("%", "m/m")  # units of grades that are slopes, the tangent of the angle
 SI = {quantity: next(iter(units)) for quantity, units in UNITS.items()}
-QUESTIONS = {  # for numbers outside of their range
-    "time": "; is it in ms, us or ns (units.time)?",
+QUESTIONS = {  # for numbers outside of their range, with the setting of their unit
+    "time": "; is it in ms, us or ns ({})?",
     "grade": "; is it in % (leader.units.grade=%)?",
 }
 # Spellings of units in names of columns; "min" may also mean the minimum.

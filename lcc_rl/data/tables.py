@@ -92,6 +92,7 @@ class TableFile:
         self.first: list[str] = []  # cells of the first row of text
         self.count = 0  # number of rows, known after reading
         self.comma = False  # whether numbers have a decimal comma
+        self.units = ""  # place of the units in the configuration, if they are settings
         if not self.path.is_file():
             raise DataError(f"{self.path}: no such file; expected a table, .csv or .parquet")
         self.parquet = self.path.suffix in PARQUET
@@ -128,6 +129,7 @@ class TableFile:
             DataError: if a column is missing, or naming the row and column of a cell at fault, or
                 if every row has a blank cell.
         """
+        self.units = option and f"{option.removesuffix('columns')}units"
         self.names = {c.key: name for c in columns if (name := names.get(c.key)) is not None}
         missing = [name for name in self.names.values() if name not in self.header]
         if missing:
@@ -135,7 +137,7 @@ class TableFile:
         for column in columns:
             unit = (units or {}).get(column.key, SI.get(column.quantity))
             if column.key not in self.names and unit != SI.get(column.quantity):
-                at = f"{option.removesuffix('columns')}units.{column.key}={unit}"
+                at = f"{self.units}.{column.key}={unit}"
                 raise DataError(f"{self.path}: {at} has no effect: no column is {column.key}")
         for key, used in ((c.key, c.used) for c in columns if c.key in self.header):
             if key not in names and key not in self.names.values():
@@ -323,13 +325,13 @@ class Block:
         def fault(row: int, words: str) -> DataError:
             return self.file.fault(int(self.row[row]), column.key, words)
 
-        return checked_cells(self.cells[name], column, fault, scale, self.file.comma)
+        return checked_cells(self.cells[name], column, fault, scale, self.file)
 
 
 # -- cells -----------------------------------------------------------------------------------------
 
 
-def checked_cells(cells: Cells, column: Column, fault: Fault, scale: float, comma: bool) -> Any:
+def checked_cells(cells: Cells, column: Column, fault: Fault, scale: float, file: TableFile) -> Any:
     """Return the checked values of a column, numbers or a categorical.
 
     Args:
@@ -337,7 +339,7 @@ def checked_cells(cells: Cells, column: Column, fault: Fault, scale: float, comm
         column: the column, with the valid range.
         fault: returns the error for a row.
         scale: factor to SI.
-        comma: whether numbers have a decimal comma.
+        file: the file of the cells.
 
     Raises:
         DataError: for the first wrong cell.
@@ -350,7 +352,7 @@ def checked_cells(cells: Cells, column: Column, fault: Fault, scale: float, comm
         if not column.blank and (blank := texts == "").any():
             raise fault(int(np.argmax(blank)), "is blank")
         return texts
-    values = numbers_of(_seconds(cells) if column.quantity == "time" else cells, fault, comma)
+    values = numbers_of(_seconds(cells) if column.quantity == "time" else cells, fault, file.comma)
     if scale != 1.0:
         values = values * scale
     least, most = (values.min(), values.max()) if len(values) else (column.least, column.most)
@@ -366,7 +368,8 @@ def checked_cells(cells: Cells, column: Column, fault: Fault, scale: float, comm
         row = int(np.argmax(wrong))
         hint = f", {column.least / scale:g} to {column.most / scale:g} in its unit"
         if scale == 1.0:
-            hint = QUESTIONS.get(column.quantity, "")
+            unit = f"{file.units}.{column.key}" if file.units else "convert it"
+            hint = QUESTIONS.get(column.quantity, "").format(unit)
         raise fault(row, f"holds {_shown(cells[row])}; expected {column.expected}{hint}")
     return values
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from lcc_rl.config.nodes import find_target
 from lcc_rl.errors import ConfigError, raised_as, require, require_known
@@ -67,17 +68,18 @@ def _check_law(kind: type[DriverConstants], name: str) -> None:
     with raised_as(ConfigError, name, Exception):
         law = kind()
 
-        def play(number: int, first: int = 0) -> torch.Tensor:
-            motion = (10.0 + number, 20.0 + number, 1.0 + number, 30.0, 1.5)
-            speed, gap, rate, v0, headway = (torch.tensor([x, 1.1 * x])[first:] for x in motion)
+        def motion(number: int) -> list[Tensor]:
+            found = (10.0 + number, 20.0 + number, 1.0 + number, 30.0, 1.5)
+            return [torch.tensor([x, 1.1 * x]) for x in found]
+
+        def play(speed: Tensor, gap: Tensor, rate: Tensor, v0: Tensor, headway: Tensor) -> Any:
             law.equilibrium_gap(speed, v0, headway)
             wish = law.wish(speed, gap, rate, v0, headway)
-            require(isinstance(wish, torch.Tensor), "wish must return one tensor, an acceleration")
-            return wish
+            require(isinstance(wish, Tensor), "wish must return one tensor, an acceleration")
+            return [wish]
 
-        check_forgets([law], play, OF_PRESENT)
-        beside, alone, again = play(0), play(0, 1), play(0, 1)
-        check_independent(kind.__name__, "acceleration", beside[1:], alone, again)
+        check_forgets([law], lambda n: play(*motion(n)), OF_PRESENT)
+        check_independent(kind.__name__, ["acceleration"], play, motion(0))
 
 
 def parameters_of(models: Iterable[str]) -> dict[str, Parameter]:

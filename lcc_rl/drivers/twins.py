@@ -41,7 +41,7 @@ LONG_GAP = 2.5  # time gap that counts as long, above 1 m/s [s]
 REPEATS = 2  # draws of the noise of every driver
 AT_ONCE = 20_000  # parallel trajectories; more would only need memory
 DRIVER_FOLDS = 5  # each fold is evaluated with the reaction chosen on the other folds
-DELAYS = tuple(round(0.1 * number, 1) for number in range(10))  # candidates [s]
+DELAYS = tuple(round(0.1 * number, 1) for number in range(10))  # candidates, see delays_at [s]
 NOISES = tuple(round(0.05 * number, 2) for number in range(13))  # likewise [m/s²]
 # Candidates of the relative noise of gaps, in addition to none; see choose_reaction.
 GAP_NOISES = tuple(round(0.1 * number, 1) for number in range(1, 7))
@@ -327,13 +327,18 @@ class Tried:
     growth: float
 
 
+def delays_at(step: float) -> list[float]:
+    """Return the multiples of a time step [s] that are nearest to :data:`DELAYS`, each once."""
+    return list(dict.fromkeys(round(round(delay / step) * step, 3) for delay in DELAYS))
+
+
 def tried(
     observed: Observed,
     drivers: pd.DataFrame,
     progress: Progress | None = None,
     perception: bool = False,
 ) -> dict[Reaction, Tried]:
-    """Drive twins with all of :data:`DELAYS` × :data:`NOISES`.
+    """Drive twins with all of :func:`delays_at` × :data:`NOISES`.
 
     Args:
         observed, drivers: see :func:`drive_twins`.
@@ -342,8 +347,9 @@ def tried(
     """
     found: dict[Reaction, Tried] = {}
     together = max(1, AT_ONCE // (REPEATS * observed.count))
-    grid = {delay: [Reaction(delay, noise) for noise in NOISES] for delay in DELAYS}
-    for delay in DELAYS[::2] if perception else ():
+    delays = delays_at(observed.time_step)
+    grid = {delay: [Reaction(delay, noise) for noise in NOISES] for delay in delays}
+    for delay in delays[::2] if perception else ():
         grid[delay] += [Reaction(delay, x, gap) for x in NOISES[::2] for gap in GAP_NOISES]
     count = sum(map(len, grid.values()))
     for every in grid.values():

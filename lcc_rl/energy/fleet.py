@@ -72,8 +72,7 @@ class VehicleClass(Settings):
             power = unchanged(level.power, motion, kind, ("speed", "acceleration"))
             shape = [*power.shape]
             require(shape == [2], f"its shape is {shape} for speeds of shape [2]")
-            alone, again = (level.power(*(x[1:] for x in motion)) for _ in range(2))
-            check_independent(kind, "power", power[1:], alone, again)
+            check_independent(kind, ["power"], lambda *x: [level.power(*x)], motion)
             steady, faster = power.tolist()
             uphill = float(model.on(UPHILL).power(*motion)[0]) if graded else steady
         stored = PROBE * model.inertia / model.efficiency

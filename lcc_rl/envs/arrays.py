@@ -140,11 +140,12 @@ class ArrayEpisodes:
             td.set(as_key(name), integers.expand(size).reshape(spec.shape).clone())
         return td
 
-    def step(self, actions: Any) -> Array:
+    def step(self, actions: Any, alone: bool = False) -> Array:
         """Advance every episode by a step, including episodes that have ended.
 
         Args:
             actions: ``[n, 1]``, in [−1, 1].
+            alone: whether messages have the shape of one episode's action, ``[1]``.
 
         Returns:
             ``[n, 3 + terms]``, float32: reward, terminated, truncated and the reward terms.
@@ -158,8 +159,8 @@ class ArrayEpisodes:
         except ValueError:  # rows of different lengths
             array = np.empty(0, np.object_)
         if array.shape != (self.count, 1) or array.dtype.kind not in "fiu":
-            message = f"actions must be real numbers {[self.count, 1]}"
-            raise ConfigError(f"{message}, got {list(array.shape)} {array.dtype}")
+            wanted, given = ([*shape][alone:] for shape in ((self.count, 1), array.shape))
+            raise ConfigError(f"actions must be real numbers {wanted}, got {given} {array.dtype}")
         array = np.ascontiguousarray(array, np.float32)
         step = int(self.state[:, self.step_column].max()) + 1
         if not np.isfinite(array).all():

@@ -99,13 +99,19 @@ def check_alone(piece: Piece, before: State, reached: State) -> None:
     Raises:
         ConfigError: naming the piece and the entry.
     """
-    states = [{key: x[1:] for key, x in state.items()} for state in (before, reached)]
+    late = list(dict.fromkeys([*piece.needs, *((False, key) for key in piece.constants)]))
+
+    def play(*values: Tensor) -> list[Tensor]:
+        states: tuple[State, State] = ({}, {})
+        for (after, key), value in zip(late, values, strict=True):
+            states[after][key] = value
+        piece.derive(*states)
+        return [states[1][key] for key in piece.targets]
+
+    inputs = [(reached if after else before)[key] for after, key in late]
+    if inputs:
+        check_independent(piece.title, [".".join(key) for key in piece.targets], play, inputs)
     piece.derive(before, reached)
-    alone, again = ({**states[1]} for _ in range(2))
-    for other in (alone, again):
-        piece.derive(states[0], other)
-    for key in piece.targets:
-        check_independent(piece.title, ".".join(key), reached[key][1:], alone[key], again[key])
 
 
 def _attempt(piece: Piece, action: object) -> None:

@@ -13,8 +13,8 @@ from torchrl.envs import TransformedEnv
 
 from lcc_rl.config import load
 from lcc_rl.config.nodes import CALLED, Node
-from lcc_rl.config.schemas import AUTO, ScenarioConfig, StudyConfig, TrainingConfig
-from lcc_rl.config.unused import refuse
+from lcc_rl.config.schemas import AUTO, SECTIONS, ScenarioConfig, StudyConfig
+from lcc_rl.config.unused import drawn_in_training, refuse
 from lcc_rl.config.words import with_variant
 from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs.checks import check_pieces
@@ -48,12 +48,18 @@ from lcc_rl.pieces.views import LEADER, VEHICLES
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import TARGET, parse, path_of
 
-# Settings of a training that no environment reads, and why they have no effect.
-OF_TRAININGS = {f"training.{x.name}": "nothing trains" for x in fields(TrainingConfig)}
-OF_TRAININGS |= dict.fromkeys(("threads", "matmul_precision"), "set it with torch")
-OF_TRAININGS |= {key: f"use make_env({key}=…)" for key in ("seed", "device")}
-OF_TRAININGS["training.environments"] = "use make_env(batch_size=…)"
-del OF_TRAININGS["training.gap_range"]  # of the first states
+# Settings that no environment reads, and why they have no effect.
+OF_COMMANDS = {
+    "seed": "use make_env(seed=…), or reset(seed=…) in Gymnasium",
+    "device": "use make_env(device=…)",
+    "training.environments": "use make_env(batch_size=…), or num_envs in Gymnasium",
+    **dict.fromkeys(("threads", "matmul_precision"), "set it with torch"),
+    "agent.hold": "use scenario.controllers.automated.hold=…",
+    "agent.": "it belongs to the learners of lcc-rl train",
+}
+for _part, _why in (("training", "nothing trains"), ("evaluation", "nothing is evaluated")):
+    OF_COMMANDS = {f"{_part}.{x.name}": _why for x in fields(SECTIONS[_part])} | OF_COMMANDS
+del OF_COMMANDS["training.gap_range"]  # of the first states
 MOMENTS = 3  # least states in memory: before and after a step, and intermediate results
 
 
@@ -121,6 +127,7 @@ def world_of(
         scenario.max_braking,
         scenario.max_acceleration,
         scenario.replaced,
+        0.0 if nominal else scenario.perturbation,
         scenario.slope and scenario.slope.made(Slope),
     )
 
@@ -294,7 +301,10 @@ def make_env(
         require(isinstance(flag, kinds), f"{name} must be True or False, got {flag!r}")
     words = with_variant(variant, overrides)
     cfg = load("train", words)
-    refuse(words, OF_TRAININGS)
+    unused = OF_COMMANDS | (drawn_in_training(cfg.scenario) if held_out else {})
+    if held_out and cfg.scenario.road != RING:
+        del unused["evaluation.profiles"]
+    refuse(words, unused)
     inputs = shared_inputs(cfg)
     profiles = inputs.evaluation if held_out else inputs.to_learn_from()
     env = build_env(cfg, profiles, inputs.population, batch_size, seed, device, held_out)

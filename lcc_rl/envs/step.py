@@ -17,6 +17,7 @@ from torchrl.data import Composite
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, FrameSkipTransform, Transform
 
+from lcc_rl.config.nodes import as_plain
 from lcc_rl.envs.single import find, group_key
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.finite import any_nonfinite, require_finite
@@ -38,6 +39,7 @@ from lcc_rl.pieces.base import (
 )
 from lcc_rl.pieces.rewards import RewardTerm, TotalReward
 from lcc_rl.pieces.world import World
+from lcc_rl.settings import TARGET, path_of, values
 
 DONE, TERMINATED, TRUNCATED = ("done",), ("terminated",), ("truncated",)
 PARTIAL = "_step"  # TorchRL's key of the mask of episodes that take the step
@@ -163,6 +165,12 @@ def transforms_of(env: TransformedEnv) -> list[Any]:
 def pieces_of(env: TransformedEnv) -> list[Piece]:
     """Return the pieces of an environment."""
     return [piece for piece in transforms_of(env) if isinstance(piece, Piece)]
+
+
+def observation_settings(env: TransformedEnv) -> dict[str, Any]:
+    """Return the settings of an environment's observation as plain containers."""
+    observation = next(piece for piece in pieces_of(env) if OBSERVATION in piece.targets)
+    return as_plain({TARGET: path_of(type(observation)), **values(observation)})
 
 
 class Pieces(Compose):

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pandas as pd
+import torch
 
 from lcc_rl.config.compose import identity, with_inputs
 from lcc_rl.config.schemas import StudyConfig
@@ -44,7 +45,8 @@ def mark_of(strategy: Strategy) -> str:
     weights = getattr(strategy.policy, "state_dict", None)
     for name, value in sorted(weights().items()) if weights else ():
         digest.update(name.encode())
-        digest.update(value.detach().cpu().numpy().tobytes())
+        plain = value.detach().cpu().contiguous().flatten()
+        digest.update(plain.view(torch.uint8).numpy().tobytes())  # NumPy has no bfloat16
     return digest.hexdigest()
 
 

@@ -26,7 +26,7 @@ from lcc_rl.evaluation.fit import (
     other_traffic,
     task_of,
 )
-from lcc_rl.evaluation.foreign import GivenPolicy
+from lcc_rl.evaluation.foreign import GivenPolicy, check_observed
 from lcc_rl.evaluation.named import DIRECT, PEOPLE, controller_of, is_policy, label_of
 from lcc_rl.evaluation.strategies import (
     Strategy,
@@ -218,6 +218,7 @@ class Entrants:
         _check_label(name, "a policy", "")
         require(cfg.learns, f"{name} is a policy, and variant {cfg.variant} has no agent")
         env = build_env(cfg, inputs.evaluation, inputs.population, 1, 0, cfg.device, nominal=True)
+        check_observed(policy, env)
         policy.tried(env.reset())
         return Strategy(name, cfg, policy)
 

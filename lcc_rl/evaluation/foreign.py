@@ -16,15 +16,20 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
+from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import CatFrames, ObservationNorm, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lcc_rl.envs.arrays import LARGEST_SCALED
-from lcc_rl.errors import ConfigError, raised_as, require
+from lcc_rl.envs.step import observation_settings
+from lcc_rl.errors import ConfigError, line_of, raised_as, replacing, require
+from lcc_rl.functional.guard import check_independent
 from lcc_rl.pieces.base import ACTION, OBSERVATION, STEP, StepTransform
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.views import NEXT
+from lcc_rl.results.runs import differing, flatten
 
+BY_NEXT = "draw random numbers, or remember but by ('next', key) of a TensorDictModule"
 INITIAL = "is_init"  # key from which recurrent modules of TorchRL read that an episode begins
 
 
@@ -69,7 +74,15 @@ class GivenPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``("automated", "action")``, ``[*batch, vehicles, 1]``."""
-        observed, first = tensordict.get(OBSERVATION), tensordict.get(STEP) == 0
+        action = self._action(tensordict.get(OBSERVATION), tensordict.get(STEP) == 0)
+        size = action.detach().abs().cpu()
+        self.steps += 1
+        self.beyond = self.beyond + (size > 1.0 + 1e-5).float().mean()
+        self.largest = torch.maximum(self.largest, size.max())
+        return tensordict.set(ACTION, action)
+
+    def _action(self, observed: Tensor, first: Tensor) -> Tensor:
+        """Return the actions for observations, in whose type, and keep the module's memory."""
         td = TensorDict({OBSERVATION: observed}, observed.shape[:-2])
         if not self.grouped:
             first = first.unsqueeze(-2).expand(*observed.shape[:-1], 1).reshape(-1, 1)
@@ -85,12 +98,7 @@ class GivenPolicy(TensorDictModuleBase):
             td = self.module.eval()(td)
             self.module.train(training)
         self.kept = {key: td.get(after) for key, after in self.memory.items()}
-        action = td.get(self.action).reshape(*observed.shape[:-1], 1)
-        size = action.detach().abs().cpu()
-        self.steps += 1
-        self.beyond = self.beyond + (size > 1.0 + 1e-5).float().mean()
-        self.largest = torch.maximum(self.largest, size.max())
-        return tensordict.set(ACTION, action)
+        return td.get(self.action).reshape(*observed.shape[:-1], 1).to(observed.dtype)
 
     def clipped(self) -> str:
         """Return a warning if actions so far were beyond [−1, 1]; else nothing."""
@@ -103,16 +111,24 @@ class GivenPolicy(TensorDictModuleBase):
             "accelerations in m/s² by it"
         )
 
+    @torch.no_grad()
     def tried(self, moment: TensorDictBase) -> None:
-        """Check that it returns an action for the first state of an episode.
+        """Check that it returns actions, for each episode by its observations alone.
 
         Raises:
             ConfigError: with the error in one line.
         """
-        width = moment.get(OBSERVATION).shape[-1]
-        message = f"{self.name} fails for observations of {width} numbers"
-        with raised_as(ConfigError, message, Exception):  # any error of the user's module
-            self(moment)
+        seen = moment.get(OBSERVATION)
+        seen = seen.reshape(-1, *seen.shape[-2:])[:1].expand(2, -1, -1)
+
+        def play(*steps: Tensor) -> list[Tensor]:
+            firsts = (torch.full((len(seen), 1), n == 0) for n, seen in enumerate(steps))
+            return [self._action(*one) for one in zip(steps, firsts, strict=True)]
+
+        message = f"{self.name} fails for observations of {seen.shape[-1]} numbers"
+        with replacing(lambda error: ConfigError(f"{message}: {line_of(error)}")):
+            names = "first action", "second action"
+            check_independent(self.name, names, play, [seen, seen], BY_NEXT, 1e-2)
 
 
 def _anew(head: Transform) -> Transform:
@@ -156,6 +172,20 @@ def as_given(policy: Any, name: str) -> GivenPolicy | None:
     if (network := network_of(policy)) is None:
         return None
     return GivenPolicy(TensorDictModule(network, [OBSERVATION[-1]], [ACTION[-1]]), name)
+
+
+def check_observed(policy: GivenPolicy, env: TransformedEnv) -> None:
+    """Check that a model of stable-baselines3 observes as in its environment, if it has one.
+
+    Raises:
+        ConfigError: naming the settings of the observation that differ.
+    """
+    here = dict(flatten(observation_settings(env)))
+    for module in policy.modules():
+        there = dict(flatten(getattr(module, "observes", None) or here))
+        other = [f"observation.{key}={there.get(key)}" for key in differing(here, there)]
+        text = f"{policy.name} was trained with {', '.join(other)}, which are other here: "
+        require(not other, f"{text}give the variant and overrides of its environment")
 
 
 def network_of(policy: Any, normalize: Any = None) -> nn.Module | None:
@@ -208,6 +238,7 @@ class StableBaselinesPolicy(nn.Module):
         super().__init__()
         self.title, policy = type(model).__name__, model.policy
         vectors, names = self._wrappers(model.get_env() if normalize is None else normalize)
+        self.observes = vectors[-1].get_attr("observes", 0)[0] if vectors else None
         # Only models trained with VecNormalize have it; those with a replay buffer always do.
         raw = getattr(model, "_last_original_obs", None) is not None
         normalized = NORMALIZED in names or (vectors and hasattr(model, "replay_buffer"))

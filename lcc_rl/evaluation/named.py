@@ -82,22 +82,32 @@ def setting_of(spec: Any, where: str = "compare") -> str | Node:
         return Node.of(spec, where)
     if isinstance(spec, PathLike):
         return fspath(spec)
-    expected = "expected a run, a file, a controller, a torch module or a model"
-    known = callable(spec) and not isinstance(spec, nn.Module)
-    require(known, f"{where}: {expected}, got {in_short(spec)}")
+    message = f"{where}: expected a run, a file or a controller, got {in_short(spec)}"
+    if isinstance(spec, nn.Module) or hasattr(spec, "predict"):  # a model of stable-baselines3
+        message += "; lcc_rl.export(…, 'policy.onnx') makes a file of a torch network or a model"
+    require(callable(spec) and not isinstance(spec, nn.Module), message)
     return path_of(spec)
 
 
-def one_of(given: Any) -> tuple[str, Any]:
-    """Return name and setting of a policy or controller, or of a mapping of one by its name.
+def value_of(given: Any) -> tuple[str, Any]:
+    """Return a value and its name: "", or that of a mapping of one.
 
     Raises:
-        ConfigError: as :func:`setting_of`, or if the mapping has several.
+        ConfigError: if the mapping has several.
     """
     named = isinstance(given, Mapping) and TARGET not in given
     message = f"controller: expected one, such as {{'name': MyACC()}}, got {in_short(given)}"
     require(not named or len(given) == 1, message)
-    name, value = next(iter(given.items())) if named else ("", given)
+    return next(iter(given.items())) if named else ("", given)
+
+
+def one_of(given: Any) -> tuple[str, Any]:
+    """Return name and setting of a policy or controller, see :func:`value_of`.
+
+    Raises:
+        ConfigError: as :func:`setting_of`, or if the mapping has several.
+    """
+    name, value = value_of(given)
     spec = setting_of(value, "controller")
     return name or (spec if isinstance(spec, str) else label_of(spec)), spec
 

@@ -27,7 +27,7 @@ from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import POPULATION, Inputs, build_drivers, build_energy, constant_profiles
 from lcc_rl.errors import ConfigError, DataError, in_short, raised_as, require
 from lcc_rl.evaluation.entrants import Entrants
-from lcc_rl.evaluation.foreign import GivenPolicy
+from lcc_rl.evaluation.foreign import GivenPolicy, as_given
 from lcc_rl.evaluation.metrics import (
     METRICS,
     ROAD_METRICS,
@@ -36,7 +36,7 @@ from lcc_rl.evaluation.metrics import (
     energy_measures,
     safety_measures,
 )
-from lcc_rl.evaluation.named import controller_of, is_policy, one_of
+from lcc_rl.evaluation.named import controller_of, is_policy, one_of, value_of
 from lcc_rl.evaluation.rollout import Player, Record, reset_options, warn_of_brakes, warn_of_idle
 from lcc_rl.evaluation.rows import INDEX, highest
 from lcc_rl.evaluation.strategies import Strategy
@@ -113,7 +113,8 @@ def simulate(
         string: the vehicles behind the leader from front to back, see docs/strings.md.
         controller: controller or policy of the automated vehicles, as for
             :func:`lcc_rl.compare`, or a mapping of one by its name, with ``_filtered`` to put it
-            behind the safety filter; None: an IDM driver without noise.
+            behind the safety filter; None: an IDM driver without noise. A policy of another library
+            reads the observation of ``alcc``.
         drivers: a table of ``lcc-rl calibrate`` or a population of
             :mod:`lcc_rl.drivers.population`; None: those of ``overrides`` or the shipped ones. The
             first human is the first driver of it in the first repeat, the second in the next one.
@@ -140,11 +141,11 @@ def simulate(
     mix = f"'{string}'"
     if not isinstance(string, str):
         mix = f"{{{', '.join(f'{key}: {value}' for key, value in string.items())}}}"
-    name, spec = ("", None) if controller is None else one_of(controller)
+    name, spec, policies = _resolved(controller)
     reads = () if spec is None or is_policy(spec) else controller_of(spec).kind.reads
     settings = (
         *("evaluation.baselines=[]", "evaluation.behind_filter=[]", "evaluation.warm_up=0"),
-        f"variant={'alcc' if is_policy(spec) else 'idm'}",
+        f"variant={'alcc' if policies or is_policy(spec) else 'idm'}",
         *(["drivers=calibrated", f"drivers.path={quoted(drivers)}"] if table else []),
         *(["scenario=platoon"] * (not MESSAGES.isdisjoint(reads)) + list(overrides)),
         *(f"scenario.string={mix}", f"scenario.time_step={float(time_step)!r}"),
@@ -155,14 +156,26 @@ def simulate(
         (cfg.scenario.road == RING) == (leader is None),
         "simulate: a ring (scenario=ring in overrides) has leader=None, an open road has a leader",
     )
-    require(cfg.automated or spec is None, "simulate: controller has no vehicle to drive in string")
+    require(
+        cfg.automated or controller is None,
+        "simulate: controller has no vehicle to drive in string",
+    )
     people = build_drivers(cfg) if table or drivers is None else drivers
     fits = all(hasattr(people, name) for name in POPULATION)
     require(fits, f"drivers: not a population: {in_short(people)}")
     inputs = Inputs(no_profiles(time_step), profiles, people)
-    strategy = Entrants(cfg, spec is None, typed=overrides).strategies(inputs)[-1]
+    strategy = Entrants(cfg, controller is None, policies, overrides).strategies(inputs)[-1]
     given = [word for word in overrides if top_key(word) == "drivers"]
     return _driven(strategy, inputs, repeats, seed, given + ["drivers"] * (drivers is not None))
+
+
+def _resolved(controller: Any) -> tuple[str, Any, dict[str, GivenPolicy]]:
+    """Return a controller's name and setting, or a policy of another library by its name."""
+    if controller is None:
+        return "", None, {}
+    name, value = value_of(controller)
+    policy = as_given(value, name or type(value).__name__)
+    return (*one_of(controller), {}) if policy is None else ("", None, {policy.name: policy})
 
 
 def _profiles(leader: Any, time_step: float, seconds: float | None) -> Profiles:
@@ -200,6 +213,7 @@ def _record(leader: Any, time_step: float) -> Tensor:
         return resample(*read_speed_record(fspath(leader), hard), time_step)
     message = "simulate: leader must be speeds [m/s], a shipped cycle or a file"
     with raised_as(ConfigError, message, ValueError, TypeError):
+        leader = leader.detach().cpu().numpy() if isinstance(leader, Tensor) else leader
         record = torch.from_numpy(np.array(np.ma.filled(leader, np.nan), dtype=np.float32))
         if record.ndim != 1:
             raise ValueError(f"got an array of shape {list(record.shape)}; give a column of speeds")
@@ -246,6 +260,8 @@ def _driven(
         log.warning("without effect on these vehicles: %s", ", ".join(idle))
     record, alive = player.play(options)
     warn_of_idle([player.idle])
+    if isinstance(strategy.policy, GivenPolicy) and (text := strategy.policy.clipped()):
+        log.warning("%s", text)
     return _Motion(cfg, record, player.start, alive).tables()
 
 

@@ -187,12 +187,12 @@ GAP_NOISE_TIME = 2.0  # time constant of the noise of the perceived gap [s]
 
 @dataclass(frozen=True)
 class NoiseStep:
-    """A step of a smooth noise, exact for any time step.
+    """A step of a smooth noise with the standard deviation 1 at any time step.
 
     The noise is white noise behind two low-pass filters of one time constant. Its jerk is finite,
     as that of a pedal; an Ornstein–Uhlenbeck process has one low-pass filter only. With
-    z ~ N(0, 1), xₖ = 2ρ xₖ₋₁ − ρ² xₖ₋₂ + c z has the standard deviation 1; successive values have
-    the correlation ``linked``.
+    z ~ N(0, 1), xₖ = 2ρ xₖ₋₁ − ρ² xₖ₋₂ + c z. The correlation ``linked`` of successive values is
+    that of continuous filters for short steps: 1 − linked is 9 % larger at 0.1 s, 31 % at 0.5 s.
 
     Args:
         kept: ρ.

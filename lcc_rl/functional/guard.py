@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import FunctionType, ModuleType
 from typing import Any
 
@@ -19,6 +20,8 @@ AS_ENTRY = (
     "a state must be an entry, which a controller of a class names in remembers, see "
     "docs/controllers.md"
 )
+BY_SEED = "remember, or draw random numbers but by the episode's seed"
+BESIDE, ALONE = 64, 6  # episodes with drawn inputs, and how many of them play alone
 
 
 def unchanged(
@@ -54,25 +57,71 @@ def changed(title: str, name: str) -> ConfigError:
     )
 
 
-def check_independent(title: str, entry: str, beside: Tensor, alone: Tensor, again: Tensor) -> None:
-    """Refuse numbers of an episode that depend on others, on earlier calls or on chance.
+def check_independent(
+    title: str,
+    names: Sequence[str],
+    function: Callable[..., Sequence[Tensor]],
+    inputs: Sequence[Tensor],
+    remedy: str = BY_SEED,
+    near: float = 1e-4,
+) -> None:
+    """Refuse a function whose numbers of an episode depend on others, earlier calls or chance.
+
+    It is called with the given inputs and with drawn ones, because an ``if`` may have the same
+    outcome for all given episodes. Drawn inputs that it does not accept are passed over.
 
     Args:
-        title: what computed them.
-        entry: their name.
-        beside: those of the episode beside another.
-        alone: those without another.
-        again: those without another, a second time.
+        title: what computes the numbers.
+        names: those of the function's results, in order.
+        function: maps inputs to results; the first dimension of each is that of the episodes.
+        inputs: those of some episodes.
+        remedy: what to do instead.
+        near: largest difference that counts as none.
 
     Raises:
-        ConfigError: naming the title and the entry.
+        ConfigError: naming the title and the numbers.
     """
-    first, second, third = (x.nan_to_num().double() for x in (beside, alone, again))
-    require(
-        torch.equal(second, third) and torch.allclose(first, second, rtol=1e-3, atol=1e-4),
-        f"{title} gives an episode other {entry} alone, or in the same step again: it must not mix "
-        "episodes (mean() of a batch), remember, or draw random numbers but by the episode's seed",
-    )
+    for given in (inputs, *_examples(inputs)):
+        rows = (*range(min(len(given[0]), ALONE)), 0)
+        try:
+            with torch.random.fork_rng(devices=[]), warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # of numbers that no car has
+                alone = [function(*(x[row : row + 1].clone() for x in given)) for row in rows]
+                beside = function(*(x.clone() for x in given))
+            several = zip(names, beside, zip(*alone, strict=True), strict=True)
+            wrong = [name for name, found, each in several if not _same(found, each, near)]
+        except Exception:
+            if given is inputs:
+                raise
+            continue
+        text = f"{title} gives an episode other {', '.join(wrong)} alone, or in the same step again"
+        mixing = "mix episodes (mean() of a batch; if with any(): use torch.where)"
+        require(not wrong, f"{text}: it must not {mixing}, {remedy}")
+
+
+def _same(beside: Tensor, alone: Sequence[Tensor], near: float) -> bool:
+    """Whether rows alone, and the first of them a second time, are the first ones of all rows."""
+    *rows, again = (x.nan_to_num().double() for x in alone)
+    first, both = beside[: len(rows)].nan_to_num().double(), torch.cat(rows)
+    same = torch.equal(rows[0], again) and first.shape == both.shape
+    return same and torch.allclose(first, both, rtol=1e-3, atol=near)
+
+
+def _examples(inputs: Sequence[Tensor]) -> Iterator[list[Tensor]]:
+    """Yield inputs of drawn episodes: numbers are scaled by 0 or 0.02 to 12, then shifted, too."""
+    generator = torch.Generator().manual_seed(0)
+    for shift in (0.0, 3.0):
+        # All numbers of an episode share a part of the scale.
+        found, shared = [], 3.0 * torch.rand(BESIDE, generator=generator) - 2.0
+        for given in inputs:
+            x = given.detach()[torch.arange(BESIDE) % len(given)]
+            chance, scale = torch.rand((2, *x.shape), generator=generator)
+            moved = shift * torch.randn(x.shape, generator=generator)
+            scale = (shared.reshape(-1, *[1] * (x.ndim - 1)) + 3.5 * scale - 2.0).exp()
+            if x.is_floating_point():
+                x = x * (scale * (chance > 0.1)).to(x) + moved.to(x)
+            found.append((chance > 0.5).to(x.device) if x.dtype == torch.bool else x)
+        yield found
 
 
 def _kept(item: Any) -> dict[str, list[Any]]:

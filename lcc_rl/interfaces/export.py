@@ -88,7 +88,9 @@ def c_code(module: DrivingProgram, about: str, name: str) -> str:
         for i in recorder.needed(variable for output in outputs for variable in output):
             body += _statement(i, *recorder.statements[i], types)
     except Untranslatable as error:
-        raise ConfigError(f"C code of this policy or rule: {error} is not supported") from error
+        memory = f", with a memory of {module.width} numbers," * (module.width > 0)
+        text = f"C code of this policy or rule{memory} is not supported: {error}; use .onnx or .pt2"
+        raise ConfigError(text) from error
     body += [f"memory[{index}] = v{i};" for index, i in enumerate((*outputs, ())[1])]
     lines = "".join(f"    {line}\n" for line in [*body, f"return v{outputs[0][0]};"])
     inputs = [described_input(name) for name in module.names]

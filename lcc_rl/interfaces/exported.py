@@ -24,7 +24,7 @@ from lcc_rl.envs.factory import build_env
 from lcc_rl.envs.inputs import constant_profiles
 from lcc_rl.envs.step import pieces_of, read_before
 from lcc_rl.errors import ConfigError, require
-from lcc_rl.evaluation.foreign import as_given
+from lcc_rl.evaluation.foreign import as_given, check_observed
 from lcc_rl.evaluation.strategies import with_weights
 from lcc_rl.functional.pattern import AUTOMATED, HUMAN, VehicleString
 from lcc_rl.pieces import Action, CBFFilter, Controller, Observation
@@ -323,6 +323,7 @@ def program(
     leader = constant_profiles(10.0, scenario.horizon, scenario.time_step, ["constant"])
     env = build_env(cfg, leader, population)
     if isinstance(policy, nn.Module) and (foreign := as_given(policy, type(policy).__name__)):
+        check_observed(foreign, env)
         foreign.tried(env.reset())
     pieces = pieces_of(env)
     by_kind = {kind: [p for p in pieces if isinstance(p, kind)] for kind in (Observation, Action)}

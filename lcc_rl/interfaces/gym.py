@@ -21,6 +21,7 @@ from lcc_rl.envs.arrays import LARGEST_SCALED, ArrayEpisodes
 from lcc_rl.envs.clock import checked_seed
 from lcc_rl.envs.factory import make_env
 from lcc_rl.envs.rowwise import Array
+from lcc_rl.envs.step import observation_settings
 from lcc_rl.errors import ConfigError, require, require_known
 
 GYM_VARIANTS = ("alcc", "reference", "own_energy")
@@ -109,6 +110,7 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         render_mode: str | None = None,
     ) -> None:
         self.episodes = _episodes(variant, 1, overrides, held_out, render_mode)
+        self.observes = observation_settings(self.episodes.env)  # read from a model's environment
         self.render_mode = render_mode
         self.observation_space, self.action_space = _spaces(self.episodes)
         self.running = False
@@ -135,7 +137,7 @@ class CarFollowing(gymnasium.Env[Array, Array]):
         """Play one step."""
         if not self.running:
             raise ResetNeeded("call reset before the first step, and after the last of an episode")
-        results = self.episodes.step([action])
+        results = self.episodes.step([action], alone=True)
         reward, terminated, truncated, *terms = results[0].tolist()
         self.running = not (terminated or truncated)
         info = {TERMS_INFO: dict(zip(self.episodes.terms, terms, strict=True))}

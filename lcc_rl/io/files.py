@@ -212,7 +212,8 @@ def _constants(columns: Mapping[str, Any]) -> ds.Expression:
 def _read(path: str | Path, reader: Callable[[Path], Any]) -> Any:
     """Read a parquet file, or raise a ResultsError of one line."""
     path = Path(path)
-    with raised_as(ResultsError, f"{path}: not readable as parquet", pa.ArrowException, OSError):
+    faults = pa.ArrowException, OSError, UnicodeDecodeError  # the last of damaged names
+    with raised_as(ResultsError, f"{path}: not readable as parquet", *faults):
         check_file(path)
         return reader(path)
 

@@ -82,7 +82,7 @@ class Drivers(Controller):
     latest = Entry("role.acceleration_noise", "m/s²", "noise of the acceleration, latest first", 2)
     gap_latest = Entry("role.gap_noise", "–", "noise of ln(perceived gap), latest first", 2)
     law: ClassVar[type[DriverConstants]] = IDMConstants
-    tells_gap: ClassVar[bool] = False  # whether the equilibrium gap is written
+    tells_gap = False  # whether the equilibrium gap is written
     further: ClassVar[tuple[str, ...]] = ()  # entries of the role that acceleration reads, too
     desired_speeds: ClassVar[Tensor]
     time_gaps: ClassVar[Tensor]
@@ -304,6 +304,7 @@ class DriverModel(Drivers):
         own = f"controller@scenario.controllers.{HUMAN}=calibrated drives each by its own"
         require(shared, f"{where}: drivers differ in model, a, b or s0; {own}")
         self.reads_drivers = not single or constants != self.law()
+        self.tells_gap = self.tells_gap or self.parameters is not None
         return (*drivers[:2], constants)
 
 

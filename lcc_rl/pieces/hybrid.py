@@ -52,7 +52,7 @@ class Hybrid(Controller):
     A subclass names entries in ``reads`` and defines :meth:`choose`.
     """
 
-    rule: InstanceOf[Controller]  # its command is one candidate
+    rule: InstanceOf[Controller]  # without memory; its command is one candidate
     max_acceleration: Positive = MAX_ACCELERATION  # acceleration of action 1 [m/s²]
 
     takes_action = True
@@ -69,6 +69,8 @@ class Hybrid(Controller):
     def declare(self, world: World, reads: Any = None, *others: Any, **named: Any) -> None:
         """Read the action, the entries of the choice and those of the rule."""
         self.rule = self.rule.bind(world, self.name)
+        kept = ", ".join(".".join(key) for key in self.rule.targets[1:])
+        require(not kept, f"{self.title}.rule: {self.rule.title} remembers {kept}; it must not")
         own = self.reads if reads is None else reads
         self.weighed = len(own)
         super().declare(world, [f"{self.name}.action", *own, *self.rule.names], *others, **named)

@@ -30,7 +30,7 @@ from lcc_rl.pieces.base import (
 from lcc_rl.pieces.cbf import CBFFilter
 from lcc_rl.pieces.connected import Communication
 from lcc_rl.pieces.controllers import Controller
-from lcc_rl.pieces.leader import NEXT_SPEED, PROFILE, PROFILE_START, NGSIMLeader
+from lcc_rl.pieces.leader import NEXT_SPEED, PROFILE, PROFILE_START, NGSIMLeader, perturbed
 from lcc_rl.pieces.sensors import Sensors
 from lcc_rl.pieces.views import EPISODE, LEADER, NEXT, VEHICLES, Key, Views
 from lcc_rl.pieces.world import World
@@ -67,6 +67,7 @@ class LeaderPreview(Feature):
         require(not world.replaced, "a preview reads the record of a leader that is replaced")
         self.declare(world, writes=[self.known.wide((1, len(self.horizons)))])
         self.stream = stream_id("preview.noise")
+        self.perturbation, self.time_step = world.perturbation, world.time_step
         where = f"scenario.pieces.{self.name}"
         late = world.steps(self.delay, f"{where}.delay")
         steps = [world.steps(ahead, f"{where}.horizons") - late for ahead in self.horizons]
@@ -80,6 +81,9 @@ class LeaderPreview(Feature):
     def compute(self, profile: Tensor, start: Tensor, seed: Tensor, step: Tensor) -> Tensor:
         index = torch.minimum(start + step + self.shift, self.last[profile]).clamp(min=0)
         speed = self.speeds[self.offsets[profile] + index]
+        if self.perturbation:
+            seconds = (step + self.shift).clamp(min=0) * self.time_step
+            speed = perturbed(speed, seconds, seed, self.perturbation)
         if self.noise:
             error = normal(seed, step, self.stream + self.columns)
             speed = (speed + self.noise * error).clamp(min=0.0)

@@ -16,10 +16,26 @@ from lcc_rl.pieces.views import EPISODE
 from lcc_rl.pieces.world import World
 from lcc_rl.settings import NonNegative
 
+PERTURBATION = [stream_id(f"leader.perturbation.{letter}") for letter in "cAtp"]
 PROFILE, PROFILE_START = ("leader", "profile"), ("leader", "start")
 LEADER_SPEED, LEADER_ACCELERATION, NEXT_SPEED = (
     ("leader", name) for name in ("speed", "acceleration", "next_speed")
 )
+
+
+def perturbed(speed: Tensor, seconds: Tensor, seed: Tensor, size: float) -> Tensor:
+    """Return a perturbed leader's speeds [m/s], see :class:`NGSIMLeader`.
+
+    Args:
+        speed: v of the record, any shape [m/s].
+        seconds: t, the time since the start of the episode, of a shape that broadcasts [s].
+        seed: the episode's seed.
+        size: p.
+    """
+    share, height, period, phase = (uniform(seed, 0, stream) for stream in PERTURBATION)
+    angle = 2 * math.pi * (seconds / (4.0 + 16.0 * period) + phase)
+    factor = 1.0 + size * 0.4 * (share - 0.5)
+    return (factor * speed + size * height * angle.sin()).clamp(min=0.0)
 
 
 class NGSIMLeader(StepTransform):
@@ -72,7 +88,6 @@ class NGSIMLeader(StepTransform):
         self.time_step, self.names = world.time_step, profiles.names
         self.profile_stream = stream_id("leader.profile")
         self.start_stream = stream_id("leader.start")
-        self.streams = [stream_id(f"leader.perturbation.{letter}") for letter in "cAtp"]
         self.register_buffer("speeds", profiles.speeds)
         self.register_buffer("offsets", profiles.offsets)
         self.register_buffer("lengths", profiles.lengths)
@@ -98,12 +113,8 @@ class NGSIMLeader(StepTransform):
         if self.foresight:
             sample = torch.minimum(sample, self.lengths[profile] - 1)
         speed = self.speeds[self.offsets[profile] + sample]
-        if not self.perturbed:
-            return speed
-        share, height, period, phase = (uniform(seed, 0, stream) for stream in self.streams)
-        angle = 2 * math.pi * (step * self.time_step / (4.0 + 16.0 * period) + phase)
-        factor = 1.0 + self.perturbed * 0.4 * (share - 0.5)
-        return (factor * speed + self.perturbed * height * angle.sin()).clamp(min=0.0)
+        size, seconds = self.perturbed, step * self.time_step
+        return perturbed(speed, seconds, seed, size) if size else speed
 
     def begin(self, given: TensorDictBase, start: TensorDictBase) -> None:
         seed = start.get(SEED)

@@ -107,17 +107,20 @@ class Sensors(RoleTransform):
             for name in ("delay", "longest_dropout", "lost_for")
         )
         errors = (self.gap_error, self.speed_error, self.ahead_error, self.scale_error)
-        return Sensing(*errors, late, max(self.longest, self.lost))
+        # A loss may follow a drop-out, and end within another one.
+        longest = self.lost + (2 if self.lost else 1) * self.longest
+        return Sensing(*errors, late, longest)
 
     def compute(self, memory: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
         *now, seed, step = inputs
         frames = join([*now, memory[..., AGES : -len(TRUE_STATE)]], -1)
         ages, missing = memory[..., :AGES], uniform(seed, step, self.missing + self.index)
-        kept = (missing < self.dropouts) & (ages < self.sensing.late + self.longest)
+        # The own speed's age counts the steps of a drop-out, the target's those of a loss, too.
+        kept = (missing < self.dropouts) & (ages[..., 1:] < self.sensing.late + self.longest)
+        lost = torch.zeros_like(kept)
         if self.lost_from is not None:
-            lost = (step > self.first_lost) & (step <= self.first_lost + self.lost)
-            target, own = kept.split(1, -1)
-            kept = join([target | lost & (ages[..., :1] < self.sensing.oldest), own], -1)
+            lost = ((step > self.first_lost) & (step <= self.first_lost + self.lost)) | lost
+        kept = join([kept | lost, kept], -1)
         ages = torch.where(kept, ages + 1.0, float(self.sensing.late))
         return self._measured(frames, ages, seed, step)
 

@@ -18,6 +18,7 @@ from lcc_rl.pieces.world import Part, World
 from lcc_rl.settings import Factors, NonNegative, Positive
 
 DEFAULT_TIME_GAP = 1.5  # [s]
+RECORDED_GAP = "it starts at the recorded gap; time_gap=1.5 sets another"
 GAP_STREAM, SPEED_STREAM = stream_id("platoon.gap"), stream_id("platoon.speed")
 
 
@@ -50,10 +51,15 @@ class TimeGapStart(Part):
         self.stream = stream_id(f"{stream_name(self.name)}.gap_factor")
         self.lowest, self.highest = world.deviations(self.gap_range)
         self.given = DEFAULT_TIME_GAP if self.time_gap == "recorded" else float(self.time_gap)
-        profiles, first = world.profiles, world.string.places(self.name)[:1] == (0,)
-        recorded = first and not world.string.drawn and profiles is not None
+        profiles, places = world.profiles, world.string.places(self.name)
+        recorded = places[:1] == (0,) and not world.string.drawn and profiles is not None
         recorded = recorded and profiles.followers is not None and self.time_gap == "recorded"
         self.records = (profiles.followers, profiles.offsets) if recorded else None
+        changed = self.standstill_gap != type(self).standstill_gap
+        # Changed settings without effect on this role, and why.
+        self.idle = (
+            {"standstill_gap": RECORDED_GAP} if recorded and changed and len(places) == 1 else {}
+        )
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""

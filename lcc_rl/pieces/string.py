@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.layout import join, reverse
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import between, stream_id, uniform
@@ -135,8 +135,18 @@ class StringMotion(StepTransform):
         missing = [role for role in string.names if role not in self.start]
         if missing and not string.ring:
             raise ConfigError(f"scenario.start has no entry for {', '.join(missing)}")
+        self._check_starts()
         order = [place for role in string.names for place in string.places(role)]
         self.arrange = selector([order.index(place) for place in range(len(order))], len(order))
+
+    def _check_starts(self) -> None:
+        """Refuse settings of starts without effect, unless another role uses the same value."""
+        idle = {role: getattr(start, "idle", {}) for role, start in self.starts.items()}
+        for role, name in ((role, name) for role, names in idle.items() for name in names):
+            value = getattr(self.starts[role], name)
+            users = [x for other, x in self.starts.items() if name not in idle[other]]
+            text = f"scenario.start.{role}.{name}={value:g} has no effect: {idle[role][name]}"
+            require(value in [getattr(x, name, None) for x in users], text)
 
     def _ring_gaps(self, world: World) -> tuple[float, float]:
         """Return least and largest gap on a ring [m]; :meth:`begin` uses the lengths of classes."""

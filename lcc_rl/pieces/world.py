@@ -41,6 +41,7 @@ class World:
         max_braking: hardest braking of automated vehicles [m/s²].
         max_acceleration: largest acceleration of automated vehicles [m/s²].
         replaced: whether the leader is replaced during episodes.
+        perturbation: of the leader's speed, see :class:`lcc_rl.pieces.NGSIMLeader`.
         slope: the grade of the road, :class:`lcc_rl.pieces.Slope`; None: a level road.
         limited_by: section of the limits, for messages.
     """
@@ -58,6 +59,7 @@ class World:
     max_braking: float = MAX_ACCELERATION
     max_acceleration: float = MAX_ACCELERATION
     replaced: bool = False
+    perturbation: float = 0.0
     slope: Any = None
     limited_by: str = "scenario"
 

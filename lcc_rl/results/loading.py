@@ -252,7 +252,9 @@ def _of_one_type(values: Sequence[Any]) -> list[Any]:
 
 def _frame(parts: Mapping[Path, pa.Table], constants: Runs) -> pd.DataFrame:
     """Return tables with their constant columns as one data frame."""
-    table = pa.concat_tables(parts.values(), promote_options="permissive")
+    # Without the metadata of pandas, which may differ between tables, or be damaged.
+    plain = (rows.replace_schema_metadata() for rows in parts.values())
+    table = pa.concat_tables(plain, promote_options="permissive")
     counts = [len(rows) for rows in parts.values()]
     integers = {
         name: table[name].to_pandas(types_mapper=NULLABLE.get)
@@ -264,8 +266,7 @@ def _frame(parts: Mapping[Path, pa.Table], constants: Runs) -> pd.DataFrame:
         values = pd.Series([constants[path][key] for path in parts])
         values = values if is_numeric_dtype(values) else values.astype("category")
         columns[key] = values.repeat(counts).array
-    # Without the metadata of pandas, which may differ between tables.
-    frame = table.to_pandas(split_blocks=True, self_destruct=True, ignore_metadata=True)
+    frame = table.to_pandas(split_blocks=True, self_destruct=True)
     return pd.concat([frame.assign(**integers), pd.DataFrame(columns, copy=False)], axis=1)
 
 

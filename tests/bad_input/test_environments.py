@@ -20,7 +20,7 @@ from lcc_rl.envs import DifferentiableRollout, StringCollector, build_env, make_
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.guard import _variables
 from lcc_rl.interfaces.driver import Driver
-from lcc_rl.pieces import Controller, Feature, Law
+from lcc_rl.pieces import Controller, Feature, Law, RewardTerm
 from lcc_rl.pieces.base import REWARD
 from lcc_rl.settings import path_of
 
@@ -96,11 +96,24 @@ def test_an_impossible_batch_seed_or_device() -> None:
 
 def test_settings_of_trainings_have_no_effect_on_an_environment() -> None:
     cases = [
-        ("seed=7", r"^seed=7 has no effect: use make_env\(seed=…\)"),
+        ("seed=7", r"^seed=7 has no .*: use make_env\(seed=…\), or reset\(seed=…\) in Gymnasium"),
         ("training={environments: 3}", r"use make_env\(batch_size=…\)"),
+        ("agent.hold=5", r"^agent\.hold=5 .*: use scenario\.controllers\.automated\.hold=…"),
+        ("agent.humans_first=5", "has no effect: it belongs to the learners of lcc-rl train"),
+        *((f"evaluation.{x}=3", "has no effect: nothing is eval") for x in ("drivers", "profiles")),
+        ("evaluation={seed: 3}", "nothing is evaluated"),
     ]
     check_refused(lambda word: make_env("alcc", overrides=[word]), cases)
+    cases = [
+        ("training.gap_range=[1,1]", "only episodes of a training draw it"),
+        ("scenario.controllers.human.time_gap_range=[1,2]", "only episodes of a training draw it"),
+        ("agent.hold=5", "has no effect"),
+        ("evaluation.batch_size=3", "nothing is evaluated"),
+    ]
+    check_refused(lambda word: make_env("alcc", overrides=[word], held_out=True), cases)
     assert make_env("alcc", 2, ["experiment=smoke", "training.gap_range=[0.5,0.6]"])
+    given = ["experiment=smoke", "evaluation.profiles=1", "agent=ppo"]
+    assert make_env("alcc", 2, given, held_out=True)
 
 
 def test_seeds_that_would_play_the_same_episodes_are_refused(envs) -> None:
@@ -208,6 +221,24 @@ def drawing(speed):
     return torch.randn_like(speed)
 
 
+def alarmed(gap, speed):
+    return 0.1 * (gap - 2.0 * speed) - (3.0 if (gap < 0.5 * speed + 3.0).any() else 0.0)
+
+
+def careful(gap, speed):
+    """Branches, and refuses states, as a right rule may."""
+    assert (speed >= 0.0).all()
+    command = 0.1 * (gap - 2.0 * speed)
+    return torch.where(gap < 3.0, -3.0, command) if (gap < 3.0).any() else command
+
+
+class Crowded(RewardTerm):
+    reads = ("self.gap",)
+
+    def reward(self, gap):
+        return -gap if gap.max() > 60.0 else 0.0 * gap
+
+
 class Counting(Controller):
     """Counts its calls in its class, where no check of attributes looks."""
 
@@ -290,7 +321,7 @@ def test_a_function_that_remembers_in_a_variable_is_refused() -> None:
 
 def test_a_command_is_of_one_episode_and_one_step_alone() -> None:
     words = "{} gives an episode other automated.command alone, or in the same step again"
-    for name in ("mixing", "drawing"):
+    for name in ("mixing", "drawing", "alarmed"):
         law = {"_target_": path_of(Law), "law": f"{__name__}.{name}"}
         with pytest.raises(ConfigError, match=words.format(f"{__name__}.{name}")):
             driven_by("controllers", "automated", law)
@@ -298,6 +329,11 @@ def test_a_command_is_of_one_episode_and_one_step_alone() -> None:
             Driver(f"{__name__}.{name}", 0.1)
     with pytest.raises(ConfigError, match=words.format("Counting")):
         driven_by("controllers", "automated", {"_target_": f"{__name__}.Counting"})
+    term = f"+reward.terms.crowded={{_target_: {__name__}.Crowded}}"
+    with pytest.raises(ConfigError, match=r"Crowded gives an episode other .*: use torch\.where"):
+        build_env(compose("alcc", term), wavy_profiles(), bootstrap(), 2)
+    driven_by("controllers", "automated", {"_target_": path_of(Law), "law": f"{__name__}.careful"})
+    Driver(f"{__name__}.careful", 0.1)
 
 
 def test_pieces_and_controllers_inside_others_are_held_to_it_too() -> None:

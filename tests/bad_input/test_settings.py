@@ -97,6 +97,8 @@ IGNORED = {
     "variant=cacc split.by=vehicle": "leader=trajectories",
     f"controller@{AUTO}=handover agent=td3": "handover drives the .* uses no action",
     "scenario.circumference=200": "belongs to scenario.road=ring",
+    "scenario=ring scenario.start.human.cap_time_gap=2": "of a ring start evenly spaced",
+    "scenario=ring training.gap_range=[1,1]": "of a ring start evenly spaced",
     "variant=idm training.episodes=20": "variant idm has no agent",
     "variant=alcc scenario.string=human*3 training.episodes=20": "no vehicle .* is automated",
     f"variant=direct {AUTO}.max_acceleration=2": "no vehicle of the string is automated",
@@ -118,7 +120,8 @@ IGNORED = {
 # Settings of an evaluation of a policy without effect, by variant, and why.
 OF_TRAINING = "has the (settings|agent) of its training"
 EVALUATED = {
-    "alcc training.gap_range=[0.2,0.3]": OF_TRAINING,
+    "alcc training.segment=20": OF_TRAINING,
+    "alcc training.gap_range=[0.2,0.3]": "only episodes of a training draw it",
     "alcc agent.hold=5": OF_TRAINING,
     "alcc scenario.controllers.human.time_gap_range=[1,2]": "only episodes of a training draw it",
     "alcc agent=ppo": f"{OF_TRAINING}, analytic",

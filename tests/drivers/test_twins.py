@@ -173,6 +173,9 @@ def test_the_search_for_a_reaction_reports_its_progress(monkeypatch) -> None:
     seen = []
     tried(observe(episodes), known, lambda *state: seen.append(state))
     assert seen == [(13, 26, "reactions tried"), (26, 26, "reactions tried")]
+    monkeypatch.setattr(twins, "DELAYS", (0.0, 0.2, 0.3, 0.9))
+    every = tried(observe(episodes.iloc[::5]), known)  # two samples a second
+    assert {reaction.delay for reaction in every} == {0.0, 0.5, 1.0}  # what is driven
 
 
 def test_noises_of_the_gap_are_tried_and_weigh_rough_leaders_only_where_asked(monkeypatch) -> None:

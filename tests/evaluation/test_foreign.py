@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
+from itertools import count
+
+import numpy as np
 import pytest
 import torch
 from commands import NO_AGENT
@@ -141,6 +145,40 @@ def test_actions_beyond_their_range_are_named(caplog) -> None:
     (line,) = [one for one in caplog.messages if "beyond" in one]
     assert line.startswith("loud: ")
     assert "share of the largest acceleration" in line
+
+
+CALLS = count()
+MIXING = [
+    lambda net, seen: net(seen - seen.mean(0)),
+    lambda net, seen: net(seen) * (0.5 if (seen > 2.0).any() else 1.0),
+    lambda net, seen: net(nn.functional.dropout(seen)),
+    lambda net, seen: net(seen) + 0.001 * next(CALLS),
+]
+
+
+def test_a_policy_acts_by_the_observations_of_a_row_alone() -> None:
+    moment = lcc_rl.make_env("alcc", 1, [*NO_AGENT], seed=0, single=False).reset()
+    words = r"x gives an episode other .*second action alone, or in the same .* \('next', key\)"
+    cases = [(TensorDictModule(partial(act, networks()[0]), *ROOT), words) for act in MIXING]
+    check_refused(lambda policy: as_given(policy, "x").tried(moment), cases, ConfigError)
+    normed = nn.Sequential(nn.BatchNorm1d(WIDTH), nn.Dropout(), networks()[0])
+    for right in (normed, *networks()[1].values()):
+        (given := as_given(right, "x")).tried(moment)
+        assert not given.clipped()
+
+
+def test_actions_and_weights_may_have_another_type() -> None:
+    network, half = networks()[0], networks()[0].bfloat16()
+    rounded = TensorDictModule(lambda seen: seen.bfloat16(), ["observation"], ["seen"])
+    policies = {
+        "a": network,
+        "b": TensorDictModule(lambda seen: network(seen).double(), *ROOT),
+        "c": TensorDictSequential(rounded, TensorDictModule(half, ["seen"], ["action"])),
+    }
+    found = lcc_rl.compare(policies, overrides=SMALL).rows
+    plain, same, near = (x for _, x in found.groupby("strategy")["total_path_energy_kj"])
+    np.testing.assert_array_equal(plain, same)
+    np.testing.assert_allclose(plain, near, rtol=0.05)
 
 
 def test_a_recurrent_policy_of_torchrl_drives() -> None:

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 import torch
 from helpers import POPULATION, check_refused, wavy_profiles
+from tensordict.nn import TensorDictModule
 
 import lcc_rl
 from lcc_rl.assets import ASSETS
@@ -22,11 +23,13 @@ from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.entrants import Entrants
 from lcc_rl.evaluation.episodes import evaluate
 from lcc_rl.evaluation.metrics import METRICS
+from lcc_rl.interfaces.driver import Driver
 from lcc_rl.pieces import Controller
 
 STEPS = 200
 MARGIN = "scenario.filters.automated.margin"
 WAVE = 8.0 + 3.0 * np.sin(0.1 * np.arange(STEPS + 1) / 4.0)
+EPOCH = pd.DataFrame({"time_s": 1.7e12 + 100.0 * np.arange(9), "speed_mps": 9.0})
 BEHIND = {"leader": WAVE, "string": "automated"}
 QUICK = ["scenario.horizon=200", "evaluation.baselines=[]", "evaluation.warm_up=0"]
 
@@ -184,10 +187,12 @@ def test_wrong_arguments_are_named(tmp_path) -> None:
         ({"leader": WAVE, "overrides": ["scenario=ring"]}, "an open road has a leader"),
         ({"leader": [3.0]}, "at least two speeds"),
         ({"leader": []}, "at least two speeds"),
+        ({"leader": torch.ones(2, 3, requires_grad=True)}, r"shape \[2, 3\]; give a column"),
         ({"leader": [3.0, -1.0]}, "speed 1, at 0.1 s, is -1, not from 0 to 70 m/s"),
         ({"leader": [3.0, np.inf], "time_step": 0.2}, "speed 1, at 0.2 s, is inf, not from 0"),
         ({"leader": np.ones((2, 3))}, r"speeds .*shape \[2, 3\]; give a column"),
         ({"leader": pd.DataFrame({"v": WAVE})}, "^the data frame: lacks .*time_s"),
+        ({"leader": EPOCH}, r"expected a number .* s; is it in ms, us or ns \(convert it\)\?$"),
         ({"leader": pd.DataFrame({"v": [1, "x"]})}, "^the data frame: .*Could not convert 'x'"),
         ({"leader": 12.0 * WAVE}, r"leader must be speeds .*is 96, not .*in km/h"),
         ({"leader": np.ma.masked_greater(WAVE, 9.0)}, "speed 14, at 1.4 s, is nan, not from 0"),
@@ -318,3 +323,23 @@ def test_the_command_drives_as_the_function_does(tmp_path, capsys) -> None:
         (["scenario=ring"], "leader=None needs scenario=ring and seconds"),
     ]
     check_refused(main, cases)
+
+
+def test_networks_of_other_libraries_drive_as_their_exported_programs(tmp_path, caplog) -> None:
+    torch.manual_seed(0)
+    network = torch.nn.Sequential(torch.nn.Linear(7, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1))
+    module = TensorDictModule(network, ["observation"], ["action"])
+    lcc_rl.export(network, tmp_path / "policy.onnx")
+    found = [
+        lcc_rl.simulate(WAVE, "automated human", x).steps
+        for x in (network, {"mine": module}, tmp_path / "policy.onnx")
+    ]
+    pd.testing.assert_frame_equal(*found[:2], check_exact=True)
+    pd.testing.assert_frame_equal(*found[1:], rtol=1e-3, atol=1e-3)
+    network[2].bias.data.fill_(9.0)
+    lcc_rl.simulate(WAVE, "automated human", network)
+    assert "Sequential: 1e+02 % of its actions are beyond" in caplog.text
+    expected = (
+        r"expected a run, a file or a controller, got Seq.*; lcc_rl\.export\(…, 'policy.onnx'"
+    )
+    check_refused(Driver, [(network, 0.1, expected)], ConfigError)

@@ -291,6 +291,10 @@ def test_bad_input_is_one_clear_error() -> None:
         (["idm_acc", "x.html"], r"idm_acc: a page \(.html\) needs a run or a policy file"),
         ([f"{__name__}.nothing", "x.c"], "nothing cannot be exported: its command is not finite"),
         ([f"{__name__}.nothing_filtered", "x.c"], "nothing_filtered cannot be exported: its comm"),
+        (
+            ["follower_stopper", "x.c"],
+            "memory of 602 numbers, is not .*: it takes .*; use .onnx or",
+        ),
         (["human", "x.c"], "human draws noise from seeds: it cannot be exported"),
     ]
     check_refused(main, cases, ConfigError)

@@ -182,9 +182,10 @@ def test_what_cannot_take_effect_is_refused_and_changes_nothing(env, many) -> No
 def test_an_action_that_is_none_is_refused_and_changes_nothing(env, many) -> None:
     real = "actions must be real numbers"
     no_array = (STILL + 0j, STILL > 0, STILL.astype(object), STILL.astype(str), None, {})
-    no_number = (0j, [1j], True, [True], {"action": 0.0}, [None], "0", [0.1, 0.2], 0.1)
+    no_number = (0j, [1j], True, [True], {"action": 0.0}, [None], "0", 0.1)
     given = [
         (many, np.zeros((2, 1)), r"numbers \[3, 1\], got \[2, 1\]"),
+        (env, [0.1, 0.2], r"numbers \[1\], got \[2\] float64"),
         (many, STILL + np.nan, "automated.action is nan at step 1"),
         *((many, action, real) for action in (*no_array, [[0.1], [0.2, 0.3], [0.4]])),
         *((env, action, real) for action in no_number),
@@ -420,19 +421,21 @@ def test_models_of_stable_baselines3_are_compared_and_exported(sb3, tmp_path) ->
     wide = nn.Linear(9, 1)
     cases = [
         (wide, "Linear fails for observations of 7"),
-        (object(), "expected a run, a file, a controller, a torch"),
+        (object(), "expected a run, a file or a controller, got"),
     ]
     check_refused(lambda who: lcc_rl.export(who, tmp_path / "x.onnx"), cases, ConfigError)
     with pytest.raises(ConfigError, match="needs a run or a policy file"):
         lcc_rl.export(model, tmp_path / "x.html")
 
 
-def trained(sb3, kind="PPO", wrap=None, around=None, policy="MlpPolicy", seed=0, **settings):
+def trained(
+    sb3, kind="PPO", wrap=None, around=None, policy="MlpPolicy", seed=0, words=(), **settings
+):
     """Return a model of a few steps whose weights are as large as those of a trained one."""
     from stable_baselines3.common.vec_env import DummyVecEnv
 
     wrap = wrap or (lambda env: env)
-    env = DummyVecEnv([lambda: wrap(gymnasium.make(NAME, overrides=SHORT))])
+    env = DummyVecEnv([lambda: wrap(gymnasium.make(NAME, overrides=[*SHORT, *words]))])
     few = {"n_steps": 20, "batch_size": 20} if kind == "PPO" else {"learning_starts": 10}
     env = around(env) if around else env
     model = getattr(sb3, kind)(policy, env, device="cpu", seed=seed, **few, **settings)
@@ -525,3 +528,16 @@ def test_models_that_would_act_differently_are_refused(sb3, tmp_path) -> None:
     check_refused(lambda model: lcc_rl.export(model, tmp_path / "x.pt2"), cases, ConfigError)
     with pytest.raises(ConfigError, match="NormalizeObservation"):
         lcc_rl.compare({"x": seen})
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_model_with_another_observation_than_its_environment_is_refused(sb3, tmp_path) -> None:
+    words = ["observation.scales.self.gap=1.0"]
+    model = trained(sb3, words=words)
+    wrong = r"was trained with observation\.scales\.self\.gap=1\.0, which are other here: give the"
+    with pytest.raises(ConfigError, match=wrong):
+        lcc_rl.simulate([9.0] * 20, "automated human", model)
+    with pytest.raises(ConfigError, match=wrong):
+        lcc_rl.export(model, tmp_path / "x.onnx")
+    assert lcc_rl.simulate([9.0] * 20, "automated human", model, overrides=words)
+    assert lcc_rl.export(model, tmp_path / "x.onnx", overrides=words)

@@ -70,6 +70,14 @@ def test_drivers_start_at_their_equilibrium_and_stay(model) -> None:
     assert data["next", "human", "command"].abs().max() < 1e-3
 
 
+def test_idm_drivers_with_own_parameters_start_at_their_own_equilibrium() -> None:
+    own = "{_target_: lcc_rl.functional.idm.IDMConstants, min_gap: 4.0, acceleration: 2.0}"
+    cap = "scenario.start.human.cap_time_gap=100"
+    cfg = human("human", QUIET, cap, f"+scenario.controllers.human.parameters={own}")
+    data = rolled(cfg, steady(), batch=64, seed=3)
+    assert data["next", "human", "command"].abs().max() < 1e-3
+
+
 @EACH
 def test_a_delay_replays_the_same_law_on_what_was(model) -> None:
     delay = 3

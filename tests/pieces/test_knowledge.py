@@ -32,6 +32,19 @@ def test_preview_is_what_the_leader_will_do() -> None:
     assert torch.allclose(data[OBSERVATION][0, :, 0, -2:], 0.5 * difference)
 
 
+def test_preview_is_what_a_perturbed_leader_will_do() -> None:
+    words = ("+knowledge=preview", "scenario.pieces.preview.horizons=[0,0.5]", FIRST[1])
+    for size in (0.0, 1.0):
+        env = small_env(
+            "alcc", 2, [*words, FIRST[0], f"scenario.pieces.leader.perturbation={size}"]
+        )
+        data = env.rollout(20, steady(0.0, env))
+        seen, leader = data["preview", "speed"][:, :, 0], data["leader", "speed"][..., 0]
+        assert torch.allclose(seen[..., 0], leader, atol=1e-5)
+        assert torch.allclose(seen[:, :-5, 1], leader[:, 5:], atol=1e-5)
+        assert torch.equal(leader[0], leader[1]) == (size == 0.0)
+
+
 def test_a_ring_has_no_leader_to_preview() -> None:
     with pytest.raises(ConfigError, match=r"LeaderPreview reads leader\..* a ring road has no"):
         small_env("alcc", 2, ["scenario=ring", "+knowledge=preview"])

@@ -11,6 +11,7 @@ import torch
 from helpers import (
     POPULATION,
     check_episodes,
+    check_refused,
     compose,
     composed,
     followed_profiles,
@@ -177,3 +178,19 @@ def test_a_recorded_driver_that_cannot_be_played_is_never_silent(words, message,
     with caplog.at_level(logging.WARNING, logger="lcc_rl"):
         assert "recorded" not in [one.name for one in strategies_of(cfg)[0]]
     assert "recorded is left out: no driver was recorded behind these leaders" in caplog.text
+
+
+def test_a_gap_at_standstill_that_no_vehicle_uses_is_refused() -> None:
+    gap = "scenario.start.automated.standstill_gap=2.5"
+    copied = "scenario.start.human=${scenario.start.automated}"
+
+    def build(profiles, string: str, *words: str):
+        cfg = compose("alcc", f"scenario.string={string}", gap, *words)
+        return build_env(cfg, profiles, POPULATION, 2, nominal=True)
+
+    idle = r"^scenario\.start\.automated\.standstill_gap=2\.5 has no effect: .* recorded gap"
+    check_refused(build, [(followed_profiles(), "automated human*2", idle)])
+    for words in (["automated*2"], ["automated human", copied], ["human automated"]):
+        assert build(followed_profiles(), *words)
+    assert build(followed_profiles(), "automated human", "scenario.start.automated.time_gap=1")
+    assert build(wavy_profiles(), "automated human")

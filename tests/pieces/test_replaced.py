@@ -20,7 +20,7 @@ from lcc_rl.pieces import ReplacedLeader
 LEADER = "scenario.pieces.leader"
 ROAD = [("leader", "speed"), ("leader", "acceleration")]
 SENSED = tuple(f"sensed_{name}" for name in ("gap", "speed", "ahead_speed"))
-OWN = [("automated", name) for name in ("promised", "safe", "command", *SENSED)]
+OWN = [("automated", name) for name in ("promised", "safe", "command", "sensors", *SENSED)]
 KEYS = [*ROAD, *OWN, *(("vehicles", name) for name in ("gap", "speed", "ttc", "followed"))]
 STEADY = from_records([torch.full((400,), 15.0)], ["steady@0s"], ["steady"], 0.1)
 
@@ -130,16 +130,19 @@ def test_a_target_is_lost_as_long_beside_faults_of_sensors() -> None:
     one, other = config(*both), config(*both[::-1])
     assert one.scenario.sensors == other.scenario.sensors
     exact = [f"{x}=0" for x in ("gap_error", "speed_error", "ahead_error")]
-    words = [f"scenario.sensors.automated.{x}" for x in ("lost_from=4", *exact)]
-    held = driven([*both, *words], 1.0, wavy_profiles())["sensed_gap"][..., 0, 0].diff(dim=0) == 0.0
+    words = [f"scenario.sensors.automated.{x}" for x in ("lost_from=4", "dropouts=0.5", *exact)]
+    found = driven([*both, *words], 1.0, wavy_profiles())
+    held = found["sensed_gap"][..., 0, 0].diff(dim=0) == 0.0
+    target, own = found["sensors"][..., 0, :2].unbind(-1)
+    assert (own <= target).all()  # the filter assumes it
+    assert held[39:59].all()  # no measurement arrives during the loss
     longest = torch.zeros(4, dtype=torch.long)
     run = longest.clone()
     for step, still in enumerate(held[5:], 5):
         run = torch.where(still, run + 1, 0)
         assert step in range(39, 66) or run.max() <= 4  # a drop-out ends after 0.4 s
         longest = longest.maximum(run)
-    assert (longest >= 16).all()
-    assert (longest <= 20).all()
+    assert (longest <= 28).all()  # a drop-out may precede the loss, another one outlast it
 
 
 def test_a_memory_starts_anew_behind_another_vehicle() -> None:

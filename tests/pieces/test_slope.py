@@ -59,6 +59,16 @@ def test_energies_count_the_grade_at_the_place_of_each_vehicle() -> None:
         assert row["path_energy_kj"] == pytest.approx(net, rel=1e-3)
 
 
+def test_places_stay_exact_for_an_hour() -> None:
+    slope = Slope(points=POINTS, repeats=True).bind(
+        World(time_step=0.02, energy=Fleet({"all": ElectricCar()})), "leader"
+    )
+    speed, place, rest = torch.tensor([33.3]), torch.zeros(1), torch.zeros(1)
+    for _ in range(180_000):
+        place, _, rest = slope.compute(place, rest, speed, speed)
+    assert place.item() == pytest.approx(3600.0 * speed.item(), abs=0.05)
+
+
 def test_an_evaluation_counts_the_same(subtests) -> None:
     words = ["variant=alcc", "evaluation.baselines=[]", "evaluation.warm_up=0", *HILLS]
     cfg = load("evaluate", [*words, "scenario.horizon=399"]).with_(compare=["idm_acc"])

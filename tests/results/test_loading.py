@@ -204,6 +204,18 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
 }
 
 
+def test_a_flipped_bit_at_the_end_of_a_table_is_named_or_harmless(tmp_path) -> None:
+    file = made(tmp_path / "run") / TABLE
+    content, refused = file.read_bytes(), 0
+    for place in range(9, len(content) - 400, 35):
+        file.write_bytes(content[:-place] + bytes([content[-place] ^ 128]) + content[1 - place :])
+        try:
+            assert len(results.load(tmp_path, strict=True)) == 6
+        except ResultsError:
+            refused += 1
+    assert refused > 10
+
+
 def test_damaged_runs_are_named_in_a_line_each_and_the_rest_is_read(tmp_path, caplog) -> None:
     for name, damage in DAMAGES.items():
         damage(made(tmp_path / name))
