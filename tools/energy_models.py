@@ -44,8 +44,7 @@ def own(model: EnergyModel) -> Price:
     def price(speeds: Speeds, step: float) -> NDArray[np.float64]:
         speed = torch.from_numpy(speeds)
         motion = speed[:, :-1], speed.diff(dim=1) / step
-        unpaid = model.unpaid(*motion)
-        drawn = (model.power(*motion) + (0.0 if unpaid is None else unpaid)).sum(1) * step
+        drawn = (model.power(*motion) + model.unpaid(*motion)).sum(1) * step
         gain = model.stored_energy(speed[:, -1]) - model.stored_energy(speed[:, 0])
         return (drawn - gain).numpy()
 

@@ -94,20 +94,19 @@ def _energies(records: Profiles, block: slice, model: Any) -> pd.DataFrame:
     if records.grades is not None:
         model = model.at(records.grades[rows][:-1])
     motion = speed[:-1], speed.diff() / step
-    unpaid, beyond = (
-        torch.zeros_like(motion[0]) if x is None else x.float()
-        for x in (model.unpaid(*motion), model.infeasible(*motion))
-    )
-    rates = np.stack([model.power(*motion), model.climbing(speed[:-1]) - unpaid, beyond])
+    beyond = model.infeasible(*motion)
+    beyond = torch.zeros_like(motion[0]) if beyond is None else beyond.float()
+    stored_rate = model.climbing(speed[:-1]) - model.unpaid(*motion)
+    rates = np.stack([model.power(*motion), stored_rate, beyond])
     rates[:, last[:-1]] = 0.0  # from one record to the next
     lost = np.flatnonzero(~np.isfinite(rates[0]))
     if len(lost):
         part = int(np.searchsorted(first, lost[0], side="right")) - 1
-        at, risen = (float(x[lost[0]]) for x in motion)
+        after, (at, risen) = times(lost[0] - first[part], step), (float(x[lost[0]]) for x in motion)
         raise DataError(
             f"{records.recordings[block][part]}: {type(model).__name__}.power is "
-            f"{rates[0, lost[0]]} at {at:.4g} m/s and {risen:.4g} m/s², "
-            f"{times(lost[0] - first[part], step):g} s after the start of the trip or of its part"
+            f"{rates[0, lost[0]]} at {at:.4g} m/s and {risen:.4g} m/s², {after:g} s after the "
+            "start of the trip or of its part"
         )
     drawn, climbed, spent = step * np.add.reduceat(rates, first, axis=1, dtype=np.float64)
     drawn, climbed = KILO * drawn, KILO * climbed

@@ -96,8 +96,7 @@ class EnergyModel(Settings, ABC):
     def path_power(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the smooth power [W] minus the change of kinetic energy and of height."""
         stored = self.inertia / self.efficiency * speed * acceleration
-        unpaid = self.unpaid(speed, acceleration)
-        stored = stored if unpaid is None else stored - unpaid
+        stored = stored - self.unpaid(speed, acceleration)
         net = self.smooth_power(speed, acceleration) - stored
         return net if self.level else net - self.climbing(speed)
 
@@ -121,12 +120,12 @@ class EnergyModel(Settings, ABC):
         """Return the power dissipated by accelerating [W]; None if the model has no such part."""
         return None
 
-    def unpaid(self, speed: Tensor, acceleration: Tensor) -> Tensor | None:
+    def unpaid(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the power that becomes kinetic energy, over efficiency, but is not drawn [W].
 
-        None if :meth:`power` draws what every acceleration takes.
+        It is 0 unless accelerations that are infeasible draw less than they take.
         """
-        return None
+        return torch.zeros_like(speed)
 
     def strongest(self, speed: Tensor) -> Tensor | None:
         """Return the largest acceleration at a speed [m/s²]; None if the model defines none."""

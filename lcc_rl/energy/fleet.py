@@ -262,11 +262,9 @@ class Fleet:
         """Return the power dissipated by accelerating [W]; None unless all models define it."""
         return self._known("acceleration_loss", all, speed, acceleration, kind)
 
-    def unpaid(
-        self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None
-    ) -> Tensor | None:
-        """Return kinetic power that no model draws [W], see :meth:`EnergyModel.unpaid`."""
-        return self._known("unpaid", any, speed, acceleration, kind)
+    def unpaid(self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None) -> Tensor:
+        """Return the kinetic power that is not drawn [W], see :meth:`EnergyModel.unpaid`."""
+        return self._of(lambda model, *motion: model.unpaid(*motion), speed, acceleration, kind)
 
     def infeasible(
         self, speed: Tensor, acceleration: Tensor, kind: Tensor | None = None
@@ -295,7 +293,7 @@ class Fleet:
 
         def of(model: EnergyModel, speed: Tensor, acceleration: Tensor) -> Tensor:
             found = getattr(model, name)(speed, acceleration)
-            return torch.zeros_like(speed) if found is None else found
+            return torch.zeros_like(speed, dtype=torch.bool) if found is None else found
 
         return self._of(of, *motion)
 

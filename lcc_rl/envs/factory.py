@@ -50,6 +50,12 @@ from lcc_rl.settings import TARGET, parse, path_of
 
 # Settings that no environment reads, and why they have no effect.
 OF_COMMANDS = {
+    **{
+        f"{part}.{x.name}": why
+        for part, why in (("training", "nothing trains"), ("evaluation", "nothing is evaluated"))
+        for x in fields(SECTIONS[part])
+        if x.name != "gap_range"  # of the first states
+    },
     "seed": "use make_env(seed=…), or reset(seed=…) in Gymnasium",
     "device": "use make_env(device=…)",
     "training.environments": "use make_env(batch_size=…), or num_envs in Gymnasium",
@@ -57,9 +63,6 @@ OF_COMMANDS = {
     "agent.hold": "use scenario.controllers.automated.hold=…",
     "agent.": "it belongs to the learners of lcc-rl train",
 }
-for _part, _why in (("training", "nothing trains"), ("evaluation", "nothing is evaluated")):
-    OF_COMMANDS = {f"{_part}.{x.name}": _why for x in fields(SECTIONS[_part])} | OF_COMMANDS
-del OF_COMMANDS["training.gap_range"]  # of the first states
 MOMENTS = 3  # least states in memory: before and after a step, and intermediate results
 
 

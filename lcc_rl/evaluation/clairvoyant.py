@@ -201,8 +201,7 @@ class Goal:
         power = fleet.power(*motion, kind) if self.exact else fleet.path_power(*motion, kind)
         if self.exact:
             stored = fleet.stored_energy(then, kind) - fleet.stored_energy(now, kind)
-            unpaid = fleet.unpaid(*motion, kind)
-            power = power - stored / self.time_step + (0.0 if unpaid is None else unpaid)
+            power = power - stored / self.time_step + fleet.unpaid(*motion, kind)
         return power.flatten(1).sum(1) * self.time_step * KILO
 
 

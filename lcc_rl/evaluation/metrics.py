@@ -71,8 +71,7 @@ def energy_measures(
     steps = alive.sum(0, keepdim=True).long().expand(1, *speed.shape[1:])
     last = speed.gather(0, steps).squeeze(0)
     stored = (energy.stored_energy(last, kind) - energy.stored_energy(speed[0], kind)) * KILO
-    if (unpaid := energy.unpaid(*motion, kind)) is not None:
-        stored = stored - total(unpaid) * KILO
+    stored = stored - total(energy.unpaid(*motion, kind)) * KILO
     if not energy.level:
         stored = stored + total(energy.climbing(speed[:-1], kind)) * KILO
     lost = energy.acceleration_loss(*motion, kind)

@@ -220,7 +220,9 @@ def studied(
     weights, own_cfg = policy
     cfg = _of_training(cfg, own_cfg, f"policy={cfg.policy}")
     kept = {x: own_cfg.scenario.pieces[x] for x in sorted(of_observation(own_cfg))}
-    _observed(f"policy={cfg.policy}", kept, cfg.scenario.pieces)  # differ in conditions at most
+    _under_conditions(
+        f"policy={cfg.policy}", kept, cfg.scenario.pieces
+    )  # differ in conditions at most
     strategy = with_weights(cfg, weights, own_cfg.seed, str(cfg.policy), population)
     strategy = replace(strategy, own=own_cfg)
     return [strategy] if cfg.deployed is None else hybrids(strategy)
@@ -258,7 +260,7 @@ def _replaced(
     return changed
 
 
-def _observed(
+def _under_conditions(
     path: str, own: Mapping[str, Node], given: Mapping[str, Node | None]
 ) -> dict[str, Node]:
     """Return the pieces that a policy observes, under the conditions of a command."""
@@ -298,7 +300,7 @@ def trained(cfg: StudyConfig, path: str, policy: TrainedPolicy, population: Popu
     own, given = training.scenario.pieces, other.scenario.pieces
     kept = {x: own[x] for x in sorted(of_observation(training))}
     pieces = {x: own[x] for x in own if x in kept or x not in given}
-    pieces |= _observed(path, kept, given)
+    pieces |= _under_conditions(path, kept, given)
     driver = {AUTOMATED: training.scenario.controllers[AUTOMATED]}
     other = other.with_(
         variant=training.variant,

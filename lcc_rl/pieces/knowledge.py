@@ -40,6 +40,11 @@ Seconds = Annotated[float, Field(ge=0.0, le=3600.0)]  # ages of memories, horizo
 Times = Annotated[tuple[Seconds, ...], Field(min_length=1)]
 
 
+def with_errors(speed: Tensor, size: float, seed: Tensor, step: Tensor, streams: Tensor) -> Tensor:
+    """Return speeds with normal errors of this size [m/s], at least 0; none for 0."""
+    return (speed + size * normal(seed, step, streams)).clamp(min=0.0) if size else speed
+
+
 class LeaderPreview(Feature):
     """The leader's future speed, as a message from further down the road would contain it.
 
@@ -84,9 +89,7 @@ class LeaderPreview(Feature):
         if self.perturbation:
             seconds = (step + self.shift).clamp(min=0) * self.time_step
             speed = perturbed(speed, seconds, seed, self.perturbation)
-        if self.noise:
-            error = normal(seed, step, self.stream + self.columns)
-            speed = (speed + self.noise * error).clamp(min=0.0)
+        speed = with_errors(speed, self.noise, seed, step, self.stream + self.columns)
         return speed.unsqueeze(-2)
 
 
@@ -156,7 +159,7 @@ class TrafficAhead(StepTransform):
         if not self.noise:
             return reports
         seed, step = (entry.unsqueeze(-1) for entry in read[-2:])
-        return (reports + self.noise * normal(seed, step, self.streams)).clamp(min=0.0)
+        return with_errors(reports, self.noise, seed, step, self.streams)
 
 
 def driving_reads(pieces: Sequence[Piece]) -> set[Key]:

@@ -57,9 +57,8 @@ class TimeGapStart(Part):
         self.records = (profiles.followers, profiles.offsets) if recorded else None
         changed = self.standstill_gap != type(self).standstill_gap
         # Changed settings without effect on this role, and why.
-        self.idle = (
-            {"standstill_gap": RECORDED_GAP} if recorded and changed and len(places) == 1 else {}
-        )
+        unused = recorded and changed and len(places) == 1
+        self.idle = {"standstill_gap": RECORDED_GAP} if unused else {}
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""

@@ -122,9 +122,9 @@ def test_a_path_takes_what_is_drawn_less_what_is_stored(name) -> None:
         float(part(*motion).sum()) * 0.01 for part in (model.smooth_power, model.path_power)
     )
     stored = float(model.stored_energy(speed[-1]) - model.stored_energy(speed[0]))
-    if (unpaid := model.unpaid(*motion)) is not None:  # 0.7 m/s² is too much for trucks
-        assert (float(unpaid.sum()) > 0.0) == (name in TRUCKS)
-        stored -= float(unpaid.sum()) * 0.01
+    unpaid = float(model.unpaid(*motion).sum())  # 0.7 m/s² is too much for trucks
+    assert (unpaid > 0.0) == (name in TRUCKS)
+    stored -= unpaid * 0.01
     if name == "motor":  # whose own stored energy is not the kinetic one
         loss = float(model.acceleration_loss(*motion).sum()) * 0.01
         steady = float(model.power(speed[:-1], torch.zeros_like(speed[:-1])).sum()) * 0.01
