@@ -304,7 +304,14 @@ class StudyConfig(BaseConfig):
         return self.scenario.vehicles.count(AUTOMATED)
 
     def driven_by(self, controller: Node) -> Self:
-        """Return the configuration with another controller of the automated vehicles."""
+        """Return the configuration with another controller of the automated vehicles.
+
+        A hybrid strategy keeps the scale of the actions of the controller before.
+        """
+        before = self.scenario.controllers.get(AUTOMATED)
+        scale = before and before.settings.get("max_acceleration")
+        if scale and controller.settings.get("action_scale", 0.0) is None:
+            controller = controller.changed(action_scale=scale)
         return self.with_(deployed=None, scenario={"controllers": {AUTOMATED: controller}})
 
     def after_training(self) -> Self:

@@ -124,7 +124,8 @@ class CBFFilter(RoleTransform):
         self.guaranteed = self.robust or self.role not in {*world.actuators, *world.sensors}
         if not self.robust:
             actuation, sensors = Actuation(), Sensors()
-        limits = world.limits(self.role, self.max_acceleration)
+        lower = None if self.max_acceleration == MAX_ACCELERATION else self.max_acceleration
+        limits = world.limits(self.role, lower, where=f"scenario.filters.{self.role}")
         assert limits is not None
         self.least, self.largest = limits
         self.response = actuation.response_in(world, self.role, -self.least)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional import cacc
-from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.string import entries_ahead, gather
 from lcc_rl.pieces.base import Entry, Feature, as_key
 from lcc_rl.pieces.controllers import Controller
@@ -109,7 +109,8 @@ def leader_names(lookahead: str) -> list[str]:
 class CACC(Controller):
     """Cooperative adaptive cruise control (HCFS H11)."""
 
-    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
+    # In both directions; None: the limits of the vehicles [m/s²].
+    max_acceleration: Positive | None = None
     k1: Number = 0.04  # gain of e_x(i,i−1) [1/s]
     k2: Number = 0.12  # gain of e_v(i,i−1)
     k3: Number = 1.4  # gain of e_x(i,0) [1/s]
@@ -143,7 +144,8 @@ class DeadBeat(Controller):
     errors remain: it is a baseline only.
     """
 
-    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
+    # In both directions; None: the limits of the vehicles [m/s²].
+    max_acceleration: Positive | None = None
     lookahead: Lookahead = "causal"
 
     steady = True
@@ -179,7 +181,7 @@ def check_platoon(controller: Controller, option: str, fact: str, remedy: str) -
     """
     names = controller.string.names
     if names != (controller.role,):
+        where = getattr(controller, "option", f"scenario.controllers.{controller.role}")
         raise ConfigError(
-            f"scenario.controllers.{controller.role}.{option} {fact}, but the string has "
-            f"{', '.join(names)}; use {remedy}"
+            f"{where}.{option} {fact}, but the string has {', '.join(names)}; use {remedy}"
         )

@@ -101,15 +101,19 @@ class World:
         return self.steps(seconds, what)
 
     def limits(
-        self, role: str, forward: float | None = None, backward: float | None = None
+        self,
+        role: str,
+        forward: float | None = None,
+        backward: float | None = None,
+        where: str = "",
     ) -> tuple[float, float] | None:
         """Return the least and the largest command to the vehicles of a role [m/s²].
 
         Args:
             role: vehicles that are not automated have only the limits of their controller.
-            forward: the controller's ``max_acceleration``. None and :data:`MAX_ACCELERATION`, the
-                default, mean the limit of automated vehicles; other values lower it.
+            forward: the controller's ``max_acceleration``; None: that of automated vehicles.
             backward: its ``max_deceleration``, positive; None: ``forward``.
+            where: place of both settings, for messages.
 
         Raises:
             ConfigError: if a setting exceeds the limits of automated vehicles.
@@ -119,10 +123,11 @@ class World:
             return None if forward is None else (-(backward or forward), forward)
         ends, most = [], (self.max_braking, self.max_acceleration)
         for (name, value), vehicle in zip(bounds.items(), most, strict=True):
-            value = vehicle if value in (None, MAX_ACCELERATION) else value
+            value = vehicle if value is None else value
+            option = ".".join(filter(None, (where, name if backward else "max_acceleration")))
             require(
                 value <= (vehicle if backward else max(most)),
-                f"{name if backward else 'max_acceleration'}={value:g} exceeds the limits of "
+                f"{option}={value:g} exceeds the limits of "
                 f"automated vehicles, which brake by at most {most[0]:g} m/s² "
                 f"({self.limited_by}.max_braking) and accelerate by at most {most[1]:g} m/s² "
                 f"({self.limited_by}.max_acceleration)",

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from helpers import POPULATION, composed, network, string, wavy_profiles
+from helpers import POPULATION, check_refused, composed, network, string, wavy_profiles
 from platoons import (
     A_MAX,
     ACTORS,
@@ -361,6 +361,42 @@ def test_the_first_decides_for_one_platoon_only() -> None:
     words = "choice=first needs a string that is one platoon, but the string has automated, human"
     with pytest.raises(ConfigError, match=words):
         HCFS(rule=CACC(), choice="first").bind(World(MIXED, T))
+
+
+class Learned(HCFS):
+    def choose(self, rule, learned, *entries):
+        return torch.ones_like(rule, dtype=torch.bool)
+
+
+def test_the_hybrid_has_the_limits_of_its_vehicles_and_the_policy_of_its_training() -> None:
+    def bound(kind: type = HCFS, limit: float = 3.0, **settings: float) -> HCFS:
+        world = World(parse_string("automated*2"), T, max_braking=limit, max_acceleration=limit)
+        return kind(rule=CACC(), **settings).bind(world)
+
+    def braking(**settings: float) -> float:
+        return bound(**settings).both_brake.own
+
+    assert [braking(), braking(limit=2.0), braking(limit=6.0)] == [3.0, 2.0, 6.0]
+    assert [braking(max_acceleration=2.0), braking(braking=1.0)] == [2.0, 1.0]
+    stronger = r"deployed\.braking=3 exceeds the brakes of the vehicles, 2 m/s² \(scenario\.max_br"
+    cases = [({"limit": 2.0, "braking": 3.0}, stronger)]
+    cases += [({"max_acceleration": 2.0, "braking": 3.0}, stronger)]
+    cases += [({"max_acceleration": 5.0}, r"deployed\.max_acceleration=5 exceeds the limits")]
+    check_refused(lambda given: bound(**given), cases, ConfigError)
+    for settings, expected in (
+        ({"max_acceleration": 2.0}, [1.5, 2.0]),  # limited, not scaled
+        ({"limit": 6.0}, [1.5, 3.0]),
+        ({"action_scale": 1.0}, [0.5, 1.0]),
+    ):
+        hybrid = bound(Learned, **settings)
+        values = dict.fromkeys((key for _, key in hybrid.needs), torch.ones(2, 1))
+        values["automated", "action"] = torch.tensor([[0.5], [1.0]])
+        reached: dict[tuple[str, ...], torch.Tensor] = {}
+        hybrid.derive(values, reached)
+        assert reached["automated", "command"].flatten().tolist() == expected
+    for word, expected in (("deployed", 3.0), ("scenario.controllers.automated", 2.0)):
+        cfg = composed("variant=hcfs", f"{word}.max_acceleration=2").after_training()
+        assert cfg.scenario.controllers["automated"].settings["action_scale"] == expected
 
 
 def test_a_reward_by_which_hcfs_does_not_compare_is_refused() -> None:
