@@ -113,15 +113,10 @@ class Decision(NamedTuple):
 def jerk_interval(
     last_acceleration: Tensor, jerk_bound: float, time_step: float, limits: tuple[float, float]
 ) -> tuple[Tensor, Tensor]:
-    """Return the accelerations between which |jerk| stays within the bound J of H15–H21.
-
-    Args:
-        limits: least and largest acceleration [m/s²].
-    """
+    """Return the accelerations within limits between which |jerk| keeps the bound J of H15–H21."""
     reach = jerk_bound * time_step
-    least, largest = limits
-    low = (last_acceleration - reach).clamp(min=least)
-    return low, (last_acceleration + reach).clamp(max=largest)
+    low = (last_acceleration - reach).clamp(min=limits[0])
+    return low, (last_acceleration + reach).clamp(max=limits[1])
 
 
 def hybrid_decision(

@@ -160,8 +160,7 @@ class OnnxPolicy(Controller):
     """
 
     path: str  # the program's file
-    # In both directions; None: the limits of the vehicles [m/s²].
-    max_acceleration: Positive | None = None
+    max_acceleration: Positive | None = None  # None: the limits of the vehicles [m/s²]
 
     def validate(self) -> None:
         """Read the program, so that an invalid one is refused at once."""

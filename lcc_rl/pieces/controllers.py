@@ -76,7 +76,6 @@ class Controller(RoleTransform):
     command: ClassVar[Callable[..., Any]]
 
     measures = True
-    scaled = False  # whether max_acceleration is that of action 1, for every limit
     orders = (COMMANDED, WISHED)
 
     def bind(self, world: World | None = None, name: str | None = None) -> Self:
@@ -107,9 +106,7 @@ class Controller(RoleTransform):
         """
         self.time_step = world.time_step
         # Limits of the commands [m/s²]; None: not clamped.
-        self.limits: tuple[float, float] | None = world.limits(
-            self.role, *self.lowering(world), getattr(self, "option", self.title)
-        )
+        self.limits: tuple[float, float] | None = world.limits(self.role, self)
         memory = self.remembers if remembers is None else remembers
         entries = [Entry((ROLE, x)) if isinstance(x, str) else x for x in memory]
         names = [".".join(as_key(entry.of(self.role).key)) for entry in entries]
@@ -117,20 +114,6 @@ class Controller(RoleTransform):
         order = self.orders[self.role in world.filtered]
         outputs = self.writes if writes is None else writes
         super().declare(world, self.names, [order, *entries, *outputs], keeps)
-
-    def lowering(self, world: World) -> tuple[float | None, float | None]:
-        """Return its largest acceleration and braking [m/s²], see :meth:`World.limits`."""
-        forward, backward = (
-            getattr(self, name, None) for name in ("max_acceleration", "max_deceleration")
-        )
-        if self.scaled and forward == MAX_ACCELERATION:  # allowed with weaker brakes, too
-            forward = None
-        automated = self.role == AUTOMATED
-        if hasattr(self, "max_acceleration") and not automated:
-            forward = forward or MAX_ACCELERATION
-        if hasattr(self, "max_deceleration"):
-            backward = backward or (world.max_braking if automated else MAX_ACCELERATION)
-        return forward, backward
 
     def compute(self, *entries: Tensor) -> Any:
         """Return the results of :meth:`command` with clamped commands."""
@@ -153,7 +136,7 @@ class Action(Controller):
     max_acceleration: Positive = MAX_ACCELERATION  # of action 1, in both directions [m/s²]
     hold: NonNegative = 0.0  # time for which an action is executed [s]; 0: one step
 
-    steady = scaled = True
+    steady = of_limits = True
     reads = (".".join(ACTION),)
     held = Entry("role.held", "–", "action of a policy that is executed since its last decision")
 

@@ -19,8 +19,7 @@ class Cruise(Controller):
     The other settings of a class are the constants of its law, in this order.
     """
 
-    # In both directions; None: the limits of the vehicles [m/s²].
-    max_acceleration: Positive | None = None
+    max_acceleration: Positive | None = None  # None: the limits of the vehicles [m/s²]
 
     reads = ("self.speed", "self.gap", "self.relative_speed")
     observed = tuple((name,) for name in reads)  # as columns of an observation

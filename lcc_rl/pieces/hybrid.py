@@ -53,10 +53,8 @@ class Hybrid(Controller):
     """
 
     rule: InstanceOf[Controller]  # without memory; its command is one candidate
-    # Of both candidates, in both directions; None: the limits of the vehicles [m/s²].
-    max_acceleration: Positive | None = None
-    # Acceleration of action 1; None: that of the controller with which the policy was trained, in
-    # a configuration, else 3 [m/s²].
+    max_acceleration: Positive | None = None  # None: the limits of the vehicles [m/s²]
+    # Acceleration of action 1; None: that of the policy's training, without a configuration 3.
     action_scale: Positive | None = None
 
     takes_action = True
@@ -141,7 +139,7 @@ class HCFS(Hybrid):
             check_platoon(self, "choice=first", "needs a string that is one platoon", "between")
         self.reward = PlatoonReward(**values(self, PlatoonReward))
         assert self.limits is not None
-        hardest = -self.limits[0]
+        self.bounds, hardest = self.limits, -self.limits[0]
         braking = self.braking or hardest
         require(
             braking <= hardest,
@@ -152,8 +150,7 @@ class HCFS(Hybrid):
 
     def choose(self, rule: Tensor, learned: Tensor, *entries: Tensor) -> Decision:
         before, speed, last, gap, speed_error, leader_gap, *leader = entries
-        assert self.limits is not None
-        interval = jerk_interval(last, self.jerk_bound, self.time_step, self.limits)
+        interval = jerk_interval(last, self.jerk_bound, self.time_step, self.bounds)
         ahead, time_step = speed + speed_error, self.time_step
         cap = safe_acceleration(speed, gap - self.margin, ahead, self.both_brake, time_step)
         return hybrid_decision(
@@ -167,7 +164,7 @@ class HCFS(Hybrid):
             cap if self.safe_cap else None,
             self.reward,
             self.time_step,
-            self.limits,
+            self.bounds,
             PlatoonPlace(leader_gap, leader[0]),
             self.choice,
         )

@@ -44,8 +44,7 @@ class MPCSettings(Settings):
     near_price: Positive = 3.0
     far_price: Positive = 0.1
     ttc_price: Positive = 30.0
-    # In both directions; None: the limits of the vehicles [m/s²].
-    max_acceleration: Positive | None = None
+    max_acceleration: Positive | None = None  # None: the limits of the vehicles [m/s²]
     # Absolute and relative tolerance of the solver.
     tolerance: Annotated[float, Field(ge=1e-10, le=0.1)] = 1e-4
     iterations: Annotated[int, Field(ge=1, le=1_000_000)] = 4000  # most iterations of the solver

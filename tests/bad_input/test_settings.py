@@ -48,6 +48,7 @@ WRONG = {
     "learning=follow": "choice of learning 'follow'; valid: follow_samples.*, needs --config-dir",
     "agent._partial_=true": "agent._partial_ has no effect",
     "agent.gamma=???": r"^agent\.gamma=\?\?\?: expected a value",
+    "variant=cacc gains.k5=1": r"setting of gains 'k5'.*; valid: k1, k2, k3, k4",
     f"variant=hcfs {AUTO}.jerk_weight=1": r"It is deployed\.jerk_weight",
     # types
     "seed=abc": "seed must be .* integer",
@@ -109,6 +110,7 @@ IGNORED = {
     "evaluation.full_length=true": "belong to evaluation.rows=vehicles",
     "variant=hcfs evaluation.repeats=5": "drives behind every record once",
     "variant=hcfs drivers=highway": "no vehicle of this platoon depends on drivers",
+    "variant=cacc scenario.vehicle_length=12": "evaluation.rows=vehicles has no flow",
     "variant=direct +filter=cbf": "no vehicle of the string is automated",
     "variant=direct +event=lost_target": "no vehicle of the string is automated",
     "variant=direct +faults=sensors": "no vehicle of the string is automated",

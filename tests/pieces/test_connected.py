@@ -418,6 +418,34 @@ def test_an_evaluation_with_sensors_names_who_reads_messages(caplog) -> None:
     assert not caplog.messages
 
 
+def test_an_evaluation_names_a_role_that_reads_messages_without_being_connected(caplog) -> None:
+    truck = "+controller@scenario.controllers.truck=cacc", "scenario.horizon=20"
+    start = "+scenario.start.truck=${scenario.start.automated}"
+    words = ["variant=cacc", *truck, start, string("automated*2 truck automated")]
+    option = "scenario.pieces.communication.connected"
+    inputs = Inputs(ramps(), ramps(), POPULATION)
+
+    def warned(*more: str) -> list[str]:
+        caplog.clear()
+        cfg = load("evaluate", [*words, *more])
+        Comparison(cfg, inputs, [Strategy("cacc tuned", cfg)])
+        return [x for x in caplog.messages if option in x]
+
+    assert warned() == [f"truck reads messages but is not in {option}"]
+    assert warned(f"{option}=[automated,truck]") == []
+    unknown = rf"unknown role \({option}\) 'trick'.*; valid: .*truck"
+    with pytest.raises(ConfigError, match=unknown):
+        warned(f"{option}=[automated,trick]")
+
+
+def test_a_headway_below_the_deviations_of_training_is_refused_in_training_only() -> None:
+    cfg = composed("variant=cacc", "scenario.start.automated.headway=1", "scenario.horizon=20")
+    build_env(cfg, ramps(), POPULATION, 2, nominal=True)
+    words = r"scenario\.start\.automated\.gap_spread=2 must be below its headway=1"
+    with pytest.raises(ConfigError, match=words):
+        build_env(cfg, ramps(), POPULATION, 2)
+
+
 # -- the headway and the safe cap ------------------------------------------------------------------
 
 
