@@ -116,6 +116,7 @@ class Node:
 
     def check(self) -> None:
         """Check the settings; a class or function without :class:`Settings` is not called."""
+        self._check_parts()
         if has_settings(self.kind):
             self.made()
         else:
@@ -147,6 +148,15 @@ class Node:
             for key in (key for key, value in arguments.items() if value == MISSING):
                 raise ConfigError(f"{self.where}.{key} is required: use {self.where}.{key}=…")
             return self.kind(**arguments)
+
+    def _check_parts(self) -> None:
+        """Refuse a setting that only the nodes inside have, and name their settings."""
+        names = settings_of(self.kind)
+        for key in sorted(self.settings.keys() - {TARGET, *names}) if names is not None else ():
+            parts = [x.where for x in nodes_in(self) if key in (settings_of(x.kind) or ())]
+            places = ", ".join(f"{where}.{key}" for where in parts)
+            text = f"{self.where}.{key}: {self.kind.__name__} has no {key}, its parts have it"
+            require(not parts, f"{text}: {places}")
 
     def _check_names(self) -> None:
         names = settings_of(self.kind)

@@ -73,8 +73,10 @@ class VehicleClass(Settings):
             shape = [*power.shape]
             require(shape == [2], f"its shape is {shape} for speeds of shape [2]")
             check_independent(kind, ["power"], lambda *x: [level.power(*x)], motion)
-            steady, faster = power.tolist()
-            uphill = float(model.on(UPHILL).power(*motion)[0]) if graded else steady
+        steady, faster = power.tolist()
+        with raised_as(ConfigError, f"{kind}.power with the grade as a tensor", Exception):
+            grade = torch.full((2,), UPHILL)  # trips and hills have one of each sample
+            uphill = float(model.on(grade).power(*motion)[0]) if graded else steady
         stored = PROBE * model.inertia / model.efficiency
         lifted = PROBE * model.mass / model.efficiency * GRAVITY * UPHILL
         of = "W per m/s², its kinetic energy"
