@@ -195,8 +195,9 @@ def _mapped(value: Any, where: str, change: Callable[[dict[str, Any], str], Any]
         return [_mapped(item, f"{where}[{index}]", change) for index, item in enumerate(value)]
     if not isinstance(value, Mapping):
         return value
-    places = {key: f"{where}.{key}".removeprefix(".") for key in value}
-    return change({key: _mapped(x, places[key], change) for key, x in value.items()}, where)
+    named = {str(key): x for key, x in value.items()}  # Hydra reads {1: …} as a number
+    places = {key: f"{where}.{key}".removeprefix(".") for key in named}
+    return change({key: _mapped(x, places[key], change) for key, x in named.items()}, where)
 
 
 def without_defaults(value: Any) -> Any:
