@@ -35,7 +35,7 @@ def check_used(
 
     Args:
         sweep: allow settings of an agent without one, because the runs of a sweep share them.
-        written: the configuration as plain containers with its references, for the objective.
+        written: the configuration as plain containers with its references.
 
     Raises:
         ConfigError: naming the option and the reason.
@@ -45,6 +45,8 @@ def check_used(
     reasons = dict(_of_road(cfg)) | dict(_of_rows(cfg, sweep))
     if not sweep:
         reasons |= dict(_of_roles(cfg)) | dict(_of_agent(cfg))
+        if written is not None and "${training.gap_range}" not in str(written["scenario"]):
+            reasons.setdefault("training.gap_range", "no start of the scenario refers to it")
         observation = cfg.observation.settings
         if observation[TARGET] == OBSERVATION and "behind" not in (observation.get("scales") or ()):
             for key in ("visible", "presence"):
