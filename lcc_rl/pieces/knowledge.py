@@ -72,7 +72,7 @@ class LeaderPreview(Feature):
         require(not world.replaced, "a preview reads the record of a leader that is replaced")
         self.declare(world, writes=[self.known.wide((1, len(self.horizons)))])
         self.stream = stream_id("preview.noise")
-        self.perturbation, self.time_step = world.perturbation, world.time_step
+        self.perturbation, self.time_step = world.deviation(world.perturbation), world.time_step
         where = f"scenario.pieces.{self.name}"
         late = world.steps(self.delay, f"{where}.delay")
         steps = [world.steps(ahead, f"{where}.horizons") - late for ahead in self.horizons]
