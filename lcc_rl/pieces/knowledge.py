@@ -98,7 +98,8 @@ class TrafficAhead(StepTransform):
 
     Writes ``("traffic", "speed")`` [m/s], ``[*batch, A, places]``; reports of the last steps, if
     they are late, as ``("traffic", "reports")``. Ahead of the string no vehicle is known but the
-    leader, whose speed stands for theirs. On a ring the count continues. Before the episode speeds
+    leader, whose speed stands for theirs: all that a vehicle directly behind it reads, which a
+    training therefore refuses. On a ring the count continues. Before the episode speeds
     are those of its start.
     """
 
@@ -107,6 +108,7 @@ class TrafficAhead(StepTransform):
     delay: Seconds = 0.0  # age of the reports [s]
 
     conditions = ("noise", "delay")
+    of_traffic = True  # of no use to a vehicle directly behind the leader
     reported = Entry("traffic.speed", "m/s", "speed of the vehicle at each number of places ahead")
     kept = Entry("traffic.reports", "m/s", "reports of the last steps, latest first")
     own: ClassVar[Tensor]
