@@ -157,7 +157,10 @@ def test_mistakes_are_named() -> None:
     cases = [
         (["energy._target_=builtins.dict"], "energy"),
         (["energy=fuel", "energy.vehicle=van"], "vehicle .energy.vehicle. 'van'"),
-        (["energy=mixture", "energy.grade=0.02"], "Fleet has no grade, .* energy.models.compact.gr"),
+        (
+            ["energy=mixture", "energy.grade=0.02"],
+            "Fleet has no grade, .* energy.models.compact.gr",
+        ),
         ([*MIXED, "+energy.roles.lorry={class8: 1}"], r"energy.roles.*lorry.*automated, human"),
     ]
     check_refused(lambda words: lcc_rl.make_env("alcc", 1, words), cases, ConfigError)
