@@ -245,9 +245,8 @@ def flags_first(words: Sequence[str]) -> list[str]:
             f"unknown flag {unknown[0]}: settings are written key=value, without dashes; flags "
             "are --help, --cfg job, --info, --config-dir and, for a sweep, -m"
         )
-    check_once(known.overrides)
     flags = list(words)
-    for item in known.overrides:
+    for item in check_once(known.overrides):
         flags.remove(item)
     return [*flags, *as_meant(known.overrides)]
 

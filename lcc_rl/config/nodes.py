@@ -153,10 +153,10 @@ class Node:
         """Refuse a setting that only the nodes inside have, and name their settings."""
         names = settings_of(self.kind)
         for key in sorted(self.settings.keys() - {TARGET, *names}) if names is not None else ():
-            parts = [x.where for x in nodes_in(self) if key in (settings_of(x.kind) or ())]
-            places = ", ".join(f"{where}.{key}" for where in parts)
+            having = (x for x in nodes_in(self) if key in (settings_of(x.kind) or ()))
+            places = ", ".join(f"{x.where}.{key}" for x in having)
             text = f"{self.where}.{key}: {self.kind.__name__} has no {key}, its parts have it"
-            require(not parts, f"{text}: {places}")
+            require(not places, f"{text}: {places}")
 
     def _check_names(self) -> None:
         names = settings_of(self.kind)

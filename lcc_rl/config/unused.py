@@ -53,7 +53,7 @@ def check_used(
                 reasons[f"observation.{key}"] = "observation.scales names no vehicle behind"
         if type(cfg) is TrainConfig:
             compares = "a training evaluates its own policy; lcc-rl evaluate compares"
-            reasons |= dict(_of_traffic(cfg))
+            reasons |= dict(_of_traffic(cfg.scenario))
             reasons |= dict.fromkeys({*OF_COMPARISONS} & {*map(key_of, overrides)}, compares)
             if RECORDED in cfg.evaluation.baselines:
                 reasons.pop(BASELINES, None)
@@ -142,11 +142,11 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
             yield f"scenario.fleet.{name}", f"no vehicle of the string is {' or '.join(roles)}"
 
 
-def _of_traffic(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
+def _of_traffic(scenario: Any) -> Iterator[tuple[str, str]]:
     """Yield knowledge of vehicles further ahead where there are none, and why it has no effect."""
-    string = cfg.scenario.vehicles
+    string = scenario.vehicles
     first = not (string.ring or string.drawn) and string.places(AUTOMATED) == (0,)
-    for name, node in cfg.scenario.pieces.items():
+    for name, node in scenario.pieces.items():
         if first and node is not None and getattr(node.kind, "of_traffic", False):
             why = f"no vehicle but the leader, whose speed {name} repeats, is ahead"
             yield from dict.fromkeys(("knowledge", f"scenario.pieces.{name}"), why).items()

@@ -98,8 +98,7 @@ class TrafficAhead(StepTransform):
 
     Writes ``("traffic", "speed")`` [m/s], ``[*batch, A, places]``; reports of the last steps, if
     they are late, as ``("traffic", "reports")``. Ahead of the string no vehicle is known but the
-    leader, whose speed stands for theirs: all that a vehicle directly behind it reads, which a
-    training therefore refuses. On a ring the count continues. Before the episode speeds
+    leader, whose speed stands for theirs; directly behind it, it is all. On a ring the count continues. Before the episode speeds
     are those of its start.
     """
 

@@ -75,6 +75,4 @@ TABLE = typed(Annotated[str, Field(pattern=r"\.(csv|parquet)$")])  # a file to w
 def files_and_settings(words: Sequence[str]) -> tuple[list[str], list[str]]:
     """Divide the words of a command into names, such as files, and settings ``key=value``."""
     files = [word for word in words if "=" not in word or exists(word)]
-    settings = [word for word in words if word not in files]
-    check_once(settings)
-    return files, settings
+    return files, [*check_once([word for word in words if word not in files])]
