@@ -98,8 +98,8 @@ class TrafficAhead(StepTransform):
 
     Writes ``("traffic", "speed")`` [m/s], ``[*batch, A, places]``; reports of the last steps, if
     they are late, as ``("traffic", "reports")``. Ahead of the string no vehicle is known but the
-    leader, whose speed stands for theirs; directly behind it, it is all. On a ring the count continues. Before the episode speeds
-    are those of its start.
+    leader, whose speed stands for theirs and is all that a car behind it reads. On a ring the count
+    continues. Before the episode speeds are those of its start.
     """
 
     places: Annotated[tuple[Count, ...], Field(min_length=1)] = (5, 10, 20, 40)  # 1: the next one
