@@ -130,7 +130,7 @@ EVALUATED = {
     "alcc reward.terms.safety.weight=5": "only rows of policies have it, with evaluation.terms",
     "alcc reward.without=safety": "only rows of policies have it, with evaluation.terms",
     "alcc ~reward.terms.safety": "only rows of policies have it, with evaluation.terms",
-    "alcc evaluation.behind_filter=[acc_filtered]": "no trained policy drives behind the safety filter",
+    "alcc evaluation.behind_filter=[acc_filtered]": "no trained policy drives behind",
     "idm": "variant idm has no agent",
     "hcfs +energy@evaluation.second_energy=compact": "drives behind every record once",
     "hcfs evaluation.sample_episodes=0": "drives behind every record once",
