@@ -59,8 +59,7 @@ class Diverged(LccError):
 LARGEST = 1e9
 # Exceeds any memory, which has its own error; and the largest seed.
 LARGEST_SIZE, LAST_SEED = 10**15, 2**32 - 1  # torch uses no more bits of a seed
-# Remedies of a user's code, by words of torch's errors.
-REMEDIES = {
+REMEDIES = {  # of a user's code, by words of torch's errors
     "Boolean value": "use torch.where in place of if",
     "converted to": "use torch in place of math and float: this is a tensor of several numbers",
 }

@@ -121,7 +121,8 @@ def stacked(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Return tables below each other; integers that some of them lack stay integers, with nulls."""
     columns = [set(frame) for frame in frames if len(frame.columns)]
     lacking = set().union(*columns).difference(set.intersection(*columns)) if columns else set()
-    return pd.concat([nullable(frame, lacking) for frame in frames], ignore_index=True)
+    parts = [nullable(frame, lacking) for frame in frames]
+    return pd.concat(parts, ignore_index=True)
 
 
 class Comparison:

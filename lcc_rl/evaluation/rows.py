@@ -6,7 +6,7 @@ and distances are summed over them.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Hashable, Iterator, Mapping
 
 import numpy as np
 import pandas as pd
@@ -156,7 +156,7 @@ def measures(
     return {**columns, "steps": alive.sum(0)}
 
 
-def nullable(frame: pd.DataFrame, names: Collection[str] | None = None) -> pd.DataFrame:
+def nullable(frame: pd.DataFrame, names: Collection[Hashable] | None = None) -> pd.DataFrame:
     """Return a table whose integers, all or those of some columns, may be null, without floats."""
     kept = [x for x in frame.select_dtypes("integer") if names is None or x in names]
     return frame.astype(dict.fromkeys(kept, "Int64"))
