@@ -130,7 +130,7 @@ def world_of(
         scenario.max_braking,
         scenario.max_acceleration,
         scenario.replaced,
-        0.0 if nominal else scenario.perturbation,
+        scenario.perturbation,
         scenario.slope and scenario.slope.made(Slope),
     )
 
