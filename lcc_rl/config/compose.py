@@ -265,7 +265,10 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     if "agent" in content and not _learns(content):
         content["agent"] = None
     leave_out_foreign(content, overrides)
-    leave_out_terms(content.get("reward"))
+    left_out = leave_out_terms(content.get("reward"))
+    if not sweep:
+        why = "reward.without leaves the term out"
+        refuse(overrides, {f"reward.terms.{name}": why for name in left_out})
     if "inputs" in content:
         raise ConfigError("inputs: runs record the files that they read; remove the setting")
     try:
@@ -321,20 +324,25 @@ def _learns(content: Mapping[str, Any]) -> bool:
     return takes_action(as_nodes(driver[AUTOMATED], AUTO))
 
 
-def leave_out_terms(reward: Any) -> None:
+def leave_out_terms(reward: Any) -> Sequence[str]:
     """Remove the terms of ``reward.without``, which a sweep can vary, from a reward.
 
     Args:
         reward: the section as plain containers, changed in place.
 
+    Returns:
+        The names of the removed terms.
+
     Raises:
         ConfigError: naming a term that the reward lacks.
     """
-    names = reward.pop("without", None) if isinstance(reward, dict) else None
+    given = reward.pop("without", None) if isinstance(reward, dict) else None
+    names = [given] if isinstance(given, str) else given or []
     if names:
-        terms, names = reward.get("terms") or {}, [names] if isinstance(names, str) else names
+        terms = reward.get("terms") or {}
         require_known("term of the reward in reward.without", names, terms)
         reward["terms"] = {name: term for name, term in terms.items() if name not in names}
+    return names
 
 
 def leave_out_foreign(content: dict[str, Any], overrides: Sequence[str]) -> None:

@@ -116,6 +116,8 @@ IGNORED = {
     "+filter=cbf scenario.filters.automated.robust=false": "actuators and sensors are exact",
     "sweep=mine": "names the folder of a sweep, -m",
     "variant=own_energy observation.visible=2": "scales names no vehicle behind",
+    "reward.without=safety reward.terms.safety.threshold=3": "reward.without leaves the term out",
+    "reward.without=[safety] reward.terms.safety.weight=3": "reward.without leaves the term out",
 }
 # Settings of an evaluation of a policy without effect, by variant, and why.
 OF_TRAINING = "has the (settings|agent) of its training"
