@@ -97,7 +97,7 @@ class OffPolicy(Sampling):
 
     def setup(self, scene: Scene) -> None:
         size, seed, kind = scene.observation_size, scene.seed, self.activation
-        self.count, self.generator = 0, torch.Generator(scene.device)
+        self.generator = torch.Generator(scene.device)
         self.lasting = False  # whether a target value may last for several updates
         self.actor = self.make_actor(scene)
         self.noise: TensorDictModuleBase = GaussianExploration(0.0)

@@ -119,7 +119,11 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
 
 
 def composed(entry: str | None, overrides: Sequence[str] = ()) -> DictConfig:
-    """Return the configuration that Hydra composes; without an entry point, of the choices only."""
+    """Return the configuration that Hydra composes; without an entry point, of the choices only.
+
+    Raises:
+        ConfigError: if Hydra refuses an override.
+    """
     hydra, meant = GlobalHydra.instance(), as_meant(overrides)
     try:
         where = str(hydra.config_loader().get_search_path()) if hydra.is_initialized() else ""
@@ -244,6 +248,7 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     Args:
         cfg: the composed configuration.
         entry: the command.
+        overrides: the words after the command.
         sweep: allow settings that this run does not use, because the runs of a sweep share them.
     """
     for item in overrides:
@@ -478,6 +483,7 @@ def identity(cfg: Any, *unused: str) -> str:
     Defaults of classes do not count, so settings of later versions change no hash.
 
     Args:
+        cfg: a typed tree.
         *unused: keys of further settings that do not count.
     """
     content = without_defaults(cfg)

@@ -121,6 +121,7 @@ def dots(
     """Draw a dot per row and a line along its interval.
 
     Args:
+        axis: the axes to draw on.
         places: position of every row, on the vertical axis or, if upright, the horizontal one.
         table: rows with the columns ``<column>``, ``<column>_low`` and ``<column>_high``.
         column: name of the column.
@@ -145,6 +146,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 200, formats: Iterable[str
     """Write a figure atomically; the format follows the file's suffix.
 
     Args:
+        figure, path: the figure and its file.
         dpi: pixels per inch of raster graphics.
         formats: further formats, each in its own file (``figure_formats``).
 

@@ -61,6 +61,7 @@ def write_sections(
     Args:
         folder: folder of the page.
         title: title of the page.
+        sections: values of the template's sections, in order.
         commands: the commands, oldest first.
 
     Raises:

@@ -168,6 +168,7 @@ class Piece(Part, TensorDictModuleBase, Transform):
         """Set the entries that the piece reads and writes; by default those of its class.
 
         Args:
+            world: properties that all pieces share.
             reads: arguments of :meth:`compute`, in order.
             writes: results of :meth:`compute`, in order, without ``"next"``.
             keeps: constants of an episode.
