@@ -290,6 +290,11 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         after = (content.get("deployed") or {}).get(TARGET)  # the controller after training
         if key and after and key[1] in (settings_of(find_target(after, "deployed")) or ()):
             raise ConfigError(f"{error} It is deployed.{key[1]}.") from None
+        key = re.match(r"([\w.]+) must ", str(error))
+        if key and key[1] not in set().union(*map(typed_keys, overrides)):
+            typed = " ".join(item.removeprefix("++") for item in overrides)
+            fit = f"{error}; it follows from {typed or 'the files'}: do they fit each other?"
+            raise ConfigError(fit) from None
         match = re.match(r"unknown setting of (\w+) \(", str(error))
         group = match.group(1) if match else ""
         if not group or not choices(group):
@@ -418,6 +423,10 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         if group in ADDED and len(several) > 1:
             remedy = f"a list takes several, '+{group}=[{','.join(several)}]'"
         return ConfigError(f"{' '.join(overrides)}: {group} is chosen twice: {remedy}")
+    if "Error resolving interpolation" in str(error) and (
+        gone := next((word for word in overrides if word.startswith("~")), None)
+    ):
+        return ConfigError(f"{gone}: other choices depend on it; write {gone[1:]}=null")
     cause = error.__cause__
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)
     tokens = [*overrides, *text.partition("See https://")[0].split()]

@@ -47,6 +47,9 @@ WRONG = {
     "reward.terms.safety.wieght=1": "reward.terms.safety .*'weight'",
     "learning=follow": "choice of learning 'follow'; valid: follow_samples.*, needs --config-dir",
     "agent._partial_=true": "agent._partial_ has no effect",
+    "~agent": "~agent: other choices depend on it; write agent=null$",
+    "experiment=limits agent=ddpg": r"gamma must .*; it follows from .*experiment=limits agent=dd",
+    "agent=analytic reward.terms.efficiency.threshold=0.1": "0.1; it follows from .*threshold=0",
     "agent.gamma=???": r"^agent\.gamma=\?\?\?: expected a value",
     f"variant=hcfs {AUTO}.jerk_weight=1": r"It is deployed\.jerk_weight",
     # types
