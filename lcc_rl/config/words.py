@@ -66,6 +66,16 @@ def top_key(override: str) -> str:
     return key_of(override).split(".")[0].split("@")[0]
 
 
+def check_once(words: Sequence[str]) -> Sequence[str]:
+    """Return the words of a command; refuse several values of a key, which Hydra allows."""
+    first: dict[str, str] = {}
+    for word in words:
+        key, equals, value = word.removeprefix("++").partition("=")
+        if equals and key[:1] not in "+~" and first.setdefault(key, value) != value:
+            raise ConfigError(f"{key}={first[key]} {word}: {key} is set twice; leave one out")
+    return words
+
+
 def check_overrides(words: Sequence[str], given: Collection[str], reason: str) -> None:
     """Check that the remaining words of a command line are overrides.
 
@@ -77,7 +87,7 @@ def check_overrides(words: Sequence[str], given: Collection[str], reason: str) -
     Raises:
         ConfigError: naming the wrong word.
     """
-    flags = [word for word in words if word.startswith("-")]
+    flags = [word for word in check_once(words) if word.startswith("-")]
     require(not flags, f"unknown flag {' '.join(flags)}; -h lists all flags")
     if any("=" not in word and word[:1] != "~" for word in words):
         raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")

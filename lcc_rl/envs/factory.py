@@ -130,7 +130,7 @@ def world_of(
         max_braking=scenario.max_braking,
         max_acceleration=scenario.max_acceleration,
         replaced=scenario.replaced,
-        perturbation=0.0 if nominal else scenario.perturbation,
+        perturbation=scenario.perturbation,
         slope=scenario.slope and scenario.slope.made(Slope),
     )
 

@@ -101,6 +101,8 @@ IGNORED = {
     f"controller@{AUTO}=handover agent=td3": "handover drives the .* uses no action",
     "scenario.circumference=200": "belongs to scenario.road=ring",
     "scenario=ring scenario.start.human.cap_time_gap=2": "of a ring start evenly spaced",
+    "task=platoon-us06 training.gap_range=[1,1]": "no start of the scenario refers to it",
+    "+knowledge=[memory,traffic]": "no vehicle but the leader, whose speed traffic repeats",
     "scenario=ring training.gap_range=[1,1]": "of a ring start evenly spaced",
     "variant=idm training.episodes=20": "variant idm has no agent",
     "variant=alcc scenario.string=human*3 training.episodes=20": "no vehicle .* is automated",
