@@ -47,13 +47,12 @@ class Agent(Settings, ABC):
     """Settings of a learning algorithm; ``setup`` builds its ``policy``.
 
     ``policy`` reads ``"observation"`` and writes ``"action"``; ``loop`` trains it.
-    :class:`lcc_rl.agents.CollectingLoop` also reads ``noise``, the steps ``every`` of an action and
-    ``burn_in`` of human drivers, and, if set, ``rule``, ``objective`` and ``returns``.
+    :class:`lcc_rl.agents.CollectingLoop` also reads ``noise`` and the attributes with a default.
     """
 
     loop: ClassVar[Any]  # a class, see lcc_rl.agents.loop.TrainingLoop
-    every, burn_in = 1, 0
-    rule = objective = returns = cast(Any, None)
+    every, burn_in = 1, 0  # steps of an action; first steps of an episode, with human drivers
+    rule = objective = returns = cast(Any, None)  # below the policy; of limits; scale of rewards
 
     if TYPE_CHECKING:  # set by setup
 

@@ -41,8 +41,7 @@ def check_learner(
     """Check that the results of an update and the policy's weights are finite.
 
     Args:
-        policy: whose weights are checked.
-        values: losses and other results by name.
+        policy, values: the policy, and losses and other results by name.
         advice: the remedy in the message.
 
     Raises:

@@ -124,11 +124,10 @@ class CollectingLoop(TrainingLoop[AgentT]):
             if self.rule is not None:  # the policy's part of the action
                 own = (batch.get(ACTION) - self.rule(batch.get(OBSERVATION))) / self.agent.bound
                 batch.set(ACTION, own.clamp(-ONE, ONE))
+            rewards = batch.get(("next", *REWARD))
             if self.returns is not None:
-                last = self.returns.add(
-                    batch.get(("next", *REWARD)), batch.get(("next", "done")), last
-                )
-            collected, size = time.perf_counter(), batch.get(("next", *REWARD)).numel()
+                last = self.returns.add(rewards, batch.get(("next", "done")), last)
+            collected, size = time.perf_counter(), rewards.numel()
             before = self.iteration * (self.horizon // steps) + part
             losses.append(self.learn(batch, before * size))
             require(

@@ -119,11 +119,7 @@ def load(entry: str, overrides: Sequence[str] = ()) -> Any:
 
 
 def composed(entry: str | None, overrides: Sequence[str] = ()) -> DictConfig:
-    """Return the configuration that Hydra composes; without an entry point, of the choices only.
-
-    Raises:
-        ConfigError: if Hydra refuses an override.
-    """
+    """Return the configuration that Hydra composes; without an entry point, of the choices only."""
     hydra, meant = GlobalHydra.instance(), as_meant(overrides)
     try:
         where = str(hydra.config_loader().get_search_path()) if hydra.is_initialized() else ""
@@ -270,10 +266,7 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     if "agent" in content and not _learns(content):
         content["agent"] = None
     leave_out_foreign(content, overrides)
-    left_out = leave_out_terms(content.get("reward"))
-    if not sweep:
-        why = "reward.without leaves the term out"
-        refuse(overrides, {f"reward.terms.{name}": why for name in left_out})
+    leave_out_terms(content.get("reward"), () if sweep else overrides)
     if "inputs" in content:
         raise ConfigError("inputs: runs record the files that they read; remove the setting")
     try:
@@ -292,9 +285,8 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
             raise ConfigError(f"{error} It is deployed.{key[1]}.") from None
         key = re.match(r"([\w.]+) must ", str(error))
         if key and key[1] not in set().union(*map(typed_keys, overrides)):
-            typed = " ".join(item.removeprefix("++") for item in overrides)
-            fit = f"{error}; it follows from {typed or 'the files'}: do they fit each other?"
-            raise ConfigError(fit) from None
+            typed = " ".join(overrides).replace("++", "") or "the files"
+            raise ConfigError(f"{error}; it follows from {typed}: do these fit?") from None
         match = re.match(r"unknown setting of (\w+) \(", str(error))
         group = match.group(1) if match else ""
         if not group or not choices(group):
@@ -334,17 +326,15 @@ def _learns(content: Mapping[str, Any]) -> bool:
     return takes_action(as_nodes(driver[AUTOMATED], AUTO))
 
 
-def leave_out_terms(reward: Any) -> Sequence[str]:
+def leave_out_terms(reward: Any, overrides: Sequence[str] = ()) -> None:
     """Remove the terms of ``reward.without``, which a sweep can vary, from a reward.
 
     Args:
         reward: the section as plain containers, changed in place.
-
-    Returns:
-        The names of the removed terms.
+        overrides: overrides of the command line, of which none may set a removed term.
 
     Raises:
-        ConfigError: naming a term that the reward lacks.
+        ConfigError: naming a term that the reward lacks, or an override.
     """
     given = reward.pop("without", None) if isinstance(reward, dict) else None
     names = [given] if isinstance(given, str) else given or []
@@ -352,7 +342,8 @@ def leave_out_terms(reward: Any) -> Sequence[str]:
         terms = reward.get("terms") or {}
         require_known("term of the reward in reward.without", names, terms)
         reward["terms"] = {name: term for name, term in terms.items() if name not in names}
-    return names
+    why = "reward.without leaves the term out"
+    refuse(overrides, {f"reward.terms.{name}": why for name in names})
 
 
 def leave_out_foreign(content: dict[str, Any], overrides: Sequence[str]) -> None:
@@ -423,9 +414,8 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         if group in ADDED and len(several) > 1:
             remedy = f"a list takes several, '+{group}=[{','.join(several)}]'"
         return ConfigError(f"{' '.join(overrides)}: {group} is chosen twice: {remedy}")
-    if "Error resolving interpolation" in str(error) and (
-        gone := next((word for word in overrides if word.startswith("~")), None)
-    ):
+    gone = next((word for word in overrides if word.startswith("~")), "")
+    if gone and "Error resolving interpolation" in str(error):
         return ConfigError(f"{gone}: other choices depend on it; write {gone[1:]}=null")
     cause = error.__cause__
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)

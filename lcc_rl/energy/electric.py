@@ -81,11 +81,10 @@ class ElectricCar(EnergyModel):
 
 
 class PaperMotor(EnergyModel):
-    """Electric power of the ALCC paper's car (A2).
+    """Electric power (A2); gentle braking from 15 m/s returns 2.6 times the car's kinetic energy.
 
-    Gentle braking from 15 m/s returns 2.6 times the kinetic energy, from 10 m/s 2.7, from 30 m/s
-    2.5 times. Steady power, change of kinetic energy and loss by acceleration add up to A2 exactly.
-    Of the force at the wheels (A1) and Table I, only the kinetic energy ½ δ m v² is used.
+    Steady power, change of kinetic energy and loss by acceleration add up to A2 exactly. Of the
+    force at the wheels (A1) and Table I, only the kinetic energy ½ δ m v² is used.
     """
 
     mass = 1005.0  # m of A1 [kg]

@@ -293,12 +293,10 @@ def make_env(
             there is exactly one, and several as :class:`lcc_rl.envs.MultiAgent`; False: neither.
 
     Returns:
-        A TorchRL environment. With one automated vehicle ``observation`` has shape
-        ``[*batch, features]`` (scaled to about 1, ``observation.raw=true``: SI), ``action``
-        ``[*batch, 1]`` (−1 to 1: ±3 m/s² by default), ``reward`` ``[*batch, 1]`` (no unit) and
-        ``done``, ``terminated`` (a collision) and ``truncated`` ``[*batch, 1]``; with several, and
-        without ``single``, ``("automated", "observation")`` … have ``[*batch, vehicles, …]``.
-        docs/entries.md lists all entries of a state.
+        A TorchRL environment: ``observation``, ``[*batch, features]``, scaled to about 1 or, with
+        ``observation.raw=true``, in SI units; ``action`` in [−1, 1], by default ±3 m/s²,
+        ``reward``, without unit, and ``done``, ``[*batch, 1]`` each. Several automated vehicles
+        have ``("automated", "action")`` …, ``[*batch, vehicles, 1]``. docs/entries.md lists all.
 
     Raises:
         ConfigError: if the variant or an override is unknown or has no effect, or with ``single``

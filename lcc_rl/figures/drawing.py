@@ -121,10 +121,9 @@ def dots(
     """Draw a dot per row and a line along its interval.
 
     Args:
-        axis: the axes to draw on.
         places: position of every row, on the vertical axis or, if upright, the horizontal one.
         table: rows with the columns ``<column>``, ``<column>_low`` and ``<column>_high``.
-        column: name of the column.
+        axis, column: the axes to draw on, and the name of the column.
         hue: colour of dots and lines.
         upright: draw vertical lines.
         look: options of the dots, for ``Axes.plot``.

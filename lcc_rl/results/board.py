@@ -89,8 +89,7 @@ def row_of(
 
     Args:
         table: result of :func:`lcc_rl.results.report.summary`.
-        task: the task.
-        source, strategy: names of the leaders and of the strategy.
+        task, source, strategy: the task, and names of the leaders and of the strategy.
         drivers: number of drivers of the evaluation.
         future: entries of the leader's future that it reads.
 

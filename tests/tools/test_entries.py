@@ -65,8 +65,8 @@ def test_every_equation_is_listed_once_and_named_by_docstrings() -> None:
         assert named == numbers
 
 
-def check_imports() -> None:
-    """The reference has all that pages import, all pieces and the ``__all__`` of packages."""
+def test_the_reference_has_all_that_pages_import() -> None:
+    """Also all pieces and the ``__all__`` of packages; and docstrings name all parameters."""
     text = "".join(page.read_text() for page in PAGES if page.parent.name == "reference")
     modules = {*re.findall(r":: ([\w.]+)", text)}
     assert {x.name for x in iter_modules(pieces.__path__, "lcc_rl.pieces.")} <= modules
@@ -84,24 +84,12 @@ def check_imports() -> None:
             home = found.__module__
         if not isinstance(found, ModuleType | str | tuple):
             assert modules & {home, f"{home}.{name}", f"{module}.{name}"}, f"{module}.{name}"
-
-
-def check_parameters() -> None:
-    """Docstrings with arguments name all parameters."""
-    for path in sorted((ROOT / "lcc_rl").rglob("*.py")):
+    for path in (ROOT / "lcc_rl").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if not isinstance(node, ast.FunctionDef) or node.name.startswith("_"):
                 continue
             text = (ast.get_docstring(node) or "") + "\n"
-            if (section := re.search(r"^Args:\n((?: {4}.*\n|\n)*)", text, re.M)) is None:
-                continue
-            names = ", ".join(re.findall(r"^ {4}(\S[^:\n]*):", section[1], re.M)).split(", ")
-            own = node.args
-            given = [*own.posonlyargs, *own.args, own.vararg, *own.kwonlyargs, own.kwarg]
-            parameters = {x.arg for x in given if x is not None} - {"self", "cls"}
-            assert {x.lstrip("*") for x in names} == parameters, f"{path.stem}.{node.name}"
-
-
-def test_the_reference_has_all_that_a_program_imports_and_all_parameters() -> None:
-    check_imports()
-    check_parameters()
+            if section := re.search(r"^Args:\n((?: {4}.*\n|\n)*)", text, re.M):
+                names = ", ".join(re.findall(r"^ {4}(\S[^:\n]*):", section[1], re.M)).split(", ")
+                given = {x.arg for x in ast.iter_child_nodes(node.args) if isinstance(x, ast.arg)}
+                assert {x.lstrip("*") for x in names} == given - {"self", "cls"}, node.name
