@@ -34,6 +34,7 @@ def check_used(
     """Refuse options that the configuration would ignore.
 
     Args:
+        cfg, overrides: the typed tree, and the overrides of the command line.
         sweep: allow settings of an agent without one, because the runs of a sweep share them.
         written: the configuration as plain containers with its references.
 

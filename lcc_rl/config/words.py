@@ -44,7 +44,11 @@ def typed_keys(override: str) -> set[str]:
 
 
 def with_variant(variant: str, overrides: Any) -> list[Any]:
-    """Return the words of a command from what a program gives; a text is one setting."""
+    """Return the words of a command from what a program gives; a text is one setting.
+
+    Raises:
+        ConfigError: for settings of folders, which Python ignores.
+    """
     single = isinstance(overrides, str) or not isinstance(overrides, Iterable)
     words = [overrides] if single else [*overrides]
     for word in filter(re.compile("hydra.(run|sweep|job)").match, map(str, words)):

@@ -125,7 +125,7 @@ class Program:
         """Return the accelerations, ``[batch, 1]``, and the memory if there is one.
 
         Args:
-            *given: the state, ``[batch, inputs]``, and the memory, ``[batch, n]``.
+            *inputs: the state, ``[batch, inputs]``, and the memory, ``[batch, n]``.
         """
         named = zip(TAKES, inputs, strict=False)
         feed = {name: value.detach().cpu().float().numpy() for name, value in named}

@@ -78,8 +78,7 @@ class LeaderPreview(Feature):
         steps = [world.steps(ahead, f"{where}.horizons") - late for ahead in self.horizons]
         self.register_buffer("speeds", profiles.speeds)
         self.register_buffer("offsets", profiles.offsets)
-        lengths = profiles.lengths if profiles.reach is None else profiles.reach
-        self.register_buffer("last", lengths - 1)
+        self.register_buffer("last", profiles.reach - 1)
         self.register_buffer("shift", torch.tensor(steps))
         self.register_buffer("columns", torch.arange(len(steps)))
 

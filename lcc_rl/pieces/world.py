@@ -164,6 +164,7 @@ class Part(Settings):
         """Return a copy that is bound to a world.
 
         Args:
+            world: properties that all pieces share; None: those of ``World()``.
             name: its role, or its key in the configuration.
         """
         bound = type(self)(**values(self))

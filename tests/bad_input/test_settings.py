@@ -47,6 +47,9 @@ WRONG = {
     "reward.terms.safety.wieght=1": "reward.terms.safety .*'weight'",
     "learning=follow": "choice of learning 'follow'; valid: follow_samples.*, needs --config-dir",
     "agent._partial_=true": "agent._partial_ has no effect",
+    "~agent": "~agent: other choices depend on it; write agent=null$",
+    "experiment=limits agent=ddpg": r"gamma must .*; it follows from .*experiment=limits agent=dd",
+    "agent=analytic reward.terms.efficiency.threshold=0.1": "0.1; it follows from .*threshold=0",
     "agent.gamma=???": r"^agent\.gamma=\?\?\?: expected a value",
     f"variant=hcfs {AUTO}.jerk_weight=1": r"It is deployed\.jerk_weight",
     # types
@@ -118,6 +121,8 @@ IGNORED = {
     "+filter=cbf scenario.filters.automated.robust=false": "actuators and sensors are exact",
     "sweep=mine": "names the folder of a sweep, -m",
     "variant=own_energy observation.visible=2": "scales names no vehicle behind",
+    "reward.without=safety reward.terms.safety.threshold=3": "reward.without leaves the term out",
+    "reward.without=[safety] reward.terms.safety.weight=3": "reward.without leaves the term out",
 }
 # Settings of an evaluation of a policy without effect, by variant, and why.
 OF_TRAINING = "has the (settings|agent) of its training"
