@@ -30,7 +30,7 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 45_740, "code": 30_405},
+    "lcc_rl + tools": {"lines": 45_810, "code": 30_455},
     "tests": {"lines": 27_910},
     "conf": {"yaml": 166},
 }

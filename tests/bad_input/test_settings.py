@@ -228,6 +228,8 @@ def test_options_without_effect_are_refused() -> None:
     words = ["variants=[alcc]", "evaluation.baselines=[human]"]  # a job compares
     trainings, final = composed_part(load("pipeline", words), words)
     assert final.evaluation.baselines == ["human"] != trainings["alcc"].evaluation.baselines
+    case = (["agent=none"], "variant=reference is a learned controller, but there is no agent")
+    check_refused(lambda words: composed_part(load("pipeline", words), words), [case], ConfigError)
 
 
 class Own(CACC):
