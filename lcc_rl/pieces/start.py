@@ -115,11 +115,9 @@ class HeadwayStart(Part):
 
     def setup(self, world: World) -> None:
         """Choose the deviations; 0 in an evaluation."""
-        text = f"scenario.start.{self.name}.gap_spread={self.gap_spread:g} must be below its "
-        text += f"headway={self.headway:g}"
-        require(world.nominal or self.gap_spread < self.headway, text)
-        spreads = (self.gap_spread, self.speed_spread)
-        self.gaps, self.speeds = (0.0, 0.0) if world.nominal else spreads
+        self.gaps, self.speeds = map(world.deviation, (self.gap_spread, self.speed_spread))
+        text = f"scenario.start.{self.name}.gap_spread={self.gaps:g} must be below its "
+        require(self.gaps < self.headway, f"{text}headway={self.headway:g}")
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""

@@ -47,6 +47,9 @@ WRONG = {
     "reward.terms.safety.wieght=1": "reward.terms.safety .*'weight'",
     "learning=follow": "choice of learning 'follow'; valid: follow_samples.*, needs --config-dir",
     "agent._partial_=true": "agent._partial_ has no effect",
+    "~agent": "~agent: other choices depend on it; write agent=null$",
+    "experiment=limits agent=ddpg": r"gamma must .*; it follows from .*experiment=limits agent=dd",
+    "agent=analytic reward.terms.efficiency.threshold=0.1": "0.1; it follows from .*threshold=0",
     "agent.gamma=???": r"^agent\.gamma=\?\?\?: expected a value",
     "variant=cacc gains.k5=1": r"setting of gains 'k5'.*; valid: k1, k2, k3, k4",
     f"variant=hcfs {AUTO}.jerk_weight=1": r"It is deployed\.jerk_weight",
@@ -99,6 +102,8 @@ IGNORED = {
     f"controller@{AUTO}=handover agent=td3": "handover drives the .* uses no action",
     "scenario.circumference=200": "belongs to scenario.road=ring",
     "scenario=ring scenario.start.human.cap_time_gap=2": "of a ring start evenly spaced",
+    "task=platoon-us06 training.gap_range=[1,1]": "no start of the scenario refers to it",
+    "+knowledge=[memory,traffic]": "no vehicle but the leader, whose speed traffic repeats",
     "scenario=ring training.gap_range=[1,1]": "of a ring start evenly spaced",
     "variant=idm training.episodes=20": "variant idm has no agent",
     "variant=alcc scenario.string=human*3 training.episodes=20": "no vehicle .* is automated",
@@ -118,6 +123,8 @@ IGNORED = {
     "+filter=cbf scenario.filters.automated.robust=false": "actuators and sensors are exact",
     "sweep=mine": "names the folder of a sweep, -m",
     "variant=own_energy observation.visible=2": "scales names no vehicle behind",
+    "reward.without=safety reward.terms.safety.threshold=3": "reward.without leaves the term out",
+    "reward.without=[safety] reward.terms.safety.weight=3": "reward.without leaves the term out",
 }
 # Settings of an evaluation of a policy without effect, by variant, and why.
 OF_TRAINING = "has the (settings|agent) of its training"
@@ -223,6 +230,8 @@ def test_options_without_effect_are_refused() -> None:
     words = ["variants=[alcc]", "evaluation.baselines=[human]"]  # a job compares
     trainings, final = composed_part(load("pipeline", words), words)
     assert final.evaluation.baselines == ["human"] != trainings["alcc"].evaluation.baselines
+    case = (["agent=none"], "variant=reference is a learned controller, but there is no agent")
+    check_refused(lambda words: composed_part(load("pipeline", words), words), [case], ConfigError)
 
 
 class Own(CACC):
