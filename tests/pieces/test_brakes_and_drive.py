@@ -115,9 +115,8 @@ def test_the_limits_hold_for_commands_of_every_kind() -> None:
     assert Action().bind(World(max_braking=2.0)).compute(action).flatten().tolist() == [-2.0, 3.0]
     human = IDMACC().bind(World(max_braking=6.0), "human")
     assert human.limits == (-3.0, 3.0)  # limits of automated vehicles only
-    weak = CBFFilter(max_acceleration=2.5).bind(strong, "automated")
-    filters = [CBFFilter().bind(strong, "automated"), weak]  # 3 does not lower, policies have it
-    assert [(x.least, x.largest) for x in filters] == [(-6.0, 2.0), (-2.5, 2.0)]
+    for limit, least in ((3.0, -6.0), (2.5, -2.5)):  # a filter's 3 does not lower
+        assert CBFFilter(max_acceleration=limit).bind(strong, "automated").least == least
 
 
 def test_limits_without_effect_are_refused() -> None:
