@@ -30,8 +30,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 45_640, "code": 30_350},
-    "tests": {"lines": 27_800},
+    "lcc_rl + tools": {"lines": 45_670, "code": 30_370},
+    "tests": {"lines": 27_810},
     "conf": {"yaml": 166},
 }
 CASES = 1_335  # ceiling of all quick tests, see tests/tools/test_size.py
