@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -15,6 +16,7 @@ from lcc_rl.functional.power import POWER_COEFFICIENTS
 
 REFERENCE = ROOT / "outputs" / "reference"
 PATH, FLOW, FUEL = "total_path_energy_kj", "flow_vph", 42.4  # kJ per g of petrol
+BOTH = "[cav_energy,hdv_energy]"
 PETROL, VARIANTS = "total_second_path_energy_kj", ("alcc", "own_energy")
 
 
@@ -218,12 +220,32 @@ def leaderboard() -> list[str]:
     ]
 
 
+def ablations() -> list[str]:
+    acts = "share_filter_acts"
+    rows = means("ablations", PATH, "distance_m", FLOW, acts)
+    full, *others = (
+        f"alcc reward.without={terms}"
+        for terms in ("null", "safety", "efficiency", "cav_energy", "hdv_energy", BOTH)
+    )
+    more = {one: rows[FLOW][one] / rows[FLOW][full] - 1.0 for one in others}
+    found = [f"at {-more[others[1]]:.1%} (", f"at {more[others[-1]]:.1%} ("]
+    found.append(f"at {rows[FLOW][others[-1]] / rows[FLOW]['recorded'] - 1.0:.1%} more flow")
+    for one in others[:-1]:
+        at_flow = (equal_flow(rows, re.escape(one), x) for x in ("recorded", re.escape(full)))
+        cells = [1.0 - rows["e"][one] / rows["e"][full], *at_flow]
+        found += [f"| {100.0 * cell:.2f} (" for cell in cells]
+    held = 100.0 * rows[acts][[f"{one} X=1.7" for one in (full, *others)]]
+    found.append(f"in {held[:-1].min():.0f} to {held[:-1].max():.0f}%")
+    return [*found, f"in {held.iloc[-1]:.0f}%"]
+
+
 PAGES: dict[str, tuple[Callable[[], list[str]], str]] = {
     "README": (readme, ""),
     "limits, bounds": (bounds, ""),
     "limits": (limits, "| network, `pretrained/alcc_limits` | 528,"),
     "limits, equal flow": (at_equal_flow, "| OpenACC, test track and low speed"),
     "limits, trainings": (trainings, ""),
+    "ablations": (ablations, ""),
     "alcc": (alcc, "| this study |"),
     "hcfs": (hcfs, "| I-80 | HCFS |"),
     "waves": (waves, "| 0.4 s, noise 0.4 m/s² |"),

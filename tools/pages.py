@@ -11,7 +11,8 @@ import argparse
 import re
 import shutil
 import sys
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -39,10 +40,12 @@ from lcc_rl.io.files import read_parquet
 from lcc_rl.io.settings import read_json
 from lcc_rl.results import board
 from lcc_rl.results.fronts import ENERGY, FRONT_KINDS, LONG_SHARE, at_equal_flow, points
+from lcc_rl.results.intervals import BOUNDED
 from lcc_rl.results.measures import FLOW, SIGNS, Measure, signed
-from lcc_rl.results.names import NETWORK, ON_FRONT, in_words, worded
+from lcc_rl.results.names import MARKS, NETWORK, ON_FRONT, in_words, worded
 from lcc_rl.results.remarks import MORE_NAMED
-from lcc_rl.results.render import as_markdown, markdown_table, saved_text
+from lcc_rl.results.render import as_markdown, for_print, markdown_table, saved_text
+from lcc_rl.results.report import report
 from lcc_rl.results.runs import naming_run
 from lcc_rl.results.task import Task
 from lcc_rl.studies.alcc.study import narrow
@@ -77,6 +80,12 @@ SOURCES = {
     "platoons": "OpenACC, motorways (`data=platoons`)",
 }
 FILTERED_RULE = "idm_acc_filtered"
+ALL_TERMS = f"{NETWORK} reward.without=null"
+ROWS_WITHOUT = {  # rows of an ablation in words
+    f" [{MARKS}]": "",
+    re.escape(in_words(ALL_TERMS)): "all terms",
+    r"network \(reward\.without=\[?([^\]]+?)\]?\)": r"without \1",
+}
 
 
 def fill(page: Path, tables: Mapping[str, str]) -> None:
@@ -110,7 +119,7 @@ def study(name: str, reference: Path, docs: Path) -> None:
 
 
 def tasks(reference: Path, docs: Path) -> None:
-    """Write the tables of docs/{fleets,leaderboard,limits,notes/results}.md."""
+    """Write the tables of docs/{ablations,fleets,leaderboard,limits,notes/results}.md."""
     tables = {path.stem: read_parquet(path) for path in sorted((reference / "tasks").glob("*"))}
     parts = [task_table(name, tables[name]) for name in TASKS_SHOWN]
     rows = tables["fleets_fronts"]
@@ -125,6 +134,8 @@ def tasks(reference: Path, docs: Path) -> None:
     fill(docs / "notes" / "results.md", {**found, "tasks": "\n\n".join(parts)})
     kept = read_parquet(reference / "averaged.parquet")
     fill(docs / "limits.md", {"averaged": averaged(kept)})
+    kept = read_parquet(reference / "ablations.parquet")
+    fill(docs / "ablations.md", {"ablations": as_markdown(ablations(kept))})
 
 
 def averaged(rows: pd.DataFrame) -> str:
@@ -139,10 +150,7 @@ def averaged(rows: pd.DataFrame) -> str:
     for source, words in SOURCES.items():
         part = rows[rows["source"] == source]
         names = part["strategy"].unique()
-        own, rule = (
-            [x for x in names if x.partition(ON_FRONT)[0] == one]
-            for one in (NETWORK, FILTERED_RULE)
-        )
+        own, rule = (points_of(names, one) for one in (NETWORK, FILTERED_RULE))
         for label, mine, other in (
             ("network against the recorded drivers", own, [RECORDED]),
             ("tuned IDM against the recorded drivers", rule, [RECORDED]),
@@ -170,6 +178,30 @@ def learners(reference: Path, docs: Path) -> None:
     for page, own in (("learners.md", table[~chosen]), ("notes/agents.md", table[chosen])):
         shown = {"learners": as_markdown(own.dropna(axis=1, how="all"))}
         fill(docs / page, shown | found)
+
+
+def ablations(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the table of rewards without some terms, compared at equal flow.
+
+    Args:
+        rows: result of :func:`lcc_rl.results.windows.windows_of` of policies that were trained with
+            ``reward.without``, behind filters with several longest time gaps.
+    """
+    found, names = report(rows, against=ALL_TERMS), rows["strategy"].unique()
+    keys = ["driver", "energy_kj_per_km", "saved_pct", "flow_pct", "flow_saved_pct"]
+    shown, table, fronts = for_print(found, keys), found.short, partial(points_of, names)
+    compared = table["flow_saved_pct"].notna() & (table["strategy"] != ALL_TERMS)
+    saved = [
+        at_equal_flow(rows, fronts(name) * kept, fronts(ALL_TERMS), ENERGY, RECORDED).percent
+        for name, kept in zip(table["strategy"], compared, strict=True)
+    ]
+    shown[[f"at equal flow [%]{end}" for end in BOUNDED]] = saved
+    return shown.replace({"driven by": ROWS_WITHOUT}, regex=True)
+
+
+def points_of(names: Iterable[str], kind: str) -> list[str]:
+    """Return the strategies along the front of one kind."""
+    return [x for x in names if x.partition(ON_FRONT)[0] == kind]
 
 
 def task_table(name: str, table: pd.DataFrame) -> str:
