@@ -17,8 +17,7 @@ import yaml
 from pydantic import AfterValidator, Field
 
 from lcc_rl.config.nodes import Node, as_nodes, as_plain, check_nodes, check_numbers, nodes_in
-from lcc_rl.errors import ConfigError, require, require_known
-from lcc_rl.functional.cacc import Gains
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import (
     AUTOMATED,
     HUMAN,
@@ -345,7 +344,6 @@ class StudyConfig(BaseConfig):
     def validate(self) -> None:
         for module in self.measures:
             load_module(module, "measures")
-        require_known("setting of gains", self.gains or (), Gains.__dataclass_fields__)
 
 
 class TrainConfig(StudyConfig):

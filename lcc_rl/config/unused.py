@@ -48,6 +48,9 @@ def check_used(
         reasons |= dict(_of_roles(cfg)) | dict(_of_agent(cfg))
         if written is not None and "${training.gap_range}" not in str(written["scenario"]):
             reasons.setdefault("training.gap_range", "no start of the scenario refers to it")
+        for key in map(key_of, overrides):
+            if key.startswith("gains.") and f"${{{key}}}" not in str(written):
+                reasons[key] = "no controller refers to it"
         observation = cfg.observation.settings
         if observation[TARGET] == OBSERVATION and "behind" not in (observation.get("scales") or ()):
             for key in ("visible", "presence"):

@@ -189,7 +189,7 @@ def test_the_option_that_adds_an_entry_is_named() -> None:
     cases = [(Uphill, r"writes; \+slope=hills adds"), (Ahead, r"\+slope=hills \+knowledge=terrain")]
     check_refused(lambda kind: lcc_rl.simulate([9.0] * 50, "automated", kind()), cases)
     for options in ADDED_BY.values():  # each adds all entries for which it stands
-        words = ["energy=electric", *options.split()]
+        words = ["energy=electric", "scenario.string=automated human automated", *options.split()]
         written = {name for name, said in ADDED_BY.items() if said == options}
         env = lcc_rl.make_env("alcc", 2, words)
         keys = [key for piece in pieces_of(env) for key in piece.entries]
