@@ -59,6 +59,10 @@ class Diverged(LccError):
 LARGEST = 1e9
 # Exceeds any memory, which has its own error; and the largest seed.
 LARGEST_SIZE, LAST_SEED = 10**15, 2**32 - 1  # torch uses no more bits of a seed
+REMEDIES = {  # of a user's code, by words of torch's errors
+    "Boolean value": "use torch.where in place of if",
+    "converted to": "use torch in place of math and float: this is a tensor of several numbers",
+}
 # Folders of code that is not the user's: package, tools of a clone, Python.
 NOT_USERS = (Path(__file__).parent, Path(__file__).parents[1] / "tools", get_path("stdlib"))
 
@@ -123,7 +127,8 @@ def line_of(error: BaseException, typed: bool = False) -> str:
         return one_line(str(error))
     text, place = one_line(str(error))[:500], place_of(error)
     text = f"{type(error).__name__}: {text}" if typed or place else text
-    return f"{text} ({place})" if place else text
+    remedy = "".join(f" ({remedy})" for words, remedy in REMEDIES.items() if words in text)
+    return f"{text} ({place}){remedy}" if place else text
 
 
 @contextmanager
@@ -145,8 +150,7 @@ def naming(title: str) -> AbstractContextManager[None]:
     """Raise an error of a user's code as a ConfigError: its class, then the error's type, line."""
 
     def named(error: Exception) -> LccError | None:
-        hint = " (use torch.where in place of if)" if "Boolean value" in str(error) else ""
-        return ConfigError(f"{title} fails: {line_of(error)}{hint}") if place_of(error) else None
+        return ConfigError(f"{title} fails: {line_of(error)}") if place_of(error) else None
 
     return replacing(named)
 

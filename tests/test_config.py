@@ -14,7 +14,7 @@ import lcc_rl.conf
 from lcc_rl.agents.actor import shared_policy
 from lcc_rl.agents.factory import build_agent
 from lcc_rl.config.compose import CONF as MODULE
-from lcc_rl.config.compose import as_meant, composed, identity, load
+from lcc_rl.config.compose import as_meant, composed, identity, load, parsed
 from lcc_rl.config.nodes import as_plain, settings_at, with_defaults, without_defaults
 from lcc_rl.config.schemas import TrainConfig, as_text, parse_config
 from lcc_rl.envs import build_env
@@ -104,6 +104,9 @@ def test_a_sweep_can_leave_out_a_term() -> None:
         other = load("train", ["variant=alcc", *(f"~reward.terms.{name}" for name in removed)])
         assert identity(one) == identity(other) != identity(whole)
         assert {*whole.reward.terms} - {*one.reward.terms} == {*removed}
+    words = ["variant=alcc", "reward.without=safety", "reward.terms.safety.threshold=3"]
+    run = parsed(composed("train", words), "train", words, sweep=True)  # others have the term
+    assert "safety" not in run.reward.terms
 
 
 def test_every_choice_of_a_group_builds(subtests) -> None:

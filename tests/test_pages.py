@@ -102,7 +102,7 @@ class Reader:
         for block in blocks(page):
             file = re.match(r"# ([\w/]+\.py)", block.text)
             if block.language == "yaml":
-                self.write(block.before.strip("`:"), block.text)
+                self.write(block.before.strip("`:").rpartition("`")[2], block.text)
             elif block.language == "python" and file:
                 self.write(file[1], block.text)
             elif block.language == "python":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -67,6 +68,18 @@ def test_the_gradient_through_the_simulator_trains_platoons_too(tmp_path) -> Non
     # Without the recipe its segments divide the platoon's episodes.
     cfg = load("train", ["variant=ddpg", "agent=analytic"])
     assert cfg.scenario.horizon % cfg.training.segment == 0
+
+
+def test_leaders_without_cases_have_no_figures_of_cases(tmp_path) -> None:
+    record = tmp_path / "mine.csv"
+    seconds = np.arange(0.0, 120.0, 0.2)
+    speeds = 10.0 + 2.0 * np.sin(seconds / 8.0)
+    pd.DataFrame({"time_s": seconds, "speed_mps": speeds}).to_csv(record, index=False)
+    words = ["variant=cacc", "leader=record", f"leader.path={record}", "evaluation.profiles=1"]
+    words += ["evaluation.full_length=false", "evaluation.baselines=[cacc tuned]"]
+    rows = evaluation.run(load("evaluate", words), tmp_path)  # not quiet: draws figures
+    assert set(rows["strategy"]) == {"cacc tuned"}
+    assert not (tmp_path / "figures").exists()
 
 
 @pytest.mark.slow

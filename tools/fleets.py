@@ -45,6 +45,12 @@ SETTINGS = {  # labels of the stored fronts
     "metres": "whole drives",
     "metres_200": "200 s after 100 s",
     "metres_400": "whole drives after 100 s",
+    "metres_200_traffic": "200 s after 100 s, with the traffic ahead",
+    "metres_400_traffic": "whole drives after 100 s, with the traffic ahead",
+    "metres_400_wavy_traffic": "wavy half after 100 s, with the traffic ahead",
+    "metres_200_each": "200 s after 100 s, … and a limit behind each leader",
+    "metres_400_each": "whole drives after 100 s, … and a limit behind each leader",
+    "metres_400_wavy_each": "wavy half after 100 s, … and a limit behind each leader",
 }
 PANELS = ("front", "free", "long", "true")
 TAUGHT = ", trained "  # part of the label of a setting with fleets trained in it

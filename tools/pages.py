@@ -21,6 +21,7 @@ import fleets
 import measured_energy
 import numpy as np
 import pandas as pd
+import trained
 from matplotlib.figure import Figure
 
 from lcc_rl.cli.guard import main_guard
@@ -85,7 +86,6 @@ ROWS_WITHOUT = {  # rows of an ablation in words
     re.escape(in_words(ALL_TERMS)): "all terms",
     r"network \(reward\.without=\[?([^\]]+?)\]?\)": r"without \1",
 }
-LEARNERS = {"ppo": "PPO", "td3": "TD3", "sac": "SAC", "analytic": "gradient (`analytic`)"}
 
 
 def fill(page: Path, tables: Mapping[str, str]) -> None:
@@ -164,7 +164,8 @@ def averaged(rows: pd.DataFrame) -> str:
 
 def learners(reference: Path, docs: Path) -> None:
     """Write the scores of learners: a row per task and learner, with the range of seeds."""
-    rows = worded(read_parquet(reference / "learners.parquet")).replace({"strategy": LEARNERS})
+    rows = worded(read_parquet(reference / "learners.parquet"))
+    rows = rows.replace({"strategy": trained.LEARNERS})
     scores = {"score": "mean", "score_low": "min", "score_high": "max"}
     how = {name: ("score", kind) for name, kind in scores.items()}
     how |= {name: (name, "mean") for name in rows.columns[4:]}
@@ -172,8 +173,11 @@ def learners(reference: Path, docs: Path) -> None:
     table.loc[table["score_low"] == table["score_high"], ["score_low", "score_high"]] = np.nan
     table.attrs["decimals"] = 2
     chosen = table["task"].str.contains("training")  # where settings were chosen
+    windows = read_parquet(reference / "learner_windows.parquet")
+    found = {"savings": trained.learner_savings(windows)}
     for page, own in (("learners.md", table[~chosen]), ("notes/agents.md", table[chosen])):
-        fill(docs / page, {"learners": as_markdown(own.dropna(axis=1, how="all"))})
+        shown = {"learners": as_markdown(own.dropna(axis=1, how="all"))}
+        fill(docs / page, shown | found)
 
 
 def ablations(rows: pd.DataFrame) -> pd.DataFrame:

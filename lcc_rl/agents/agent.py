@@ -7,7 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, cast
 
 import torch
 from pydantic import Field
@@ -29,6 +29,7 @@ class Scene:
         observation_size: entries of the observation of one automated vehicle.
         seed: seed of the initial weights and of the random numbers of updates.
         device: device of the networks.
+        world: properties that the pieces of the environment share.
         observation: the observation, for policies that are rules.
         max_acceleration: acceleration of action 1 [m/s²], for rules; None if the controller of
             automated vehicles has no such setting.
@@ -46,9 +47,12 @@ class Agent(Settings, ABC):
     """Settings of a learning algorithm; ``setup`` builds its ``policy``.
 
     ``policy`` reads ``"observation"`` and writes ``"action"``; ``loop`` trains it.
+    :class:`lcc_rl.agents.CollectingLoop` also reads ``noise`` and the attributes with a default.
     """
 
     loop: ClassVar[Any]  # a class, see lcc_rl.agents.loop.TrainingLoop
+    every, burn_in = 1, 0  # steps of an action; first steps of an episode, with human drivers
+    rule = objective = returns = cast(Any, None)  # below the policy; of limits; scale of rewards
 
     if TYPE_CHECKING:  # set by setup
 
@@ -108,6 +112,7 @@ def anneal(
     """Set learning rates that fall from their initial value to a fraction of it.
 
     Args:
+        optimizers: whose rates are set.
         share: share of the training that is over.
         final_lr_fraction: final rate as a fraction of the initial one; 1: constant.
         schedule: half a cosine, or a line.

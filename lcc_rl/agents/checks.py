@@ -41,7 +41,7 @@ def check_learner(
     """Check that the results of an update and the policy's weights are finite.
 
     Args:
-        values: losses and other results by name.
+        policy, values: the policy, and losses and other results by name.
         advice: the remedy in the message.
 
     Raises:

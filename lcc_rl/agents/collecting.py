@@ -57,14 +57,11 @@ class CollectingLoop(TrainingLoop[AgentT]):
             f"agent: setup of {type(self.agent).__name__} must make noise, the exploration, such "
             "as GaussianExploration(0.3), or None",
         )
-        self.every = getattr(self.agent, "every", 1)
-        burn_in: int = getattr(self.agent, "burn_in", 0)
-        self.skipped, rest = divmod(burn_in, self.settings.segment)
+        self.every, self.rule, self.returns = self.agent.every, self.agent.rule, self.agent.returns
+        self.skipped, rest = divmod(self.agent.burn_in, self.settings.segment)
         require(not rest, "training.segment must divide the steps of agent.humans_first")
-        self.horizon -= burn_in
-        self.rule = getattr(self.agent, "rule", None)
-        self.objective: Objective | None = getattr(self.agent, "objective", None)
-        self.returns = getattr(self.agent, "returns", None)
+        self.horizon -= self.agent.burn_in
+        self.objective: Objective | None = self.agent.objective
         self.wanted: list[Key] = []
         if self.objective is not None and self.objective.differs:
             self.objective.replace([x for x in pieces_of(self.env) if isinstance(x, RewardTerm)])
@@ -127,11 +124,10 @@ class CollectingLoop(TrainingLoop[AgentT]):
             if self.rule is not None:  # the policy's part of the action
                 own = (batch.get(ACTION) - self.rule(batch.get(OBSERVATION))) / self.agent.bound
                 batch.set(ACTION, own.clamp(-ONE, ONE))
+            rewards = batch.get(("next", *REWARD))
             if self.returns is not None:
-                last = self.returns.add(
-                    batch.get(("next", *REWARD)), batch.get(("next", "done")), last
-                )
-            collected, size = time.perf_counter(), batch.get(("next", *REWARD)).numel()
+                last = self.returns.add(rewards, batch.get(("next", "done")), last)
+            collected, size = time.perf_counter(), rewards.numel()
             before = self.iteration * (self.horizon // steps) + part
             losses.append(self.learn(batch, before * size))
             require(

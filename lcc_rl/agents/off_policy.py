@@ -97,17 +97,14 @@ class OffPolicy(Sampling):
 
     def setup(self, scene: Scene) -> None:
         size, seed, kind = scene.observation_size, scene.seed, self.activation
-        self.count, self.generator = 0, torch.Generator(scene.device)
+        self.generator = torch.Generator(scene.device)
         self.lasting = False  # whether a target value may last for several updates
         self.actor = self.make_actor(scene)
         self.noise: TensorDictModuleBase = GaussianExploration(0.0)
         keys = ["observation", "action"]
-        self.values = [
-            ValueOperator(seeded_mlp(size + 1, 1, self.hidden, own, kind), in_keys=keys).to(
-                scene.device
-            )
-            for own in range(seed + 1, seed + 1 + 2 * self.critics, 2)
-        ]
+        seeds = range(seed + 1, seed + 1 + 2 * self.critics, 2)
+        networks = (seeded_mlp(size + 1, 1, self.hidden, own, kind) for own in seeds)
+        self.values = [ValueOperator(x, in_keys=keys).to(scene.device) for x in networks]
 
     def anneal(self, share: float) -> float:
         """Set the learning rates after this share of the training; return the policy's."""

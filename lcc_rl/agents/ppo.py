@@ -72,7 +72,6 @@ class PPO(Sampling):
 
     def setup(self, scene: Scene) -> None:
         size, device, kind = scene.observation_size, scene.device, self.activation
-        self.count = 0
         learned = self.make_actor(scene)
         self.head = head = Gaussian(learned.module[0], self.sigma).to(device)
         self.noise = SampledAction(head, self.rule, self.bound)

@@ -76,7 +76,7 @@ class Sampling(Aiming):
             ConfigError: if the policy is a rule alone.
         """
         kind = self.policy
-        self.every = max(scene.world.steps(self.hold, "agent.hold"), 1)
+        self.count, self.every = 0, max(scene.world.steps(self.hold, "agent.hold"), 1)
         if self.horizon is not None:
             self.gamma = math.exp(-self.every * scene.world.time_step / self.horizon)
         self.returns = Returns(self.gamma).to(scene.device) if self.scale_rewards else None

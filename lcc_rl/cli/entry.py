@@ -38,7 +38,7 @@ from lcc_rl.config.compose import (
     parsed,
 )
 from lcc_rl.config.schemas import StudyConfig
-from lcc_rl.config.words import top_key
+from lcc_rl.config.words import check_once, top_key
 from lcc_rl.errors import ConfigError, Interrupted, LccError, ResultsError, input_error, require
 from lcc_rl.runs.interrupts import ending_quietly, was_interrupted
 from lcc_rl.runs.states import CONFIG, Busy, forget, record, withdraw
@@ -246,7 +246,7 @@ def flags_first(words: Sequence[str]) -> list[str]:
             "are --help, --cfg job, --info, --config-dir and, for a sweep, -m"
         )
     flags = list(words)
-    for item in known.overrides:
+    for item in check_once(known.overrides):
         flags.remove(item)
     return [*flags, *as_meant(known.overrides)]
 

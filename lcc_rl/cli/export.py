@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from lcc_rl.config.words import check_once
 from lcc_rl.runs.arguments import Arguments
 from lcc_rl.runs.interrupts import ending_quietly
 
@@ -18,6 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     text += "of a rule or a controller of your own (time_step=0.02)"
     parser.add_argument("settings", nargs="*", default=[], help=text)
     options = parser.parse_args(arguments)
+    check_once(options.settings)
     with ending_quietly():  # loads torch
         from lcc_rl.interfaces.export import written
         from lcc_rl.interfaces.exported import described_input

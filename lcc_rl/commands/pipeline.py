@@ -36,6 +36,7 @@ from lcc_rl.drivers.calibrator import count_records
 from lcc_rl.drivers.population import bootstrap
 from lcc_rl.envs.inputs import LOADS, MADE, build_energy, load_inputs, second_energy
 from lcc_rl.errors import ConfigError, Interrupted, ResultsError
+from lcc_rl.evaluation.fit import check_variant
 from lcc_rl.figures.drawing import save
 from lcc_rl.figures.evaluation import write_figures
 from lcc_rl.figures.page import held_to, write_page
@@ -124,6 +125,8 @@ def composed_part(
     learned = [override for override in shared if key_of(override) not in OF_COMPARISONS]
     names = cfg.variants or NETWORKS
     trainings = {name: load("train", [*learned, f"variant={name}"]) for name in names}
+    for settings in trainings.values():
+        check_variant(settings)
     if cfg.variants is None and trainings[names[-1]].agent.kind is Analytic:
         trainings = {RULE: load("train", [*learned, f"variant={RULE}"]), **trainings}
     final = load("evaluate", [*known_settings(shared, "evaluate"), f"variant={names[-1]}"])

@@ -244,6 +244,7 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     Args:
         cfg: the composed configuration.
         entry: the command.
+        overrides: the words after the command.
         sweep: allow settings that this run does not use, because the runs of a sweep share them.
     """
     for item in overrides:
@@ -265,7 +266,7 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
     if "agent" in content and not _learns(content):
         content["agent"] = None
     leave_out_foreign(content, overrides)
-    leave_out_terms(content.get("reward"))
+    leave_out_terms(content.get("reward"), () if sweep else overrides)
     if "inputs" in content:
         raise ConfigError("inputs: runs record the files that they read; remove the setting")
     try:
@@ -282,6 +283,10 @@ def parsed(cfg: DictConfig, entry: str, overrides: Sequence[str] = (), sweep: bo
         after = (content.get("deployed") or {}).get(TARGET)  # the controller after training
         if key and after and key[1] in (settings_of(find_target(after, "deployed")) or ()):
             raise ConfigError(f"{error} It is deployed.{key[1]}.") from None
+        key = re.match(r"([\w.]+) must ", str(error))
+        if key and key[1] not in set().union(*map(typed_keys, overrides)):
+            typed = " ".join(overrides).replace("++", "") or "the files"
+            raise ConfigError(f"{error}; it follows from {typed}: do these fit?") from None
         match = re.match(r"unknown setting of (\w+) \(", str(error))
         group = match.group(1) if match else ""
         if not group or not choices(group):
@@ -321,20 +326,24 @@ def _learns(content: Mapping[str, Any]) -> bool:
     return takes_action(as_nodes(driver[AUTOMATED], AUTO))
 
 
-def leave_out_terms(reward: Any) -> None:
+def leave_out_terms(reward: Any, overrides: Sequence[str] = ()) -> None:
     """Remove the terms of ``reward.without``, which a sweep can vary, from a reward.
 
     Args:
         reward: the section as plain containers, changed in place.
+        overrides: overrides of the command line, of which none may set a removed term.
 
     Raises:
-        ConfigError: naming a term that the reward lacks.
+        ConfigError: naming a term that the reward lacks, or an override.
     """
-    names = reward.pop("without", None) if isinstance(reward, dict) else None
+    given = reward.pop("without", None) if isinstance(reward, dict) else None
+    names = [given] if isinstance(given, str) else given or []
     if names:
-        terms, names = reward.get("terms") or {}, [names] if isinstance(names, str) else names
+        terms = reward.get("terms") or {}
         require_known("term of the reward in reward.without", names, terms)
         reward["terms"] = {name: term for name, term in terms.items() if name not in names}
+    why = "reward.without leaves the term out"
+    refuse(overrides, {f"reward.terms.{name}": why for name in names})
 
 
 def leave_out_foreign(content: dict[str, Any], overrides: Sequence[str]) -> None:
@@ -405,6 +414,9 @@ def explained(error: Exception, overrides: Sequence[str] = ()) -> ConfigError:
         if group in ADDED and len(several) > 1:
             remedy = f"a list takes several, '+{group}=[{','.join(several)}]'"
         return ConfigError(f"{' '.join(overrides)}: {group} is chosen twice: {remedy}")
+    gone = next((word for word in overrides if word.startswith("~")), "")
+    if gone and "Error resolving interpolation" in str(error):
+        return ConfigError(f"{gone}: other choices depend on it; write {gone[1:]}=null")
     cause = error.__cause__
     text = f"{error}: {cause}" if isinstance(error, HydraException) and cause else str(error)
     tokens = [*overrides, *text.partition("See https://")[0].split()]
@@ -470,6 +482,7 @@ def identity(cfg: Any, *unused: str) -> str:
     Defaults of classes do not count, so settings of later versions change no hash.
 
     Args:
+        cfg: a typed tree.
         *unused: keys of further settings that do not count.
     """
     content = without_defaults(cfg)

@@ -116,6 +116,7 @@ class Node:
 
     def check(self) -> None:
         """Check the settings; a class or function without :class:`Settings` is not called."""
+        self._check_parts()
         if has_settings(self.kind):
             self.made()
         else:
@@ -147,6 +148,15 @@ class Node:
             for key in (key for key, value in arguments.items() if value == MISSING):
                 raise ConfigError(f"{self.where}.{key} is required: use {self.where}.{key}=…")
             return self.kind(**arguments)
+
+    def _check_parts(self) -> None:
+        """Refuse a setting that only the nodes inside have, and name their settings."""
+        names = settings_of(self.kind)
+        for key in sorted(self.settings.keys() - {TARGET, *names}) if names is not None else ():
+            having = (x for x in nodes_in(self) if key in (settings_of(x.kind) or ()))
+            places = ", ".join(f"{x.where}.{key}" for x in having)
+            text = f"{self.where}.{key}: {self.kind.__name__} has no {key}, its parts have it"
+            require(not places, f"{text}: {places}")
 
     def _check_names(self) -> None:
         names = settings_of(self.kind)
@@ -185,8 +195,9 @@ def _mapped(value: Any, where: str, change: Callable[[dict[str, Any], str], Any]
         return [_mapped(item, f"{where}[{index}]", change) for index, item in enumerate(value)]
     if not isinstance(value, Mapping):
         return value
-    places = {key: f"{where}.{key}".removeprefix(".") for key in value}
-    return change({key: _mapped(x, places[key], change) for key, x in value.items()}, where)
+    named = {str(key): x for key, x in value.items()}  # Hydra reads {1: …} as a number
+    places = {key: f"{where}.{key}".removeprefix(".") for key in named}
+    return change({key: _mapped(x, places[key], change) for key, x in named.items()}, where)
 
 
 def without_defaults(value: Any) -> Any:

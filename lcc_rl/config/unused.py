@@ -34,8 +34,9 @@ def check_used(
     """Refuse options that the configuration would ignore.
 
     Args:
+        cfg, overrides: the typed tree, and the overrides of the command line.
         sweep: allow settings of an agent without one, because the runs of a sweep share them.
-        written: the configuration as plain containers with its references, for the objective.
+        written: the configuration as plain containers with its references.
 
     Raises:
         ConfigError: naming the option and the reason.
@@ -45,12 +46,15 @@ def check_used(
     reasons = dict(_of_road(cfg)) | dict(_of_rows(cfg, sweep))
     if not sweep:
         reasons |= dict(_of_roles(cfg)) | dict(_of_agent(cfg)) | dict(_of_reward(written))
+        if written is not None and "${training.gap_range}" not in str(written["scenario"]):
+            reasons.setdefault("training.gap_range", "no start of the scenario refers to it")
         observation = cfg.observation.settings
         if observation[TARGET] == OBSERVATION and "behind" not in (observation.get("scales") or ()):
             for key in ("visible", "presence"):
                 reasons[f"observation.{key}"] = "observation.scales names no vehicle behind"
         if type(cfg) is TrainConfig:
             compares = "a training evaluates its own policy; lcc-rl evaluate compares"
+            reasons |= dict(_of_traffic(cfg.scenario))
             reasons |= dict.fromkeys({*OF_COMPARISONS} & {*map(key_of, overrides)}, compares)
             if RECORDED in cfg.evaluation.baselines:
                 reasons.pop(BASELINES, None)
@@ -137,6 +141,16 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
         roles = node.settings.get("roles") if node is not None else None  # none of another class
         if roles and not {*roles} & {*cfg.scenario.vehicles.names}:
             yield f"scenario.fleet.{name}", f"no vehicle of the string is {' or '.join(roles)}"
+
+
+def _of_traffic(scenario: Any) -> Iterator[tuple[str, str]]:
+    """Yield knowledge of vehicles further ahead where there are none, and why it has no effect."""
+    string = scenario.vehicles
+    first = not (string.ring or string.drawn) and string.places(AUTOMATED) == (0,)
+    for name, node in scenario.pieces.items():
+        if first and node is not None and getattr(node.kind, "of_traffic", False):
+            why = f"no vehicle but the leader, whose speed {name} repeats, is ahead"
+            yield from dict.fromkeys(("knowledge", f"scenario.pieces.{name}"), why).items()
 
 
 def _of_agent(cfg: StudyConfig) -> Iterator[tuple[str, str]]:

@@ -44,7 +44,11 @@ def typed_keys(override: str) -> set[str]:
 
 
 def with_variant(variant: str, overrides: Any) -> list[Any]:
-    """Return the words of a command from what a program gives; a text is one setting."""
+    """Return the words of a command from what a program gives; a text is one setting.
+
+    Raises:
+        ConfigError: for settings of folders, which Python ignores.
+    """
     single = isinstance(overrides, str) or not isinstance(overrides, Iterable)
     words = [overrides] if single else [*overrides]
     for word in filter(re.compile("hydra.(run|sweep|job)").match, map(str, words)):
@@ -62,6 +66,16 @@ def top_key(override: str) -> str:
     return key_of(override).split(".")[0].split("@")[0]
 
 
+def check_once(words: Sequence[str]) -> Sequence[str]:
+    """Return the words of a command; refuse several values of a key, which Hydra allows."""
+    first: dict[str, str] = {}
+    for word in words:
+        key, equals, value = word.removeprefix("++").partition("=")
+        if equals and key[:1] not in "+~" and first.setdefault(key, value) != value:
+            raise ConfigError(f"{key}={first[key]} {word}: {key} is set twice; leave one out")
+    return words
+
+
 def check_overrides(words: Sequence[str], given: Collection[str], reason: str) -> None:
     """Check that the remaining words of a command line are overrides.
 
@@ -73,7 +87,7 @@ def check_overrides(words: Sequence[str], given: Collection[str], reason: str) -
     Raises:
         ConfigError: naming the wrong word.
     """
-    flags = [word for word in words if word.startswith("-")]
+    flags = [word for word in check_once(words) if word.startswith("-")]
     require(not flags, f"unknown flag {' '.join(flags)}; -h lists all flags")
     if any("=" not in word and word[:1] != "~" for word in words):
         raise ConfigError(f"expected overrides such as data=stream, got {' '.join(words)}")

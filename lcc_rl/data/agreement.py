@@ -255,6 +255,8 @@ def check_pairs(
     strange = [(pair["row"], "gap", text.format(pair["slope"])) for pair in odd]
     enough = every["seconds"] >= LEAST_ALL_S and moves.iloc[-1]
     if (enough or clear.any()) and not (right.any() or span[0] <= every["slope"] <= span[1]):
+        for _, _, words in _mistaken(every.to_dict() | {"clear": True}, units, max_mismatch):
+            raise DataError(words)  # of noisy pairs
         raise DataError(
             f"{text.format(every['slope'])}: are times in another unit, speeds to be smoothed, or "
             f"biased (the gap changes by {every['rate']:+.1f} m/s against them)?"

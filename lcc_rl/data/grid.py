@@ -124,7 +124,8 @@ def continuous(
         hole, bridged = hole | turns, bridged & ~turns
     if bridged.any():
         report.notes.append(f"{int(bridged.sum()):,} holes up to {setting} are interpolated")
-    alone = ~(same & ~hole) & np.append(~(same & ~hole)[1:], True)
+    connected = same & ~hole  # with the row before
+    alone = ~connected & np.append(~connected[1:], True)
     if not (hole.any() or alone.any()):
         return samples
     _check_clock(samples, hole, usual, place(samples), report.source)
@@ -303,6 +304,9 @@ def on_grid(
 
     Returns:
         The samples, with the frames' ``time_s``, and the frame of each.
+
+    Raises:
+        DataError: if a record is implausibly long.
     """
     at = ((samples["time_s"] - origin) / FRAME).to_numpy()
     if at.max() > LAST_FRAME:

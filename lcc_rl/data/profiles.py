@@ -34,7 +34,7 @@ class Profiles:
         recordings: the recording of each record.
         time_step: time between samples [s].
         reach: samples of each record including those after a window's end, shape ``[profiles]``,
-            for previews; None: ``lengths``.
+            for previews.
         weights: relative frequency of each record in training, ``[profiles]``, float64; None: all
             are equal.
         sources: the source of each record, if there are several; else empty.
@@ -50,7 +50,7 @@ class Profiles:
     names: tuple[str, ...]
     recordings: tuple[str, ...]
     time_step: float
-    reach: Tensor | None = None
+    reach: Tensor
     weights: Tensor | None = None
     sources: tuple[str, ...] = ()
     followers: Tensor | None = None
@@ -72,23 +72,27 @@ class Profiles:
         return None if records is None else records[start : start + int(self.lengths[index])]
 
     def select(self, indices: Iterable[int]) -> Profiles:
-        """Return the records with the given indices, in that order."""
+        """Return the records with the given indices, in that order.
+
+        Raises:
+            DataError: if there is none.
+        """
         chosen = [int(i) for i in indices]
         if not chosen:
             raise DataError(NONE_LEFT)
         index = torch.tensor(chosen)
-        reach = self.lengths if self.reach is None else self.reach
-        spans = torch.stack([self.offsets[index], self.offsets[index] + reach[index]], 1).tolist()
+        reach = self.reach[index]
+        spans = torch.stack([self.offsets[index], self.offsets[index] + reach], 1).tolist()
         behind = self.followers
         return replace(
             self,
             speeds=torch.cat([self.speeds[first:end] for first, end in spans]),
             followers=None if behind is None else torch.cat([behind[a:b] for a, b in spans]),
-            offsets=torch.cumsum(reach[index], 0) - reach[index],
+            offsets=torch.cumsum(reach, 0) - reach,
             lengths=self.lengths[index],
             names=tuple(self.names[i] for i in chosen),
             recordings=tuple(self.recordings[i] for i in chosen),
-            reach=None if self.reach is None else reach[index],
+            reach=reach,
             weights=None if self.weights is None else self.weights[index],
             sources=tuple(self.sources[i] for i in chosen if self.sources),
             starts=tuple(self.starts[i] for i in chosen if self.starts),
@@ -123,7 +127,7 @@ class Profiles:
             [self.starts[i] + start * self.time_step for i, start in cuts if self.starts],
         )
         played = torch.full_like(whole.lengths, horizon + 1)
-        return replace(whole, lengths=played, reach=whole.lengths)
+        return replace(whole, lengths=played)
 
     def spread(self, limit: int | None) -> Profiles:
         """Return at most ``limit`` records of each source, spread evenly; None: all."""
@@ -189,6 +193,7 @@ def from_records(
         speeds=torch.cat([record.to(torch.float32) for record in records]),
         offsets=torch.cumsum(lengths, 0) - lengths,
         lengths=lengths,
+        reach=lengths,
         names=tuple(names),
         recordings=tuple(recordings),
         time_step=time_step,
@@ -200,13 +205,12 @@ def from_records(
 def no_profiles(time_step: float) -> Profiles:
     """Return empty profiles, for training if all are for evaluation."""
     none = torch.zeros(0, dtype=torch.int64)
-    return Profiles(torch.zeros(0), none, none, (), (), time_step)
+    return Profiles(torch.zeros(0), none, none, (), (), time_step, none)
 
 
 def joined(parts: Sequence[Profiles]) -> Profiles:
     """Concatenate several profiles with one time step."""
     sizes = [len(part.speeds) for part in parts]
-    known = [part.lengths if part.reach is None else part.reach for part in parts]
     behind = [part.followers for part in parts if part.followers is not None]
     return Profiles(
         speeds=torch.cat([part.speeds for part in parts]),
@@ -215,7 +219,7 @@ def joined(parts: Sequence[Profiles]) -> Profiles:
         names=tuple(name for part in parts for name in part.names),
         recordings=tuple(name for part in parts for name in part.recordings),
         time_step=parts[0].time_step,
-        reach=None if all(part.reach is None for part in parts) else torch.cat(known),
+        reach=torch.cat([part.reach for part in parts]),
         followers=torch.cat(behind) if len(behind) == len(parts) else None,
         starts=sum((part.starts for part in parts if all(x.starts for x in parts)), ()),
     )

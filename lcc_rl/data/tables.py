@@ -116,6 +116,7 @@ class TableFile:
         """Read columns and check every cell.
 
         Args:
+            columns: the columns, with keys and kinds.
             names: the file's names, by key; None for a missing column.
             units: units by key; by default SI.
             option: place of the names in the configuration, for messages.

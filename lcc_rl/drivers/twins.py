@@ -155,6 +155,7 @@ def drive_twins(
     """Drive calibrated drivers from the first speed and gap of the recorded ones.
 
     Args:
+        observed: the recorded drivers and their leaders.
         drivers: their calibrated parameters by one model, a row for each episode.
         reactions: reactions with one delay; all have the same draws of the noise.
         repeats: draws of the noise.
@@ -410,7 +411,7 @@ def compare_twins(
     """Compare calibrated drivers with the recorded ones.
 
     Args:
-        drivers: see :func:`drive_twins`.
+        observed, drivers: see :func:`drive_twins`.
         react: also choose a reaction that all drivers share.
         progress, perception: see :func:`tried`.
 

@@ -98,7 +98,7 @@ class EnergyModel(Settings, ABC):
         stored = self.inertia / self.efficiency * speed * acceleration
         stored = stored - self.unpaid(speed, acceleration)
         net = self.smooth_power(speed, acceleration) - stored
-        return net if self.level else net - self.climbing(speed)
+        return net if self.level else net - self.smooth_climbing(speed)
 
     @property
     def level(self) -> bool:
@@ -111,6 +111,10 @@ class EnergyModel(Settings, ABC):
         grade = getattr(self, "grade", 0.0)
         sine = grade.sin() if isinstance(grade, Tensor) else math.sin(grade)
         return self.mass / self.efficiency * speed * (GRAVITY * sine)
+
+    def smooth_climbing(self, speed: Tensor) -> Tensor:
+        """Return what :meth:`smooth_power` contains of :meth:`climbing`, without its jumps [W]."""
+        return self.climbing(speed)
 
     def stored_energy(self, speed: Tensor) -> Tensor:
         """Return kinetic energy divided by efficiency [J], same shape."""

@@ -81,7 +81,7 @@ class ElectricCar(EnergyModel):
 
 
 class PaperMotor(EnergyModel):
-    """Electric power of the ALCC paper's car (A2); braking returns 2.4 times its kinetic energy.
+    """Electric power (A2); gentle braking from 15 m/s returns 2.6 times the car's kinetic energy.
 
     Steady power, change of kinetic energy and loss by acceleration add up to A2 exactly. Of the
     force at the wheels (A1) and Table I, only the kinetic energy ½ δ m v² is used.

@@ -73,15 +73,18 @@ class VehicleClass(Settings):
             shape = [*power.shape]
             require(shape == [2], f"its shape is {shape} for speeds of shape [2]")
             check_independent(kind, ["power"], lambda *x: [level.power(*x)], motion)
-            steady, faster = power.tolist()
-            uphill = float(model.on(UPHILL).power(*motion)[0]) if graded else steady
+        steady, faster = power.tolist()
+        with raised_as(ConfigError, f"{kind}.power with the grade as a tensor", Exception):
+            uphill = model.on(torch.full((2,), UPHILL)).power(*motion)[0] if graded else steady
         stored = PROBE * model.inertia / model.efficiency
         lifted = PROBE * model.mass / model.efficiency * GRAVITY * UPHILL
         of = "W per m/s², its kinetic energy"
         self._check_rise(kind, (faster - steady) / 0.1, of, stored, "are these in W, m/s and kg")
         if graded:
             of = f"W for a grade of {UPHILL:g} rad, its height"
-            self._check_rise(kind, uphill - steady, of, lifted, "does it use the grade, in rad")
+            self._check_rise(
+                kind, float(uphill) - steady, of, lifted, "does it use the grade, in rad"
+            )
 
     def _check_rise(self, kind: str, risen: float, of: str, stored: float, ask: str) -> None:
         """Refuse a rise of power that differs much from that of the energy stored."""

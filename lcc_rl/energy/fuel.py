@@ -86,8 +86,11 @@ class CirclesFuel(EnergyModel):
 
     def climbing(self, speed: Tensor) -> Tensor:
         """Return the heat of the fuel that the grade takes [W]; 0 at standstill."""
-        rate = self._climbing(speed.clamp(min=0.0))
-        return rate.masked_fill(speed.abs() < STANDSTILL, 0.0) * self.heating_value
+        return self.smooth_climbing(speed).masked_fill(speed.abs() < STANDSTILL, 0.0)
+
+    def smooth_climbing(self, speed: Tensor) -> Tensor:
+        """Return the same without idling; the polynomial has fuel for a grade at standstill [W]."""
+        return self._climbing(speed.clamp(min=0.0)) * self.heating_value
 
     def unpaid(self, speed: Tensor, acceleration: Tensor) -> Tensor:
         """Return the kinetic power of what exceeds the largest acceleration, which is drawn [W]."""

@@ -74,6 +74,7 @@ def check_step(piece: Piece, before: State, reached: State) -> None:
     """Compare the entries that a piece writes for :data:`BATCH` episodes with its specs.
 
     Args:
+        piece: the piece to check.
         before: entries of the state before the step.
         reached: entries of the state after the step, to which the written ones are added.
 
@@ -93,8 +94,7 @@ def check_alone(piece: Piece, before: State, reached: State) -> None:
     """Refuse a piece that gives an episode other numbers alone than beside another, or again.
 
     Args:
-        before: see :func:`check_step`.
-        reached: see :func:`check_step`.
+        piece, before, reached: see :func:`check_step`.
 
     Raises:
         ConfigError: naming the piece and the entry.

@@ -24,7 +24,7 @@ def batch_shape(batch_size: Sequence[int] | int) -> torch.Size:
     """Return the shape of a batch of episodes.
 
     Raises:
-        ConfigError: if it is empty or not of whole numbers.
+        ConfigError: if it holds no episode or is not of whole numbers.
     """
     try:
         batch = torch.Size([batch_size] if isinstance(batch_size, int) else batch_size)
@@ -69,8 +69,8 @@ class Clock(EnvBase):
         device: device of the tensors.
 
     Raises:
-        ConfigError: if the horizon is not positive, the batch is empty or not of whole numbers, or
-            the seed is out of range.
+        ConfigError: if the horizon is not positive, the batch holds no episode or is not of whole
+            numbers, or the seed is out of range.
     """
 
     entries = (

@@ -117,21 +117,21 @@ def world_of(
     """Return the world of a configuration's pieces; arguments as for :func:`build_env`."""
     scenario = cfg.scenario
     return World(
-        scenario.vehicles,
-        scenario.time_step,
-        scenario.horizon,
-        profiles,
-        population,
-        build_energy(cfg),
-        nominal,
-        {role: node.made(Actuation) for role, node in _by_role(scenario, "actuators")},
-        {role: node.made(Sensors) for role, node in _by_role(scenario, "sensors")},
-        [role for role, _ in _by_role(scenario, "filters")],
-        scenario.max_braking,
-        scenario.max_acceleration,
-        scenario.replaced,
-        0.0 if nominal else scenario.perturbation,
-        scenario.slope and scenario.slope.made(Slope),
+        string=scenario.vehicles,
+        time_step=scenario.time_step,
+        horizon=scenario.horizon,
+        profiles=profiles,
+        population=population,
+        energy=build_energy(cfg),
+        nominal=nominal,
+        actuators={role: node.made(Actuation) for role, node in _by_role(scenario, "actuators")},
+        sensors={role: node.made(Sensors) for role, node in _by_role(scenario, "sensors")},
+        filtered=[role for role, _ in _by_role(scenario, "filters")],
+        max_braking=scenario.max_braking,
+        max_acceleration=scenario.max_acceleration,
+        replaced=scenario.replaced,
+        perturbation=scenario.perturbation,
+        slope=scenario.slope and scenario.slope.made(Slope),
     )
 
 
@@ -200,6 +200,7 @@ def build_pieces(cfg: StudyConfig, world: World) -> list[Piece]:
 
     Args:
         cfg: configuration with the nodes ``scenario``, ``observation`` and ``reward``.
+        world: the world to which they are bound.
 
     Raises:
         ConfigError: naming the option at fault.
@@ -290,6 +291,12 @@ def make_env(
         held_out: play the evaluation profiles instead of the training profiles.
         single: show the one automated vehicle as :class:`lcc_rl.envs.SingleAgent`; None: so if
             there is exactly one, and several as :class:`lcc_rl.envs.MultiAgent`; False: neither.
+
+    Returns:
+        A TorchRL environment: ``observation``, ``[*batch, features]``, scaled to about 1 or, with
+        ``observation.raw=true``, in SI units; ``action`` in [−1, 1], by default ±3 m/s²,
+        ``reward``, without unit, and ``done``, ``[*batch, 1]`` each. Several automated vehicles
+        have ``("automated", "action")`` …, ``[*batch, vehicles, 1]``. docs/entries.md lists all.
 
     Raises:
         ConfigError: if the variant or an override is unknown or has no effect, or with ``single``

@@ -18,7 +18,7 @@ from lcc_rl.data.leaders import Case, TrajectoryLeaders
 from lcc_rl.data.profiles import Profiles, from_records
 from lcc_rl.data.sources import LoadedEpisodes
 from lcc_rl.energy import Fleet, VehicleClass, as_fleet
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import Concern, ConfigError
 from lcc_rl.functional.driver_models import Reaction
 from lcc_rl.functional.pattern import RING
 from lcc_rl.pieces.controllers import Population
@@ -112,7 +112,8 @@ def load_inputs(cfg: StudyConfig, episodes: Any = None) -> Inputs:
     if scenario.road == RING:
         names = [f"ring {number}" for number in range(cfg.evaluation.profiles or 1)]
         empty = constant_profiles(0.0, scenario.horizon, scenario.time_step, names)
-        return Inputs(empty, empty, population, (described(population, cfg),))
+        short = shortfalls(cfg, {"drivers": len(population.time_gap)}, {})
+        return Inputs(empty, empty, population, (described(population, cfg), *short))
     cars = len(cfg.scenario.vehicles) if cfg.evaluation.rows == "vehicles" else None
     leaders = _source_of_leaders(cfg, episodes).load(scenario.time_step, scenario.horizon, cars)
     windows, training = leaders.windows, leaders.training
@@ -222,7 +223,7 @@ def load_episodes(node: Node) -> LoadedEpisodes:
 
 def shortfalls(
     cfg: StudyConfig, available: Mapping[str, int], gone: Mapping[str, int]
-) -> list[str]:
+) -> list[Concern]:
     """Return a line for every count of an evaluation that exceeds the available data.
 
     Args:
@@ -238,5 +239,5 @@ def shortfalls(
             out = gone.get(source, 0) if name == "profiles" else 0
             only = f"only {count} {f'of {source} ' if source else ''}are available"
             only += f" and {out} are left out, see above" * bool(out) + "; taking all"
-            lines.append(f"evaluation.{name}={asked}: {only}")
+            lines.append(Concern(f"evaluation.{name}={asked}: {only}"))
     return lines

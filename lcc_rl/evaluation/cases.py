@@ -19,7 +19,7 @@ from lcc_rl.envs.inputs import Inputs
 from lcc_rl.envs.step import pieces_of
 from lcc_rl.evaluation.metrics import registered, safety_measures
 from lcc_rl.evaluation.rollout import Player, reset_options
-from lcc_rl.evaluation.rows import INDEX, VALUE_BYTES
+from lcc_rl.evaluation.rows import INDEX, VALUE_BYTES, nullable
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces.base import REWARD
@@ -169,7 +169,7 @@ def measured_series(series: CaseSeries, time_step: float = 0.1) -> pd.DataFrame:
     columns |= safety_measures(entries, alive, time_step, registered())
     runs, vehicles = energy.shape
     frame = pd.DataFrame({name: value.flatten().cpu().numpy() for name, value in columns.items()})
-    frame = frame.astype({name: "Int64" for _, name in COUNTERS if name in frame})
+    frame = nullable(frame, [name for _, name in COUNTERS])
     frame.insert(0, "run_id", np.repeat(np.arange(runs), vehicles))
     frame.insert(1, "follower", np.tile(np.arange(1, vehicles + 1), runs))
     frame["collided"] = frame["min_gap_m"] <= 0.0

@@ -21,6 +21,7 @@ from lcc_rl.errors import ResultsError
 from lcc_rl.evaluation.cases import Cases
 from lcc_rl.evaluation.episodes import Episodes, plan_of
 from lcc_rl.evaluation.rollout import warn_of_brakes, warn_of_idle
+from lcc_rl.evaluation.rows import nullable
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import IDENTITY, Rows, as_rows, parquet_metadata, read_parquet, write_parquet
 from lcc_rl.io.memory import require_memory
@@ -120,8 +121,7 @@ def stacked(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Return tables below each other; integers that some of them lack stay integers, with nulls."""
     columns = [set(frame) for frame in frames if len(frame.columns)]
     lacking = set().union(*columns).difference(set.intersection(*columns)) if columns else set()
-    kinds = [dict.fromkeys(lacking & {*x.select_dtypes("integer")}, "Int64") for x in frames]
-    parts = [frame.astype(kind) for frame, kind in zip(frames, kinds, strict=True)]
+    parts = [nullable(frame, lacking) for frame in frames]
     return pd.concat(parts, ignore_index=True)
 
 

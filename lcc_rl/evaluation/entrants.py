@@ -102,7 +102,8 @@ class Entrants:
         trainings = [x for _, x in filter(None, [self.policy, *self.policies])]
         safety = [x.scenario.filters.get(AUTOMATED) for x in (cfg, *trainings)]
         if not any(safety) or not (trainings or self.further):
-            idle = "no policy drives behind the safety filter (+filter=cbf adds one)"
+            hint = "" if any(safety) else " (+filter=cbf adds one)"
+            idle = f"no trained policy drives behind the safety filter{hint}"
             refuse(typed, {"evaluation.behind_filter": idle})
 
     def _compared(self) -> tuple[dict[str, Any], list[tuple[str, str]]]:

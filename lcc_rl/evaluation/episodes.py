@@ -249,9 +249,10 @@ def evaluate(
     repeats: int = 1,
     compiled: bool | None = None,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Run all episodes of one strategy in memory; arguments as for :class:`Episodes`.
+    """Run all episodes of one strategy in memory.
 
     Args:
+        strategy, inputs, seed, sample_episodes, compiled: see :class:`Episodes`.
         drivers: number of drivers used, spread evenly; None: all.
         batch_size: parallel episodes.
         repeats: draws of the noise of every profile and driver.

@@ -158,6 +158,14 @@ class Reductions:
         """Number of steps of each episode."""
         return self.alive.sum(0).squeeze(-2)
 
+    def at(self, entry: Tensor) -> Tensor:
+        """Return whether the episode was running at the entry's times.
+
+        An entry may lack the first times, or begin with the state before the first step.
+        """
+        missing = len(self.alive) - len(entry)
+        return self.alive[missing:] if missing >= 0 else torch.cat([self.alive[:1], self.alive])
+
     def mean(self, entry: Tensor) -> Tensor:
         """Mean over time and vehicles."""
         count = self.steps.clamp(min=1) * entry.shape[-2]
@@ -176,17 +184,16 @@ class Reductions:
 
     def change(self, entry: Tensor) -> Tensor:
         """Difference of the last and the first value, averaged over vehicles."""
-        last = (self.alive.sum(0) - 1).clamp(min=0).expand(entry.shape[1:]).unsqueeze(0)
+        last = (self.at(entry).sum(0) - 1).clamp(min=0).expand(entry.shape[1:]).unsqueeze(0)
         return (entry.gather(0, last).squeeze(0) - entry[0]).mean(-2)
 
     def lowest(self, entry: Tensor) -> Tensor:
         """Minimum over time and vehicles."""
-        return torch.where(self.alive, entry, torch.inf).amin(0).amin(-2)
+        return torch.where(self.at(entry), entry, torch.inf).amin(0).amin(-2)
 
     def highest(self, entry: Tensor) -> Tensor:
-        """Maximum over time and vehicles; an entry may lack the first times."""
-        alive = self.alive[len(self.alive) - len(entry) :]
-        values = torch.where(alive, entry, -torch.inf)
+        """Maximum over time and vehicles."""
+        values = torch.where(self.at(entry), entry, -torch.inf)
         return values.amax(0).amax(-2) if len(entry) else values.sum(0).sum(-2) * torch.nan
 
     def slope(self, entry: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ and distances are summed over them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Hashable, Iterator, Mapping
 
 import numpy as np
 import pandas as pd
@@ -156,6 +156,12 @@ def measures(
     return {**columns, "steps": alive.sum(0)}
 
 
+def nullable(frame: pd.DataFrame, names: Collection[Hashable] | None = None) -> pd.DataFrame:
+    """Return a table whose integers, all or those of some columns, may be null, without floats."""
+    kept = [x for x in frame.select_dtypes("integer") if names is None or x in names]
+    return frame.astype(dict.fromkeys(kept, "Int64"))
+
+
 def as_frame(columns: dict[str, Tensor], collided: Tensor) -> pd.DataFrame:
     """Return the measures of a batch as one row per episode.
 
@@ -163,8 +169,7 @@ def as_frame(columns: dict[str, Tensor], collided: Tensor) -> pd.DataFrame:
     """
     frame = pd.DataFrame({key: value.squeeze(-1).cpu().numpy() for key, value in columns.items()})
     if (frame["steps"] == 0).any():
-        integers = dict.fromkeys(frame.select_dtypes("integer"), "Int64")  # NaN makes floats
-        frame = frame.astype(integers).where(frame["steps"] > 0).assign(steps=frame["steps"])
+        frame = nullable(frame).where(frame["steps"] > 0).assign(steps=frame["steps"])
     frame.insert(len(frame.columns) - 1, "collided", collided.squeeze(-1).cpu().numpy())
     return frame
 

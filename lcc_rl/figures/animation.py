@@ -345,7 +345,7 @@ def unroll(motions: Mapping[str, SampleMotion], path: Path, ending: str) -> None
 
     Args:
         motions: motions on an open road with equal times, by title.
-        ending: ``.svg`` or ``.gif``.
+        path, ending: the file, and its format, ``.svg`` or ``.gif``.
 
     Raises:
         ConfigError: if a motion is on a ring.

@@ -123,7 +123,7 @@ def dots(
     Args:
         places: position of every row, on the vertical axis or, if upright, the horizontal one.
         table: rows with the columns ``<column>``, ``<column>_low`` and ``<column>_high``.
-        column: name of the column.
+        axis, column: the axes to draw on, and the name of the column.
         hue: colour of dots and lines.
         upright: draw vertical lines.
         look: options of the dots, for ``Axes.plot``.
@@ -145,6 +145,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 200, formats: Iterable[str
     """Write a figure atomically; the format follows the file's suffix.
 
     Args:
+        figure, path: the figure and its file.
         dpi: pixels per inch of raster graphics.
         formats: further formats, each in its own file (``figure_formats``).
 

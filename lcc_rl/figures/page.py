@@ -59,8 +59,8 @@ def write_sections(
     """Write ``report.html``, without scripts or network; its end is the origin of the results.
 
     Args:
-        folder: folder of the page.
-        title: title of the page.
+        folder, title: folder and title of the page.
+        sections: values of the template's sections, in order.
         commands: the commands, oldest first.
 
     Raises:

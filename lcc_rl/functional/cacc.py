@@ -47,13 +47,16 @@ def platoon_errors(
     x̂ = x − delay · v, and is never integrated.
 
     Args:
-        ahead: speed of the vehicle ahead of each vehicle [m/s].
-        lead: speed of the leader of its chain [m/s].
-        speed: v_i [m/s].
-        gap: bumper-to-bumper gap to the vehicle ahead [m].
+        ahead: speed of the vehicle ahead of each vehicle, ``[*batch, vehicles, 1]`` [m/s].
+        lead: speed of the leader of its chain, likewise [m/s].
+        speed: v_i, likewise [m/s].
+        gap: bumper-to-bumper gap to the vehicle ahead, likewise [m].
         headway: h, the gap to be kept [m].
         delay: of vehicle-to-vehicle messages [s].
         chain: the radio links; None: all vehicles are one chain behind a leader that sends.
+
+    Returns:
+        The errors of each vehicle, of the same shape.
     """
     excess = gap - headway
     received = excess - delay * ahead

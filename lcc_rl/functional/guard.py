@@ -175,6 +175,7 @@ def check_forgets(
     """Refuse pieces, or driver models, that store state where all episodes would share it.
 
     Args:
+        pieces: the pieces, or models.
         play: lets them act on values that differ by a number, 0 and 1.
         remedy: what to do instead.
 

@@ -68,8 +68,8 @@ class Driver:
         trust: modules outside this package that a policy may name.
         safety: the safety filter, or changed settings, such as ``{"margin": 2.0}``, of the default:
             that of the policy's training, or of ``+filter=cbf`` for rules with ``_filtered``.
-        seed: seed of the drivers' noise; each new car has the next seed, also if it leaves and
-            returns.
+        seed: seed of the drivers' noise; each new car has the next seed, and keeps it if it leaves
+            and returns.
         drivers: population of rules with human drivers, such as ``"human"``: a table of ``lcc-rl
             calibrate`` or a population of :mod:`lcc_rl.drivers.population`; None: the shipped one.
         limits: ``max_braking`` and ``max_acceleration`` of the car [m/s²]; by default those of the

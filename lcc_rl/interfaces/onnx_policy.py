@@ -54,7 +54,8 @@ class ProgramInput(Settings):
         if self.name not in INPUT_UNITS:
             raise ValueError(
                 f"{self.name!r} is not measured: expected self, ahead or behind and an entry of "
-                "a vehicle, such as ahead.speed; the memory of a program is its input memory"
+                "a vehicle, such as ahead.speed; the memory of a program is its input memory, and "
+                "knowledge has settings that the file lacks: compare the policy that it was made of"
             )
         if self.unit != INPUT_UNITS[self.name]:
             raise ValueError(f"{self.name} is in {INPUT_UNITS[self.name]}, got {self.unit!r}")
@@ -124,7 +125,7 @@ class Program:
         """Return the accelerations, ``[batch, 1]``, and the memory if there is one.
 
         Args:
-            *given: the state, ``[batch, inputs]``, and the memory, ``[batch, n]``.
+            *inputs: the state, ``[batch, inputs]``, and the memory, ``[batch, n]``.
         """
         named = zip(TAKES, inputs, strict=False)
         feed = {name: value.detach().cpu().float().numpy() for name, value in named}

@@ -168,9 +168,9 @@ class Piece(Part, TensorDictModuleBase, Transform):
         """Set the entries that the piece reads and writes; by default those of its class.
 
         Args:
+            world, keeps: the world, and constants of an episode.
             reads: arguments of :meth:`compute`, in order.
             writes: results of :meth:`compute`, in order, without ``"next"``.
-            keeps: constants of an episode.
         """
         string = self.string = world.string
         if not isinstance(reads, Views):

@@ -170,6 +170,7 @@ def check_platoon(controller: Controller, option: str, fact: str, remedy: str) -
     """Check that a controller drives all vehicles of its string.
 
     Args:
+        controller: a bound controller.
         option: the option that needs this, with its value.
         fact: effect or need of the option, as a predicate.
         remedy: values that can be used instead.

@@ -99,9 +99,9 @@ class Controller(RoleTransform):
         """Set the entries read and written, by default those of the class.
 
         Args:
+            world, keeps: see :meth:`lcc_rl.pieces.base.Piece.declare`.
             reads: names of the arguments of :meth:`command` before the memory.
             writes: entries that :meth:`command` returns after the command and the memory.
-            keeps: see :meth:`lcc_rl.pieces.base.Piece.declare`.
             remembers: entries of the memory.
         """
         self.time_step = world.time_step

@@ -72,14 +72,13 @@ class LeaderPreview(Feature):
         require(not world.replaced, "a preview reads the record of a leader that is replaced")
         self.declare(world, writes=[self.known.wide((1, len(self.horizons)))])
         self.stream = stream_id("preview.noise")
-        self.perturbation, self.time_step = world.perturbation, world.time_step
+        self.perturbation, self.time_step = world.deviation(world.perturbation), world.time_step
         where = f"scenario.pieces.{self.name}"
         late = world.steps(self.delay, f"{where}.delay")
         steps = [world.steps(ahead, f"{where}.horizons") - late for ahead in self.horizons]
         self.register_buffer("speeds", profiles.speeds)
         self.register_buffer("offsets", profiles.offsets)
-        lengths = profiles.lengths if profiles.reach is None else profiles.reach
-        self.register_buffer("last", lengths - 1)
+        self.register_buffer("last", profiles.reach - 1)
         self.register_buffer("shift", torch.tensor(steps))
         self.register_buffer("columns", torch.arange(len(steps)))
 
@@ -98,8 +97,8 @@ class TrafficAhead(StepTransform):
 
     Writes ``("traffic", "speed")`` [m/s], ``[*batch, A, places]``; reports of the last steps, if
     they are late, as ``("traffic", "reports")``. Ahead of the string no vehicle is known but the
-    leader, whose speed stands for theirs. On a ring the count continues. Before the episode speeds
-    are those of its start.
+    leader, whose speed stands for theirs and is all that a car behind it reads. On a ring the count
+    continues. Before the episode speeds are those of its start.
     """
 
     places: Annotated[tuple[Count, ...], Field(min_length=1)] = (5, 10, 20, 40)  # 1: the next one
@@ -107,6 +106,7 @@ class TrafficAhead(StepTransform):
     delay: Seconds = 0.0  # age of the reports [s]
 
     conditions = ("noise", "delay")
+    of_traffic = True  # of no use to a vehicle directly behind the leader
     reported = Entry("traffic.speed", "m/s", "speed of the vehicle at each number of places ahead")
     kept = Entry("traffic.reports", "m/s", "reports of the last steps, latest first")
     own: ClassVar[Tensor]

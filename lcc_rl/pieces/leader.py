@@ -80,7 +80,7 @@ class NGSIMLeader(StepTransform):
         """
         reads = [PROFILE, PROFILE_START, LEADER_SPEED, next_key(STEP), SEED]
         self.declare(world, reads, [*self.writes[: 2 + self.foresight], *self.more])
-        self.perturbed = 0.0 if world.nominal else self.perturbation
+        self.perturbed = world.deviation(self.perturbation)
         profiles = world.given("profiles", self.title).at_least(world.horizon)
         last = len(profiles) - 1
         if self.profile is not None and not 0 <= self.profile <= last:

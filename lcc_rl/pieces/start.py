@@ -119,8 +119,7 @@ class HeadwayStart(Part):
 
     def setup(self, world: World) -> None:
         """Choose the deviations; 0 in an evaluation."""
-        spreads = (self.gap_spread, self.speed_spread)
-        self.gaps, self.speeds = (0.0, 0.0) if world.nominal else spreads
+        self.gaps, self.speeds = map(world.deviation, (self.gap_spread, self.speed_spread))
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""

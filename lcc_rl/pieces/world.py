@@ -77,6 +77,10 @@ class World:
         """Return the range from which episodes draw a factor: 1 to 1 in an evaluation."""
         return (1.0, 1.0) if self.nominal else factors
 
+    def deviation(self, size: float) -> float:
+        """Return the size of a deviation that episodes draw: 0 in an evaluation."""
+        return 0.0 if self.nominal else size
+
     def steps(self, seconds: float, what: str) -> int:
         """Return a duration in steps.
 
@@ -160,6 +164,7 @@ class Part(Settings):
         """Return a copy that is bound to a world.
 
         Args:
+            world: properties that all pieces share; None: those of ``World()``.
             name: its role, or its key in the configuration.
         """
         bound = type(self)(**values(self))

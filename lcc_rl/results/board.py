@@ -89,7 +89,7 @@ def row_of(
 
     Args:
         table: result of :func:`lcc_rl.results.report.summary`.
-        source: name of the leaders.
+        task, source, strategy: the task, and names of the leaders and of the strategy.
         drivers: number of drivers of the evaluation.
         future: entries of the leader's future that it reads.
 

@@ -9,7 +9,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from pathlib import Path
 from textwrap import shorten
@@ -20,7 +19,7 @@ import pyarrow as pa
 from pandas.api.types import is_numeric_dtype
 from pyarrow.dataset import Dataset
 
-from lcc_rl.errors import ResultsError, require_known, unknown_name
+from lcc_rl.errors import ConfigError, ResultsError, nearest, require_known
 from lcc_rl.io.atomic import SUBFOLDERS
 from lcc_rl.io.files import (
     VERSION,
@@ -221,8 +220,8 @@ def _chosen(runs: Runs, names: Sequence[str] | None, columns: Sequence[str]) -> 
     every = dict.fromkeys(key for settings in runs.values() for key in settings)
     for name in names or ():
         if not any(fnmatchcase(key, name) for key in every):
-            near = get_close_matches(name, every, cutoff=0.4)  # there are hundreds
-            raise unknown_name("setting of these runs", name, near)
+            every_one = f"settings=['*'] returns all {len(every)}.{nearest(name, [*every])}"
+            raise ConfigError(f"unknown setting of these runs {name!r}; {every_one}")
     first = next(iter(runs.values()))
 
     def is_column(key: str) -> bool:

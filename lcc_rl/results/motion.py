@@ -77,7 +77,7 @@ class SampleMotion:
 
 def of_first_seed(steps: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of steps.parquet of each strategy's first training seed."""
-    if "case" in steps and "training_seed" not in steps:  # of earlier versions
+    if "training_seed" not in steps:  # no row, or of earlier versions
         return steps
     seeds = steps["training_seed"]
     return steps[seeds.isna() | (seeds == seeds.groupby(steps["strategy"]).transform("min"))]

@@ -30,7 +30,7 @@ def read_checked(path: str | Path, kind: type[S], what: str) -> S:
     """Read a possibly foreign file of tensors as a typed model.
 
     Args:
-        kind: the model.
+        path, kind: the file and the model.
         what: name of the expected kind of file, for the message.
 
     Raises:

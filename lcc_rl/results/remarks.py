@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -67,11 +67,6 @@ def flow_note(table: pd.DataFrame) -> str:
     losses = (f"{in_words(str(name))} {100.0 * share:.0f} %" for name, share in named)
     against = in_words(str(table["against"].iloc[0]))
     return f"{MARK.strip()}: flow lost against {against}: {'; '.join(losses)}." if len(lost) else ""
-
-
-def flow_reference(names: Iterable[str], against: str) -> str:
-    """Return whose flow is that of comparisons at equal flow: the recorded drivers, if present."""
-    return RECORDED if RECORDED in {*names} else against
 
 
 def front_note(table: pd.DataFrame, reference: str) -> str:

@@ -150,7 +150,7 @@ def terminal(report: Report, title: str = "", full: bool = False) -> RenderableT
     """Return a report for the terminal, within 80 characters, with a row per strategy.
 
     Args:
-        title: title of the table.
+        report, title: the report of an evaluation, and the title of the table.
         full: all measures with a column per strategy.
     """
     notes = [report.verdict] if report.verdict else []
@@ -237,7 +237,7 @@ def for_print(report: Report, names: Sequence[str] = ()) -> pd.DataFrame:
     """Return columns of a report with their intervals and the headings of its short table.
 
     Args:
-        names: names of columns; by default those of its short table.
+        report, names: the report, and names of columns; by default those of its short table.
 
     Raises:
         ConfigError: for an unknown column, naming the nearest.

@@ -40,7 +40,6 @@ from lcc_rl.results.remarks import (
     crashed,
     crashes,
     flow_note,
-    flow_reference,
     front_note,
     remarks,
     seeds_note,
@@ -201,6 +200,7 @@ def summary(
     # Without automated vehicles the values of limits are missing.
     for column in task.limits if task and WAYS[0] in windows else ():
         require(column in windows, f"task.limits.{column}: episodes.parquet has no such column")
+    reference = RECORDED if RECORDED in every else against or ""  # whose flow is that of savings
     column, *per = task.measure.columns if task else (PATH, DISTANCE)
     rows, hit = [], {name for name, frame in frames.items() if frame.get("collisions", NONE).sum()}
     for name, frame in frames.items():
@@ -220,10 +220,12 @@ def summary(
         if task:
             unit = task.unit if task.measure.per and energy is not None else KJ
             row |= in_units(values, task.measure.key, SCORE, unit, energy)
-        row |= _savings(windows, name, (column, per), None if hit & {name, against} else against)
+        other = None if hit & {name, against} else against
+        row |= _savings(windows, name, (column, per), other, reference)
         rows.append(row | values)
     table = pd.DataFrame(rows)
     table = table.astype({"collisions": int, "episodes": int}).copy()  # has few blocks
+    table.attrs["reference"] = reference
     table["single"] &= table["seeds"].max() > 1
     base = table[table["strategy"] == against]
     for key, (_, lost) in LOST.items():
@@ -239,7 +241,7 @@ def summary(
 
 
 def _savings(
-    windows: pd.DataFrame, name: str, of: tuple[str, Sequence[str]], against: str | None
+    windows: pd.DataFrame, name: str, of: tuple[str, Sequence[str]], against: str | None, flow: str
 ) -> dict[str, float]:
     """Return the savings of a strategy, see :func:`summary`; ``of``: energy and distances."""
     row: dict[str, float] = {}
@@ -255,8 +257,7 @@ def _savings(
         row |= share.columns(key)
     row["end_saving"] = row["drawn_saving"] - row["saving"]
     names = windows["strategy"].unique()
-    reference = flow_reference(names, str(against))
-    theirs = [reference] if name != reference else []
+    theirs = [flow] if name != flow else []
     fronts = {x: [y for y in names if y.partition(ON_FRONT)[0] == x] for x in (*RULE_ROWS, name)}
     rule = next((x for x in RULE_ROWS if len(fronts[x]) > 1), "")
     for key, other, energy in (
@@ -265,7 +266,7 @@ def _savings(
         ("rule_saving", fronts.get(rule, []) if name != rule else [], of[0]),
     ):
         front = fronts[name] if len(fronts[name]) > 1 and against is not None else []
-        share = at_equal_flow(windows, front, other, energy, reference)
+        share = at_equal_flow(windows, front, other, energy, flow)
         row |= share.columns(key) | ({MORE_FLOW: share.more_flow} if key == "flow_saving" else {})
     return row
 
@@ -308,10 +309,10 @@ def report(
         percent |= in_units(table, PATH_PER_KM, _energy_in(one).key, one, energy)
     percent |= {shown: -100.0 * table[lost] for lost, (shown, _) in LOST.items()}
     every = with_drivers(pd.concat([table, pd.DataFrame(percent)], axis=1))
-    fields = _of_task(every, task) if task else _of_energy(every, units, second)
+    reference = in_words(table.attrs["reference"])
+    fields = _of_task(every, task) if task else _of_energy(every, units, second, reference)
     short, shown = fields.pop("short")
     baseline = str(table["against"].iloc[0])
-    reference = in_words(flow_reference(table["strategy"], baseline))
     rows = _rows(task, baseline, reference, shown[1] if task or unit else None)
     text = "" if task else verdict(windows, table, few)
     seen, shown_windows = (x[x["strategy"].isin(short["strategy"])] for x in (table, windows))
@@ -359,7 +360,9 @@ def _rows(task: Task | None, against: str, reference: str, score: Shown | None) 
     ]
 
 
-def _of_energy(table: pd.DataFrame, units: Sequence[str], second: Fleet | None) -> dict[str, Any]:
+def _of_energy(
+    table: pd.DataFrame, units: Sequence[str], second: Fleet | None, reference: str
+) -> dict[str, Any]:
     """Return the parts of a report that are specific to one without a task, most energy first."""
     # A string without automated vehicles has fewer vehicles and is not comparable.
     cars = table[table[PATH].notna()] if table[PATH].notna().any() else table
@@ -381,9 +384,8 @@ def _of_energy(table: pd.DataFrame, units: Sequence[str], second: Fleet | None) 
     of = "fuel" if second is not None and burns_one_fuel(second) else "second model"
     shown = [Shown(key, heading.format(of)) for key, heading in [*shown, COLLISIONS]]
     note += SHARES * (not fronts)
-    reference = flow_reference(table["strategy"], str(against))
-    if AT_FLOW[0] in fronts and against != reference:
-        note += f"saved at their flow: against {in_words(reference)}, at the flow of these; "
+    if AT_FLOW[0] in fronts and in_words(str(against)) != reference:
+        note += f"saved at their flow: against {reference}, at the flow of these; "
     return {
         "short": shortened(cars.assign(**columns), shown, spread),
         "caption": CAPTION.format(note + behind_filter(cars)),

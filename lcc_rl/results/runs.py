@@ -91,6 +91,7 @@ def check_folder(cfg: BaseConfig, folder: Path, *but: str) -> None:
     """Refuse a folder with results, or a stopped run, of other settings.
 
     Args:
+        cfg, folder: configuration of the run and its folder.
         *but: settings and sections that may differ, besides ``trust``.
 
     Raises:

@@ -219,7 +219,7 @@ def savings(
 
     Args:
         rows: rows of an evaluation, or result of :func:`windows_of`.
-        column: the energy.
+        column, strategy, baseline: the energy, and names of the strategies.
         per: columns of distances; the total energy is divided by their sum. Without them energies
             of whole episodes are compared, which falling behind lowers.
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any, NoReturn
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
+from lcc_rl.config.words import check_once
 from lcc_rl.errors import ConfigError
 
 HELP_WIDTH = 79
@@ -74,4 +75,4 @@ TABLE = typed(Annotated[str, Field(pattern=r"\.(csv|parquet)$")])  # a file to w
 def files_and_settings(words: Sequence[str]) -> tuple[list[str], list[str]]:
     """Divide the words of a command into names, such as files, and settings ``key=value``."""
     files = [word for word in words if "=" not in word or exists(word)]
-    return files, [word for word in words if word not in files]
+    return files, [*check_once([word for word in words if word not in files])]

@@ -45,6 +45,9 @@ REFUSED = {
     "run variant=idm": "variant=idm has no effect on lcc-rl run",
     "train experiment=limits +filter=cbf": "filter is chosen twice: leave one out",
     f"train -m variant=idm {' '.join(LISTS)}": "at most 100000 runs",
+    "train seed=1 variant=idm ++seed=2": r"seed=1 \+\+seed=2: seed is set twice; leave one out$",
+    "score idm seed=1 seed=2": "seed is set twice",
+    "energy trips.csv energy=bolt energy=fuel": "energy is set twice",
     "train filter=cbf": r"write \+filter=",
     "train ~agent.gamma": "~agent.gamma: no file sets it",
     "export policy.pt": "required: path ",
@@ -83,7 +86,7 @@ def test_bad_input_is_one_line_and_exit_code_2_and_leaves_nothing(tmp_path) -> N
 
 
 def test_a_job_that_fails_once_its_data_are_read_is_recorded(tmp_path) -> None:
-    words = (*NO_AGENT, "data.recordings=1", "hydra.run.dir=job")
+    words = ("experiment=smoke", DATA[0], "data.recordings=1", DATA[2], "hydra.run.dir=job")
     done = run_command("run", *words, cwd=tmp_path)
     assert done.stderr.count("\n") == 1
     assert "split.by=vehicle" in inspect_run(tmp_path / "job").error

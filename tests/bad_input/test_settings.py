@@ -47,6 +47,9 @@ WRONG = {
     "reward.terms.safety.wieght=1": "reward.terms.safety .*'weight'",
     "learning=follow": "choice of learning 'follow'; valid: follow_samples.*, needs --config-dir",
     "agent._partial_=true": "agent._partial_ has no effect",
+    "~agent": "~agent: other choices depend on it; write agent=null$",
+    "experiment=limits agent=ddpg": r"gamma must .*; it follows from .*experiment=limits agent=dd",
+    "agent=analytic reward.terms.efficiency.threshold=0.1": "0.1; it follows from .*threshold=0",
     "agent.gamma=???": r"^agent\.gamma=\?\?\?: expected a value",
     f"variant=hcfs {AUTO}.jerk_weight=1": r"It is deployed\.jerk_weight",
     # types
@@ -98,6 +101,8 @@ IGNORED = {
     f"controller@{AUTO}=handover agent=td3": "handover drives the .* uses no action",
     "scenario.circumference=200": "belongs to scenario.road=ring",
     "scenario=ring scenario.start.human.cap_time_gap=2": "of a ring start evenly spaced",
+    "task=platoon-us06 training.gap_range=[1,1]": "no start of the scenario refers to it",
+    "+knowledge=[memory,traffic]": "no vehicle but the leader, whose speed traffic repeats",
     "scenario=ring training.gap_range=[1,1]": "of a ring start evenly spaced",
     "variant=idm training.episodes=20": "variant idm has no agent",
     "variant=alcc scenario.string=human*3 training.episodes=20": "no vehicle .* is automated",
@@ -117,6 +122,8 @@ IGNORED = {
     "sweep=mine": "names the folder of a sweep, -m",
     "reward.without=safety reward.terms.safety.weight=3": "reward.without leaves the term out",
     "variant=own_energy observation.visible=2": "scales names no vehicle behind",
+    "reward.without=safety reward.terms.safety.threshold=3": "reward.without leaves the term out",
+    "reward.without=[safety] reward.terms.safety.weight=3": "reward.without leaves the term out",
 }
 # Settings of an evaluation of a policy without effect, by variant, and why.
 OF_TRAINING = "has the (settings|agent) of its training"
@@ -129,7 +136,7 @@ EVALUATED = {
     "alcc reward.terms.safety.weight=5": "only rows of policies have it, with evaluation.terms",
     "alcc reward.without=safety": "only rows of policies have it, with evaluation.terms",
     "alcc ~reward.terms.safety": "only rows of policies have it, with evaluation.terms",
-    "alcc evaluation.behind_filter=[acc_filtered]": "no policy drives behind the safety filter",
+    "alcc evaluation.behind_filter=[acc_filtered]": "no trained policy drives behind",
     "idm": "variant idm has no agent",
     "hcfs +energy@evaluation.second_energy=compact": "drives behind every record once",
     "hcfs evaluation.sample_episodes=0": "drives behind every record once",
@@ -222,6 +229,8 @@ def test_options_without_effect_are_refused() -> None:
     words = ["variants=[alcc]", "evaluation.baselines=[human]"]  # a job compares
     trainings, final = composed_part(load("pipeline", words), words)
     assert final.evaluation.baselines == ["human"] != trainings["alcc"].evaluation.baselines
+    case = (["agent=none"], "variant=reference is a learned controller, but there is no agent")
+    check_refused(lambda words: composed_part(load("pipeline", words), words), [case], ConfigError)
 
 
 class Own(CACC):

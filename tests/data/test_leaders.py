@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from lcc_rl.data.profiles import Split, at_step, joined, leader_profiles
 from lcc_rl.data.sources import SHIPPED_FILES, NgsimSource
 from lcc_rl.data.speed_records import read_speed_record
 from lcc_rl.envs import load_inputs
-from lcc_rl.errors import ConfigError, DataError
+from lcc_rl.errors import Concern, ConfigError, DataError
 from lcc_rl.functional.random import choose, stream_id
 from lcc_rl.pieces.leader import NGSIMLeader
 from lcc_rl.pieces.world import World
@@ -154,6 +155,10 @@ def test_calm_windows_are_counted_and_a_record_without_a_window_is_not_listed(tm
     assert "2 of 3 record(s) for evaluation" in used
     assert used.endswith(": a, b")
     assert "only 10 are available and 5 are left out" in lines[-1]
+    words = ["task=ring-22", "evaluation.drivers=5000"]
+    line = load_inputs(load("evaluate", words)).report[-1]
+    assert re.match(r"evaluation.drivers=5000: only \d+ are available; taking all", line)
+    assert all(isinstance(x, Concern) for x in (line, lines[-1]))  # lcc_rl.compare logs them, too
 
 
 def test_a_file_of_esmini_is_read(tmp_path) -> None:

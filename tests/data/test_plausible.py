@@ -236,6 +236,10 @@ def test_a_faulty_sensor_fits_no_unit_and_is_refused_only_where_all_are() -> Non
     assert judged(one)[-1].endswith("of 2 pair(s), slope and lag unknown for 1")
     with pytest.raises(DataError, match=r"f\.csv: the gap changes by -?0\.\d\d m .* no unit fits"):
         judged(table.assign(gap_m=noise))
+    noisy = table.assign(gap_m=table["gap_m"] + rng.normal(size=len(table)))
+    judged(noisy)
+    with pytest.raises(DataError, match=r"f\.csv: where .*; are leader and follower exchanged\?"):
+        judged(noisy.rename(columns=dict(zip(SPEEDS, SPEEDS[::-1], strict=True))))
 
 
 def test_a_start_from_standing_is_not_said_to_be_in_another_unit() -> None:

@@ -105,6 +105,11 @@ def test_electric_cars_use_what_their_label_says(subtests) -> None:
 
 
 def test_braking_returns_no_more_than_the_limits_allow() -> None:
+    speed, motor = torch.linspace(0.0, 15.0, 1001), PaperMotor()
+    faster, slower = (motor.power(speed, torch.full_like(speed, x)) for x in (0.1, -0.1))
+    returned = torch.trapezoid((faster - slower) / 0.2, speed)  # gently, of the papers' motor
+    kinetic = motor.stored_energy(speed[-1]) - motor.stored_energy(speed[0])
+    assert float(returned / kinetic) == pytest.approx(2.6, abs=0.05)
     car = ElectricCar(auxiliary=0.0, regeneration_limit=20e3, efficiency=0.9)
     speed = torch.tensor([30.0, 20.0, 2.5, 0.0])
     power = car.power(speed, torch.full((4,), -3.0))

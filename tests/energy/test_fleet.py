@@ -1,5 +1,7 @@
 """Classes of vehicles: who has which energy model, and what an environment makes of it."""
 
+import math
+
 import pytest
 import torch
 from helpers import check_refused, compose, make_agent, slow_but, small_env, steady, string
@@ -116,6 +118,11 @@ class Rolling(EnergyModel):
         return power.sum() if self.summed else power
 
 
+class Single(Rolling):
+    def validate(self):
+        math.sin(self.grade)  # of one number only
+
+
 class Uphill(Weightless):
     mass = 1500.0
     grade = property(lambda self: 0.01)  # cannot be set
@@ -142,6 +149,7 @@ def test_mistakes_are_named() -> None:
         ({"x": Rolling(heating_value=42.4)}, "Rolling: heating_value must .* J/g, got 42.4"),
         ({"x": Rolling(heating_value=42e3)}, "Rolling: density must .* 0.05 to 1.5 kg/L, got 0.0"),
         ({"x": Uphill()}, "Uphill.power: .*'grade'"),
+        ({"x": Single()}, "Single.power with the grade as a tensor: .*use torch in place of math"),
         ({"x": Rolling(warming=True)}, "Rolling gives an episode other power .* again"),
         ({"x": Rolling(summed=True)}, r"Rolling.power: its shape is \[\] for"),
     ]
@@ -149,6 +157,10 @@ def test_mistakes_are_named() -> None:
     cases = [
         (["energy._target_=builtins.dict"], "energy"),
         (["energy=fuel", "energy.vehicle=van"], "vehicle .energy.vehicle. 'van'"),
+        (
+            ["energy=mixture", "energy.grade=0.02"],
+            "Fleet has no grade, .* energy.models.compact.gr",
+        ),
         ([*MIXED, "+energy.roles.lorry={class8: 1}"], r"energy.roles.*lorry.*automated, human"),
     ]
     check_refused(lambda words: lcc_rl.make_env("alcc", 1, words), cases, ConfigError)

@@ -6,6 +6,7 @@ import torch
 from lcc_rl.energy import AVERAGED, as_fleet
 from lcc_rl.evaluation.metrics import (
     ROAD_METRICS,
+    Reductions,
     averaged_energies,
     damping_time,
     energy_measures,
@@ -221,3 +222,15 @@ def test_what_a_road_asks_of_all_vehicles() -> None:
     alive[5] = False
     found = safety_measures(series, alive, 0.5, ROAD_METRICS)
     assert float(found["brakings_below_2"]) == 1.0
+
+
+def test_reductions_of_speeds_end_with_the_episode() -> None:
+    # Speeds 0 to 5 with the one before the first step; the second episode ends after 3 of 5 steps.
+    speed = torch.arange(6.0).reshape(6, 1, 1, 1).expand(6, 2, 1, 1)
+    alive = torch.ones(5, 2, 1, 1, dtype=torch.bool)
+    alive[3:, 1] = False
+    over = Reductions(alive, 1.0)
+    assert over.highest(speed).flatten().tolist() == [5.0, 3.0]
+    assert over.change(speed).flatten().tolist() == [5.0, 3.0]
+    assert over.lowest(5.0 - speed).flatten().tolist() == [0.0, 2.0]
+    assert over.highest(speed[3:]).flatten().tolist() == [5.0, 3.0]  # without the first times

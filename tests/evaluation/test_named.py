@@ -252,6 +252,7 @@ def test_names_of_rows_on_the_command_line(tmp_path) -> None:
     named = {"IDM T_1.8 s": "idm", "a-b+c/d%e*f@g?h|i": "acc"}
     text = ", ".join(f"{name}: {who}" for name, who in named.items())
     assert load("evaluate", [*SMALL, f"compare={{{text}}}"]).compare == named
+    assert load("evaluate", [*SMALL, "compare={1: idm}"]).compare == {"1": "idm"}
     typed = f'compare={{"IDM, T = 1.8 s": {PATH}}}'
     with pytest.raises(LccError, match=re.escape(typed) + ".*: names before a colon|no quotes"):
         load("evaluate", [*SMALL, typed])

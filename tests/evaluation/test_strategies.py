@@ -166,13 +166,15 @@ def test_a_policy_keeps_the_pieces_that_it_observes(monkeypatch) -> None:
 
 def test_a_policy_meets_the_conditions_of_the_command(monkeypatch, caplog) -> None:
     monkeypatch.setattr(strategies, "with_weights", lambda cfg, *_: Strategy("alcc", cfg))
-    at = "scenario.pieces.traffic"
+    at, ahead = (
+        "scenario.pieces.traffic",
+        ["+knowledge=traffic", "scenario.string='human automated'"],
+    )
     policy, late = (
-        compose("alcc", "+knowledge=traffic", *words).with_(policy="p.pt")
-        for words in ([], [f"{at}.delay=2.0"])
+        compose("alcc", *ahead, *words).with_(policy="p.pt") for words in ([], [f"{at}.delay=2.0"])
     )
     check_policy(late, policy)
-    other = compose("alcc", "+knowledge=traffic", f"{at}.delay=2.0", f"{at}.places=[7]")
+    other = compose("alcc", *ahead, f"{at}.delay=2.0", f"{at}.places=[7]")
     for cfg in (late, other):
         piece = trained(cfg, "p.pt", ({}, policy), POPULATION).cfg.scenario.pieces["traffic"]
         assert piece == policy.scenario.pieces["traffic"].changed(delay=2.0)

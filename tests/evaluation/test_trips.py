@@ -109,6 +109,9 @@ def test_a_truck_uphill_has_the_net_energy_of_a_level_road() -> None:
                 net[can], level.path_power(speed, still)[can], rtol=0.05, atol=0
             )
             assert float(level.on(grade).climbing(torch.zeros(1))) == 0.0
+            slow = torch.linspace(0.0, 0.2, 41)  # across the speed of idling
+            paths = (x.path_power(slow, 0.0 * slow) for x in (level.on(grade), level))
+            torch.testing.assert_close(*paths)
     for words in (["energy=fuel"], ["energy=electric", "energy.regeneration_limit=0"]):
         build_energy(load("evaluate", ["variant=direct", "energy.grade=-0.05", *words]))
 

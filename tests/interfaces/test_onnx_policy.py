@@ -189,6 +189,10 @@ def test_it_remembers_as_the_piece_does(knowledge, kind) -> None:
 FOREIGN = [
     ({**ABOUT, "inputs": [{**GAP, "name": "leader.next_speed"}]}, "'leader.next_speed' is not"),
     ({**ABOUT, "inputs": [{**GAP, "name": "../../etc/passwd"}]}, "is not measured"),
+    (
+        {**ABOUT, "inputs": [{**GAP, "name": "traffic.speed.0"}]},
+        "knowledge .* lacks: compare the p",
+    ),
     ({**ABOUT, "inputs": [{**GAP, "unit": "ft"}]}, "self.gap is in m, got 'ft'"),
     ({**ABOUT, "inputs": [GAP, GAP]}, r"expected the input state \[batch, 2\]"),
     ({}, "lacks the metadata"),

@@ -172,6 +172,8 @@ def test_an_unknown_setting_is_refused_with_the_nearest(tmp_path) -> None:
     assert found.to_dict() == {("safety", 0): 6}
     with pytest.raises(ConfigError, match=r"'agent.gama'.*Did you mean 'agent.gamma'"):
         results.load(tmp_path, settings=["seed", "agent.gama"])
+    with pytest.raises(ConfigError, match=r"'nothing\.\*'; settings=\['\*'\] returns all \d+\.$"):
+        results.load(tmp_path, settings=["nothing.*"])
 
 
 # -- damaged runs ----------------------------------------------------------------------------------
