@@ -47,7 +47,9 @@ def print_again(options: Namespace) -> None:
             if options.format == "text" and not names:
                 print(run.printed(options.all, options.against))
                 return
-            report = together(run.reports(options.against))
+            report = together(reports := run.reports(options.against))
+            if names and len(reports) > 1 and not csv:
+                names = list(dict.fromkeys(["of", *names]))
         if options.all:
             table = chosen(report.table, names)
         else:

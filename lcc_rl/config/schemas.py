@@ -17,7 +17,8 @@ import yaml
 from pydantic import AfterValidator, Field
 
 from lcc_rl.config.nodes import Node, as_nodes, as_plain, check_nodes, check_numbers, nodes_in
-from lcc_rl.errors import ConfigError, require
+from lcc_rl.errors import ConfigError, require, require_known
+from lcc_rl.functional.cacc import Gains
 from lcc_rl.functional.pattern import (
     AUTOMATED,
     HUMAN,
@@ -304,7 +305,11 @@ class StudyConfig(BaseConfig):
         return self.scenario.vehicles.count(AUTOMATED)
 
     def driven_by(self, controller: Node) -> Self:
-        """Return the configuration with another controller of the automated vehicles."""
+        """Return it with another controller of the automated vehicles, for the same policy."""
+        before = self.scenario.controllers.get(AUTOMATED)
+        scale = before and before.settings.get("max_acceleration")
+        if scale and controller.settings.get("action_scale", 0.0) is None:
+            controller = controller.changed(action_scale=scale)
         return self.with_(deployed=None, scenario={"controllers": {AUTOMATED: controller}})
 
     def after_training(self) -> Self:
@@ -340,6 +345,7 @@ class StudyConfig(BaseConfig):
     def validate(self) -> None:
         for module in self.measures:
             load_module(module, "measures")
+        require_known("setting of gains", self.gains or (), Gains.__dataclass_fields__)
 
 
 class TrainConfig(StudyConfig):

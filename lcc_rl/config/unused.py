@@ -115,6 +115,8 @@ def _of_rows(cfg: StudyConfig, sweep: bool) -> Iterator[tuple[str, str]]:
     if cfg.evaluation.rows == "vehicles":
         for name in OF_EPISODES[: 3 if sweep else None]:
             yield f"evaluation.{name}", "evaluation.rows=vehicles drives behind every record once"
+        if cfg.scenario.road != RING:
+            yield "scenario.vehicle_length", "evaluation.rows=vehicles has no flow"
     elif not sweep:
         yield "evaluation.full_length", "whole records belong to evaluation.rows=vehicles"
 

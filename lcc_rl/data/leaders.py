@@ -185,7 +185,7 @@ class RecordLeaders(Settings):
         for name, node in self.cases.items():
             x = self._parsed(CaseSettings, node, f"leader.cases.{name}")
             end = x.start_s + horizon * time_step
-            profile = stretch(x.path, time_step, x.scale, x.start_s, end, self.plausible)
+            profile = self._cut(x, f"leader.cases.{name}", time_step, x.start_s, end)
             cases.append(Case(name.replace("_", " "), profile, x.followers))
         wholes = self.full_length or {}
         profiles = self._stretches("full_length", wholes, time_step)
@@ -198,9 +198,16 @@ class RecordLeaders(Settings):
     def _stretches(self, group: str, nodes: StretchNodes, time_step: float) -> list[Profiles]:
         profiles = []
         for name, node in nodes.items():
-            x = self._parsed(Stretch, node, f"leader.{group}.{name}")
-            profiles.append(stretch(x.path, time_step, x.scale, x.from_s, x.to_s, self.plausible))
+            where = f"leader.{group}.{name}"
+            x = self._parsed(Stretch, node, where)
+            profiles.append(self._cut(x, where, time_step, x.from_s, x.to_s))
         return profiles
+
+    def _cut(self, x: Any, where: str, time_step: float, begin: Any, end: Any) -> Profiles:
+        try:
+            return stretch(x.path, time_step, x.scale, begin, end, self.plausible)
+        except DataError as error:
+            raise DataError(f"{where}: {error}") from error
 
     def _parsed(self, kind: type[Settings], node: Mapping[str, Any] | None, where: str) -> Any:
         """Return settings of a stretch or case; it or ``self`` has a path."""

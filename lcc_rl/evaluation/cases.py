@@ -134,9 +134,10 @@ def measured_series(series: CaseSeries, time_step: float = 0.1) -> pd.DataFrame:
     """Return one row per run and vehicle; ``time_step`` [s].
 
     Speed errors are e_v(i,0), as in the paper's tables; sums and squares of them and of jerks, and
-    ``max_gap_error_m``, the largest |e_x(i,i−1)|, are NaN for vehicles that are not automated.
-    ``energy_ratio`` is Σ e_v(i,i−1)² divided by that of the vehicle ahead (string stability: at
-    most 1); it is missing for the first vehicle and without motion. ``drawn_energy_kj_per_km`` is
+    ``max_gap_error_m``, the largest |e_x(i,i−1)| by the position received, which is late, are NaN
+    for vehicles that are not automated. ``energy_ratio`` is Σ e_v(i,i−1)² divided by that of the
+    vehicle ahead (string stability: at most 1); it is missing for the first vehicle and if the
+    divisor is at most 1e-3 m²/s². ``drawn_energy_kj_per_km`` is
     the scenario's power over the distance, missing at standstill.
     """
     error, jerk = series["leader_speed_error"].abs(), series["jerk"].abs()

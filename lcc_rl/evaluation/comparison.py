@@ -25,7 +25,7 @@ from lcc_rl.evaluation.rows import nullable
 from lcc_rl.evaluation.strategies import Strategy
 from lcc_rl.io.files import IDENTITY, Rows, as_rows, parquet_metadata, read_parquet, write_parquet
 from lcc_rl.io.memory import require_memory
-from lcc_rl.pieces.knowledge import hears
+from lcc_rl.pieces.knowledge import hears, unconnected
 from lcc_rl.results.names import in_words
 from lcc_rl.results.runs import EPISODES, STEPS
 from lcc_rl.runs.progress import BETWEEN_LINES, ProgressReporter
@@ -155,6 +155,9 @@ class Comparison:
         heard = [in_words(x.name) for x, one in rows if hears(pieces_of(one.player.env))]
         if heard:
             log.warning("sensors change no messages, which are read by %s", "; ".join(heard))
+        for role in set().union(*(unconnected(pieces_of(x.player.env)) for x in self.players)):
+            text = "%s reads messages but is not in scenario.pieces.communication.connected"
+            log.warning(text, role)
         warn_of_brakes(one.player for one in self.players)
         if settings.rows == "episodes" and not any(x.player.reads_drivers for x in self.players):
             log.warning("no row depends on the human drivers: drivers=… has no effect")

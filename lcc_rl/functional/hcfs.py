@@ -111,12 +111,12 @@ class Decision(NamedTuple):
 
 
 def jerk_interval(
-    last_acceleration: Tensor, jerk_bound: float, time_step: float, max_acceleration: float
+    last_acceleration: Tensor, jerk_bound: float, time_step: float, limits: tuple[float, float]
 ) -> tuple[Tensor, Tensor]:
-    """Return the accelerations between which |jerk| stays within the bound J of H15–H21."""
+    """Return the accelerations within limits between which |jerk| keeps the bound J of H15–H21."""
     reach = jerk_bound * time_step
-    low = (last_acceleration - reach).clamp(min=-max_acceleration)
-    return low, (last_acceleration + reach).clamp(max=max_acceleration)
+    low = (last_acceleration - reach).clamp(min=limits[0])
+    return low, (last_acceleration + reach).clamp(max=limits[1])
 
 
 def hybrid_decision(
@@ -130,7 +130,7 @@ def hybrid_decision(
     cap: Tensor | None,
     reward: PlatoonReward,
     time_step: float,
-    max_acceleration: float,
+    limits: tuple[float, float],
     place: PlatoonPlace | None = None,
     choice: Choice = "better",
 ) -> Decision:
@@ -150,24 +150,22 @@ def hybrid_decision(
     cancels in the errors between neighbours, which follow the rule's law for any policy.
 
     Args:
-        rule, learned: the candidates [m/s²]; the rule's may exceed a_max, so that neighbours
+        rule, learned: the candidates [m/s²]; the rule's may exceed the limits, so that neighbours
             differ by its law there, too.
         speed: v_i [m/s].
         last_acceleration: a_{k−1} as executed [m/s²].
         last_winner: winner of the step before; negative or None where there was none.
         leader_next: the predicted speed of each vehicle's leader [m/s].
         interval: see :func:`jerk_interval`; None: no bound (the literal rule).
-        cap: see :func:`lcc_rl.functional.braking.safe_acceleration`; it may be below −a_max. None:
+        cap: see :func:`lcc_rl.functional.braking.safe_acceleration`; it may be below them. None:
             no cap. If the cap or a candidate is not finite, the vehicle brakes fully.
         reward: the reward by which candidates are compared.
         time_step: T [s].
-        max_acceleration: a_max [m/s²], of both candidates and of the brakes.
+        limits: least and largest acceleration, in the paper −a_max and a_max [m/s²].
         place: the vehicle's place in its platoon, needed by a reward with a spacing weight.
         choice: see above. With ``"between"`` and ``"first"`` the winner is the nearer candidate.
     """
-    (one, two), clamped, capped = _bounded(
-        torch.stack([rule, learned]), interval, cap, max_acceleration
-    )
+    (one, two), clamped, capped = _bounded(torch.stack([rule, learned]), interval, cap, limits)
 
     def earned(x: Tensor) -> Tensor:
         return reward.one_step(speed, last_acceleration, x, leader_next, time_step, place)
@@ -187,7 +185,7 @@ def hybrid_decision(
     chosen = torch.lerp(one, two, share)
     if choice == "first":
         same = rule + (chosen - rule)[..., :1, :]
-        (chosen,), clamped, capped = _bounded(same[None], interval, cap, max_acceleration)
+        (chosen,), clamped, capped = _bounded(same[None], interval, cap, limits)
     return Decision(chosen, winner, switched, clamped, capped)
 
 
@@ -219,18 +217,18 @@ def _bounded(
     candidates: Tensor,
     interval: tuple[Tensor, Tensor] | None,
     cap: Tensor | None,
-    max_acceleration: float,
+    limits: tuple[float, float],
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the candidates within jerk bound and cap, and whether each cut one (step 1)."""
-    given, free = candidates, candidates.clamp(-max_acceleration, max_acceleration)
+    given, free = candidates, candidates.clamp(*limits)
     candidates = free
     if interval is not None:
         candidates = candidates.clamp(*interval)
     clamped = (candidates != free).any(0)
     if cap is None:
         return candidates, clamped, torch.zeros_like(clamped)
-    bounded = torch.minimum(candidates, cap.clamp(min=-max_acceleration))
+    bounded = torch.minimum(candidates, cap.clamp(min=limits[0]))
     # If a candidate or an input of the cap is NaN, no command is known to be safe.
     known = (given.isfinite() & bounded.isfinite() & cap.isfinite()).all(0)
-    bounded = torch.where(known, bounded, -max_acceleration)
+    bounded = torch.where(known, bounded, limits[0])
     return bounded, clamped, (bounded != candidates).any(0)

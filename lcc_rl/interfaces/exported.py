@@ -87,6 +87,7 @@ class NetworkController(Controller):
     network: InstanceOf[nn.Module]  # maps the scaled observation to actions
     max_acceleration: Positive  # acceleration of action 1, in both directions [m/s²]
 
+    of_limits = True
     reads = (next_key(OBSERVATION),)
 
     def setup(self, world: World) -> None:

@@ -21,7 +21,6 @@ from pydantic import Field
 from torch import Tensor
 
 from lcc_rl.errors import ResultsError, needing, raised_as, require
-from lcc_rl.functional.pattern import MAX_ACCELERATION
 from lcc_rl.io.paths import check_file
 from lcc_rl.pieces.base import Entry, Piece, declared
 from lcc_rl.pieces.controllers import Controller
@@ -162,7 +161,7 @@ class OnnxPolicy(Controller):
     """
 
     path: str  # the program's file
-    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
+    max_acceleration: Positive | None = None  # None: the limits of the vehicles [m/s²]
 
     def validate(self) -> None:
         """Read the program, so that an invalid one is refused at once."""

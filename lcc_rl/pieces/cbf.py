@@ -102,7 +102,7 @@ class CBFFilter(RoleTransform):
     least_gap: NonNegative = 2.0  # gap that the limit of the time gap allows at any speed [m]
     from_s: NonNegative = 0.0  # time of the episode from which it acts, see Handover [s]
 
-    measures = True
+    measures = of_limits = True
     agreed = Entry(
         "role.agreement",
         "–, m, m/s",
@@ -124,7 +124,7 @@ class CBFFilter(RoleTransform):
         self.guaranteed = self.robust or self.role not in {*world.actuators, *world.sensors}
         if not self.robust:
             actuation, sensors = Actuation(), Sensors()
-        limits = world.limits(self.role, self.max_acceleration)
+        limits = world.limits(self.role, self)
         assert limits is not None
         self.least, self.largest = limits
         self.response = actuation.response_in(world, self.role, -self.least)

@@ -7,9 +7,9 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require_known
 from lcc_rl.functional import cacc
-from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.string import entries_ahead, gather
 from lcc_rl.pieces.base import Entry, Feature, as_key
 from lcc_rl.pieces.controllers import Controller
@@ -53,9 +53,11 @@ class Communication(Feature):
         """Find which vehicle receives messages from which.
 
         Raises:
-            ConfigError: if a chain goes all the way round a ring.
+            ConfigError: if a role is unknown, or a chain goes all the way round a ring.
         """
         string = world.string
+        where = f"role (scenario.pieces.{self.name or 'communication'}.connected)"
+        require_known(where, {*self.connected} - {AUTOMATED}, string.names)
         leader = [] if string.ring else [(LEADER, "speed"), (LEADER, "acceleration")]
         roles = [role for role in string.names if role in self.connected and string.drawn]
         motion = [(VEHICLES, name) for name in ("speed", "gap", "acceleration")]
@@ -109,7 +111,7 @@ def leader_names(lookahead: str) -> list[str]:
 class CACC(Controller):
     """Cooperative adaptive cruise control (HCFS H11)."""
 
-    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
+    max_acceleration: Positive | None = None  # None: the limits of the vehicles [m/s²]
     k1: Number = 0.04  # gain of e_x(i,i−1) [1/s]
     k2: Number = 0.12  # gain of e_v(i,i−1)
     k3: Number = 1.4  # gain of e_x(i,0) [1/s]
@@ -143,7 +145,7 @@ class DeadBeat(Controller):
     errors remain: it is a baseline only.
     """
 
-    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
+    max_acceleration: Positive | None = None  # None: the limits of the vehicles [m/s²]
     lookahead: Lookahead = "causal"
 
     steady = True
@@ -180,7 +182,7 @@ def check_platoon(controller: Controller, option: str, fact: str, remedy: str) -
     """
     names = controller.string.names
     if names != (controller.role,):
+        where = getattr(controller, "option", f"scenario.controllers.{controller.role}")
         raise ConfigError(
-            f"scenario.controllers.{controller.role}.{option} {fact}, but the string has "
-            f"{', '.join(names)}; use {remedy}"
+            f"{where}.{option} {fact}, but the string has {', '.join(names)}; use {remedy}"
         )

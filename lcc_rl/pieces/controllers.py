@@ -105,9 +105,8 @@ class Controller(RoleTransform):
             remembers: entries of the memory.
         """
         self.time_step = world.time_step
-        most = (getattr(self, name, None) for name in ("max_acceleration", "max_deceleration"))
         # Limits of the commands [m/s²]; None: not clamped.
-        self.limits: tuple[float, float] | None = world.limits(self.role, *most)
+        self.limits: tuple[float, float] | None = world.limits(self.role, self)
         memory = self.remembers if remembers is None else remembers
         entries = [Entry((ROLE, x)) if isinstance(x, str) else x for x in memory]
         names = [".".join(as_key(entry.of(self.role).key)) for entry in entries]
@@ -137,7 +136,7 @@ class Action(Controller):
     max_acceleration: Positive = MAX_ACCELERATION  # of action 1, in both directions [m/s²]
     hold: NonNegative = 0.0  # time for which an action is executed [s]; 0: one step
 
-    steady = True
+    steady = of_limits = True
     reads = (".".join(ACTION),)
     held = Entry("role.held", "–", "action of a policy that is executed since its last decision")
 

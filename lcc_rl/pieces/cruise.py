@@ -9,7 +9,6 @@ from torch import Tensor
 
 from lcc_rl.functional.driver_models import Each
 from lcc_rl.functional.idm import IDMConstants
-from lcc_rl.functional.pattern import MAX_ACCELERATION
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.settings import Positive, defaults
 
@@ -20,7 +19,7 @@ class Cruise(Controller):
     The other settings of a class are the constants of its law, in this order.
     """
 
-    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
+    max_acceleration: Positive | None = None  # None: the limits of the vehicles [m/s²]
 
     reads = ("self.speed", "self.gap", "self.relative_speed")
     observed = tuple((name,) for name in reads)  # as columns of an observation

@@ -53,9 +53,12 @@ class Hybrid(Controller):
     """
 
     rule: InstanceOf[Controller]  # without memory; its command is one candidate
-    max_acceleration: Positive = MAX_ACCELERATION  # acceleration of action 1 [m/s²]
+    max_acceleration: Positive | None = None  # None: the limits of the vehicles [m/s²]
+    # Acceleration of action 1; None: that of the policy's training, without a configuration 3.
+    action_scale: Positive | None = None
 
     takes_action = True
+    option = "deployed"  # its place in a configuration
     remembers = (
         Entry(WINNER, "–", "candidate chosen: 0 rule, 1 policy, −1 at reset", whole=True),
         Entry(SWITCHES, "–", "changes of the winner since the start", whole=True),
@@ -79,7 +82,7 @@ class Hybrid(Controller):
         """Return the commands, the winners and the counters."""
         read, (before, *counts) = entries[: -len(self.remembers)], entries[-len(self.remembers) :]
         rule = self.rule.command(*read[self.weighed :])
-        learned = action * self.max_acceleration
+        learned = action * (self.action_scale or MAX_ACCELERATION)
         chosen: Any = self.choose(rule, learned, *read[: self.weighed])
         if isinstance(chosen, Tensor) and chosen.dtype == torch.bool:
             winner, no = chosen.to(before.dtype), torch.zeros_like(chosen)
@@ -113,7 +116,7 @@ class HCFS(Hybrid):
     # no less than either; or, for a string that is one platoon, every vehicle's rule plus the
     # first vehicle's correction of its rule.
     choice: Choice = "better"
-    braking: Positive = 3.0  # b of the safe cap [m/s²]
+    braking: Positive | None = None  # b of the safe cap; None: the brakes of the vehicles [m/s²]
     margin: NonNegative = 0.5  # gap that the cap keeps at standstill [m]
     # Settings of lcc_rl.functional.hcfs.PlatoonReward, by which candidates are compared. With
     # spacing_weight 0, as in the paper, gap_scale and spacing_time have no effect.
@@ -128,13 +131,6 @@ class HCFS(Hybrid):
     steady = True
     reads = (*HYBRID_READS, *leader_names("causal"))
 
-    def validate(self) -> None:
-        if self.braking > self.max_acceleration:  # harder braking than possible is not safe
-            raise ValueError(
-                f"braking must be at most max_acceleration={self.max_acceleration}, "
-                f"got {self.braking}"
-            )
-
     def setup(self, world: World) -> None:
         """Read the entries of both candidates and of the decision."""
         self.declare(world, [*HYBRID_READS, *leader_names(self.lookahead)])
@@ -142,11 +138,19 @@ class HCFS(Hybrid):
         if self.choice == "first":
             check_platoon(self, "choice=first", "needs a string that is one platoon", "between")
         self.reward = PlatoonReward(**values(self, PlatoonReward))
-        self.both_brake = Braking(self.braking, self.braking, time_to_collision=0.0)
+        assert self.limits is not None
+        self.bounds, hardest = self.limits, -self.limits[0]
+        braking = self.braking or hardest
+        require(
+            braking <= hardest,
+            f"{self.option}.braking={braking:g} exceeds the brakes of the vehicles, {hardest:g} "
+            f"m/s² (scenario.max_braking, {self.option}.max_acceleration): the safe cap needs them",
+        )
+        self.both_brake = Braking(braking, braking, time_to_collision=0.0)
 
     def choose(self, rule: Tensor, learned: Tensor, *entries: Tensor) -> Decision:
         before, speed, last, gap, speed_error, leader_gap, *leader = entries
-        interval = jerk_interval(last, self.jerk_bound, self.time_step, self.max_acceleration)
+        interval = jerk_interval(last, self.jerk_bound, self.time_step, self.bounds)
         ahead, time_step = speed + speed_error, self.time_step
         cap = safe_acceleration(speed, gap - self.margin, ahead, self.both_brake, time_step)
         return hybrid_decision(
@@ -160,7 +164,7 @@ class HCFS(Hybrid):
             cap if self.safe_cap else None,
             self.reward,
             self.time_step,
-            self.max_acceleration,
+            self.bounds,
             PlatoonPlace(leader_gap, leader[0]),
             self.choice,
         )

@@ -28,7 +28,7 @@ from lcc_rl.pieces.base import (
     next_key,
 )
 from lcc_rl.pieces.cbf import CBFFilter
-from lcc_rl.pieces.connected import Communication
+from lcc_rl.pieces.connected import MESSAGES, Communication
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.leader import NEXT_SPEED, PROFILE, PROFILE_START, NGSIMLeader, perturbed
 from lcc_rl.pieces.sensors import Sensors
@@ -197,6 +197,13 @@ def hears(pieces: Sequence[Piece]) -> bool:
     radio = (Communication, TrafficAhead)
     heard = {x for piece in pieces if isinstance(piece, radio) for x in piece.targets}
     return sensed and not heard.isdisjoint(driving_reads(pieces))
+
+
+def unconnected(pieces: Sequence[Piece]) -> set[str]:
+    """Return the roles whose controllers read messages but are not connected."""
+    connected = {role for x in pieces if isinstance(x, Communication) for role in x.connected}
+    controllers = (piece for piece in pieces if isinstance(piece, Controller))
+    return {x.role for x in controllers if not MESSAGES.isdisjoint(x.names)} - connected
 
 
 class ObservationMemory(StepTransform):

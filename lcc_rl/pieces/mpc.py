@@ -11,7 +11,6 @@ from pydantic import Field
 from torch import Tensor
 
 from lcc_rl.errors import ConfigError, how_to_install
-from lcc_rl.functional.pattern import MAX_ACCELERATION
 from lcc_rl.functional.power import POWER_COEFFICIENTS
 from lcc_rl.pieces.base import Entry
 from lcc_rl.pieces.controllers import Controller
@@ -45,7 +44,7 @@ class MPCSettings(Settings):
     near_price: Positive = 3.0
     far_price: Positive = 0.1
     ttc_price: Positive = 30.0
-    max_acceleration: Positive = MAX_ACCELERATION  # in both directions [m/s²]
+    max_acceleration: Positive | None = None  # None: the limits of the vehicles [m/s²]
     # Absolute and relative tolerance of the solver.
     tolerance: Annotated[float, Field(ge=1e-10, le=0.1)] = 1e-4
     iterations: Annotated[int, Field(ge=1, le=1_000_000)] = 4000  # most iterations of the solver

@@ -31,7 +31,7 @@ class Averaging(Controller):
 
     window: Window = 60.0  # length of the mean [s]
     max_acceleration: Positive = 1.5  # of the command [m/s²]
-    max_deceleration: Positive = 3.0  # of the command [m/s²]
+    max_deceleration: Positive | None = None  # None: the limit of the vehicles [m/s²]
 
     history = Entry("role.speed_history", "m/s", "own speeds of the last steps, latest first")
 

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lcc_rl.errors import ConfigError
+from lcc_rl.errors import ConfigError, require
 from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.functional.random import stream_id, uniform
 from lcc_rl.pieces.base import SEED
@@ -113,13 +113,11 @@ class HeadwayStart(Part):
     of_training = ("gap_spread", "speed_spread")
     steady = True
 
-    def validate(self) -> None:
-        if self.gap_spread >= self.headway:
-            raise ValueError(f"gap_spread={self.gap_spread} must be below headway={self.headway}")
-
     def setup(self, world: World) -> None:
         """Choose the deviations; 0 in an evaluation."""
         self.gaps, self.speeds = map(world.deviation, (self.gap_spread, self.speed_spread))
+        text = f"scenario.start.{self.name}.gap_spread={self.gaps:g} must be below its "
+        require(self.gaps < self.headway, f"{text}headway={self.headway:g}")
 
     def __call__(self, start: TensorDictBase, role: str, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return speed and gap, see :class:`lcc_rl.pieces.string.Start`."""

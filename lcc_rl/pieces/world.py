@@ -104,34 +104,36 @@ class World:
         require(seconds < 1.001 * most, f"{what} must be at most {most:g} s, got {seconds:g} s")
         return self.steps(seconds, what)
 
-    def limits(
-        self, role: str, forward: float | None = None, backward: float | None = None
-    ) -> tuple[float, float] | None:
+    def limits(self, role: str, own: Any = None) -> tuple[float, float] | None:
         """Return the least and the largest command to the vehicles of a role [m/s²].
 
         Args:
             role: vehicles that are not automated have only the limits of their controller.
-            forward: the controller's ``max_acceleration``. None and :data:`MAX_ACCELERATION`, the
-                default, mean the limit of automated vehicles; other values lower it.
-            backward: its ``max_deceleration``, positive; None: ``forward``.
+            own: a controller or filter, whose ``max_acceleration`` and, in its place for brakes,
+                ``max_deceleration`` lower them unless None. Where ``of_limits`` is true,
+                :data:`MAX_ACCELERATION` does not.
 
         Raises:
             ConfigError: if a setting exceeds the limits of automated vehicles.
         """
-        bounds = {"max_deceleration": backward or forward, "max_acceleration": forward}
-        if role != AUTOMATED:
-            return None if forward is None else (-(backward or forward), forward)
-        ends, most = [], (self.max_braking, self.max_acceleration)
-        for (name, value), vehicle in zip(bounds.items(), most, strict=True):
-            value = vehicle if value in (None, MAX_ACCELERATION) else value
+        automated, separate = role == AUTOMATED, hasattr(own, "max_deceleration")
+        if not automated and not hasattr(own, "max_acceleration"):
+            return None
+        names = ("max_deceleration" if separate else "max_acceleration", "max_acceleration")
+        most = (self.max_braking, self.max_acceleration) if automated else (MAX_ACCELERATION,) * 2
+        ends, where = [], getattr(own, "option", type(own).__name__)
+        for name, vehicle in zip(names, most, strict=True):
+            value = getattr(own, name, None)
+            if value is None or (value == MAX_ACCELERATION and getattr(own, "of_limits", False)):
+                value = vehicle
             require(
-                value <= (vehicle if backward else max(most)),
-                f"{name if backward else 'max_acceleration'}={value:g} exceeds the limits of "
+                not automated or value <= (vehicle if separate else max(most)),
+                f"{where}.{name}={value:g} exceeds the limits of "
                 f"automated vehicles, which brake by at most {most[0]:g} m/s² "
                 f"({self.limited_by}.max_braking) and accelerate by at most {most[1]:g} m/s² "
                 f"({self.limited_by}.max_acceleration)",
             )
-            ends.append(min(value, vehicle))
+            ends.append(min(value, vehicle) if automated else value)
         return -ends[0], ends[1]
 
     def sensed(self, role: str, names: Sequence[NestedKey]) -> list[NestedKey]:

@@ -25,8 +25,8 @@ def case_table(episodes: pd.DataFrame, case: str) -> pd.DataFrame:
         One row per strategy. Means over seeds of sums over automated followers and steps:
         Σ|e_v(i,0)| and its standard deviation [m/s], Σ|jerk| and its standard deviation [m/s³],
         Σ reward with its 95 % interval over seeds, switches and interventions. Over all seeds:
-        smallest gap and largest gap error [m], collided vehicles, peak jerk [m/s³], worst error
-        ratio and the share of steps of the learned policy.
+        smallest gap, largest gap error as received [m], collided vehicles, peak jerk [m/s³], worst
+        error ratio and the share of steps of the learned policy.
 
     Raises:
         ConfigError: if there is no such case.
@@ -66,7 +66,7 @@ PLATOON = [
     Measure("jerk_std_mps3", "std |jerk|", unit="m/s³"),
     Measure("reward", "Σ reward", short="Σ reward"),
     Measure("min_gap_m", "smallest gap", unit="m", aggregate="min", short="least\ngap [m]"),
-    Measure("max_gap_error_m", "largest gap error", unit="m", aggregate="max"),
+    Measure("max_gap_error_m", "largest gap error, as received", unit="m", aggregate="max"),
     Measure(
         "error_ratio",
         "error ratio, worst",

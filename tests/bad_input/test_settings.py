@@ -51,6 +51,7 @@ WRONG = {
     "experiment=limits agent=ddpg": r"gamma must .*; it follows from .*experiment=limits agent=dd",
     "agent=analytic reward.terms.efficiency.threshold=0.1": "0.1; it follows from .*threshold=0",
     "agent.gamma=???": r"^agent\.gamma=\?\?\?: expected a value",
+    "variant=cacc gains.k5=1": r"setting of gains 'k5'.*; valid: k1, k2, k3, k4",
     f"variant=hcfs {AUTO}.jerk_weight=1": r"It is deployed\.jerk_weight",
     # types
     "seed=abc": "seed must be .* integer",
@@ -114,6 +115,7 @@ IGNORED = {
     "evaluation.full_length=true": "belong to evaluation.rows=vehicles",
     "variant=hcfs evaluation.repeats=5": "drives behind every record once",
     "variant=hcfs drivers=highway": "no vehicle of this platoon depends on drivers",
+    "variant=cacc scenario.vehicle_length=12": "evaluation.rows=vehicles has no flow",
     "variant=direct +filter=cbf": "no vehicle of the string is automated",
     "variant=direct +event=lost_target": "no vehicle of the string is automated",
     "variant=direct +faults=sensors": "no vehicle of the string is automated",

@@ -113,6 +113,7 @@ def test_impossible_leaders() -> None:
         ({"training": {"a": {"path": "us06", "from_s": 600.0}}}, "is empty"),
         ({"training": {"a": {"path": "us06", "scale": 9.0}}}, "drives up to .*max_speed"),
         ({"training": {}}, r"leader\.training names no record"),
+        ({"held_out": {"b": {"path": "nycc"}}}, r"leader\.held_out\.b: nycc: no such file"),
         ({"least_variation": 1e6}, "least_variation, raise scenario.horizon"),
     ]
     usual = {"training": {"a": {"path": "us06"}}, "held_out": {"b": {"path": "hwfet"}}}

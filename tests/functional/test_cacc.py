@@ -17,6 +17,7 @@ from lcc_rl.functional.string import entries_ahead
 from lcc_rl.studies.hcfs.tables import weight_table
 
 T, A_MAX = 0.2, 3.0
+LIMITS = -A_MAX, A_MAX
 NAMED = {
     "path": Gains(0.225, 0.125, 0.225, 0.125),
     "paper_like": Gains(0.072, 0.168, 0.939, 0.023),
@@ -213,11 +214,11 @@ def decide(rule, learned, last=0.0, winner=None, jerk_bound=30.0, cap=None, lead
         last,
         None if winner is None else torch.tensor([[winner]]),
         torch.tensor([leader], dtype=torch.float64),
-        None if jerk_bound is None else jerk_interval(last, jerk_bound, T, A_MAX),
+        None if jerk_bound is None else jerk_interval(last, jerk_bound, T, LIMITS),
         None if cap is None else column(cap),
         more.pop("reward", PlatoonReward()),
         T,
-        A_MAX,
+        LIMITS,
         **more,
     )
 
@@ -282,9 +283,9 @@ def test_theorem_holds_with_clamping_for_every_bound() -> None:
         last_winner = torch.randint(-1, 2, shape, generator=generator)
         given = (draw(A_MAX), draw(A_MAX), 10.0 + draw(2.0), last, last_winner)
         leader = torch.full((1,), 10.0)
-        for interval in (jerk_interval(last, bound, T, A_MAX), None):
+        for interval in (jerk_interval(last, bound, T, LIMITS), None):
             got = hybrid_decision(
-                *given, leader, interval, None, PlatoonReward(), T, A_MAX
+                *given, leader, interval, None, PlatoonReward(), T, LIMITS
             ).acceleration
             jerk = (got - last).abs() / T
             violated = (jerk > bound + 1e-4).float().mean()
@@ -307,9 +308,12 @@ def test_no_step_earns_less_than_a_parent_would(choice, bound) -> None:
 
     last, speed, rule, learned = draw(A_MAX), 10.0 + draw(0.5), draw(2.0), draw(2.0)
     before = torch.randint(-1, 2, shape, generator=generator)
-    leader, interval = torch.full((3000, 1, 1), 10.0).double(), jerk_interval(last, bound, T, A_MAX)
+    leader, interval = (
+        torch.full((3000, 1, 1), 10.0).double(),
+        jerk_interval(last, bound, T, LIMITS),
+    )
     got = hybrid_decision(
-        *(rule, learned, speed, last, before, leader, interval, None, PlatoonReward(), T, A_MAX),
+        *(rule, learned, speed, last, before, leader, interval, None, PlatoonReward(), T, LIMITS),
         choice=choice,
     )
 

@@ -16,7 +16,7 @@ from lcc_rl.envs import build_env
 from lcc_rl.errors import ConfigError
 from lcc_rl.evaluation.strategies import Strategy, baseline, trained
 from lcc_rl.functional.pattern import RING, parse_string
-from lcc_rl.pieces import Action, Actuation, FollowerStopper
+from lcc_rl.pieces import CACC, Action, Actuation, CBFFilter, FollowerStopper
 from lcc_rl.pieces.cruise import IDMACC
 from lcc_rl.pieces.world import World
 from lcc_rl.results.policies import SHIPPED_POLICIES, load_policy
@@ -101,6 +101,8 @@ def test_the_limits_hold_for_commands_of_every_kind() -> None:
     cases = (
         (IDMACC(), strong, (-6.0, 2.0)),
         (IDMACC(max_acceleration=2.5), strong, (-2.5, 2.0)),
+        (IDMACC(max_acceleration=3.0), strong, (-3.0, 2.0)),
+        (CACC(max_acceleration=3.0), World(max_braking=6.0, max_acceleration=6.0), (-3.0, 3.0)),
         (FollowerStopper(), strong, (-6.0, 1.5)),
         (FollowerStopper(max_deceleration=2.0), strong, (-2.0, 1.5)),
         (Action(), World(max_braking=6.0), None),  # its scale is that of the training
@@ -113,6 +115,8 @@ def test_the_limits_hold_for_commands_of_every_kind() -> None:
     assert Action().bind(World(max_braking=2.0)).compute(action).flatten().tolist() == [-2.0, 3.0]
     human = IDMACC().bind(World(max_braking=6.0), "human")
     assert human.limits == (-3.0, 3.0)  # limits of automated vehicles only
+    for limit, least in ((3.0, -6.0), (2.5, -2.5)):  # a filter's 3 does not lower
+        assert CBFFilter(max_acceleration=limit).bind(strong, "automated").least == least
 
 
 def test_limits_without_effect_are_refused() -> None:

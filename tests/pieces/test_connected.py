@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from helpers import POPULATION, composed, network, string, wavy_profiles
+from helpers import POPULATION, check_refused, composed, network, string, wavy_profiles
 from platoons import (
     A_MAX,
     ACTORS,
@@ -363,6 +363,34 @@ def test_the_first_decides_for_one_platoon_only() -> None:
         HCFS(rule=CACC(), choice="first").bind(World(MIXED, T))
 
 
+class Learned(HCFS):
+    def choose(self, rule, learned, *entries):
+        return torch.ones_like(rule, dtype=torch.bool)
+
+
+def test_the_hybrid_has_the_limits_of_its_vehicles_and_the_policy_of_its_training() -> None:
+    def bound(kind: type = HCFS, limit: float = 3.0, **settings: float) -> HCFS:
+        world = World(parse_string("automated*2"), T, max_braking=limit, max_acceleration=limit)
+        return kind(rule=CACC(), **settings).bind(world)
+
+    given = ({}, {"limit": 2.0}, {"limit": 6.0}, {"max_acceleration": 2.0}, {"braking": 1.0})
+    assert [bound(**x).both_brake.own for x in given] == [3.0, 2.0, 6.0, 2.0, 1.0]
+    stronger = r"deployed\.braking=3 exceeds the brakes of the vehicles, 2 m/s² \(scenario\.max_br"
+    cases = [({x: 2.0, "braking": 3.0}, stronger) for x in ("limit", "max_acceleration")]
+    cases += [({"max_acceleration": 5.0}, r"deployed\.max_acceleration=5 exceeds the limits")]
+    check_refused(lambda given: bound(**given), cases, ConfigError)
+    same = [({"max_acceleration": 2.0}, [1.5, 2.0]), ({"limit": 6.0}, [1.5, 3.0])]
+    for settings, expected in [*same, ({"action_scale": 1.0}, [0.5, 1.0])]:
+        hybrid, reached = bound(Learned, **settings), {}
+        values = dict.fromkeys((key for _, key in hybrid.needs), torch.ones(2, 1))
+        values["automated", "action"] = torch.tensor([[0.5], [1.0]])
+        hybrid.derive(values, reached)
+        assert reached["automated", "command"].flatten().tolist() == expected
+    for word, expected in (("deployed", 3.0), ("scenario.controllers.automated", 2.0)):
+        cfg = composed("variant=hcfs", f"{word}.max_acceleration=2").after_training()
+        assert cfg.scenario.controllers["automated"].settings["action_scale"] == expected
+
+
 def test_a_reward_by_which_hcfs_does_not_compare_is_refused() -> None:
     own = "+reward.terms.mine={_target_: lcc_rl.pieces.SafetyReward}"
     env_of(ramps(), Driver(("variant=ddpg", own)))
@@ -380,6 +408,32 @@ def test_an_evaluation_with_sensors_names_who_reads_messages(caplog) -> None:
     caplog.clear()
     Comparison(load("evaluate", ["variant=cacc", "scenario.horizon=20"]), inputs, [both[1]])
     assert not caplog.messages
+
+
+def test_an_evaluation_names_a_role_that_reads_messages_without_being_connected(caplog) -> None:
+    words = ["variant=cacc", "+controller@scenario.controllers.truck=cacc", "scenario.horizon=20"]
+    words += ["+scenario.start.truck=${scenario.start.automated}", string("automated*2 truck")]
+    option, inputs = "scenario.pieces.communication.connected", Inputs(ramps(), ramps(), POPULATION)
+
+    def warned(*more: str) -> list[str]:
+        caplog.clear()
+        cfg = load("evaluate", [*words, *more])
+        Comparison(cfg, inputs, [Strategy("cacc tuned", cfg)])
+        return [x for x in caplog.messages if option in x]
+
+    assert warned() == [f"truck reads messages but is not in {option}"]
+    assert warned(f"{option}=[automated,truck]") == []
+    with pytest.raises(ConfigError, match=rf"unknown role \({option}\) 'trick'.*; valid: .*truck"):
+        warned(f"{option}=[automated,trick]")
+
+
+def test_a_headway_below_the_deviations_of_training_is_refused_in_training_only() -> None:
+    cfg = composed("variant=cacc", "scenario.start.automated.headway=1", "scenario.horizon=20")
+    build_env(cfg, ramps(), POPULATION, 2, nominal=True)
+    with pytest.raises(
+        ConfigError, match=r"start\.automated\.gap_spread=2 must be below its headw"
+    ):
+        build_env(cfg, ramps(), POPULATION, 2)
 
 
 # -- the headway and the safe cap ------------------------------------------------------------------

@@ -63,7 +63,7 @@ def best_plan(settings: MPCSettings, moment: list[float]) -> np.ndarray:
         "type": "ineq",
         "fun": lambda plan: moment[0] + settings.step * np.cumsum(plan),
     }
-    limit = settings.max_acceleration
+    limit = settings.max_acceleration or 3.0
 
     def cost(plan: np.ndarray) -> tuple[float, np.ndarray]:
         plan = torch.tensor(plan, requires_grad=True)

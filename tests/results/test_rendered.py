@@ -111,6 +111,9 @@ def test_tables_are_printed_as_kept(name: str, tmp_path: Path, capsys, monkeypat
     cfg = load("evaluate", SETTINGS[name])
     save_config(cfg, tmp_path)
     write_parquet(ROWS[name](), tmp_path / EPISODES)
+    if name == "platoons":
+        table.main([str(tmp_path), "--format", "latex", "--columns", "driver,reward"])
+        assert "\ncase 1 & CACC, tuned & " in capsys.readouterr().out
     for form, words in FORMS.items():
         table.main([str(tmp_path), *words])
         printed, file = capsys.readouterr().out, KEPT / f"{name}.{form}.txt"
