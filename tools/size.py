@@ -30,8 +30,8 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
-    "lcc_rl + tools": {"lines": 45_870, "code": 30_500},
-    "tests": {"lines": 28_005},
+    "lcc_rl + tools": {"lines": 45_880, "code": 30_510},
+    "tests": {"lines": 28_010},
     "conf": {"yaml": 166},
 }
 CASES = 1_335  # ceiling of all quick tests, see tests/tools/test_size.py

@@ -45,7 +45,7 @@ def check_used(
         return
     reasons = dict(_of_road(cfg)) | dict(_of_rows(cfg, sweep))
     if not sweep:
-        reasons |= dict(_of_roles(cfg)) | dict(_of_agent(cfg)) | dict(_of_reward(written))
+        reasons |= dict(_of_roles(cfg)) | dict(_of_agent(cfg))
         if written is not None and "${training.gap_range}" not in str(written["scenario"]):
             reasons.setdefault("training.gap_range", "no start of the scenario refers to it")
         observation = cfg.observation.settings
@@ -170,13 +170,6 @@ def _of_agent(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
     yield from {"agent": reason, "training": reason}.items()
     if cfg.policy is not None:
         yield "policy", reason
-
-
-def _of_reward(written: Any) -> Iterator[tuple[str, str]]:
-    """Yield terms that ``reward.without`` leaves out, and why their settings have no effect."""
-    names = ((written or {}).get("reward") or {}).get("without") or ()
-    for name in [names] if isinstance(names, str) else names:
-        yield f"reward.terms.{name}", "reward.without leaves the term out"
 
 
 def _of_objective(

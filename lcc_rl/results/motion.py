@@ -77,7 +77,8 @@ class SampleMotion:
 
 def of_first_seed(steps: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of steps.parquet of each strategy's first training seed."""
-    if "training_seed" not in steps:  # no row, or of earlier versions
+    earlier = "case" in steps and "training_seed" not in steps  # of a version before
+    if steps.empty or earlier:
         return steps
     seeds = steps["training_seed"]
     return steps[seeds.isna() | (seeds == seeds.groupby(steps["strategy"]).transform("min"))]

@@ -122,7 +122,6 @@ IGNORED = {
     "variant=alcc deployed.choice=first": "belongs to variant=hcfs",
     "+filter=cbf scenario.filters.automated.robust=false": "actuators and sensors are exact",
     "sweep=mine": "names the folder of a sweep, -m",
-    "reward.without=safety reward.terms.safety.weight=3": "reward.without leaves the term out",
     "variant=own_energy observation.visible=2": "scales names no vehicle behind",
     "reward.without=safety reward.terms.safety.threshold=3": "reward.without leaves the term out",
     "reward.without=[safety] reward.terms.safety.weight=3": "reward.without leaves the term out",
