@@ -178,7 +178,9 @@ class Runner(Reader):
                     if stop.code:
                         raise RuntimeError(errors.getvalue()) from stop
             return
-        rest += [] if error else self.shrunk(name, rest)
+        small = [] if error else self.shrunk(name, rest)
+        keys = {item.partition("=")[0] for item in small if "=" in item}
+        rest = [*(word for word in rest if word.partition("=")[0] not in keys), *small]
         done = run_command(name, *rest, cwd=self.folder)
         assert done.returncode == (2 if error else 0), done.stderr[-2000:]
         assert not error or error in done.stderr, done.stderr
