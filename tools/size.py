@@ -31,7 +31,7 @@ DOCUMENTED = (ast.Module, ast.ClassDef, *FUNCTIONS)
 # make lint fails above these ceilings; further work may use the difference.
 CEILINGS = {
     "lcc_rl + tools": {"lines": 45_880, "code": 30_510},
-    "tests": {"lines": 28_010},
+    "tests": {"lines": 28_030},
     "conf": {"yaml": 166},
 }
 CASES = 1_335  # ceiling of all quick tests, see tests/tools/test_size.py

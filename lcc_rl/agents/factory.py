@@ -19,8 +19,8 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import after_humans, warm_up_steps, world_of
 from lcc_rl.errors import ConfigError, raised_as, require
-from lcc_rl.functional.pattern import AUTOMATED
-from lcc_rl.pieces import Observation
+from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION
+from lcc_rl.pieces import Hybrid, Observation
 from lcc_rl.pieces.controllers import Population
 
 
@@ -33,8 +33,11 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
     require(cfg.learns, f"variant {cfg.variant} has no agent")
     world = world_of(cfg, population=population)
     observation = cfg.observation.made(Observation).bind(world)
-    driver = cfg.scenario.controllers.get(AUTOMATED)
-    limit = driver and getattr(driver.made(), "max_acceleration", None)
+    node = cfg.scenario.controllers.get(AUTOMATED)
+    driver = node and node.made()
+    limit = getattr(driver, "max_acceleration", None)
+    if isinstance(driver, Hybrid):
+        limit = driver.action_scale or MAX_ACCELERATION
     scene = Scene(observation.event_shape[-1], cfg.seed, device, world, observation, limit)
     agent: Agent = cfg.agent.made(Agent)
     learner = agent.start(scene)

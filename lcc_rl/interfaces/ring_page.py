@@ -99,7 +99,7 @@ def page_data(policy: Any, trust: Sequence[str], overrides: Sequence[str]) -> di
             role: {kind: stream_id(f"{stream_name(role)}.{kind}") for kind in DRAWS}
             for role in (HUMAN, AUTOMATED)
         },
-        "rules": {name: {**values(rule), "samples": rule.samples} for name, rule in rules.items()},
+        "rules": {name: _rule(rule) for name, rule in rules.items()},
         "network": _network(policy, scenario.time_step, trust),
         "vehicle": car.vehicle,
         "fuel": {**car.own, "standstill": STANDSTILL, "still": STILL},
@@ -139,6 +139,13 @@ def _human(cfg: StudyConfig) -> dict[str, Any] | None:
     noise = {"noise": human.noise, "wiener": human.wiener, "spread": human.spreads[0]}
     late = {"late": human.late, "stray": human.noise_spread, **vars(human.noise_step)}
     return {"drivers": drivers, **vars(human.drivers), **noise, **late}
+
+
+def _rule(rule: Any) -> dict[str, Any]:
+    """Return the settings of a rule, with the limits of its commands, and its samples."""
+    least, largest = rule.limits
+    limits = {"max_deceleration": -least, "max_acceleration": largest}
+    return {**values(rule), **limits, "samples": rule.samples}
 
 
 def _network(policy: str | Path, time_step: float, trust: Sequence[str]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from lcc_rl.commands import evaluation, training
 from lcc_rl.config.nodes import Node
 from lcc_rl.errors import ConfigError
 from lcc_rl.functional.idm import IDMConstants
-from lcc_rl.pieces import Observation
+from lcc_rl.pieces import Hybrid, Observation
 from lcc_rl.pieces.controllers import Controller
 from lcc_rl.pieces.cruise import LinearACC
 
@@ -66,6 +66,22 @@ class Scaled(Controller):
 
     def command(self, action: torch.Tensor) -> torch.Tensor:
         return action * self.scale
+
+
+class Learned(Hybrid):
+    """A hybrid that always takes the policy's action."""
+
+    def choose(self, rule: torch.Tensor, learned: torch.Tensor) -> torch.Tensor:
+        return torch.ones_like(learned, dtype=torch.bool)
+
+
+def test_a_rule_in_a_hybrid_has_the_scale_of_its_actions_not_its_limit() -> None:
+    cfg = tiny("train", "variant=alcc", "agent=analytic", "agent.policy=idm", agent=False)
+    own = {"_target_": f"{__name__}.Learned", "rule": {"_target_": "lcc_rl.pieces.IDMACC"}}
+    for more, scale in (({"max_acceleration": 1.0}, 3.0), ({"action_scale": 2.0}, 2.0)):
+        node = Node.of({**own, **more}, "automated")
+        agent = make_agent(cfg.with_(scenario={"controllers": {"automated": node}}))
+        assert agent.policy.module.max_acceleration == scale
 
 
 def test_a_rule_of_unknown_scale_and_a_bound_of_no_residual_are_refused() -> None:

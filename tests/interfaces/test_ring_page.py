@@ -25,7 +25,7 @@ from lcc_rl.evaluation.named import controller_of
 from lcc_rl.evaluation.strategies import trained
 from lcc_rl.functional.pattern import parse_string
 from lcc_rl.interfaces.export import export
-from lcc_rl.interfaces.ring_page import RING_TASK, filter_data, ring_of, ring_page
+from lcc_rl.interfaces.ring_page import RING_TASK, filter_data, page_data, ring_of, ring_page
 from lcc_rl.pieces import CBFFilter
 from lcc_rl.pieces.base import SEED
 from lcc_rl.pieces.cbf import REMEMBERS
@@ -195,6 +195,12 @@ def test_a_page_has_the_ring_of_the_training_but_for_what_is_given(monkeypatch) 
     assert found() == (300.0, 22, 0.83, "midSUV")
     assert found("scenario.circumference=400")[:3] == (400.0, 22, 0.83)
     assert found("drivers=i80", "energy=compact") == (300.0, 22, None, "Compact")
+
+
+def test_rules_of_a_page_have_the_limits_of_their_cars() -> None:
+    rules = page_data(RING, (), ())["rules"].values()
+    limits = [(rule["max_deceleration"], rule["max_acceleration"]) for rule in rules]
+    assert limits == [(3.0, 1.5), (3.0, 1.5)]
 
 
 def test_settings_in_the_address(browser) -> None:
