@@ -102,9 +102,11 @@ def curve(part: pd.DataFrame, name: str) -> tuple[pd.Series, pd.Series]:
     return saving, own[FLOW]
 
 
-def against(part: pd.DataFrame, name: str, measure: Statistic) -> Estimate:
-    """Return a measure of the learned fleet against another."""
-    kinds = (LEARNED, "fleet"), (name, "fleet")
+def against(
+    part: pd.DataFrame, name: str, measure: Statistic, own: str = LEARNED, policy: str = "fleet"
+) -> Estimate:
+    """Return a measure of the learned fleet, or another kind, against a third."""
+    kinds = (own, policy), (name, policy)
     return compare_fronts(part, *kinds, columns=FLEET, measure=measure)
 
 

@@ -5,14 +5,7 @@ from __future__ import annotations
 import fleets
 import pandas as pd
 
-from lcc_rl.results.fronts import (
-    FLEET,
-    Statistic,
-    compare_fronts,
-    fleet_saved,
-    flow_gained,
-    saved_at_flow,
-)
+from lcc_rl.results.fronts import fleet_saved, flow_gained, saved_at_flow
 from lcc_rl.results.render import markdown_table
 
 TASKS_TRAINED = {"alcc": "ALCC", "i24-follow5": "`i24-follow5`"}
@@ -25,6 +18,11 @@ LEARNERS = {
     "sac": "SAC",
     "ddpg": "DDPG",
 }
+MEASURED = (  # with what a learner is compared, and how
+    (fleets.HUMAN, fleet_saved),
+    (fleets.HUMAN, flow_gained),
+    ("idm", saved_at_flow),
+)
 
 
 def learner_savings(rows: pd.DataFrame) -> str:
@@ -44,13 +42,8 @@ def learner_savings(rows: pd.DataFrame) -> str:
             if own.empty:
                 continue
             cells = [label, words, str(own["training_seed"].nunique())]
-            cells += [_against(part, name, fleets.HUMAN, x) for x in (fleet_saved, flow_gained)]
-            cells.append(_against(part, name, "idm", saved_at_flow))
+            for other, measure in MEASURED:
+                cells.append(fleets.percent(fleets.against(part, other, measure, name, "")))
             minutes = own["minutes"].mean()
             lines.append([*cells, f"{minutes:.1f}" if minutes > 0.0 else "–"])
     return markdown_table([*head, "minutes"], lines)
-
-
-def _against(part: pd.DataFrame, name: str, other: str, measure: Statistic) -> str:
-    found = compare_fronts(part, (name, ""), (other, ""), columns=FLEET, measure=measure)
-    return fleets.percent(found)

@@ -19,7 +19,7 @@ from lcc_rl.data.profiles import Profiles
 from lcc_rl.envs import build_env
 from lcc_rl.envs.factory import after_humans, warm_up_steps, world_of
 from lcc_rl.errors import ConfigError, raised_as, require
-from lcc_rl.functional.pattern import AUTOMATED, MAX_ACCELERATION
+from lcc_rl.functional.pattern import AUTOMATED
 from lcc_rl.pieces import Hybrid, Observation
 from lcc_rl.pieces.controllers import Population
 
@@ -35,9 +35,8 @@ def build_agent(cfg: StudyConfig, population: Population, device: str = "cpu") -
     observation = cfg.observation.made(Observation).bind(world)
     node = cfg.scenario.controllers.get(AUTOMATED)
     driver = node and node.made()
-    limit = getattr(driver, "max_acceleration", None)
-    if isinstance(driver, Hybrid):
-        limit = driver.action_scale or MAX_ACCELERATION
+    named = getattr(driver, "max_acceleration", None)
+    limit = driver.scale if isinstance(driver, Hybrid) else named
     scene = Scene(observation.event_shape[-1], cfg.seed, device, world, observation, limit)
     agent: Agent = cfg.agent.made(Agent)
     learner = agent.start(scene)

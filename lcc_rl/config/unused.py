@@ -46,11 +46,8 @@ def check_used(
     reasons = dict(_of_road(cfg)) | dict(_of_rows(cfg, sweep))
     if not sweep:
         reasons |= dict(_of_roles(cfg)) | dict(_of_agent(cfg))
-        if written is not None and "${training.gap_range}" not in str(written["scenario"]):
-            reasons.setdefault("training.gap_range", "no start of the scenario refers to it")
-        for key in map(key_of, overrides):
-            if key.startswith("gains.") and f"${{{key}}}" not in str(written):
-                reasons[key] = "no controller refers to it"
+        if written is not None:
+            reasons = dict(_of_references(written, overrides)) | reasons
         observation = cfg.observation.settings
         if observation[TARGET] == OBSERVATION and "behind" not in (observation.get("scales") or ()):
             for key in ("visible", "presence"):
@@ -146,6 +143,17 @@ def _of_roles(cfg: StudyConfig) -> Iterator[tuple[str, str]]:
         roles = node.settings.get("roles") if node is not None else None  # none of another class
         if roles and not {*roles} & {*cfg.scenario.vehicles.names}:
             yield f"scenario.fleet.{name}", f"no vehicle of the string is {' or '.join(roles)}"
+
+
+def _of_references(written: Any, overrides: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield settings that serve by reference only and have none, and why they have no effect."""
+    text = str(written)
+    for key in map(key_of, overrides):
+        if f"${{{key}}}" not in text:
+            if key == "training.gap_range":
+                yield key, "no start of the scenario refers to it"
+            elif key.startswith("gains."):
+                yield key, "no controller refers to it"
 
 
 def _of_traffic(scenario: Any) -> Iterator[tuple[str, str]]:

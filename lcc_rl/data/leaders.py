@@ -204,10 +204,8 @@ class RecordLeaders(Settings):
         return profiles
 
     def _cut(self, x: Any, where: str, time_step: float, begin: Any, end: Any) -> Profiles:
-        try:
+        with raised_as(DataError, where, DataError):
             return stretch(x.path, time_step, x.scale, begin, end, self.plausible)
-        except DataError as error:
-            raise DataError(f"{where}: {error}") from error
 
     def _parsed(self, kind: type[Settings], node: Mapping[str, Any] | None, where: str) -> Any:
         """Return settings of a stretch or case; it or ``self`` has a path."""

@@ -78,11 +78,16 @@ class Hybrid(Controller):
         self.weighed = len(own)
         super().declare(world, [f"{self.name}.action", *own, *self.rule.names], *others, **named)
 
+    @property
+    def scale(self) -> float:
+        """Acceleration of action 1 [m/s²]."""
+        return self.action_scale or MAX_ACCELERATION
+
     def command(self, action: Tensor, *entries: Tensor) -> tuple[Tensor, ...]:
         """Return the commands, the winners and the counters."""
         read, (before, *counts) = entries[: -len(self.remembers)], entries[-len(self.remembers) :]
         rule = self.rule.command(*read[self.weighed :])
-        learned = action * (self.action_scale or MAX_ACCELERATION)
+        learned = action * self.scale
         chosen: Any = self.choose(rule, learned, *read[: self.weighed])
         if isinstance(chosen, Tensor) and chosen.dtype == torch.bool:
             winner, no = chosen.to(before.dtype), torch.zeros_like(chosen)
